@@ -58,7 +58,7 @@ test-lowest: ## the quick tests with the lowest versions that pyproject.toml all
 	.ci/lowest
 
 # audit, daemon, discovery, fleet and scale take longer: each is run by itself
-BENCHMARKS := adjustment frame front_door montecarlo object_space "prediction --seeds 1" simulation \
+BENCHMARKS := adjustment frame front_door gauge montecarlo object_space "prediction --seeds 1" simulation \
   store study thermal_model
 bench: $(STAMP) ## ratios to peers, in one run on one thread, within five minutes
 	@failed=; for b in $(BENCHMARKS); do echo "== $$b"; \

@@ -1,7 +1,7 @@
 """Every printed standard deviation against the scatter of what it belongs to, and every level.
 
 Run: python -m benchmarks.audit [SECTION …] [--draws N] [--seed S] [--page FILE]
-Prints the rows of docs/reference/standard-deviations.md: error over stated standard deviation (root
+Prints what docs/reference/standard-deviations.md shows: error over stated standard deviation (root
 mean square over the draws; 1 where the statement is true) or the fraction of false alarms. Exit
 status 1 where a ratio lies outside 0.9 to 1.1 by more than three of its own sds, or a level is
 exceeded by as much; rows that are known to be cautious have a lower bound of their own. With
@@ -23,17 +23,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks import audit_camera, audit_field, audit_null, audit_study, audit_thermal
-from benchmarks.audit_rows import Row, ratio, share
+from benchmarks.audit_rows import HEADER, Row, ratio, share, table
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["HEADER", "SECTIONS", "main", "ratio", "share", "with_rows"]
-
-HEADER = (
-    "| printed by | what | holds | error / sd, or false alarms at 5 % | draws | seed |\n"
-    "|---|---|---|---|---|---|"
-)
+__all__ = ["HEADER", "SECTIONS", "main", "ratio", "share", "table", "with_rows"]
 
 SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
     "epoch": audit_camera.epoch,
@@ -55,11 +50,11 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
 }
 
 
-def with_rows(page: str, section: str, rows: list[str]) -> str:
+def with_rows(page: str, section: str, rows: list[Row]) -> str:
     """The page with the table of one section written again."""
     start = page.index(HEADER, page.index(f"## {section.capitalize()}\n"))
     end = page.index("\n\n", start)
-    return page[:start] + "\n".join([HEADER, *rows]) + page[end:]
+    return page[:start] + table(rows) + page[end:]
 
 
 def main() -> int:
@@ -74,7 +69,6 @@ def main() -> int:
         parser.error(f"{min(unknown)}: there are {', '.join(SECTIONS)}")
     seed = given.seed or int(np.random.SeedSequence().generate_state(1)[0])
     missed = 0
-    print(HEADER)
     for name in given.sections or SECTIONS:
         begin = time.process_time()
         rows = SECTIONS[name](given.draws, np.random.default_rng(seed))
@@ -83,8 +77,7 @@ def main() -> int:
             missed += not row.met
         if given.page is not None:
             page = given.page.read_text(encoding="utf-8")
-            written = with_rows(page, name, [row.text(seed) for row in rows])
-            given.page.write_text(written, encoding="utf-8")
+            given.page.write_text(with_rows(page, name, rows), encoding="utf-8")
         print(f"{name}: {time.process_time() - begin:.0f} s of processor", file=sys.stderr)
     return 1 if missed else 0
 

@@ -10,8 +10,7 @@ import numpy as np
 from benchmarks.audit_rows import Row, ratio
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.analysis.online.equilibrium import slope
-from thermocald.analysis.online.field_errors import FieldErrors
-from thermocald.analysis.online.filter import OnlineFilter
+from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
@@ -113,7 +112,7 @@ def series(draws: int, rng: np.random.Generator) -> list[Row]:
         sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
         strong.append((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
     return [
-        ratio("`replay`, `study`: a series", "the same, warm-up by 16 px in 150 epochs",
+        ratio("`replay`, `study`: a series", "sd of last − first; warm-up by 16 px in 150 epochs",
               "noise of both epochs", np.array(strong)),
         ratio("`replay`, `study`: a series", "sd of last − first; c, x0, y0",
               "noise of both epochs", np.array(change)),

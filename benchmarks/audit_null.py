@@ -123,10 +123,9 @@ def null(draws: int, rng: np.random.Generator) -> list[Row]:
             tests = [drift_test(one, np.ones(n), np.full(n, 280.0), times=times) for one in y.T]
             drifting.append(min(holm([t.p_value for t in tests if t])) <= LEVEL)
             dependent.append(min(holm([slope_p_value(one, warm, times) for one in y.T])) <= LEVEL)
-        where = f"{kind}; any of c, x0, y0"
         holds = "30 to 400 epochs, noise of any size and memory"
-        rows.append(share("`study`, `replay`: drift at 1 %", where, holds, drifting, LEVEL))
-        rows.append(share("`study`, `replay`: r at 1 %", where, holds, dependent, LEVEL))
+        rows.append(share("`study`, `replay`: drift at 1 %", kind, holds, drifting, LEVEL))
+        rows.append(share("`study`, `replay`: r at 1 %", kind, holds, dependent, LEVEL))
     return rows
 
 

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+HEADER = "| printed by | error / sd, or share of false alarms |\n|---|---|"
+
 
 @dataclass(frozen=True)
 class Row:
@@ -32,13 +34,30 @@ class Row:
             return self.value <= self.level + 3 * self.sd
         return self.low - 3 * self.sd <= self.value <= 1.1 + 3 * self.sd
 
-    def text(self, seed: int) -> str:
-        shown = f"{self.value:.2f} ± {self.sd:.2f}"
+    @property
+    def shown(self) -> str:
         if self.level is not None:
-            shown = f"{100 * self.value:.1f} ± {100 * self.sd:.1f} %"
+            return f"{100 * self.value:.1f} ± {100 * self.sd:.1f} %"
+        return f"{self.value:.2f} ± {self.sd:.2f}"
+
+    def text(self, seed: int) -> str:
         return (
-            f"| {self.printed_by} | {self.what} | {self.holds} | {shown} | {self.draws} | {seed} |"
+            f"{self.shown}  {self.printed_by}: {self.what} "
+            f"(holds {self.holds or 'no more'}; {self.draws} draws, seed {seed})"
         )
+
+
+def table(rows: list[Row]) -> str:
+    """Return the rows as the page has them: a line per command, equal figures together."""
+    lines = [HEADER]
+    for printed_by in dict.fromkeys(row.printed_by for row in rows):
+        figures: dict[str, list[str]] = {}
+        for row in rows:
+            if row.printed_by == printed_by:
+                figures.setdefault(row.shown, []).append(row.what)
+        cell = "<br>".join(f"{shown}: {' · '.join(whats)}" for shown, whats in figures.items())
+        lines.append(f"| {printed_by} | {cell} |")
+    return "\n".join(lines)
 
 
 def ratio(printed_by: str, what: str, holds: str, standardised: Array, low: float = 0.9) -> Row:

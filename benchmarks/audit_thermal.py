@@ -13,8 +13,7 @@ from thermocald.analysis.thermal.correction import correct_points
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.discovery.model import build_model
-from thermocald.discovery.result import discover_series
+from thermocald.discovery.result import build_model, discover_series
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect, follow_angle
@@ -26,7 +25,6 @@ from thermocald.thermal.source import epochs_input
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.analysis.thermal.result import FittedModel
     from thermocald.thermal.series import SeriesInput
 
     Array = NDArray[np.float64]
@@ -58,7 +56,7 @@ def seen(s: Any, rng: np.random.Generator | None = None) -> SeriesInput:
     return epochs_input(s.head, field, list(s.epochs()), s.programme.series)
 
 
-def fitted(source: SeriesInput, *effects: ModelEffect) -> FittedModel:
+def fitted(source: SeriesInput, *effects: ModelEffect) -> ThermalCamera:
     """The series reduced as `fit` does it, and fitted."""
     return fit_thermal_model([reduce_series(source, affinity=False, strict=False)], effects)
 
@@ -95,7 +93,9 @@ def distortion(draws: int, rng: np.random.Generator) -> list[Row]:
     for seed in _seeds(rng, draws):
         s = simulated(seed, ())
         f = fitted(seen_by_opencv(s))
-        rates.append([(f.model.rates[n] - s.model.rates[n]) / f.sd(f"rates.{n}") for n in NAMES])
+        rates.append(
+            [(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
+        )
         wrong.append(f.model.distortion != "angle")
     return [
         ratio("`fit`", "sd of the rates of c, x0, y0; rendered by OpenCV with changing f",
@@ -126,9 +126,11 @@ def delay(draws: int, rng: np.random.Generator) -> list[Row]:
         s = simulated(seed, ())
         late = float(rng.uniform(-90.0, 90.0))
         f = fitted(read_apart(s, late), ModelEffect("time_offset", {"d": 0.0}))
-        shifts.append((f.model.effects[0].values["d"] + late) / f.sd("time_offset.d"))
-        rates.append([(f.model.rates[n] - s.model.rates[n]) / f.sd(f"rates.{n}") for n in NAMES])
-        noise.append(f.series[0].thermometer_sd / 0.05)
+        shifts.append((f.model.effects[0].values["d"] + late) / f.model.sd("time_offset.d"))
+        rates.append(
+            [(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
+        )
+        noise.append(f.fitted["series"][0].thermometer_sd / 0.05)
     print(f"(thermometer: {np.mean(noise):.2f} of its noise)", file=sys.stderr)
     return [
         ratio("`fit`", "sd of a clock's shift, ± 90 s; readings of 15 s, ± 0.05 K",
@@ -149,11 +151,13 @@ def thermal(draws: int, rng: np.random.Generator) -> list[Row]:
         s = simulated(seed)
         truth = s.model
         f = fitted(seen(s, rng), ModelEffect("thermal_lag", {"tau": 10.0}))
-        tau.append((f.model.effects[0].values["tau"] - TAU) / f.sd("thermal_lag.tau"))
-        rates.append([(f.model.rates[n] - truth.rates[n]) / f.sd(f"rates.{n}") for n in NAMES])
+        tau.append((f.model.effects[0].values["tau"] - TAU) / f.model.sd("thermal_lag.tau"))
+        rates.append(
+            [(f.model.rates[n] - truth.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
+        )
         start = truth.interior.as_array() + (f.model.T0 - truth.T0) * truth.rate_vector
         off = f.model.interior.as_array() - start
-        level.append([off[IOP_NAMES.index(n)] / f.sd(f"interior.{n}") for n in NAMES])
+        level.append([off[IOP_NAMES.index(n)] / f.model.sd(f"interior.{n}") for n in NAMES])
         camera = ThermalCamera(f.model)
         state = camera.at(NEAR)
         steady = truth.interior.as_array() + (NEAR - truth.T0) * truth.rate_vector
@@ -250,7 +254,7 @@ def outside(draws: int, rng: np.random.Generator) -> list[Row]:
         first = fitted(seen(simulated(seed, (effect,))))
         second = simulated(seed + 1, (effect,), power=6.5, until=700.0, series="M2")
         reduced = reduce_series(seen(second), affinity=False, strict=False)
-        error = predicted_error(first.model, reduced, first.series[0].thermometer_sd)
+        error = predicted_error(first.model, reduced, first.fitted["series"][0].thermometer_sd)
         found.append(bool(error.coverage < 0.9))
     return [share("`predict --test`", "a band that holds less than 90 %; an effect that `fit` "
                   "is not told of", "no band where an effect is missing", found)]  # fmt: skip

@@ -22,8 +22,10 @@ import cv2
 import numpy as np
 
 from thermocald.acquisition.device_loop import Schedule
-from thermocald.acquisition.pipeline import AcquiredEpoch, make_epoch, pair_readings
+from thermocald.acquisition.pipeline import AcquiredEpoch
+from thermocald.acquisition.thermometers import pair_readings
 from thermocald.analysis.online.observer import OnlineObserver
+from thermocald.epoch import Epoch
 from thermocald.hal import SystemClock, VirtualClock, open_device
 from thermocald.photogrammetry.targets.image_file import decode_grey
 
@@ -49,14 +51,13 @@ def scheduled(ticks: int, work_s: float) -> tuple[list[float], float, int]:
     schedule = Schedule(SystemClock(), PERIOD_S)
     late, last = [], None
     for _ in range(ticks):
-        tick = schedule.wait()
-        assert tick is not None
-        late.append(tick.late_s)
-        last = tick
+        last = schedule.wait()
+        assert last is not None
+        late.append(time.monotonic() - schedule.due(last))
         time.sleep(work_s)
     assert last is not None
-    drift = last.due - (schedule.begin + last.index * PERIOD_S)
-    return late, drift, schedule.stats().skipped
+    drift = schedule.due(last) - (schedule.begin + last * PERIOD_S)
+    return late, drift, int(schedule.stats()["skipped"])
 
 
 def sleeping(ticks: int, work_s: float) -> tuple[list[float], float, int]:
@@ -98,12 +99,12 @@ def virtual_day() -> None:
     for _ in range(8640):
         tick = schedule.wait()
         assert tick is not None
-        late.append(tick.late_s)
+        late.append(clock.monotonic() - schedule.due(tick))
         clock.advance(float(rng.uniform(0.0, 9.0)))
     print(
         f"virtual day: 8640 ticks of 10 s with up to 9 s of work: late max {max(late):g} s, drift "
-        f"{tick.due - 8639 * 10.0:g} s, "
-        f"skipped {schedule.stats().skipped}"
+        f"{schedule.due(tick) - 8639 * 10.0:g} s, "
+        f"skipped {schedule.stats()['skipped']}"
     )
 
 
@@ -111,8 +112,7 @@ def epoch_cost(epochs: int) -> None:
     """Frame to store, 8 MP, one thread."""
     from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.daemon.epoch_keeper import EpochKeeper
-    from thermocald.daemon.given_config import mock_config
-    from thermocald.daemon.plan import plan_cameras, running_series
+    from thermocald.daemon.plan import mock_config, plan_cameras, running_series
     from thermocald.daemon.store_guard import StoreGuard
 
     clock = VirtualClock()
@@ -136,7 +136,7 @@ def epoch_cost(epochs: int) -> None:
                 clock.sleep_until(10.0 * k)
                 frame = plan.camera.capture()
                 paired = pair_readings({"temperature": thermometer.read()}, frame.monotonic)
-                epoch = make_epoch(k + 1, frame, paired)
+                epoch = Epoch(k + 1, frame.utc, paired.utc, paired.temperatures)
                 jpeg = cv2.imencode(".jpg", frame.image)[1].tobytes()
                 z = time.thread_time()
                 decode_grey(jpeg)  # what a phone's frame costs more; the mock's has grey values

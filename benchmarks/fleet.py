@@ -35,8 +35,8 @@ from tests.fleet.conftest import new_cluster
 from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.epoch import Epoch
-from thermocald.fleet.document import fleet_document
 from thermocald.fleet.forward import Forwarder
+from thermocald.fleet.overview import fleet_document
 from thermocald.fleet.reprocess import find_blocks, run_blocks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.physics.presets import preset_simulation

@@ -19,8 +19,7 @@ import cv2
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.analysis.study.montecarlo import draw_root, plane_errors, simulate_errors
-from thermocald.analysis.study.object_plane import on_plane
+from thermocald.analysis.study.montecarlo import draw_root, on_plane, plane_errors, simulate_errors
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)

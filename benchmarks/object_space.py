@@ -23,7 +23,7 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.physics import catalogue
 from thermocald.physics.model import ModelEffect
-from thermocald.physics.presets import preset_names, preset_simulation
+from thermocald.physics.presets import PRESETS, preset_simulation
 from thermocald.physics.simulation import Simulation
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.series import ReducedSeries
@@ -104,7 +104,7 @@ def _errors(
 def main() -> int:
     print(HEADER)
     rows = []
-    for preset in preset_names():
+    for preset in PRESETS:
         rows.append(measure(preset))
         print(rows[-1].markdown(), flush=True)
     worst = max(row.ratio for row in rows)

@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from tests.analysis.river_scenes import KINDS, Outcome, play
-from tests.analysis.test_scene import LACKING, day
+from tests.analysis.test_scene import LACKING, day, drawn
 
 
 def rms(values: list[float]) -> float:
@@ -65,6 +65,22 @@ def checks(count: int, first: int, folder: Path) -> bool:
     return found[""] <= max(1, 0.02 * count)
 
 
+def powers(draws: int) -> None:
+    """How often an effect is found, by its largest change of c over a frame's sd."""
+    sizes = (1.0, 2.0, 4.0, 8.0, 16.0)
+    print(f"\n| found of {draws} drawn days, effect over noise | {' | '.join(map(str, sizes))} |")
+    print("|---" * (len(sizes) + 1) + "|")
+    for lacks in filter(None, LACKING):
+        rng, found = np.random.default_rng(1), []
+        for size in sizes:
+            count = sum(drawn(rng, lacks, size).model_misses for _ in range(draws))
+            found.append(f"{count / draws:.2f}")
+        print(f"| {lacks} | {' | '.join(found)} |", flush=True)
+    rng = np.random.default_rng(2)
+    false = sum(drawn(rng, "", 0.0).model_misses for _ in range(10 * draws))
+    print(f"false alarms: {false} of {10 * draws}")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, default=56)
@@ -75,6 +91,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         passed = water_lines(a.scenes, a.first, Path(folder))
         passed &= checks(a.days, a.first, Path(folder))
+    powers(200)
     return 0 if passed or not a.check else 1
 
 

@@ -29,9 +29,8 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.database.columns import (
     CHUNK,
-    CHUNKED,
     MERGED,
-    build_missing_chunks,
+    SeriesColumns,
     insert_chunk,
     latest_columns,
 )
@@ -44,7 +43,7 @@ from thermocald.store.series import EpochResult, StoredEpoch
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-BYTES_PER_OBSERVATION = 18  # row uint16, x, y int32, sx, sy float32: see store/blob.py
+BYTES_PER_OBSERVATION = 18  # row uint16, x, y int32, sx, sy float32: see store/database/epochs.py
 BYTES_PER_RESULT = 16 * 8 + 136 * 8  # parameters, upper triangle of their covariance
 COLUMNS = [
     "epoch",
@@ -112,9 +111,9 @@ def fill_columns(path: Path, epochs: int) -> None:
         store._db.execute("BEGIN")
         for i in range(min(epochs, size)):
             _insert_row(store, series.id, i, rng)
-        build_missing_chunks(store._db, series.id)
+        SeriesColumns(store._db, series.id).build()
         if chunks > 1:
-            first = latest_columns(store._db, series.id, CHUNKED, -1)
+            first = latest_columns(store._db, series.id, -1)
             for k in range(1, chunks):
                 later = {name: rng.permutation(column) for name, column in first.items()}
                 later["number"] = first["number"] + k * size
@@ -123,7 +122,7 @@ def fill_columns(path: Path, epochs: int) -> None:
                 insert_chunk(store._db, series.id, k * size, (k + 1) * size - 1, later)
             for i in range(chunks * size, epochs):
                 _insert_row(store, series.id, i, rng)
-            build_missing_chunks(store._db, series.id)
+            SeriesColumns(store._db, series.id).build()
         store._db.execute("COMMIT")
 
 

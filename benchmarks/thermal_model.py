@@ -24,7 +24,7 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-from thermocald.analysis.thermal.thermal_model import FittedModel, fit_thermal_model
+from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.presets import preset_simulation
@@ -34,7 +34,7 @@ from thermocald.thermal.source import epochs_input
 SERIES, EPOCHS = 20, 1000
 
 
-def fitted() -> tuple[FittedModel, bool]:
+def fitted() -> tuple[ThermalCamera, bool]:
     series, reducing = [], 0.0
     for k in range(SERIES):
         s = preset_simulation("rpi-v2.1-heating", seed=k)
@@ -61,8 +61,7 @@ def fitted() -> tuple[FittedModel, bool]:
     return model, reducing + fitting <= 20.0 and peak < 1000
 
 
-def use(model: FittedModel) -> bool:
-    camera = ThermalCamera(model.model)
+def use(camera: ThermalCamera) -> bool:
     state = camera.at(35.0)
     took = []
     for _ in range(20):

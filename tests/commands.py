@@ -37,9 +37,22 @@ def call(*arguments: object, folder: Path | None = None) -> subprocess.Completed
     return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
 
 
-def invoke(*arguments: object) -> Result:
-    """The result of a command; an error of ours is raised as it is."""
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
+def answer(*arguments: object, given: str | None = None, **environment: str) -> Result:
+    """Return the result of a command; given: its standard input."""
+    words = [str(a) for a in arguments]
+    return CliRunner().invoke(application(), words, input=given, env=environment)
+
+
+def invoke(*arguments: object, **environment: str) -> Result:
+    """Return the result of a command; an error of ours is raised as it is."""
+    result = answer(*arguments, **environment)
     if isinstance(result.exception, ThermocaldError):
         raise result.exception
+    return result
+
+
+def succeed(*arguments: object, **environment: str) -> Result:
+    """Return the result of a command that has to end well."""
+    result = invoke(*arguments, **environment)
+    assert result.exit_code == 0, (result.output, result.exception)
     return result

@@ -15,20 +15,20 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 LONGEST = (
-    # of the slow suite, by `make test-slow` with --durations
-    "daemon/test_endurance", "blind/test_score", "store/test_bounds", "docs/test_commands",
-    "analysis/test_running_series", "cli/test_first_hour", "photogrammetry/test_mount",
-    "daemon/test_rhythm", "real_corners/test_real_corners", "main_paths/test_live",
-    "test_properties", "store/test_kills", "analysis/test_scene",
+    # of the slow suite, by `make test-slow` with --durations; the goldens of the quick one too
+    "daemon/test_endurance", "golden/test_golden", "store/test_bounds", "docs/test_commands",
+    "main_paths/test_live", "blind/test_score", "analysis/test_running_series",
+    "cli/test_first_hour", "photogrammetry/test_mount", "daemon/test_rhythm",
+    "real_corners/test_real_corners", "test_properties", "store/test_kills", "analysis/test_scene",
     # of the quick one
-    "daemon/test_faults", "daemon/test_page_attacks", "discovery/test_examination",
-    "daemon/test_sessions", "cli/test_commands", "photogrammetry/test_boards",
-    "photogrammetry/test_scale", "daemon/test_clock", "output/test_board_print",
-    "daemon/test_changes", "output/test_report_study", "analysis/test_online_filter",
-    "fleet/test_reprocess", "cli/test_discover", "cli/test_testfield", "daemon/test_session",
-    "photogrammetry/test_adjustment", "daemon/test_calibration_keys", "docs/test_site",
-    "output/test_testfield_print", "discovery/test_separable", "photogrammetry/test_ring_reading",
-    "daemon/test_telling", "simulation/test_outside_effect", "fleet/test_dask",
+    "daemon/test_faults", "daemon/test_page_attacks", "daemon/test_sessions", "cli/test_commands",
+    "discovery/test_examination", "daemon/test_clock", "photogrammetry/test_boards",
+    "daemon/test_changes", "output/test_testfield_print", "fleet/test_reprocess",
+    "cli/test_testfield", "cli/test_discover", "cli/test_encodings", "cli/test_real_data",
+    "daemon/test_session", "photogrammetry/test_scale", "photogrammetry/test_adjustment",
+    "daemon/test_calibration_keys", "output/test_report_study", "docs/test_site",
+    "simulation/test_outside_effect", "analysis/test_online_filter", "daemon/test_telling",
+    "main_paths/test_commands", "fleet/test_dask",
 )  # fmt: skip
 """Files that take longest, in that order: so that no process is left alone with one at the end."""
 
@@ -58,6 +58,17 @@ _QUIET = [
     "--disable-component-update",
     "--disable-sync",
 ]
+
+
+@pytest.fixture(scope="session")
+def forker():
+    """What starts daemons, with everything imported."""
+    from tests.daemon.conftest import ENVIRONMENT
+    from tests.daemon.forking import Forker
+
+    forker = Forker(ENVIRONMENT)
+    yield forker
+    forker.close()
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +108,12 @@ def page_of(browser):
     yield open_
     for page in pages:
         page.close()
+
+
+@pytest.fixture(autouse=True)
+def no_leaked_secrets(monkeypatch):
+    """What a test makes a secret stays in the texts of the next ones."""
+    monkeypatch.setattr("thermocald.addresses._known", set())
 
 
 @pytest.fixture(autouse=True)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
+import threading
+import time
+
 import pytest
 
 from thermocald.errors import ConfigurationError, RecordingError
-from thermocald.files import dump_yaml, read_yaml
+from thermocald.files import dump_yaml, overwrite_json, read_json, read_yaml
 
 
 @pytest.fixture
@@ -27,6 +32,11 @@ def test_a_mapping_is_read_in_its_order(write):
 
 def test_anchors_may_be_used(write):
     assert read_yaml(write("a: &x {k: 1}\nb: {<<: *x, l: 2}\n"))["b"] == {"k": 1, "l": 2}
+
+
+def test_a_file_s_name_that_is_no_text_is_written_so_that_it_can_be_read(write):
+    named = os.fsdecode(b"M\xe9 \xff")
+    assert read_yaml(write(dump_yaml({"series": [named]}))) == {"series": ["M\\udce9 \\udcff"]}
 
 
 BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
@@ -59,3 +69,34 @@ def test_one_clear_error(write, text, message):
 def test_the_caller_chooses_the_error(tmp_path):
     with pytest.raises(RecordingError, match="No such file"):
         read_yaml(tmp_path / "none.yaml", RecordingError)
+
+
+def test_a_file_that_is_written_in_place_meanwhile_is_read_whole(tmp_path):
+    """As the status on a full disk; each document says at both ends which it is."""
+    path, ended = tmp_path / "status.json", threading.Event()
+    texts = [json.dumps({"a": n, "x": [10 + n] * (3 + 9000 * (n % 3)), "z": n}) for n in range(9)]
+    path.write_bytes(texts[0].encode().ljust(131072))
+
+    def write():
+        while not ended.is_set():
+            for text in texts:
+                assert overwrite_json(path, text.encode())
+                time.sleep(1e-3)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        for _ in range(1000):
+            document = read_json(path)
+            assert document["a"] == document["z"]
+    finally:
+        ended.set()
+        writer.join()
+
+
+@pytest.mark.parametrize("text", [None, "", "{", '{"a": 1', "[1]", "1", "\xff", '{"a": 1}{'])
+def test_a_file_that_is_no_mapping_is_none(tmp_path, text):
+    path = tmp_path / "x.json"
+    if text is not None:
+        path.write_text(text, encoding="latin-1")
+    assert read_json(path) == {}

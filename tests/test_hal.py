@@ -29,7 +29,7 @@ def test_a_frame_holds_something():
     with pytest.raises(ValueError, match="needs an image"):
         Frame(None, 1.0, 2.0)
     assert Frame(None, 1.0, 2.0, encoded=b"\xff\xd8").image is None
-    assert Frame(None, 1.0, 2.0, metadata={"observations": {}}).image is None
+    assert Frame(None, 1.0, 2.0, observations={}).image is None
 
 
 def test_virtual_clock_jumps_and_never_goes_back():

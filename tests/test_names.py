@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,9 @@ from hypothesis import given, settings, strategies
 from tests.commands import call
 from tests.drivers.fakes.sysfs import Sysfs
 from tests.store.test_crafted import change
-from thermocald.acquisition.pipeline import AcquiredEpoch, Pipeline, Readings, require_columns
+from thermocald.acquisition.pipeline import AcquiredEpoch, Pipeline
+from thermocald.acquisition.thermometers import Thermometers, require_columns
+from thermocald.config import parse_config
 from thermocald.daemon.epoch_keeper import result_row
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError, RecordingError, StoreError, WrongDevice
@@ -28,10 +31,12 @@ from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.reader import read_recording, write_recording
+from thermocald.store.schema import COLUMN_NAMES
 
 LIKE_OURS = [
     "A1", "c", "skew_s", "frame", "sd_c", "status", "epoch", "blur_px", "lost", "online_c",
-    "drift_c_px", "temperature_time", "event",
+    "drift_c_px", "temperature_time", "event", "series_x0", "level_sd_y0", "mount_px",
+    "series_epochs", "series_restarted",
 ]  # fmt: skip
 MARKS = ["Diode, left", "a;b", "bell\x07", " lead", "x=1", 'say "t"', "", "é" * 65, "two\nlines"]
 GOOD = [
@@ -83,9 +88,8 @@ def test_every_column_that_an_epoch_can_have_is_ours(tmp_path):
     with Store.open(tmp_path / "s.db") as store:
         series = store.find_series()
         page = next(View(tmp_path / "s.db", tmp_path).csv(series.camera, series.name))
-        names = {*store.column_names(series)}
     exported = (tmp_path / "x.csv").read_text().splitlines()[0]
-    known = {*row, *names, *page.strip().split(","), *exported.split(",")}
+    known = {*row, *COLUMN_NAMES, *page.strip().split(","), *exported.split(",")}
     known -= {"temperature", *read_head(recording).channels}
     assert set(PARAMETER_NAMES) < known
     assert not [name for name in known if not channel_fault(name)]
@@ -178,14 +182,13 @@ def test_names_with_marks_are_quoted_in_the_csv_of_the_page(tmp_path):
 
 def test_the_reference_keeps_its_place_when_it_is_not_read():
     clock = VirtualClock()
-    readings = Readings({"housing": 10.0, "air": 10.0})
-    readings.add("air", Reading({"temperature": 12.0}, 0.0, clock.utc()))
+    document = {"thermometers": [{"name": n, "driver": "mock"} for n in ("housing", "air")]}
+    thermometers = Thermometers(parse_config(document, Path("config.yaml")), clock)
+    thermometers.add("air", Reading({"temperature": 12.0}, 0.0, clock.utc()))
     kept: list[AcquiredEpoch] = []
     keeper = SimpleNamespace(keep=kept.append, amend=None, backlog=lambda below: None)
-    pipeline = Pipeline(
-        "cam", None, readings, ["housing", "air"], keeper, clock, patience_s=0.0,
-        columns=lambda: ["housing", "air"],
-    )  # fmt: skip
+    names = ["housing", "air"]
+    pipeline = Pipeline("cam", None, thermometers, names, keeper, clock, patience_s=0.0)
     pipeline.start()
     pipeline.submit(Frame(np.zeros((4, 4), np.uint8), 0.0, clock.utc()))
     assert pipeline.drain(10.0)

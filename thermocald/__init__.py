@@ -12,105 +12,73 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from thermocald.analysis.camera.camera import Camera
-    from thermocald.analysis.series.epochs import Epochs
-    from thermocald.analysis.thermal.live_camera import LiveCamera
-    from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera, load_camera
-    from thermocald.api import (
-        calibrate,
-        catalogue,
-        discover,
-        fit,
-        import_photographs,
-        open,  # noqa: A004
-        open_all,
-        plan,
-        read_testfield,
-        reference_study,
-        simulate,
-        study,
+    from thermocald.analysis.camera.camera import Camera as Camera
+    from thermocald.analysis.series.epochs import Epochs as Epochs
+    from thermocald.analysis.thermal.thermal_camera import Along as Along
+    from thermocald.analysis.thermal.thermal_camera import LiveCamera as LiveCamera
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera as ThermalCamera
+    from thermocald.analysis.thermal.thermal_camera import load_camera as load_camera
+    from thermocald.api import calibrate as calibrate
+    from thermocald.api import catalogue as catalogue
+    from thermocald.api import discover as discover
+    from thermocald.api import fit as fit
+    from thermocald.api import import_photographs as import_photographs
+    from thermocald.api import open as open  # noqa: A004
+    from thermocald.api import open_all as open_all
+    from thermocald.api import plan as plan
+    from thermocald.api import read_testfield as read_testfield
+    from thermocald.api import reference_study as reference_study
+    from thermocald.api import simulate as simulate
+    from thermocald.api import study as study
+    from thermocald.photogrammetry.camera.camera_model import (
+        ExteriorOrientation as ExteriorOrientation,
     )
-    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.results import Calibration, Discovery, Study
-    from thermocald.series import Series
-    from thermocald.toolbox import (
-        check_testfield,
-        compare_cameras,
-        convert_camera,
-        correct,
-        fit_calibrations,
-        predict,
-        survey_testfield,
-    )
+    from thermocald.photogrammetry.field.testfield import TestField as TestField
+    from thermocald.results import Calibration as Calibration
+    from thermocald.results import Discovery as Discovery
+    from thermocald.results import Study as Study
+    from thermocald.series import Series as Series
+    from thermocald.toolbox import check_testfield as check_testfield
+    from thermocald.toolbox import compare_cameras as compare_cameras
+    from thermocald.toolbox import convert_camera as convert_camera
+    from thermocald.toolbox import correct as correct
+    from thermocald.toolbox import fit_calibrations as fit_calibrations
+    from thermocald.toolbox import follow_scene as follow_scene
+    from thermocald.toolbox import measure as measure
+    from thermocald.toolbox import predict as predict
+    from thermocald.toolbox import survey_testfield as survey_testfield
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "Along",
-    "Calibration",
-    "Camera",
-    "Discovery",
-    "Epochs",
-    "ExteriorOrientation",
-    "LiveCamera",
-    "Series",
-    "Study",
-    "TestField",
-    "ThermalCamera",
-    "calibrate",
-    "catalogue",
-    "check_testfield",
-    "compare_cameras",
-    "convert_camera",
-    "correct",
-    "discover",
-    "fit",
-    "fit_calibrations",
-    "import_photographs",
-    "load_camera",
-    "open",
-    "open_all",
-    "plan",
-    "predict",
-    "read_testfield",
-    "reference_study",
-    "simulate",
-    "study",
-    "survey_testfield",
-]
-
-# the others are in `api`; a camera alone has not to wait for what analyses series
+# a camera alone has not to wait for what analyses series
 _PLACES = {
-    "Along": "analysis.thermal.thermal_camera",
-    "Calibration": "results",
-    "Camera": "analysis.camera.camera",
-    "Discovery": "results",
-    "Epochs": "analysis.series.epochs",
-    "ExteriorOrientation": "photogrammetry.camera.camera_model",
-    "LiveCamera": "analysis.thermal.live_camera",
-    "Series": "series",
-    "Study": "results",
-    "check_testfield": "toolbox",
-    "compare_cameras": "toolbox",
-    "convert_camera": "toolbox",
-    "correct": "toolbox",
-    "fit_calibrations": "toolbox",
-    "load_camera": "analysis.thermal.thermal_camera",
-    "predict": "toolbox",
-    "survey_testfield": "toolbox",
-    "TestField": "photogrammetry.field.testfield",
-    "ThermalCamera": "analysis.thermal.thermal_camera",
+    "analysis.camera.camera": "Camera",
+    "analysis.series.epochs": "Epochs",
+    "analysis.thermal.thermal_camera": "Along LiveCamera ThermalCamera load_camera",
+    "api": (
+        "calibrate catalogue discover fit import_photographs open open_all plan read_testfield "
+        "reference_study simulate study"
+    ),
+    "photogrammetry.camera.camera_model": "ExteriorOrientation",
+    "photogrammetry.field.testfield": "TestField",
+    "results": "Calibration Discovery Study",
+    "series": "Series",
+    "toolbox": (
+        "check_testfield compare_cameras convert_camera correct fit_calibrations follow_scene "
+        "measure predict survey_testfield"
+    ),
 }
+_MODULES = {name: module for module, names in _PLACES.items() for name in names.split()}
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
     """One of the public names, imported now."""
-    if name not in __all__:
+    if name not in _MODULES:
         raise AttributeError(f"module 'thermocald' has no attribute {name!r}")
     from importlib import import_module
 
-    found = getattr(import_module(f"thermocald.{_PLACES.get(name, 'api')}"), name)
+    found = getattr(import_module(f"thermocald.{_MODULES[name]}"), name)
     globals()[name] = found
     return found
 

@@ -6,11 +6,13 @@ a foreign site makes a browser ask this machine (DNS rebinding).
 
 from __future__ import annotations
 
+import base64
 import ipaddress
+import json
 import logging
 import re
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
+from urllib.parse import quote, quote_plus, unquote, urlsplit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -18,34 +20,122 @@ if TYPE_CHECKING:
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
-_ADDRESS = re.compile(r"(?P<scheme>\b[a-zA-Z][a-zA-Z0-9+.-]*:/{1,2})(?P<rest>[^\s'\"<>]*)")
-_KEY = r"(?:passw(?:or)?d|passphrase|pwd|token|secret|api[_-]?key)"
-_VALUE = r"(?:'[^']*'|\"[^\"]*\"|[^\s&'\"]*)"
-# `key=value` of a query or of libpq, 'key': 'value' of a mapping that a library printed, a header
-_PAIR = re.compile(rf"(?i)({_KEY}\s*=\s*){_VALUE}|({_KEY}['\"]\s*:\s*){_VALUE}")
-_HEADER = re.compile(
-    r"(?i)(authorization['\"]?\s*[:=]\s*['\"]?(?:basic|bearer|digest)?)\s*[^\s'\"]+"
+_ADDRESS = re.compile(
+    r"(?P<scheme>\b[a-zA-Z][a-zA-Z0-9+.-]*(?::|%3[Aa])(?:/|%2[Ff]){1,2})(?P<rest>[^\s'\"<>]{0,2000})"
 )
 _PLAIN_USER = re.compile(
-    r"(?<![^\s'\"(=<])(?://)?(?!mailto:)[^\s:@/'\"(=<]+:[^\s:@/'\"]+@(?=[\w\[])"
+    r"(?<![^\s'\"(=<])(?://)?(?!mailto:)[^\s:@/'\"(=<]+(?::|%3[Aa])[^\s:@/'\"]+(?:@|%40)(?=[\w\[])"
 )
+_KEYS = (
+    r"(?:passw(?:or)?[dt]|passphrase|pwd|token|secret|credentials?"
+    r"|(?:api|access|private|shared|account)[_-]?key)"
+)
+_KEY = re.compile(_KEYS, re.IGNORECASE)
+_BEFORE = re.compile(  # a key of a query, of an option or a mapping, or a word before its value
+    rf"(?i)([?&#](?:[\w-]*{_KEYS}|sig|key|auth)=)|{_KEYS}\\*['\"]?(?:(\s*=\s*)|\s*:\s*"
+    r"|\s+(?:is\s+|was\s+)?(?=\\*['\"][^'\"]{3})|\s+(?=[a-z]\S*\d|\d\S*[a-z]))"
+    rf"|--?[\w-]*{_KEYS}\s+"
+)
+_QUOTED = re.compile(r"(?is)[bru]?(\\*(['\"])(?:\2\2)?)(?:(?!\1)(?:\\.|[^\\]))*(?:\1|\Z|\\\Z)")
+_OF_QUERY = re.compile(r"[^\s&'\"]*")
+# without quotes a value ends with its line, at the next option, and where a sentence goes on
+_PHRASE = re.compile(
+    r"(?:(?!\s+[\w-]+\s*=|[,;:.)}\]]*(?:\s*[\r\n]|\s*\Z|\s[({])|[,;:]\s)(?s:\\.|[^&'\"]))*"
+)
+_WORD = re.compile(  # a sentence of ours about a key goes on in small letters
+    r"(?=\S*[^a-z\d\s.,;:()…-]|\d\S*[a-z]|[a-z]\S*\d)\S+?(?=[,;:.)]*(?:\s|\Z))"
+    r"|(?!(?:unknown|missing|is|must|holds|needs)\b)[^\s,;:()…]+(?=[,;:.)]*(?:\Z|[\r\n,;:]))"
+)
+_HEADER = re.compile(
+    r"(?i)(authorization\\*['\"]?\s*[:=]\s*(?:[bru](?=\\*['\"]))?\\*['\"]?)"
+    r"(?:(?:digest|aws4-\S+|oauth)\s[^\r\n]*|(?:[a-z]+\s+)?[^\s'\"\\]+)"
+    r"|(\bbearer\s+|\bbasic\s+(?=\S*[\d=+/]))[\w.~+/=-]{6,}"
+)
+_PEM = re.compile(r"(?s)(-----BEGIN [\w ]*PRIVATE KEY-----).*?(?=-----END|\Z)")
+_SHORTEST = 4  # a shorter one is part of too many words
+_known: set[str] = set()
+
+
+def hide(value: str | None) -> None:
+    """Leave a secret out of all that is said from now on, as it is and as libraries write it."""
+    if value is None or len(value) < _SHORTEST:
+        return
+    written = {value, value.strip(), " ".join(value.split())}
+    for _ in range(2):  # of a message that was quoted within another
+        written |= {w for text in written for w in _quotations(text)}
+    written |= {w for text in list(written) for w in (text.lower(), text.upper()) if "%" in text}
+    _known.update(text for text in written if len(text) >= _SHORTEST)
+
+
+def _quotations(text: str) -> set[str]:
+    plain = text.encode(errors="replace")
+    return {
+        repr(text)[1:-1], ascii(text)[1:-1], repr(plain)[2:-1], json.dumps(text)[1:-1],
+        json.dumps(text, ensure_ascii=False)[1:-1], text.replace("\\", "\\\\").replace("'", "\\'"),
+        quote(plain), quote_plus(plain), quote(plain, safe=""),
+        base64.b64encode(plain).decode().strip("="),
+    }  # fmt: skip
+
+
+def hide_secrets(document: object, key: str = "") -> None:
+    """Leave out what stands in a configuration under a key such as `password`, and in addresses."""
+    if isinstance(document, dict):
+        for name, value in document.items():
+            hide_secrets(value, str(name))
+    elif isinstance(document, list | tuple):
+        for value in document:
+            hide_secrets(value, key)
+    elif is_secret(key) and not isinstance(document, bool) and document is not None:
+        hide(str(document))
+    elif isinstance(document, str) and "@" in document and ":" in document:
+        user, _, _ = document.partition("://")[2].rpartition("@")
+        for word in {user.partition(":")[2], unquote(user.partition(":")[2])}:
+            hide(word)
+
+
+def is_secret(key: str) -> bool:
+    """Whether the value of a key is a secret; a file that holds one is not."""
+    return _KEY.search(key) is not None and not re.search(r"(?i)file|path|name$", key)
 
 
 def without_secrets(text: str) -> str:
-    """A text without the user information and the passwords of the addresses in it."""
-    text = _PLAIN_USER.sub("", _ADDRESS.sub(_without_user, text))
-    return _PAIR.sub(r"\1\2…", _HEADER.sub(r"\1 …", text))
+    """A text without the known secrets, the user information of addresses, passwords and keys."""
+    for value in sorted(_known, key=len, reverse=True):
+        text = text.replace(value, "…")
+    text = _PLAIN_USER.sub("", _without_users(text))
+    return _without_values(_HEADER.sub(r"\1\2…", _PEM.sub(r"\1…", text)))
 
 
-def _without_user(found: re.Match[str]) -> str:
-    """One address; a password that holds a `/` ends what a parser takes for the host."""
-    place, slash, path = found["rest"].partition("/")
-    if "@" in place:
-        return found["scheme"] + place.rpartition("@")[2] + slash + path
-    port = place.rpartition(":")[2] if ":" in place else "0"
-    if "@" in path and not port.isdigit():
-        return found["scheme"] + path.rpartition("@")[2]
-    return found[0]
+def _without_users(text: str) -> str:
+    """Addresses without users, in queries of others too; a password may hold a `/`."""
+    parts, at = [], 0
+    while found := _ADDRESS.search(text, at):
+        rest = found["rest"]
+        cut = re.search(r"/|%2[Ff]", rest)
+        end = len(rest) if cut is None else cut.start()
+        host = re.split(r"@|%40", rest[:end])[-1]
+        port = host.rpartition(":")[2] if ":" in host else "0"
+        behind = re.split(r"@|%40", rest[end:])
+        if len(host) == end and not port.isdigit() and len(behind) > 1:
+            host, end = behind[-1], len(rest)
+        parts += [text[at : found.start()], found["scheme"], host]
+        at = found.start("rest") + end
+    return "".join([*parts, text[at:]])
+
+
+def _without_values(text: str) -> str:
+    """The text with … for the values of keys such as `password`."""
+    parts, at = [], 0
+    for key in _BEFORE.finditer(text):
+        if key.start() < at:
+            continue
+        end = key.end()
+        kinds = (_QUOTED, _OF_QUERY if key[1] else _PHRASE if key[2] else _WORD)
+        value = next((found for kind in kinds if (found := kind.match(text, end))), None)
+        if value is not None and value[0].strip("…"):
+            parts += [text[at:end], "…"]
+            at = value.end()
+    return "".join([*parts, text[at:]])
 
 
 class CleanFormatter(logging.Formatter):

@@ -15,7 +15,6 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camer
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.series import (
-    RecordedSeries,
     Series,
     check_exterior,
     free_names,
@@ -104,8 +103,8 @@ def import_photographs(
     spec, _ = camera_of(pictures[0], known, pixel_pitch)
     recording = in_memory(placed, spec, read_testfield(testfield), series)
     if out is None:
-        return RecordedSeries(recording)
-    write_photographs(source_of(out), recording, placed)
+        return Series(recording)
+    write_photographs(source_of(out), recording)
     return open(out)
 
 
@@ -201,10 +200,10 @@ def study(
     >>> found.cameras[0].label
     'rpi-v2.1'
     """
-    from thermocald.analysis.study.input import refuse_copies
+    from thermocald.analysis.study.measured import refuse_copies
     from thermocald.analysis.study.study import StudySettings
     from thermocald.analysis.study.study import study as run
-    from thermocald.results import Study, as_result
+    from thermocald.results import Study
 
     if not series:
         raise UsageError("give at least one series to study")
@@ -223,11 +222,7 @@ def study(
         for label, one in zip(named, series, strict=True)
     ]
     refuse_copies(measured)
-    measured = [
-        replace(found, doubts=tuple(one.doubts(interior=found.mean)))
-        for one, found in zip(series, measured, strict=True)
-    ]
-    return as_result(Study, run(measured, settings, progress))
+    return Study(settings, run(measured, settings, progress).cameras)
 
 
 def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
@@ -274,7 +269,7 @@ def fit(
     )
     from thermocald.physics.model import ThermalModel
     from thermocald.physics.model_file import read_model
-    from thermocald.thermal.effect_options import check_names
+    from thermocald.thermal.hypothesis import check_names
     from thermocald.thermal.reduce import reduce_series
 
     if not series:
@@ -296,7 +291,7 @@ def fit(
         camera = fit_type(reduced, listed, T0, kind)
     else:
         camera = fit_camera(reduced, listed, T0)
-    return replace(camera, fitted={**camera.as_dict(), "doubts": _doubts(series, reduced)})
+    return replace(camera, fitted={**(camera.fitted or {}), "doubts": _doubts(series, reduced)})
 
 
 def discover(
@@ -499,7 +494,7 @@ def _structure(
 
 def _effects(given: Effects) -> list[ModelEffect]:
     from thermocald.physics.model_file import read_effects
-    from thermocald.thermal.effect_options import effect_with, parse_effect
+    from thermocald.thermal.hypothesis import effect_with, parse_effect
 
     if isinstance(given, Mapping):
         return [effect_with(name, values) for name, values in given.items()]

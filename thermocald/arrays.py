@@ -28,7 +28,7 @@ _KEPT = _Kept()
 
 
 def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """An array with undefined contents; the next call with this name in this thread reuses it."""
+    """Return an array with undefined contents; the thread's next call with this name reuses it."""
     kind = np.dtype(dtype)
     size = int(np.prod(shape)) * kind.itemsize
     buffer = _KEPT.buffers.get(name)

@@ -26,9 +26,9 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from thermocald.addresses import is_loopback, without_secrets
+from thermocald.addresses import hide_secrets, is_loopback, is_secret, without_secrets
 from thermocald.errors import ConfigurationError
-from thermocald.files import read_yaml
+from thermocald.files import is_ordinary, read_yaml
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Period = Annotated[float, Field(ge=0.05, le=86400.0)]
@@ -36,7 +36,7 @@ Positive = Annotated[float, Field(gt=0.0, le=1e9)]
 
 
 def relative_to_file(value: Path | None, info: ValidationInfo) -> Path | None:
-    """A path of the file, which is relative to its folder."""
+    """Return a path of the file, which is relative to its folder."""
     if value is None:
         return None
     folder: Path = (info.context or {}).get("folder", Path())
@@ -59,12 +59,12 @@ class Section(BaseModel):
 
 
 def keys(section: type[Section]) -> list[str]:
-    """The keys of a section as the file spells them."""
+    """Return the keys of a section as the file spells them."""
     return [field.alias or name for name, field in section.model_fields.items()]
 
 
 def wrong(message: str) -> PydanticCustomError:
-    """An error of ours, for a validator."""
+    """Return an error of ours, for a validator."""
     return PydanticCustomError("thermocald", "{message}", {"message": message})
 
 
@@ -75,13 +75,13 @@ def _unknown(key: str, known: list[str]) -> PydanticCustomError:
 
 
 def nearest(key: str, known: list[str]) -> str:
-    """The end of a message: which known key is meant, or which there are."""
+    """Return the end of a message: which known key is meant, or which there are."""
     near = difflib.get_close_matches(key, known, 1, 0.5)
     return f"; is {near[0]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
 
 
 def in_words(path: Path | str, error: ValidationError) -> str:
-    """The first error, as file or place (or none), dotted key, value and what is allowed."""
+    """Return the first error, as file or place (or none), dotted key, value and what is allowed."""
     first = error.errors()[0]
     where = "".join(
         f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in first["loc"]
@@ -93,17 +93,17 @@ def in_words(path: Path | str, error: ValidationError) -> str:
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     message = without_secrets(first["msg"])
     if first["type"] == "missing":
-        return f"{place}{where}: is missing{more}"
-    if first["type"] == "value_error":  # of a check that is shared with others
-        return f"{place}{where + ': ' if where else ''}{context['error']}{more}"
-    if first["type"] in ("thermocald", "unknown_key"):
-        return f"{place}{where + ': ' if where else ''}{message}{more}"
-    message = message[0].lower() + message[1:]
-    return f"{place}{where}: is {_short(first['input'])}; {message}{more}"
+        message = "is missing"
+    elif first["type"] == "value_error":  # of a check that is shared with others
+        message = str(context["error"])
+    elif first["type"] not in ("thermocald", "unknown_key"):
+        given = "a secret" if is_secret(where.rpartition(".")[2]) else _short(first["input"])
+        message = f"is {given}; {message[0].lower()}{message[1:]}"
+    return f"{place}{where + ': ' if where else ''}{message}{more}"
 
 
 def _key(key: str) -> str:
-    """A key as it stands, or quoted where it is not of letters."""
+    """Return a key as it stands, or quoted where it is not of letters."""
     return key if key.isprintable() and len(key) <= 60 else _short(key)
 
 
@@ -162,7 +162,7 @@ class CalibrationConfig(Section):
     """With series: a constant offset per target, for an imperfect field."""
     correlation_bound: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.9999
     """Above it an epoch's geometry is called weak."""
-    snooping_alpha: Annotated[float, Field(ge=0.0, le=0.1)] = 0.001
+    snooping_alpha: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0005
     """Probability that the test rejects a single good observation; 0: no test."""
 
     @model_validator(mode="after")
@@ -269,7 +269,7 @@ class CameraConfig(DeviceConfig):
 
 
 def _resolved(value: Any, folder: Path) -> Any:
-    """A driver's option with paths made absolute, also within lists and mappings."""
+    """Return a driver's option with paths made absolute, also within lists and mappings."""
     if isinstance(value, str) and re.match(r"\.\.?/", value):
         return str(folder / value)
     if isinstance(value, list):
@@ -418,7 +418,7 @@ class Config(Section):
         return self
 
     def calibration_of(self, camera: CameraConfig) -> CalibrationConfig:
-        """The settings that hold for a camera."""
+        """Return the settings that hold for a camera."""
         return camera.calibration or self.calibration
 
 
@@ -436,6 +436,7 @@ def parse_config(
     document: dict[str, Any], path: Path, option_names: OptionNames | None = None
 ) -> Config:
     """The configuration in a mapping; `path` is what relative paths and messages refer to."""
+    hide_secrets(document)
     try:
         config = Config.model_validate(document, context={"folder": path.absolute().parent})
     except ValidationError as cause:
@@ -460,7 +461,9 @@ def _check_places(config: Config, path: Path) -> None:
     }
     for i, output in enumerate(config.outputs):
         place = output.options.get("path")
-        if not isinstance(place, str) or "\0" in place or _is_device(Path(place)):
+        if not isinstance(place, str) or "\0" in place:
+            continue
+        if Path(place).exists() and not is_ordinary(Path(place)):  # several may write to a device
             continue
         for what, files in taken.items():
             if any(_same_file(Path(place), file) for file in files):
@@ -475,13 +478,8 @@ def _check_places(config: Config, path: Path) -> None:
         raise ConfigurationError(f"{path}: store.path: is the configuration; choose another file")
 
 
-def _is_device(path: Path) -> bool:
-    """Whether several may write to a path."""
-    return path.exists() and not path.is_file()
-
-
 def _same_file(one: Path, other: Path) -> bool:
-    """Whether two paths lead to one file, by links of either kind, there or not."""
+    """Return whether two paths lead to one file, by links of either kind, there or not."""
     try:
         return one.samefile(other)
     except OSError:

@@ -6,7 +6,6 @@ beside what was found.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,24 +33,30 @@ def run_demo(out: Path, epochs: int, seed: int, advance: Callable[[int], None]) 
     """
     if out.exists() and any(out.iterdir()):
         raise DataError(f"{out}: exists and is not empty; give another folder with --out")
-    run = _acquire(out, epochs, seed, advance)
-    ok, temperature = run.table.ok, run.table.temperature
+    series, truth = _acquire(out, epochs, seed, advance)
+    table = series.calibrate(exterior="series")
+    ok, temperature = table.ok, table.temperature
     return {
         "format": "thermocald-demo/1",
         "epochs": epochs,
         "ok": int(ok.sum()),
-        "targets": run.targets,
-        "sigma0": float(np.median(run.table.sigma0[ok])),
+        "targets": len(series.testfield),
+        "sigma0": float(np.median(table.sigma0[ok])),
         "temperature": [float(np.nanmin(temperature)), float(np.nanmax(temperature))],
-        "parameters": _compare(run),
+        "parameters": _compare(table, truth, series.head.camera.sensor.pixel_pitch),
         "store": out / "demo.db",
         "recording": out / "M1",
     }
 
 
-def _acquire(out: Path, epochs: int, seed: int, advance: Callable[[int], None]) -> _Run:
-    """Have the daemon take the epochs on a virtual clock, then write their recording."""
-    from thermocald.daemon.given_config import demo_config
+def _acquire(
+    out: Path, epochs: int, seed: int, advance: Callable[[int], None]
+) -> tuple[tc.Series, Array]:
+    """Have the daemon take the epochs on a virtual clock, then write their recording.
+
+    Returns what was taken, and the true interior orientation (E, 10) at the frames' times.
+    """
+    from thermocald.daemon.plan import demo_config
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
     from thermocald.hal import VirtualClock, open_device
@@ -78,28 +83,18 @@ def _acquire(out: Path, epochs: int, seed: int, advance: Callable[[int], None]) 
     with Store.open(config.store.path) as store:
         archive_series(store, store.find_series(), out / "M1")
     series = tc.open(config.store.path)
-    table = series.calibrate(exterior="series")
     with open_device("camera", "mock", {"seed": seed}, VirtualClock()) as camera:
-        truth = np.array([camera.truth(float(utc) - begin).iop[0] for utc in table.frame_time])
-    return _Run(table, truth, series.head.camera.sensor.pixel_pitch, len(series.testfield))
+        return series, np.array([camera.truth(float(t) - begin).iop[0] for t in series.frame_time])
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
-    table: tc.Epochs
-    truth: Array  # (E, 10) at the frames' times
-    pitch: float
-    targets: int
-
-
-def _compare(run: _Run) -> list[dict[str, Any]]:
-    """Per kelvin and over the series: the drift put in and the drift found."""
-    table, ok = run.table, run.table.ok & np.isfinite(run.table.temperature)
+def _compare(table: tc.Epochs, truth: Array, pitch: float) -> list[dict[str, Any]]:
+    """Per kelvin and over the series: the drift put in and the drift found; pitch: of a pixel."""
+    ok = table.ok & np.isfinite(table.temperature)
     t = table.temperature[ok] - table.temperature[ok].mean()
     hottest = int(np.argmax(table.temperature[ok]))
     rows = []
     for k, name in enumerate(_NAMES):
-        found, sd, true = table.values[ok, k], table.sd[ok, k], run.truth[ok, k]
+        found, sd, true = table.values[ok, k], table.sd[ok, k], truth[ok, k]
         error = (found - found.mean()) - (true - true.mean())
         drifts = {
             "in": float(true[hottest] - true[0]),
@@ -112,9 +107,9 @@ def _compare(run: _Run) -> list[dict[str, Any]]:
                 "drift_in_mm": drifts["in"],
                 "drift_found_mm": drifts["found"],
                 "sd_drift_found_mm": drifts["sd"],
-                "drift_in_px": drifts["in"] / run.pitch,
-                "drift_found_px": drifts["found"] / run.pitch,
-                "sd_drift_found_px": drifts["sd"] / run.pitch,
+                "drift_in_px": drifts["in"] / pitch,
+                "drift_found_px": drifts["found"] / pitch,
+                "sd_drift_found_px": drifts["sd"] / pitch,
                 "rate_in_mm_per_k": float(true @ t / (t @ t)),
                 "rate_found_mm_per_k": float(found @ t / (t @ t)),
                 "scatter_over_sd": float(np.sqrt(np.mean(error**2) / np.mean(sd**2))),

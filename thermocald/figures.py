@@ -1,12 +1,14 @@
 """The figures of all reports: described once, drawn with matplotlib as SVG, as PNG for papers.
 
-A figure is a list of panels. Long curves are thinned to the minimum and maximum of each stretch,
-so that no outlier disappears and no file grows with the length of a series. Text stays text: it
-can be searched, copied and edited.
+A figure is a list of panels, each drawn by itself on a page and all together for a paper, or one
+drawing of its own. Long curves are thinned to the minimum and maximum of each stretch, so that no
+outlier disappears and no file grows with the length of a series. Text stays text: it can be
+searched, copied and edited.
 """
 
 from __future__ import annotations
 
+import base64
 import io
 import re
 import warnings
@@ -17,14 +19,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from thermocald.errors import DriverMissing
 from thermocald.files import new_file
 from thermocald.numbers import coefficient, shortened, superscript
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from thermocald.arrays import Array
 
@@ -89,7 +90,10 @@ class Arrows:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One diagram; horizontal: (y, label) of dashed lines; equal: same scale on both axes."""
+    """One diagram; horizontal: (y, label) of dashed lines; equal: same scale on both axes.
+
+    y_down: y grows downwards, as in the image.
+    """
 
     title: str
     x_label: str
@@ -97,48 +101,61 @@ class Panel:
     curves: tuple[Curve, ...]
     log_y: bool = False
     equal: bool = False
+    y_down: bool = False
     horizontal: tuple[tuple[float, str], ...] = ()
     arrows: Arrows | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Panels under one name, which is a file name too; columns: in a drawing for a paper."""
+    """Panels under one name, which is a file name too, or a drawing of matplotlib.
+
+    images: (label, PNG bytes), in a page only; columns: most panels in a row.
+    """
 
     name: str
     title: str
     caption: str
-    panels: tuple[Panel, ...]
+    panels: tuple[Panel, ...] = ()
     columns: int = 3
+    drawing: Any = None
+    images: tuple[tuple[str, bytes], ...] = ()
+
+    @property
+    def in_a_row(self) -> int:
+        """How many panels or images stand side by side."""
+        return max(1, min(self.columns, len(self.panels) + len(self.images)))
+
+    @property
+    def width_rem(self) -> float:
+        """The width of a column on a page that has the room."""
+        return 27.0 if self.drawing is None else 7.4 * float(self.drawing.get_size_inches()[0])
+
+    def svgs(self, prefix: str = "") -> list[str]:
+        """Return the drawings of a page as <svg> elements; prefix: of their ids."""
+        name = prefix + self.name
+        if self.drawing is not None:
+            return [inline_svg(self.drawing, name, self.title)]
+        return [
+            inline_svg(draw_panel(panel, legend=i == 0), f"{name}-{i}", panel.title)
+            for i, panel in enumerate(self.panels)
+        ]
+
+    def sources(self) -> list[tuple[str, str]]:
+        """Return the label and the address of each image."""
+        start = "data:image/png;base64,"
+        return [(label, start + base64.b64encode(png).decode()) for label, png in self.images]
 
 
-def thin(x: Array, *ys: Array, most: int = _MOST_POINTS) -> tuple[Array, ...]:
-    """Columns (n,) at about `most` rows or fewer, which hold the extremes of the first of `ys`."""
-    n = len(x)
-    if n <= most:
+def thin(x: Array, *ys: Array) -> tuple[Array, ...]:
+    """Columns (n,) at some hundred rows or fewer, which hold the extremes of the first of `ys`."""
+    if len(x) <= _MOST_POINTS:
         return (x, *ys)
-    edges = np.linspace(0, n, most // 2 + 1).astype(int)[:-1]
-    y = ys[0]
-    filled_low = np.where(np.isfinite(y), y, np.inf)
-    filled_high = np.where(np.isfinite(y), y, -np.inf)
-    rows = np.unique(
-        np.concatenate(
-            [
-                _position(filled_low, np.minimum.reduceat(filled_low, edges), edges),
-                _position(filled_high, np.maximum.reduceat(filled_high, edges), edges),
-            ]
-        )
-    )
+    low, high = (np.where(np.isfinite(ys[0]), ys[0], other) for other in (np.inf, -np.inf))
+    stretches = np.array_split(np.arange(len(x)), _MOST_POINTS // 2)
+    kept = [(r[np.argmin(low[r])], r[np.argmax(high[r])]) for r in stretches]
+    rows = np.unique(kept)
     return tuple(column[rows] for column in (x, *ys))
-
-
-def _position(values: Array, extremes: Array, edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The first row of each stretch that holds its extreme."""
-    lengths = np.diff(np.append(edges, len(values)))
-    hit = np.flatnonzero(values == np.repeat(extremes, lengths))
-    stretch = np.searchsorted(edges, hit, side="right") - 1
-    _, first = np.unique(stretch, return_index=True)
-    return np.asarray(hit[first])
 
 
 @contextmanager
@@ -157,11 +174,22 @@ def drawing_style() -> Iterator[None]:
 def new_drawing(
     width: float, height: float, layout: Literal["constrained"] | None = "constrained"
 ) -> Any:
-    """An empty drawing of so many inches."""
+    """Make an empty drawing of so many inches; DriverMissing without matplotlib."""
     # Without pyplot: no global state, no window, nothing to close.
-    from matplotlib.figure import Figure as Canvas
+    try:
+        from matplotlib.figure import Figure as Canvas
+    except ImportError:
+        raise DriverMissing(
+            "a drawing needs matplotlib: pip install 'thermocald[report]'"
+        ) from None
 
-    return Canvas(figsize=(width, height), layout=layout)
+    class Shown(Canvas):
+        """A drawing that a notebook shows without `%matplotlib`."""
+
+        def _repr_svg_(self) -> str:
+            return inline_svg(self, "drawing", "drawing")
+
+    return Shown(figsize=(width, height), layout=layout)
 
 
 def inline_svg(drawing: Any, prefix: str, label: str) -> str:
@@ -177,7 +205,10 @@ def inline_svg(drawing: Any, prefix: str, label: str) -> str:
     text = re.sub(r'\bid="', f'id="{prefix}-', text)
     text = re.sub(r"url\(#", f"url(#{prefix}-", text)
     text = re.sub(r'href="#', f'href="#{prefix}-', text)
-    text = re.sub(r"<[^>]*>", lambda tag: _shorter(tag[0]), text)
+    # numbers to 0.01 pt, a tag on one line
+    text = re.sub(
+        r"<[^>]*>", lambda tag: re.sub(r"(\.\d\d)\d+", r"\1", re.sub(r"\s+", " ", tag[0])), text
+    )
     # The page decides the width; the height follows from the viewBox.
     head, rest = text.split(">", 1)
     head = re.sub(r'\s(width|height)="[^"]*"', "", head)
@@ -196,11 +227,6 @@ def _scales(drawing: Any) -> str:
     corners = (box.x0 * width, box.x1 * width, (1 - box.y0) * height, (1 - box.y1) * height)
     numbers = [f"{v:.6g}" for v in (*corners, *axis.get_xlim(), *axis.get_ylim())]
     return f' data-scales="{" ".join(numbers)}"'
-
-
-def _shorter(tag: str) -> str:
-    """A tag with its numbers to 0.01 pt, on one line."""
-    return re.sub(r"(\.\d\d)\d+", r"\1", re.sub(r"\s+", " ", tag))
 
 
 def save(drawing: Any, folder: Path, name: str) -> list[Path]:
@@ -224,15 +250,20 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
         rows = _fill(axis, panel, legend=legend)
         drawing.subplots_adjust(right=0.95, bottom=0.19, top=0.89 - 0.055 * rows)
         # how many ticks there are, and with how many digits, depends on the height
-        longest = max((len(text) for text in _tick_labels(axis)), default=0)
+        low, high = sorted(axis.get_ylim())
+        ticks = [tick for tick in axis.get_yticks() if low <= tick <= high]
+        labels = axis.yaxis.get_major_formatter().format_ticks(ticks)
+        longest = max(map(len, labels), default=0)
         drawing.subplots_adjust(left=min(0.36, 0.155 + 0.0185 * longest))
         return drawing
 
 
 def draw_figure(figure: Figure) -> Any:
-    """All panels of a figure in one drawing, for a paper."""
+    """All of a figure in one drawing, for a paper."""
+    if figure.drawing is not None:
+        return figure.drawing
     with drawing_style():
-        columns = min(figure.columns, len(figure.panels))
+        columns = figure.in_a_row
         rows = -(-len(figure.panels) // columns)
         drawing = new_drawing(_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * rows)
         axes = np.atleast_1d(drawing.subplots(rows, columns)).ravel()
@@ -242,14 +273,6 @@ def draw_figure(figure: Figure) -> Any:
             else:
                 axis.set_axis_off()
         return drawing
-
-
-def _tick_labels(axis: Any) -> list[str]:
-    """The labels of the y axis that will be drawn, without drawing it."""
-    low, high = axis.get_ylim()
-    ticks = [tick for tick in axis.get_yticks() if low <= tick <= high]
-    labels: list[str] = axis.yaxis.get_major_formatter().format_ticks(ticks)
-    return labels
 
 
 def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
@@ -270,6 +293,8 @@ def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
     if panel.equal:
         axis.set_aspect("equal", adjustable="datalim")
         axis.locator_params(nbins=5)  # narrow: more labels would touch
+    if panel.y_down:
+        axis.invert_yaxis()
     label_axes(axis, panel.x_label, panel.y_label)
     names = {c.name for c in panel.curves if c.name}
     rows = legend_above(axis) if legend and len(names) > 1 else 0
@@ -282,17 +307,11 @@ def label_axes(axis: Any, x: str = "", y: str = "") -> None:
     """Name both axes and write their ticks without an offset or a power that stands apart."""
     if x:
         axis.set_xlabel(shortened(x, 48))
-        _plain_ticks(axis.xaxis, axis.get_xlim())
     if y:
         axis.set_ylabel(shortened(y, 36))
-        if axis.get_yscale() == "linear":
-            _plain_ticks(axis.yaxis, axis.get_ylim())
-
-
-def _plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
-    largest = max(map(abs, limits))
-    if largest >= 1e5 or largest < 1e-3:
-        axis.set_major_formatter(lambda value, _: tick_text(value))
+    for one, limits in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
+        if one.get_scale() == "linear" and not 1e-3 <= max(map(abs, limits)) < 1e5:
+            one.set_major_formatter(lambda value, _: tick_text(value))
 
 
 def tick_text(value: float) -> str:
@@ -310,20 +329,14 @@ def use_logarithm(axis: Any) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
     low, high = axis.get_ylim()
-    low = min((v for v in _positive(axis)), default=low)
+    drawn = [np.asarray(line.get_ydata(), dtype=float) for line in axis.get_lines()]
+    low = min((float(y[np.isfinite(y)].min()) for y in drawn if np.isfinite(y).any()), default=low)
     if low <= 0 or np.log10(high / low) < _DECADES:
         return
     axis.set_yscale("log")
     axis.yaxis.set_major_locator(LogLocator(numticks=6))
     axis.yaxis.set_major_formatter(lambda value, _: tick_text(value))
     axis.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _positive(axis: Any) -> Iterator[float]:
-    for line in axis.get_lines():
-        values = np.asarray(line.get_ydata(), dtype=float)
-        if (values := values[np.isfinite(values)]).size:
-            yield float(values.min())
 
 
 def legend_above(axis: Any) -> int:
@@ -371,9 +384,16 @@ def draw_arrows(axis: Any, arrows: Arrows) -> None:
         quiver, 0.9, 1.05, reference, f"{tick_text(reference)} px", labelpos="W",
         coordinates="axes", color="black", fontproperties={"size": 8},
     )  # fmt: skip
-    axis.set_xlim(-0.6 * share * width, (1 + 0.6 * share) * width)
-    axis.set_ylim((1 + 0.6 * share) * height, -0.6 * share * height)
+    # the tips are in the picture too, except those of gross errors
+    tips = np.nan_to_num(arrows.points + arrows.vectors / scale)
+    low = np.clip(tips.min(axis=0, initial=0.0), -0.3 * width, 0.0) - 0.03 * width
+    high = np.clip(
+        tips.max(axis=0, initial=0.0), (width, height), (1.3 * width, height + 0.3 * width)
+    )
+    axis.set_xlim(low[0], high[0] + 0.03 * width)
+    axis.set_ylim(high[1] + 0.03 * width, low[1])
     axis.set_aspect("equal")
+    axis.locator_params(nbins=6)
     axis.grid(visible=False)
 
 
@@ -409,5 +429,5 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
         axis.set_aspect("equal")
         axis.grid(visible=False)
         axis.tick_params(length=0)
-        axis.set_title(shortened(title, 40), loc="left")
+        axis.set_title(shortened(title, 44), loc="left")
         return drawing

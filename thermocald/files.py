@@ -3,25 +3,33 @@
 What is written goes into `.<name>.partial` next to the file first, and is removed whatever ends the
 writing: an error, an interrupt, a full disk, a folder that became read-only meanwhile. YAML is read
 with one clear error, no key twice, and no code run.
+
+Numbers with units in files written by hand are `3.04` or `{value: 3.04, sd: 0.01, unit: mm}`. A
+bare number has the unit the documentation states; a unit that is written out must be that one.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import json
+import math
 import os
 import shutil
 import stat
+import time
 from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import yaml
 
 from thermocald.errors import ConfigurationError, OutputError, ThermocaldError
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Iterator
+    from collections.abc import Hashable, Iterable, Iterator, Mapping
 
 # the disk's fault, not the user's: exit status 3
 _DISK = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.ENXIO}
@@ -35,6 +43,7 @@ _ADVICE = {
     errno.EEXIST: "; choose another name",
 }
 _DATABASE = b"SQLite format 3\0"
+_KERNEL = (("/", "proc"), ("/", "sys"))
 _WAL_MAGIC = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
 _RECORDED = {"epochs.csv", "observations.csv", "observations.parquet", "readings.csv"}
 
@@ -47,6 +56,24 @@ def cannot_write(path: Path | str, cause: OSError) -> OutputError:
     advice = _ADVICE.get(cause.errno or 0, "")
     status = 3 if cause.errno in _DISK else 2
     return OutputError(f"{path}: cannot be written: {why}{advice}", status)
+
+
+def check_output(path: Path) -> None:
+    """Refuse an output before it is computed: OutputError where nothing could be written there.
+
+    What is found out is whether the nearest folder that exists takes a file; folders below it are
+    made when it is written.
+    """
+    place = Path(os.path.realpath(path))
+    folder = next(folder for folder in (place, *place.parents) if folder.exists())
+    if folder == place and not folder.is_dir():
+        return  # a file, a device, a pipe: `output_place` knows
+    if folder.parts[:2] in _KERNEL:
+        raise cannot_write(path, OSError(errno.EROFS, "the kernel keeps this folder"))
+    if not folder.is_dir():
+        raise cannot_write(path, OSError(errno.ENOTDIR, f"{folder} is a file"))
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise cannot_write(path, OSError(errno.EACCES, os.strerror(errno.EACCES)))
 
 
 def output_place(path: Path) -> tuple[Path, bool]:
@@ -67,23 +94,36 @@ def output_place(path: Path) -> tuple[Path, bool]:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if not os.access(path, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-    if not stat.S_ISREG(found.st_mode) or place.is_relative_to("/proc"):
+    if not is_ordinary(path):
         return path, True
     if what := is_measured(place):
         raise FileExistsError(errno.EEXIST, f"it is {what}")
     return place, False
 
 
+def is_ordinary(path: Path) -> bool:
+    """Whether a path leads to a file on a disk: no device, no pipe, nothing of the kernel's."""
+    return path.is_file() and Path(os.path.realpath(path)).parts[:2] not in _KERNEL
+
+
+def is_database(path: Path) -> bool:
+    """Whether a file is one that SQLite wrote."""
+    return _beginning(path) == _DATABASE
+
+
 def is_measured(path: Path) -> str:
     """Say what of the measurements a file is that nothing else may be written to, "" if none."""
+    if is_database(path):
+        return "a store (an SQLite database)"
+    return "what was written last to a store" if _beginning(path)[:4] in _WAL_MAGIC else ""
+
+
+def _beginning(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            head = file.read(len(_DATABASE))
+            return file.read(len(_DATABASE))
     except OSError:
-        return ""
-    if head == _DATABASE:
-        return "a store (an SQLite database)"
-    return "what was written last to a store" if head.startswith(_WAL_MAGIC) else ""
+        return b""
 
 
 @contextmanager
@@ -147,6 +187,45 @@ def make_folder(path: Path) -> None:
         raise cannot_write(path, cause) from cause
 
 
+_LOOKS, _PAUSE_S = 10, 0.01
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file that another process writes; empty where there is none.
+
+    It may be seen when `overwrite_json` has written half of it: what two looks agree on is whole.
+    """
+    for _ in range(_LOOKS):
+        try:
+            data = path.read_bytes()
+            document = json.loads(data)
+            if path.read_bytes() == data:
+                return document if isinstance(document, dict) else {}
+        except OSError:
+            return {}
+        except ValueError:
+            pass
+        time.sleep(_PAUSE_S)
+    return {}
+
+
+def overwrite_json(path: Path, data: bytes) -> bool:
+    """Write a document over the one at a path, which takes no room on the disk; whether it fits.
+
+    It is no JSON until all of it is there.
+    """
+    try:
+        with path.open("r+b", buffering=0) as file:
+            room, document = os.fstat(file.fileno()).st_size, data.rstrip()
+            if len(document) > room:
+                return False
+            os.pwrite(file.fileno(), b"\0", 0)
+            written = os.pwrite(file.fileno(), document[1:].ljust(room - 1), 1)
+            return written == room - 1 and os.pwrite(file.fileno(), document[:1], 0) == 1
+    except OSError:
+        return False
+
+
 _MOST_VALUES = 100_000
 _MOST_BYTES = 20_000_000
 _DEEPEST = 60
@@ -203,7 +282,7 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     if document is None:
         raise error(f"{path}: is empty")
     if not isinstance(document, dict):
-        raise error(f"{path}: must hold `key: value` lines, not a {type(document).__name__}")
+        raise error(f"{path}: must hold `key: value` lines, and holds something else")
     for key in document:
         if not isinstance(key, str):
             raise error(f"{path}: key {key!r} must be text")
@@ -236,9 +315,156 @@ def _is_too_large(document: dict[str, Any]) -> bool:
     return left <= 0
 
 
+class _Dumper(yaml.SafeDumper):
+    """The safe dumper; what no file can hold (half of a pair, from a file's name) as its code."""
+
+    def represent_text(self, text: str) -> yaml.ScalarNode:
+        return self.represent_str(text.encode(errors="backslashreplace").decode())
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+
+
 def dump_yaml(document: dict[str, Any]) -> str:
     """YAML text that keeps the order of the keys and writes short mappings on one line."""
-    text: str = yaml.safe_dump(
-        document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
+    text: str = yaml.dump(
+        document,
+        Dumper=_Dumper,
+        sort_keys=False,
+        allow_unicode=True,
+        default_flow_style=None,
+        width=100,
     )
     return text
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A value and its standard deviation (None where none is known), in the unit asked for."""
+
+    value: float
+    sd: float | None = None
+
+
+def write_quantity(value: float, unit: str, sd: float | None = None) -> dict[str, Any]:
+    """Return the mapping that a file holds for a number."""
+    document: dict[str, Any] = {"value": float(value)}
+    if sd is not None and math.isfinite(sd):
+        document["sd"] = float(sd)
+    return {**document, "unit": unit}
+
+
+class QuantityReader:
+    """One mapping of a file; errors name the file and the dotted key."""
+
+    error: ClassVar[type[ThermocaldError]] = ConfigurationError
+
+    def __init__(self, path: Path | str, mapping: Any, prefix: str = "") -> None:
+        self._path = path
+        self._prefix = prefix
+        if not isinstance(mapping, dict):
+            what = "is missing" if mapping is None else "must hold `key: value` pairs"
+            raise self.error(f"{path}, {prefix.rstrip('.') or 'the file'}: {what}")
+        self.mapping: Mapping[str, Any] = mapping
+
+    def fail(self, key: str, message: str) -> ThermocaldError:
+        """Make an error at a key; the caller raises it."""
+        return self.error(f"{self._path}, key {self._prefix}{key}: {message}")
+
+    def require_format(self, wanted: str, said: str = "this program reads") -> None:
+        """Refuse a file of another format."""
+        found = self.text("format")
+        if found != wanted:
+            raise self.fail("format", f"is {found[:60]!r}; {said} {wanted!r}")
+
+    def only(self, known: Iterable[str]) -> None:
+        """Refuse keys that nobody reads."""
+        names = list(known)
+        for key in self.mapping:
+            if key not in names:
+                near = get_close_matches(str(key), names, 1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
+                raise self.fail(str(key), f"is unknown; {hint}")
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Read text; a number counts as its digits."""
+        value = self.mapping.get(key, default)
+        if value is None:
+            raise self.fail(key, "is missing")
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise self.fail(key, "must be text")
+        return str(value)
+
+    def number(
+        self, key: str, unit: str, default: float | None = None,
+        low: float = -math.inf, above: float = -math.inf, high: float = math.inf,
+    ) -> float:  # fmt: skip
+        """Read the value of a quantity: at least `low`, more than `above`, at most `high`."""
+        value = self.quantity(key, unit, default).value
+        if value <= above:
+            raise self.fail(key, f"is {value:g} {unit}; it must be above {above:g}")
+        if value < low:
+            raise self.fail(key, f"is {value:g} {unit}; it must be at least {low:g}")
+        if value > high:
+            raise self.fail(key, f"is {value:g} {unit}; it is at most {high:g}")
+        return value
+
+    def share(self, key: str, default: float) -> float:
+        """Read a share, at least 0 and below 1."""
+        value = self.number(key, "1", default, low=0.0)
+        if value >= 1:
+            raise self.fail(key, f"is {value:g}; it is a share below 1")
+        return value
+
+    def quantity(self, key: str, unit: str, default: float | None = None) -> Quantity:
+        """Read a number in `unit`; an error if it is missing, no number, or of another unit."""
+        raw = self.mapping.get(key, default)
+        if raw is None:
+            raise self.fail(key, f"is missing; it is a number in {unit}")
+        sd: float | None = None
+        if isinstance(raw, dict):
+            inner = type(self)(self._path, raw, f"{self._prefix}{key}.")
+            inner.only(("value", "sd", "unit"))
+            found = inner.text("unit", unit)
+            if found != unit:
+                raise inner.fail("unit", f"is {found!r}; it must be {unit!r}: convert the value")
+            if "value" not in raw:
+                raise inner.fail("value", "is missing")
+            if raw.get("sd") is not None:
+                sd = inner.finite("sd", raw["sd"])
+                if sd < 0:
+                    raise inner.fail("sd", f"is {sd:g}; a standard deviation is not negative")
+            raw = raw["value"]
+        return Quantity(self.finite(key, raw), sd)
+
+    def finite(self, key: str, raw: Any) -> float:
+        """Return a value at a key as a finite number."""
+        try:
+            # PyYAML reads 1e-3 as text, since YAML 1.1 wants a point
+            value = float(raw) if isinstance(raw, str | int | float) else math.nan
+        except (ValueError, OverflowError):
+            value = math.nan
+        if isinstance(raw, bool) or not math.isfinite(value):
+            raise self.fail(key, f"{str(raw)[:40]!r} is not a finite number")
+        return value
+
+    def whole(self, key: str, unit: str, high: float = math.inf) -> int:
+        """Read a whole number from 1 on."""
+        value = self.number(key, unit, low=1, high=high)
+        if value != int(value):
+            raise self.fail(key, f"is {value:g} {unit}; it must be a whole number")
+        return int(value)
+
+    def inner(self, key: str) -> Self:
+        """Enter the mapping at a key."""
+        if self.mapping.get(key) is None:
+            raise self.fail(key, "is missing")
+        return type(self)(self._path, self.mapping[key], f"{self._prefix}{key}.")
+
+    def items(self, key: str) -> Iterator[Self]:
+        """Yield the mappings of a list at a key; none where the key is absent."""
+        values = self.mapping.get(key) or []
+        if not isinstance(values, list):
+            raise self.fail(key, "must be a list (lines that begin with `-`)")
+        for number, value in enumerate(values, start=1):
+            yield type(self)(self._path, value, f"{self._prefix}{key}[{number}].")

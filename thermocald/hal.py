@@ -20,10 +20,20 @@ import threading
 import time
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Protocol,
+    Self,
+    runtime_checkable,
+)
 
-from pydantic import ConfigDict, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
+from thermocald.addresses import hide_secrets
 from thermocald.config import Section, in_words, keys
 from thermocald.errors import ConfigurationError, DriverMissing, WrongDevice
 from thermocald.names import channel_fault as channel_fault
@@ -43,7 +53,8 @@ class Frame:
     """One image as a camera delivered it.
 
     image: (H, W) uint8 or uint16 grey values, read-only; None where `encoded` holds a JPEG, or
-    where the frame was measured before and `metadata["observations"]` holds its image points.
+    where the frame was measured before and `observations` holds its image points, as
+    `thermocald.photogrammetry.field.testfield.observations_from_lists` reads them.
     monotonic, utc: s, the middle of the exposure as well as the device reports it, on the clock's
     two scales.
     exposure: s, or None.
@@ -51,7 +62,6 @@ class Frame:
     settings: what moves the image, as read back with this frame, by name: focus, exposure, gain,
     white balance in the device's own units; 1.0 and 0.0 for automatic modes. Stored with the epoch
     as the columns `camera_<name>`.
-    metadata: what else the device reported, JSON-able; not stored.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16] | None
@@ -60,14 +70,12 @@ class Frame:
     exposure: float | None = None
     sequence: int | None = None
     encoded: bytes | None = None
-    metadata: Mapping[str, Any] = field(default_factory=dict)
+    observations: Mapping[str, Any] | None = None
     settings: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.image is None and self.encoded is None and "observations" not in self.metadata:
-            raise ValueError(
-                "a frame needs an image, encoded bytes, or observations in its metadata"
-            )
+        if self.image is None and self.encoded is None and self.observations is None:
+            raise ValueError("a frame needs an image, encoded bytes, or observations")
         if self.image is not None:
             self.image.setflags(write=False)
 
@@ -76,7 +84,8 @@ class Frame:
 class Reading:
     """What a thermometer reported, and when.
 
-    values: {channel: °C}; a channel that could not be read is absent, never repeated or filled in;
+    values: {channel: °C}; a channel that could not be read is absent, never repeated or filled in,
+    and stands in `missing` with the reason;
     one that is called like a column of the program, or holds a mark that separates columns
     (`names`), is refused as WrongDevice.
     monotonic, utc: s, the time of the conversion as well as the device reports it.
@@ -85,7 +94,7 @@ class Reading:
     values: Mapping[str, float]
     monotonic: float
     utc: float
-    metadata: Mapping[str, Any] = field(default_factory=dict)
+    missing: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in self.values:
@@ -113,14 +122,6 @@ class Found:
         # names come from devices: no line break may leave the comment, no escape code be printed
         shown = "".join(c if c.isprintable() else "?" for c in self.about)
         object.__setattr__(self, "about", shown)
-
-
-@dataclass(frozen=True, slots=True)
-class KnownScene:
-    """What a simulated camera looks at: its sensor and test field."""
-
-    sensor: Any
-    testfield: Any
 
 
 @runtime_checkable
@@ -151,6 +152,13 @@ class DriverOptions(Section):
             raise ConfigurationError(in_words(where, error)) from error
 
 
+class HeatingStep(DriverOptions):
+    """A step of a heating programme: hold a temperature (°C; None: do not heat) for a time (s)."""
+
+    seconds: Annotated[float, Field(ge=1.0, le=1e6)]
+    hold_c: Annotated[float, Field(ge=-40.0, le=150.0)] | None
+
+
 class Device:
     """What every driver has: its options, `open`, `close`, and use as a context manager.
 
@@ -170,7 +178,7 @@ class Device:
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> Sequence[Found]:  # noqa: ARG003
-        """The devices of this driver that are attached; a DeviceError if it cannot look."""
+        """List the attached devices of this driver; a DeviceError if it cannot look."""
         return []
 
     def open(self) -> None:
@@ -184,7 +192,7 @@ class Device:
         return {}
 
     def warnings(self) -> Sequence[str]:
-        """One sentence for each setting that harms the results; shown in the status."""
+        """Return one sentence for each setting that harms the results; shown in the status."""
         return []
 
     def __enter__(self) -> Self:
@@ -203,11 +211,14 @@ class Camera(Device):
         raise NotImplementedError
 
     def frame_size(self) -> tuple[int, int] | None:
-        """(width, height) in px of the frames, where the configuration states it."""
+        """Return (width, height) in px of the frames, where the configuration states it."""
         return None
 
-    def known_scene(self) -> KnownScene | None:
-        """What it looks at, where the driver knows; it then needs no test field in the stanza."""
+    def known_scene(self) -> tuple[Any, Any] | None:
+        """Return the sensor and the test field it looks at, where a simulated camera knows both.
+
+        It then needs no test field in the stanza.
+        """
         return None
 
 
@@ -224,12 +235,10 @@ class Thermometer(Device):
 
 
 class Output(Device):
-    """`emit()` passes a result on; it must not block longer than its `timeout_s`."""
+    """`emit()` passes a result on; it must not block longer than its option `timeout_s`."""
 
     heats: ClassVar[bool] = False
     """Whether it heats the camera by a `programme`, which a session may replace."""
-
-    timeout_s: float = 5.0
 
     def emit(self, result: Mapping[str, Any]) -> None:
         """Pass on one epoch's result: the columns of the CSV export, and `device`, `state`."""
@@ -296,12 +305,12 @@ _GROUPS: Mapping[Kind, str] = {
 
 
 def driver_names(kind: Kind) -> list[str]:
-    """The registered drivers of one kind, sorted."""
+    """Return the registered drivers of one kind, sorted."""
     return sorted({point.name for point in entry_points(group=_GROUPS[kind])})
 
 
 def load_driver(kind: Kind, name: str) -> type[Any]:
-    """The class behind one entry point; ConfigurationError names those that exist."""
+    """Return the class behind one entry point; ConfigurationError names those that exist."""
     points = {point.name: point for point in entry_points(group=_GROUPS[kind])}
     if name not in points:
         raise ConfigurationError(
@@ -316,7 +325,7 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
 
 
 def option_names(kind: Kind, name: str) -> list[str]:
-    """The options of a driver; errors as `load_driver`."""
+    """Return the options of a driver; errors as `load_driver`."""
     return keys(load_driver(kind, name).Options)
 
 
@@ -327,6 +336,7 @@ def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock)
     """
     driver = load_driver(kind, name)
     where = f"{kind} driver {name!r}"
+    hide_secrets(options)
     try:
         device = driver(clock=clock, **options)
     except (ConfigurationError, TypeError) as error:  # TypeError: a key that is no name

@@ -10,6 +10,7 @@ vcgencmd get_throttled (the bits); systemd-timesyncd(8) for the clock; kernel do
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import grp
 import importlib.util
@@ -65,10 +66,6 @@ class Finding:
     remedy: str = ""
 
 
-def _has_module(name: str) -> bool:
-    return importlib.util.find_spec(name) is not None
-
-
 @dataclass(frozen=True)
 class Machine:
     """A machine as its files show it.
@@ -84,16 +81,22 @@ class Machine:
     uid: int
     groups: frozenset[str]
     synchronised: bool | None
-    has_module: Callable[[str], bool] = _has_module
+    has_module: Callable[[str], bool] = lambda name: importlib.util.find_spec(name) is not None
 
     @classmethod
     def here(cls, root: Path) -> Self:
-        """The machine whose root folder is given, for the user who runs the program."""
+        """Return the machine whose root folder is given, for the user who runs the program."""
         trusted = machine_clock_trusted() if root == Path("/") else None
-        return cls(root, _user_name(), os.getuid(), frozenset(_group_names()), trusted)
+        user, groups = str(os.getuid()), set()  # a container's may have no names
+        with contextlib.suppress(KeyError):
+            user = pwd.getpwuid(os.getuid()).pw_name
+        for number in (os.getgid(), *os.getgroups()):
+            with contextlib.suppress(KeyError):
+                groups.add(grp.getgrgid(number).gr_name)
+        return cls(root, user, os.getuid(), frozenset(groups), trusted)
 
     def findings(self) -> list[Finding]:
-        """Everything that was looked at, in the order in which it is best mended."""
+        """Look at everything, in the order in which it is best mended."""
         checks = (
             self._board, self._camera_stack, self._camera_enabled, self._groups, self._i2c,
             self._one_wire, self._phones, self._clock, self._power, self._heat, self._disk,
@@ -319,24 +322,6 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
     lines.append("")
     lines.append(f"to mend: {', '.join(missing)}" if missing else "nothing is missing")
     return lines
-
-
-def _user_name() -> str:
-    """The user's name, or number where it has none (a container)."""
-    try:
-        return pwd.getpwuid(os.getuid()).pw_name
-    except KeyError:
-        return str(os.getuid())
-
-
-def _group_names() -> list[str]:
-    names = []
-    for number in {os.getgid(), *os.getgroups()}:
-        try:
-            names.append(grp.getgrgid(number).gr_name)
-        except KeyError:
-            continue
-    return names
 
 
 class _Timex(ctypes.Structure):

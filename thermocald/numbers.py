@@ -26,12 +26,12 @@ _MINUS = "−"
 
 
 def parameter_label(name: str) -> str:
-    """How a parameter or a thermometer is called in figures and tables."""
+    """Return the name of a parameter or a thermometer in figures and tables."""
     return _SYMBOLS.get(name) or column_label(name).replace("_", " ")
 
 
 def column_label(name: str) -> str:
-    """Of a logger's column the label that its owner gave (LBL), else the quantity.
+    """Return the label that its owner gave a logger's column (LBL), else its quantity.
 
     Serial numbers are no name: `Temp, °C (LGR S/N: 204, SEN S/N: 204, LBL: housing)` is `housing`.
     """
@@ -44,7 +44,7 @@ def column_label(name: str) -> str:
 
 
 def shortened(text: str, most: int) -> str:
-    """A text of at most so many letters: its middle gives way, since units stand at the end."""
+    """Shorten a text to so many letters: its middle gives way, since units stand at the end."""
     if len(text) <= most:
         return text
     tail = (most - 1) // 2
@@ -52,7 +52,7 @@ def shortened(text: str, most: int) -> str:
 
 
 def superscript(exponent: int) -> str:
-    """An exponent as raised digits."""
+    """Return an exponent as raised digits."""
     return str(exponent).translate(_SUPERSCRIPT)
 
 
@@ -65,7 +65,7 @@ def typeset_powers(text: str) -> str:
 
 
 def with_sd(value: float, sd: float, unit: str = "") -> str:
-    """`6.959 ± 0.028 mm`, with a power of ten outside 0.001 to 10000; an en dash for nothing."""
+    """Write `6.959 ± 0.028 mm`, with a power of ten outside 0.001 to 10000; nothing as a dash."""
     if not math.isfinite(value):
         return "–"
     if not math.isfinite(sd) or sd <= 0:
@@ -82,13 +82,13 @@ def with_sd(value: float, sd: float, unit: str = "") -> str:
 
 
 def signed(value: float, sd: float, unit: str = "") -> str:
-    """The same with its sign: `+0.350 ± 0.002 px/K`."""
+    """Write the same with its sign: `+0.350 ± 0.002 px/K`."""
     text = with_sd(value, sd, unit)
     return f"+{text}" if value > 0 and not text.startswith("(") else text
 
 
 def rounded(value: float, sd: float, unit: str = "") -> str:
-    """A number to the second digit of its standard deviation, which is not shown."""
+    """Write a number to the second digit of its standard deviation, which is not shown."""
     if not math.isfinite(value) or not math.isfinite(sd) or sd <= 0:
         return plain(value, unit, 6)
     if max(abs(value), sd) < 1e-3:
@@ -101,7 +101,7 @@ def rounded(value: float, sd: float, unit: str = "") -> str:
 
 
 def plain(value: float, unit: str = "", digits: int = 4) -> str:
-    """A number to some significant digits, with a power of ten where it needs one."""
+    """Write a number to some significant digits, with a power of ten where it needs one."""
     if not math.isfinite(value):
         return "∞" if math.isinf(value) else "–"
     if value == 0:
@@ -115,7 +115,7 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
 
 
 def duration(seconds: float) -> str:
-    """`25 minutes`, `1 minute`, `3.5 hours`, `12 days`: as long as a person would say it."""
+    """Write a duration as people say it: `25 minutes`, `1 minute`, `3.5 hours`, `12 days`."""
     for unit, length in (("day", 86_400.0), ("hour", 3600.0), ("minute", 60.0)):
         if seconds >= 2 * length or (unit == "minute" and seconds >= 59.5):
             count = seconds / length
@@ -126,7 +126,7 @@ def duration(seconds: float) -> str:
 
 
 def percent(share: float, decimals: int = 0) -> str:
-    """A share as per cent; never 100 or 0 for what is not all or none."""
+    """Write a share as per cent; never 100 or 0 for what is not all or none."""
     if not math.isfinite(share):
         return "–"
     shown = f"{100 * share:.{decimals}f}"
@@ -139,14 +139,14 @@ def percent(share: float, decimals: int = 0) -> str:
 
 
 def p_text(p: float) -> str:
-    """A p-value: `≤ 0.001`, or two digits."""
+    """Write a p-value: `≤ 0.001`, or two digits."""
     if not math.isfinite(p):
         return "–"
     return "≤ 0.001" if p <= 0.001 else f"{p:.2g}"
 
 
 def coefficient(r: float) -> str:
-    """A correlation: two digits, three close to ±1, and 1 only for what is 1."""
+    """Write a correlation: two digits, three close to ±1, and 1 only for what is 1."""
     if not math.isfinite(r):
         return "–"
     if abs(r) == 1:
@@ -159,12 +159,12 @@ def coefficient(r: float) -> str:
     return shown.replace("-", _MINUS)
 
 
-def short_duration(seconds: float) -> str:
-    """A duration in the largest unit of which there are two: `90 s`, `2 min`, `3 h`, `12 d`.
+def short_duration(seconds: float | None) -> str:
+    """Write a duration in the largest unit of which there are two: `90 s`, `2 min`, `3 h`, `12 d`.
 
-    seconds: may be negative; `–` where it is not finite.
+    seconds: may be negative; `–` where it is not known or not finite.
     """
-    if not math.isfinite(seconds):
+    if seconds is None or not math.isfinite(seconds):
         return "–"
     for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if abs(seconds) >= 2 * size:

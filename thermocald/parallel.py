@@ -1,4 +1,4 @@
-"""What is many times independent, on several processes, with the same results as on one.
+"""Independent pieces of work on several processes, with the same results as on one.
 
 The results come in the order of the items and are put together by who asked for them, so that sums
 are added in one order whatever the number of processes: every bit is the same.
@@ -31,7 +31,7 @@ _current: tuple[Any, Any] | None = None  # of a process of the pool: its functio
 def in_order(
     work: Callable[[State, Item], Result], state: State, items: Iterable[Item], jobs: int = 1
 ) -> Iterator[Result]:
-    """The results of `work(state, item)` for all items, in their order.
+    """Yield the results of `work(state, item)` for all items, in their order.
 
     work: a function of a module; state: what it needs besides the item, handed to each process
     once; items: taken as results are asked for, a few ahead; jobs: how many processes, 1: this one.
@@ -65,7 +65,7 @@ def in_order(
 def processes(
     jobs: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
 ) -> ProcessPoolExecutor:
-    """A pool of fresh processes, each of which begins with `begin(*given)`.
+    """Make a pool of fresh processes, each of which begins with `begin(*given)`.
 
     Not forked: the threads of OpenCV and of linear algebra do not survive that.
     """

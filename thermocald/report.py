@@ -7,47 +7,28 @@ does not cover. The page can be read without its script, which copies tables and
 
 from __future__ import annotations
 
-import base64
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 from thermocald import __version__
-from thermocald.figures import Figure, draw_matrix, draw_panel, inline_svg
 from thermocald.numbers import typeset_powers
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from thermocald.arrays import Array
+    from thermocald.figures import Figure
 
+_Record = TypeVar("_Record")
 _TEMPLATES = Path(__file__).parent / "templates"
 _A_YEAR = 31_557_600.0
 _RIGHT_TO_LEFT = "\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc"
 _WORDS_TO_LEFT = re.compile(
     f"[{_RIGHT_TO_LEFT}](?:[{_RIGHT_TO_LEFT}\\s\u200c\u200d-]*[{_RIGHT_TO_LEFT}])?"
 )
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure as the page shows it; images: (label, PNG bytes)."""
-
-    name: str
-    title: str
-    caption: str
-    svgs: tuple[str, ...] = ()
-    images: tuple[tuple[str, bytes], ...] = ()
-    columns: int = 1
-    width_rem: float = 27.0  # of a single column, on a page that has the room
-
-    def sources(self) -> list[tuple[str, str]]:
-        """(label, address) of each image."""
-        start = "data:image/png;base64,"
-        return [(label, start + base64.b64encode(png).decode()) for label, png in self.images]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +40,25 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
 
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        records: Iterable[_Record],
+        columns: Mapping[str, Callable[[_Record], str]],
+        note: str = "",
+    ) -> Table:
+        """Return a table with a row for each record; columns: how a cell is written, by heading."""
+        rows = tuple(tuple(cell(record) for cell in columns.values()) for record in records)
+        return cls(title, tuple(columns), rows, note)
+
 
 @dataclass(frozen=True)
 class Answer:
     """The card that a chapter opens with; more: sentences beside the first."""
 
     sentence: str
-    proof: Drawing | None = None
+    proof: Figure | None = None
     more: tuple[str, ...] = ()
     next_steps: tuple[str, ...] = ()
     not_covered: tuple[str, ...] = ()
@@ -80,7 +73,7 @@ class Section:
 
     title: str
     text: tuple[str, ...] = ()
-    figures: tuple[Drawing, ...] = ()
+    figures: tuple[Figure, ...] = ()
     tables: tuple[Table, ...] = ()
     items: tuple[tuple[str, str], ...] = ()
     folded: bool = False
@@ -98,10 +91,8 @@ class Chapter:
     notes: tuple[str, ...] = ()
 
 
-def render_report(
-    title: str, chapters: Sequence[Chapter], lead: str = "", made: datetime | None = None
-) -> str:
-    """Return the page as HTML text; made: the time that it bears, by default now."""
+def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> str:
+    """Return the page as HTML text."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
     environment = Environment(
@@ -112,7 +103,7 @@ def render_report(
         finalize=lambda value: isolated(value) if type(value) is str else value,
     )
     environment.filters["powers"] = typeset_powers
-    at = made or datetime.now(tz=UTC)
+    at = datetime.now(tz=UTC)
     versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy"))
     return environment.get_template("report.html.j2").render(
         title=title,
@@ -125,34 +116,18 @@ def render_report(
     )
 
 
+def as_sentence(text: str) -> str:
+    """Return a line with a capital letter and a full stop."""
+    text = text.strip().rstrip(".")
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 def isolated(text: str) -> str:
     """Return a text in which Hebrew and Arabic words turn nothing around but themselves.
 
     Else a camera's name exchanges the width and the height that follow it.
     """
     return _WORDS_TO_LEFT.sub(lambda m: f"\u2068{m[0]}\u2069", text)
-
-
-def of_figure(figure: Figure, prefix: str = "") -> Drawing:
-    """A figure of panels as the page shows it."""
-    name = f"{prefix}{figure.name}"
-    svgs = tuple(
-        inline_svg(draw_panel(panel, legend=i == 0), f"{name}-{i}", panel.title)
-        for i, panel in enumerate(figure.panels)
-    )
-    columns = min(figure.columns, len(figure.panels))
-    return Drawing(name, figure.title, figure.caption, svgs, columns=columns)
-
-
-def of_drawing(drawing: Any, name: str, title: str, caption: str) -> Drawing:
-    """A drawing that is wider than a panel as the page shows it."""
-    width_rem = 7.4 * float(drawing.get_size_inches()[0])
-    return Drawing(name, title, caption, (inline_svg(drawing, name, title),), width_rem=width_rem)
-
-
-def of_matrix(matrix: Array, names: Sequence[str], name: str, title: str, caption: str) -> Drawing:
-    """A correlation matrix as the page shows it."""
-    return of_drawing(draw_matrix(matrix, names, title), name, title, caption)
 
 
 def day(start_utc: float) -> str:

@@ -1,22 +1,24 @@
-"""What an analysis gives: one object that is printed, written as JSON, drawn and reported."""
+"""The result of an analysis: one object that is printed, written as JSON, drawn and reported."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import fields, is_dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import DriverMissing
 from thermocald.files import write_text
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from matplotlib.figure import Figure
 
 
 class Result(ABC):
-    """What an analysis found; `print` shows what the command prints."""
+    """The result of an analysis; `print` shows what the command prints."""
 
     heading = "What was found"
     caption = "What was found over time, and its standard deviations."
@@ -29,6 +31,10 @@ class Result(ABC):
     def lines(self) -> list[str]:
         """Return the lines that the command prints."""
 
+    def answer(self) -> str:
+        """Return the sentence, without its stop, that a report opens with."""
+        return self.lines()[0]
+
     @abstractmethod
     def plot(self) -> Figure:
         """Draw the result with matplotlib (extra `report`)."""
@@ -39,14 +45,20 @@ class Result(ABC):
         title: of the page, by default `heading`. Returns the file's path; raises OutputError where
         it cannot be written.
         """
-        from thermocald.report import Answer, Chapter, Section, of_drawing, render_report
-
-        first, *others = self.lines()
-        proof = of_drawing(self.plot(), "proof", "The result drawn", self.caption)
-        said = Section("What the command prints", printed="\n".join(others))
-        chapter = Chapter(title or self.heading, Answer(f"{first}.", proof), (said,))
-        write_text(Path(path), render_report(chapter.title, [chapter]))
+        write_text(Path(path), self.page(title))
         return Path(path)
+
+    def page(self, title: str = "") -> str:
+        """Return the report as HTML text; title: by default `heading`."""
+        from thermocald.figures import Figure
+        from thermocald.report import Answer, Chapter, Section, render_report
+
+        answer = self.answer()
+        others = [line for line in self.lines() if line != answer]
+        proof = Figure("proof", "The result drawn", self.caption, drawing=self.plot())
+        said = Section("What the command prints", printed="\n".join(others))
+        chapter = Chapter(title or self.heading, Answer(f"{answer}.", proof), (said,))
+        return render_report(chapter.title, [chapter])
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
@@ -55,7 +67,7 @@ class Result(ABC):
         return f"<{type(self).__name__}: {self.lines()[0]}>"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
+        """Return the HTML that a notebook shows."""
         return f"<pre>{escape(str(self))}</pre>"
 
 
@@ -66,38 +78,18 @@ def new_figure(
 
     panel: width and height of one, inches. Raises DriverMissing without matplotlib.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise DriverMissing(
-            "a drawing needs matplotlib: pip install 'thermocald[report]'"
-        ) from None
+    from thermocald.figures import drawing_style, new_drawing
 
-    class Shown(Figure):
-        """A figure that a notebook shows without `%matplotlib`."""
-
-        def _repr_svg_(self) -> str:
-            return svg(self)
-
-    figure = Shown(figsize=(panel[0] * columns, panel[1] * rows), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False, sharex=columns == 1)
-
-
-def svg(figure: Figure) -> str:
-    """Return a figure as an <svg> element."""
-    import io
-
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
+    with drawing_style():
+        figure = new_drawing(panel[0] * columns, panel[1] * rows)
+        return figure, figure.subplots(rows, columns, squeeze=False, sharex=columns == 1)
 
 
 def jsonable(value: Any) -> Any:
     """Return a value as JSON has it: NaN and infinity as null, paths as text.
 
-    Arrays and tuples become lists, what has `as_dict` that document, other dataclasses mappings of
-    their fields, named as `metadata={"json": …}` says, left out where that is empty.
+    Arrays and tuples become lists, what has `as_dict` that document, other dataclasses what
+    `document_of` makes of them.
     """
     if isinstance(value, dict):
         return {str(key): jsonable(inner) for key, inner in value.items()}
@@ -111,8 +103,26 @@ def jsonable(value: Any) -> Any:
         return str(value)
     if hasattr(value, "as_dict"):
         return jsonable(value.as_dict())
-    fields = getattr(value, "__dataclass_fields__", None)
-    if fields is not None and not isinstance(value, type):
-        named = {name: field.metadata.get("json", name) for name, field in fields.items()}
-        return {key: jsonable(getattr(value, name)) for name, key in named.items() if key}
-    return value
+    return document_of(value) if is_dataclass(value) and not isinstance(value, type) else value
+
+
+def document_of(record: Any) -> dict[str, Any]:
+    """Return a dataclass as JSON has it: its fields by name.
+
+    Its class may say otherwise in JSON, {attribute: key}: another key, "" for what stays out, "*"
+    for what has keys of its own that stand in its place; what is no field is added.
+    """
+    named = {field.name: field.name for field in fields(record)} | getattr(record, "JSON", {})
+    document: dict[str, Any] = {}
+    for name, key in named.items():
+        if key:
+            told = jsonable(getattr(record, name))
+            document |= told if key == "*" else {key: told}
+    return document
+
+
+def with_sds(names: Iterable[str], values: Iterable[Any], sds: Iterable[Any]) -> dict[str, float]:
+    """Return numbers by name, and their standard deviations as `sd_` of the name."""
+    named = list(names)
+    told = {name: float(value) for name, value in zip(named, values, strict=True)}
+    return told | {f"sd_{name}": float(sd) for name, sd in zip(named, sds, strict=True)}

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
+from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.analysis.study import study as studies
 from thermocald.discovery import result as discoveries
 from thermocald.discovery.entries import effects_of
-from thermocald.discovery.model import build_model
+from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
-from thermocald.files import write_text
-from thermocald.output.printed import calibration_document, calibration_lines, discovery_lines
+from thermocald.numbers import UNITS, plain, with_sd
 from thermocald.output.study.summary import study_document, study_lines
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.model_file import write_effects, write_model
-from thermocald.result import Result, jsonable, new_figure
+from thermocald.result import Result, document_of, jsonable
+from thermocald.store.logger.photographs import focal_length
+from thermocald.store.recording.head import CameraSpec
+from thermocald.store.recording.sense import doubt_lines, interior_doubts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,6 +34,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
     from thermocald.photogrammetry.camera_files import CameraFile
     from thermocald.physics.model import ThermalModel
+
 
 _Kind = TypeVar("_Kind")
 
@@ -46,25 +52,25 @@ class Study(Result, studies.Study):
     was made with; reference: each figure of the reference study beside ours, where that was asked.
     """
 
+    heading = "Thermal study of a camera"
     reference: tuple[Comparison, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald study --json` writes."""
         document = study_document(self)
         if self.reference:
-            document["reference"] = [c.as_dict() for c in self.reference]
+            document["reference"] = jsonable(self.reference)
         return document
 
     def lines(self) -> list[str]:
         """Return what `thermocald study` prints."""
         return study_lines(self, self.reference)
 
-    def report(self, path: Path | str, title: str = "Thermal study of a camera") -> Path:
-        """Write the report, one HTML file (extra `report`)."""
+    def page(self, title: str = "") -> str:
+        """Return the report as HTML text."""
         from thermocald.output.study.report import render_study
 
-        write_text(Path(path), render_study(self, title))
-        return Path(path)
+        return render_study(self, title or self.heading)
 
     def save_figures(self, folder: Path | str) -> list[Path]:
         """Write every figure as SVG and PNG; returns the files."""
@@ -99,25 +105,18 @@ class Discovery(Result, discoveries.Discovery):
         """Return what `thermocald discover` prints."""
         return discovery_lines(self)
 
-    def report(self, path: Path | str, title: str = "") -> Path:
-        """Write the report, one HTML file (extra `report`)."""
+    def page(self, title: str = "") -> str:
+        """Return the report as HTML text; title: by default the name of what was explained."""
         from thermocald.output.discovery import report_html
 
-        write_text(Path(path), report_html(self, title or self.name))
-        return Path(path)
+        return report_html(self, title or self.name)
 
     def plot(self) -> Figure:
-        """Draw the gap before and after each effect, reduced χ² over its floor."""
-        figure, axes = new_figure(1)
-        names = [stage.added or "base model" for stage in self.stages]
-        axis = axes[0, 0]
-        axis.plot(names, [s.fit.chi2_reduced for s in self.stages], "o-", label="M1")
-        if all(s.verify is not None for s in self.stages):
-            gaps = [s.verify.chi2_reduced for s in self.stages if s.verify is not None]
-            axis.plot(names, gaps, "s--", label="verified on")
-        axis.axhline(1.0, lw=0.6, color="grey")
-        axis.set_ylabel("reduced χ² (no unit)")
-        axis.legend()
+        """Draw the gap before and after each effect, px, against the noise."""
+        from thermocald.figures import draw_figure
+        from thermocald.output.discovery import gap_figure
+
+        figure: Figure = draw_figure(gap_figure(self))
         return figure
 
     @cached_property
@@ -149,9 +148,29 @@ class Calibration(Result):
     file: what was known of the camera; pitch_assumed: nobody said how large a pixel is.
     """
 
+    JSON: ClassVar = {
+        "photographs": "*", "file": "", "pitch_assumed": "", "head": "camera", "doubts": "doubts",
+    }  # fmt: skip
+
     photographs: Photographs
     file: CameraFile
     pitch_assumed: bool = False
+
+    @property
+    def head(self) -> dict[str, Any]:
+        """The camera as a document has it."""
+        assumed = {"pixel_pitch_assumed": self.pitch_assumed}
+        return {"name": self.file.name, **document_of(self.file.sensor), **assumed}
+
+    @property
+    def doubts(self) -> list[str]:
+        """Return what is doubtful in the estimated camera, a sentence each."""
+        found = self.photographs
+        if found.interior is None or not found.estimated or self.pitch_assumed:
+            return []
+        nominal = self.file.principal_distance or focal_length(Path(found.photographs[0].path))
+        c, x0, y0 = found.interior.as_array()[:3].tolist()
+        return interior_doubts(CameraSpec(self.file.name, self.file.sensor, nominal), c, x0, y0)
 
     @property
     def status(self) -> str:
@@ -160,7 +179,7 @@ class Calibration(Result):
 
     @property
     def posed(self) -> bool:
-        """Whether the camera was calibrated, or a photograph has a pose."""
+        """Return whether the camera was calibrated, or a photograph has a pose."""
         return self.status == "ok" or any(p.status == "ok" for p in self.photographs.photographs)
 
     @property
@@ -193,35 +212,24 @@ class Calibration(Result):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald calibrate --json` writes."""
-        document = calibration_document(
-            self.photographs, self.file.name, self.file.sensor, self.pitch_assumed,
-            self.file.principal_distance,
-        )  # fmt: skip
-        converted: dict[str, Any] = jsonable(document)
-        return converted
+        return {"format": "thermocald-calibration/1", **document_of(self)}
 
     def lines(self) -> list[str]:
         """Return what `thermocald calibrate` prints."""
         return calibration_lines(self.as_dict())
 
-    def report(self, path: Path | str, title: str = "") -> Path:  # noqa: ARG002
-        """Write residuals and coverage, one HTML file (extra `report`)."""
+    def page(self, title: str = "") -> str:
+        """Return residuals and coverage as HTML text; title: by default the camera's name."""
         from thermocald.output.calibration import render_calibration
 
-        page = render_calibration(self.photographs, self.file.sensor, self.file.name)
-        write_text(Path(path), page)
-        return Path(path)
+        return render_calibration(self.photographs, self.file.sensor, title or self.file.name)
 
     def plot(self) -> Figure:
         """Draw the residuals of all photographs over the image, px."""
-        figure, axes = new_figure(1, panel=(6.0, 4.5))
-        axis = axes[0, 0]
-        for p in self.photographs.photographs:
-            if len(p.points):
-                x, y = p.points[p.used].T
-                axis.quiver(x, y, *p.residuals[p.used].T, angles="xy", width=0.002)
-        axis.set(xlim=(0, self.file.sensor.width), ylim=(self.file.sensor.height, 0))
-        axis.set(xlabel="x, px", ylabel="y, px", aspect="equal", title=f"sigma0 {self.sigma0:.2f}")
+        from thermocald.figures import draw_figure
+        from thermocald.output.calibration import residual_figure
+
+        figure: Figure = draw_figure(residual_figure(self.photographs, self.file.sensor))
         return figure
 
     def save(self, path: Path | str) -> Path:
@@ -241,3 +249,89 @@ class Calibration(Result):
         known = replace(self.file, interior=self.photographs.interior)
         write_camera(Path(path), known, self.photographs.covariance[:10, :10], comment)
         return Path(path)
+
+
+def discovery_lines(found: Discovery) -> list[str]:
+    """Return the lines that `thermocald discover` prints."""
+    first, last = found.stages[0], found.stages[-1]
+    lines = [f"verdict: {found.headline}"]
+    if found.verdict == "adequate":
+        lines.append(say_adequate(found.examination))
+    for effect in found.effects:
+        lines.append(f"{effect.effect}: {effect.statement}")
+        for name, e in effect.estimates.items():
+            if isinstance(e["value"], float):
+                sd = math.nan if e["sd"] is None else e["sd"]
+                lines.append(f"    {name} = {with_sd(e['value'], sd, e['unit'])}")
+        if "false_alarm_probability" in effect.evidence:
+            surrogates = effect.evidence["surrogates"]
+            lines.append(
+                f"    probability of a false name {effect.evidence['false_alarm_probability']:.3f} "
+                f"(gain {surrogates['gain']:.0f}; the largest of {surrogates['count']} surrogates "
+                f"{surrogates['gains_of_surrogates'][-1]:.0f})"
+            )
+        if proposal := effect.evidence.get("proposal"):
+            lines.append(
+                f"    constants of the first recording explain "
+                f"{proposal['closed_on_verify_by_fit']:.0%} of the misfit of the second; "
+                f"probability of a false formula {proposal['false_alarm_probability']:.3f}"
+            )
+        lines += [
+            f"    not excluded: {a['effect']}; {a['experiment']}"
+            for a in effect.alternatives
+            if not a.get("resembles")
+        ]
+    lines += [*mount_lines(found.examination), *field_lines(found.examination)]
+    names = [Path(e.source.name).name or e.source.name for e in found.examination.fitter.series]
+    gaps = zip(first.gaps, last.gaps, strict=True)
+    for name, (before, after) in zip(names, gaps, strict=True):
+        lines.append(
+            f"gap on {name}: {before.rms_px:.4f} → {after.rms_px:.4f} px RMS, reduced χ² "
+            f"{before.chi2_reduced:.3f} → {after.chi2_reduced:.3f}, "
+            f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
+        )
+    return [*lines, *doubt_lines(found.doubts)]
+
+
+def calibration_lines(document: dict[str, Any]) -> list[str]:
+    """Return what `thermocald calibrate` prints of its document."""
+    lines: list[str] = []
+    interior = document["interior"]
+    if document["status"] == "ok":
+        used = sum(p["exterior"] is not None for p in document["photographs"])
+        lines.append(
+            f"calibrated from {used} of {document['n_photographs']} photographs: sigma0 "
+            f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
+            + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
+        )
+        rows = [("", "value ± sd", "in px")]
+        pitch = document["camera"]["pixel_pitch"]
+        for name in IOP_NAMES:
+            sd = interior.get(f"sd_{name}")
+            if sd is None:
+                rows.append((name, f"{plain(interior[name], UNITS[name], 6)} (held)", ""))
+                continue
+            px = with_sd(interior[name] / pitch, sd / pitch) if name in ("c", "x0", "y0") else ""
+            rows.append((name, with_sd(interior[name], sd, UNITS[name]), px))
+        width = [max(len(row[k]) for row in rows) for k in range(3)]
+        lines += ["  ".join(f"{t:<{w}}" for t, w in zip(row, width, strict=True)) for row in rows]
+        lines += doubt_lines(document["doubts"])
+        if document["camera"]["pixel_pitch_assumed"]:
+            lines.append(
+                "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are thousandths "
+                "of px; give --pixel-pitch or --camera"
+            )
+    else:
+        lines.append(f"not calibrated: {document['status']}: {document['reason']}")
+    for p in document["photographs"]:
+        line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
+        if p["exterior"] is not None:
+            e = p["exterior"]
+            line += f", {p['rms_px']:.2f} px, at " + ", ".join(
+                with_sd(e[n], e["sd_" + n]) for n in ("X0", "Y0", "Z0")
+            )
+            line += " mm"
+        if p["reason"]:
+            line += f": {p['reason']}"
+        lines.append(line)
+    return lines

@@ -6,8 +6,8 @@ which one it is.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,13 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.series.drift import with_drifts
-from thermocald.analysis.series.recorded import recorded_table
-from thermocald.analysis.series.stored import replay_into, table_of_stored
-from thermocald.analysis.study.input import measured_series, stored_series
+from thermocald.analysis.series.recorded import recorded_table, replay_into, table_of_stored
+from thermocald.analysis.study.measured import measured_series
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
-from thermocald.photogrammetry.series.blocks import give_back
 from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
 from thermocald.store.recording.reader import Recording, open_recording
 from thermocald.store.recording.sense import interior_doubts
@@ -35,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.series.epochs import Epochs
+    from thermocald.analysis.series.epochs import Columns, Epochs
     from thermocald.analysis.study.measured import MeasuredSeries
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -46,10 +44,9 @@ if TYPE_CHECKING:
 
     Progress = Callable[[int], None] | None
     Say = Callable[[str], None] | None
-    Source = Recording | StoredRecording
 
 
-class Series(ABC):
+class Series:
     """What was measured: one series of one camera.
 
     head: name, interval s, camera and thermometers; testfield: the known points, mm; source: where
@@ -60,13 +57,27 @@ class Series(ABC):
     ('rpi-v2.1', 'M1', 150)
     """
 
-    head: Head
-    testfield: TestField
-    source: str
-    place: str
-    """The same for two that are the same."""
     simulation: Simulation | None = None
-    """Where a simulated series comes from, else None."""
+    """The simulation that a simulated series comes from, else None."""
+
+    def __init__(self, measured: Recording | StoredSeries, store: Path | None = None) -> None:
+        """Take a recording, or a series of a store, which is opened for each reading.
+
+        `place` is the same for two series that are the same.
+        """
+        self._measured, self._store = measured, store
+        self.head: Head = measured.head
+        self.testfield: TestField = measured.testfield
+        if isinstance(measured, Recording):
+            self.source = measured.title
+            path = measured.path
+            self.place = str(path.resolve()) if path.name else str(id(measured))
+        else:
+            assert store is not None
+            named = f"{measured.camera}/{measured.name}"
+            self.source = f"{source_name(store)}: {named}"
+            where = store if is_server(store) else store.resolve()
+            self.place = f"{where} {named} {measured.id}"
 
     @property
     def name(self) -> str:
@@ -78,14 +89,15 @@ class Series(ABC):
         """The camera's name."""
         return self.head.camera.name
 
-    @property
-    @abstractmethod
+    @cached_property
     def frame_time(self) -> Array:
-        """(E,) s UTC: when each frame was taken."""
+        """(E,) s UTC: when each frame was taken, corrected where a daemon's clock was wrong."""
+        with self._opened() as source:
+            return source.columns.frame_time
 
     @property
     def truth(self) -> Array | None:
-        """Of a simulated series the true interior orientation (E, 10), else None."""
+        """The true interior orientation (E, 10) of a simulated series, else None."""
         return None if self.simulation is None else np.array(self.simulation.truth.iop)
 
     @property
@@ -93,12 +105,33 @@ class Series(ABC):
         """(E,): the frames' times, UTC, to the microsecond."""
         return np.round(self.frame_time * 1e6).astype(np.int64).astype("datetime64[us]")
 
-    @property
-    @abstractmethod
+    @cached_property
     def temperatures(self) -> dict[str, Array]:
         """{thermometer: (E,) °C} at the frames' times, NaN where unknown; the first is the
         reference.
         """
+        with self._opened() as source:
+            return {name: source.columns.at_frame(name) for name in self.head.channels}
+
+    def besides(self, numbers: NDArray[np.int64], *, extra: bool = False) -> Columns:
+        """Return what else is known of epochs `numbers` (E,): every thermometer's °C at the frames.
+
+        extra: and what the camera reported, light, blur, the filter's state, a file's unknown
+        columns.
+        """
+        found: Columns = {f"temperature {n}": column for n, column in self.temperatures.items()}
+        with self._opened() as source:
+            known = source.columns.numbers
+            if extra:
+                found |= source.extra_columns()
+        rows = np.searchsorted(known, numbers)
+        rows = np.where(np.append(known, -1)[rows] == numbers, rows, -1)
+        for name, column in found.items():
+            if isinstance(column, np.ndarray):
+                found[name] = np.append(column, np.nan)[rows]
+            else:
+                found[name] = tuple("" if row < 0 else column[row] for row in rows)
+        return found
 
     @property
     def temperature(self) -> Array:
@@ -142,21 +175,17 @@ class Series(ABC):
         """
         if exterior != "stored":
             check_exterior(exterior)
+        elif isinstance(self._measured, Recording):
+            raise UsageError(f"exterior 'stored': {self.source} is a recording, not a store")
         settings = AdjustmentSettings(free=free_names(free))
-        if store is not None:
-            return self._kept(source_of(store), settings, exterior, progress, jobs)
-        with self._opened() as source:
-            return with_drifts(self._table(source, settings, exterior, progress, jobs)[0])
-
-    def _kept(
-        self,
-        store: Path,
-        settings: AdjustmentSettings,  # noqa: ARG002
-        exterior: str,  # noqa: ARG002
-        progress: Progress,  # noqa: ARG002
-        jobs: int,  # noqa: ARG002
-    ) -> Epochs:
-        raise UsageError(f"{store}: {self.source} is in a store already")
+        if store is None:
+            with self._opened() as source:
+                return with_drifts(_adjust(source, settings, exterior, progress, jobs)[0])
+        path = source_of(store)
+        if not isinstance(self._measured, Recording):
+            raise UsageError(f"{path}: {self.source} is in a store already")
+        tell = progress or (lambda _: None)
+        return replay_into(path, self._measured, settings, exterior, tell, jobs)
 
     def doubts(self, epochs: Epochs | None = None, interior: Array | None = None) -> list[str]:
         """Return what cannot have been meant in what was recorded, a sentence each.
@@ -167,26 +196,13 @@ class Series(ABC):
         >>> tc.open("M1").doubts()
         []
         """
+        found = self._measured.doubts() if isinstance(self._measured, Recording) else []
         if epochs is not None and epochs.ok.any():
             interior = np.median(epochs.values[epochs.ok, :3], axis=0)
-        if interior is None:
-            return []
-        return interior_doubts(self.head.camera, *(float(value) for value in interior[:3]))
-
-    @abstractmethod
-    def _opened(self) -> AbstractContextManager[Source]:
-        """Open its source for reading."""
-
-    @abstractmethod
-    def _table(
-        self,
-        source: Source,
-        settings: AdjustmentSettings,
-        exterior: str,
-        progress: Progress,
-        jobs: int,
-    ) -> tuple[Epochs, Callable[[int], Observations | None]]:
-        """Return its epochs adjusted, and what shows an epoch's observations."""
+        if interior is not None:
+            c, x0, y0 = interior[:3].tolist()
+            found = [*found, *interior_doubts(self.head.camera, c, x0, y0)]
+        return found
 
     def measured(
         self,
@@ -196,14 +212,23 @@ class Series(ABC):
         free: Iterable[str] = DEFAULT_FREE,
         jobs: int = 1,
     ) -> MeasuredSeries:
-        """Return the series as a study reads it; label: what it treats as one camera."""
+        """Return the series as a study reads it.
+
+        label: what it treats as one camera, by default the camera's name, and of a store the start
+        condition. Of a store `free` is what was stored, and `exterior="per_epoch"` gives the epochs
+        as they were stored.
+        """
+        usual = self.camera
+        if not isinstance(self._measured, Recording):
+            usual += f"-{self._measured.start}" if self._measured.start else ""
+            free = self._measured.settings.get("free", DEFAULT_FREE)
+            exterior = "stored" if exterior == "per_epoch" else exterior
         settings = AdjustmentSettings(free=tuple(free))
         with self._opened() as source:
-            table, observations = self._table(source, settings, exterior, None, jobs)
-            name = label or self.camera
-            found = measured_series(source, table, observations, name, thermometer_sd)
-        give_back()
-        return found
+            source.head.require_calibrated(source.title)
+            table, observations = _adjust(source, settings, exterior, None, jobs)
+            found = measured_series(source, table, observations, label or usual, thermometer_sd)
+        return replace(found, doubts=tuple(self.doubts(interior=found.mean)))
 
     def observed(self, progress: Progress = None, jobs: int = 1, say: Say = None) -> SeriesInput:
         """Return the series as a thermal model and discovery read it; frames are measured.
@@ -213,115 +238,28 @@ class Series(ABC):
         with self._opened() as source:
             return series_input(source, say, progress, jobs)
 
-
-class RecordedSeries(Series):
-    """A series in a recording's folder, or one that is put together in memory."""
-
-    def __init__(self, recording: Recording) -> None:
-        self.recording = recording
-        self.head, self.testfield = recording.head, recording.testfield
-        self.source = recording.title
-        self.place = str(recording.path.resolve()) if recording.path.name else str(id(recording))
-
-    @property
-    def frame_time(self) -> Array:
-        """As the recording's."""
-        return self.recording.columns.frame_time
-
-    @cached_property
-    def temperatures(self) -> dict[str, Array]:
-        """As the recording's, interpolated to the frames' times."""
-        return {name: self.recording.columns.at_frame(name) for name in self.head.channels}
-
-    def doubts(self, epochs: Epochs | None = None, interior: Array | None = None) -> list[str]:
-        """As the base says, with times, readings and repeated epochs."""
-        return [*self.recording.doubts(), *super().doubts(epochs, interior)]
-
-    def _opened(self) -> AbstractContextManager[Source]:
-        return nullcontext(self.recording)
-
-    def _table(
-        self,
-        source: Source,
-        settings: AdjustmentSettings,
-        exterior: str,
-        progress: Progress,
-        jobs: int,
-    ) -> tuple[Epochs, Callable[[int], Observations | None]]:
-        assert isinstance(source, Recording)
-        if exterior == "stored":
-            raise UsageError(f"exterior 'stored': {self.source} is a recording, not a store")
-        return recorded_table(source, settings, exterior, progress, jobs)
-
-    def _kept(
-        self,
-        store: Path,
-        settings: AdjustmentSettings,
-        exterior: str,
-        progress: Progress,
-        jobs: int,
-    ) -> Epochs:
-        tell = progress or (lambda _: None)
-        return replay_into(store, self.recording, settings, exterior, tell, jobs)
-
-
-class KeptSeries(Series):
-    """A series in a store, of a file or on a server, which is opened for each reading."""
-
-    def __init__(self, path: Path, stored: StoredSeries) -> None:
-        self.path, self.stored = path, stored
-        self.head, self.testfield = stored.head, stored.testfield
-        self.source = f"{source_name(path)}: {stored.camera}/{stored.name}"
-        where = path if is_server(path) else path.resolve()
-        self.place = f"{where} {stored.camera}/{stored.name} {stored.id}"
-
-    @cached_property
-    def frame_time(self) -> Array:
-        """As the store's, corrected where the clock was wrong."""
-        with self._opened() as source:
-            return source.columns.frame_time
-
-    @cached_property
-    def temperatures(self) -> dict[str, Array]:
-        """As the store's, interpolated to the frames' times."""
-        with self._opened() as source:
-            return {name: source.columns.at_frame(name) for name in self.head.channels}
-
     @contextmanager
-    def _opened(self) -> Iterator[StoredRecording]:
-        with open_source(self.path) as store:
-            yield StoredRecording(store, self.stored)
+    def _opened(self) -> Iterator[Recording | StoredRecording]:
+        """Open its source for reading."""
+        if isinstance(self._measured, Recording):
+            yield self._measured
+        else:
+            assert self._store is not None
+            with open_source(self._store) as store:
+                yield StoredRecording(store, self._measured)
 
-    def _table(
-        self,
-        source: Source,
-        settings: AdjustmentSettings,
-        exterior: str,
-        progress: Progress,  # noqa: ARG002
-        jobs: int,
-    ) -> tuple[Epochs, Callable[[int], Observations | None]]:
-        assert isinstance(source, StoredRecording)
-        return table_of_stored(source, settings, exterior, jobs), source.observations
 
-    def measured(
-        self,
-        label: str | None = None,
-        thermometer_sd: float | None = None,
-        exterior: str = "auto",
-        free: Iterable[str] = (),  # noqa: ARG002
-        jobs: int = 1,
-    ) -> MeasuredSeries:
-        """As the base says, by default labelled with the start condition; `free` is the store's.
-
-        `exterior="per_epoch"` gives the epochs as they were stored.
-        """
-        start = self.stored.start
-        label = label or (f"{self.camera}-{start}" if start else self.camera)
-        if exterior == "per_epoch":
-            with self._opened() as source:
-                return stored_series(source, label, thermometer_sd)
-        own = self.stored.settings.get("free", DEFAULT_FREE)
-        return super().measured(label, thermometer_sd, exterior, own, jobs)
+def _adjust(
+    source: Recording | StoredRecording,
+    settings: AdjustmentSettings,
+    exterior: str,
+    progress: Progress,
+    jobs: int,
+) -> tuple[Epochs, Callable[[int], Observations | None]]:
+    """Return the epochs of an open source adjusted, and what shows an epoch's observations."""
+    if isinstance(source, Recording):
+        return recorded_table(source, settings, exterior, progress, jobs)
+    return table_of_stored(source, settings, exterior, jobs), source.observations
 
 
 def open_series(source: Path, name: str | None = None) -> Series:
@@ -330,21 +268,21 @@ def open_series(source: Path, name: str | None = None) -> Series:
     Raises StoreError, listing what there is, where none or several fit.
     """
     if require_source(source).is_dir():
-        series = RecordedSeries(open_recording(source))
+        series = Series(open_recording(source))
         if name not in (None, series.name, f"{series.camera}/{series.name}"):
             raise DataError(f"{source}: is {series.camera}/{series.name}, not {name}")
         return series
     camera, _, series_name = (name or "").rpartition("/")
     with open_source(source) as store:
-        return KeptSeries(source, store.find_series(camera or None, series_name or None))
+        return Series(store.find_series(camera or None, series_name or None), source)
 
 
 def open_every_series(source: Path) -> list[Series]:
     """Open every series of a source; DataError for a store without any."""
     if require_source(source).is_dir():
-        return [RecordedSeries(open_recording(source))]
+        return [Series(open_recording(source))]
     with open_source(source) as store:
-        found: list[Series] = [KeptSeries(source, stored) for stored in store.all_series()]
+        found = [Series(stored, source) for stored in store.all_series()]
     if not found:
         raise DataError(f"{source_name(source)}: the store holds no series")
     return found

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.camera.difference import CameraDifference
     from thermocald.analysis.field.advice import FieldAssessment
+    from thermocald.analysis.thermal.places import Places
     from thermocald.analysis.thermal.predictions import Prediction
+    from thermocald.analysis.thermal.scene import SceneCourse
     from thermocald.output.corrected import Correction
     from thermocald.photogrammetry.camera_files import Conversion
     from thermocald.photogrammetry.field.testfield import TestField
@@ -29,8 +31,6 @@ if TYPE_CHECKING:
     Model = ThermalCamera | Path | str
     LogRead = LogOptions | Mapping[str, Any] | None
     Point = tuple[float, float, float]
-
-_USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
 
 
 def convert_camera(
@@ -159,11 +159,104 @@ def correct(
     if size is not None:
         thermal = thermal.for_images(*size)
     if temperature_sd is None:
-        temperature_sd = thermal.thermometer_sd or _USUAL_THERMOMETER_SD
+        temperature_sd = thermal.reading_sd
     return Correction(
         path, "image" in header, thermal, table, clock, to, temperature_sd, extrapolate,
         say or (lambda _: None),
     )  # fmt: skip
+
+
+def measure(
+    points: Path | str,
+    model: Model,
+    *,
+    log: Path | str,
+    control: Path | str,
+    seen: str,
+    surface: Path | str,
+    unit: str = "mm",
+    log_options: LogRead = None,
+    timezone: str | None = None,
+    ambiguous: str = "order",
+    extrapolate: bool = False,
+    say: Callable[[str], None] | None = None,
+) -> Places:
+    """Measure where image points lie on a water surface, a plane, a staff or a cross-section.
+
+    points: a CSV with time, x, y, sx, sy (px) and name; log: a logger's file, a recording or a
+    store; control: control points (CSV, GeoJSON, pyorc's JSON) with where they were seen in the
+    image at the time `seen`; surface: a YAML with level, plane, line or profile, in the unit (mm or
+    m) and coordinates of the control points; timezone, ambiguous: of times without a zone; say:
+    receives a line for each row that is left out. Raises DataError where there is no pose or no
+    temperature, ConfigurationError naming the file, GeometryError for rays that miss the surface.
+
+    >>> tc.measure("points.csv", "camera.yaml", log="M1", control="gcp.csv", seen="0",
+    ...            surface="water.yaml", unit="km")
+    Traceback (most recent call last):
+    thermocald.errors.UsageError: --length-unit km: mm or m
+    """
+    from thermocald.analysis.thermal.control_points import UNITS, ControlPoints
+    from thermocald.analysis.thermal.model_log import read_model_log
+    from thermocald.analysis.thermal.places import measure_places, read_surface
+    from thermocald.analysis.thermal.timed_rows import first_times, row_blocks, seconds_of
+
+    if unit not in UNITS:
+        raise UsageError(f"--length-unit {unit}: mm or m")
+    tell = say or (lambda _: None)
+    thermal, path = _thermal(model), source_of(points)
+    clock = device_clock(timezone, ambiguous=ambiguous)
+    given = ControlPoints.read(source_of(control), unit)
+    if given.assumed:
+        tell(given.assumed)
+    plane = read_surface(source_of(surface), given)
+    _, near = first_times(path, clock)
+    table = read_model_log(thermal, source_of(log), _log_options(log_options), near)
+    rows = list(row_blocks(path, ("x", "y", "sx", "sy"), clock))
+    for line, why in (refused for block in rows for refused in block.refused):
+        tell(f"{path}, line {line}: {why}; left out")
+    when = seconds_of(seen, clock)
+    return measure_places(thermal, table, given, when, plane, rows, extrapolate)
+
+
+def follow_scene(
+    photographs: Path | str,
+    model: Model,
+    *,
+    log: Path | str,
+    log_options: LogRead = None,
+    times: str = "exif",
+    timezone: str | None = None,
+    progress: Callable[[int], None] | None = None,
+    recording: Path | str | None = None,
+) -> SceneCourse:
+    """Compare what does not move in photographs of a scene with what the thermal model predicts.
+
+    photographs: a folder of them, the first is the reference; log: a logger's file, a recording or
+    a store; times: of the photographs, `exif`, `name` (of the file) or `file` (date); timezone: of
+    times without one; recording: a folder to keep what does not move, which `open` and `discover`
+    read. Raises DataError where there is no temperature or nothing to follow.
+
+    >>> tc.follow_scene("photos", "camera.yaml", log="logger.csv", times="sun")
+    Traceback (most recent call last):
+    thermocald.errors.UsageError: --times sun: must be one of exif, name, file
+    """
+    from thermocald.analysis.thermal import scene
+    from thermocald.analysis.thermal.model_log import read_model_log
+    from thermocald.store.logger.photographs import SOURCES, find_photographs, read_photograph
+
+    if times not in SOURCES:
+        raise UsageError(f"--times {times}: must be one of {', '.join(SOURCES)}")
+    thermal = _thermal(model)
+    found = find_photographs([source_of(photographs)])
+    moments = [read_photograph(path, times).moment for path in found]
+    taken = device_clock(timezone).utc(moments, lambda i: str(found[i])).tolist()
+    options = _log_options(log_options or {"timezone": timezone})
+    table = read_model_log(thermal, source_of(log), options, (min(taken), max(taken)))
+    frames = list(zip(found, taken, strict=True))
+    kept = None if recording is None else Path(recording)
+    return scene.follow_scene(
+        thermal, table, frames, advance=progress or (lambda _: None), recording=kept
+    )
 
 
 def fit_calibrations(
@@ -187,14 +280,13 @@ def fit_calibrations(
     >>> tc.fit_calibrations({"cold.json": 26.0, "warm.json": 45.0}).model.T0
     35.5
     """
-    from thermocald.analysis.thermal.calibrations import is_calibration, read_calibration, with_log
-    from thermocald.analysis.thermal.camera_fit import fit_to_calibrations
+    from thermocald.analysis.thermal import calibrations as calibrated
     from thermocald.store.logger.temperatures import read_log
 
     for name in calibrations:
-        if not is_calibration(source_of(name)):
+        if not calibrated.is_calibration(source_of(name)):
             raise UsageError(f"{name}: is no calibration; fit series and calibrations apart")
-    given = [read_calibration(source_of(name), T) for name, T in calibrations.items()]
+    given = [calibrated.read_calibration(source_of(name), T) for name, T in calibrations.items()]
     channel = "temperature"
     if log is not None:
         clock = device_clock(timezone, ambiguous=ambiguous)
@@ -204,8 +296,8 @@ def fit_calibrations(
         channel = next(iter(table.channels))
         for note in table.notes:
             (say or (lambda _: None))(note)
-        given = [with_log(c, table, clock) for c in given]
-    return fit_to_calibrations(given, T0, temperature_sd, channel)
+        given = [calibrated.with_log(c, table, clock) for c in given]
+    return calibrated.fit_calibrations(given, T0, temperature_sd, channel)
 
 
 def survey_testfield(

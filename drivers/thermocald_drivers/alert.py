@@ -15,12 +15,14 @@ import logging
 import math
 import os
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from thermocald.addresses import hide
 from thermocald.errors import ConfigurationError, DeviceGone
 from thermocald.hal import DriverOptions, Output
 from thermocald.names import WITH_VALUES
@@ -52,58 +54,62 @@ class Alert:
     utc: float | None
 
     def document(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the alert as JSON has it."""
         return {"format": "thermocald-alert/1", **dataclasses.asdict(self)}
 
 
-class Condition(DriverOptions):
-    """A threshold. limits: low and high, NaN for none, and how far inside a value is in again."""
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What a condition compares: NaN where the result does not have it, or for no bound.
 
-    per_device: ClassVar[bool] = True
-    step: ClassVar[int] = 0
+    back: how far inside a bound the value is in again; step: what is added to a bound in words.
+    """
+
+    value: float
+    low: float
+    high: float
+    back: float
+    words: str
+    unit: str = ""
+    step: int = 0
 
     @property
-    def unit(self) -> str:
-        """With a blank before it, or nothing."""
-        return ""
+    def beyond(self) -> float:
+        """The bound that the value has passed, NaN if none."""
+        if self.value < self.low:
+            return self.low
+        return self.high if self.value > self.high else math.nan
+
+    @property
+    def inside(self) -> bool:
+        """Whether the value is clearly within the bounds again."""
+        above = math.isnan(self.low) or self.value >= self.low + self.back
+        return above and (math.isnan(self.high) or self.value <= self.high - self.back)
+
+    @property
+    def text(self) -> str:
+        """The value and its bound in words."""
+        if math.isnan(self.beyond):
+            return f"{self.words}: within its limits again"
+        return f"{self.words} (limit {self.beyond + self.step:g}{self.unit})"
+
+
+class Condition(DriverOptions):
+    """A threshold of `when`; `name` is what it is called in alerts."""
+
+    per_device: ClassVar[bool] = True
+    called: ClassVar[str] = ""
 
     @property
     def name(self) -> str:
-        """What it is called in alerts; given once in `when`."""
-        raise NotImplementedError
+        return self.called
 
-    @property
-    def limits(self) -> tuple[float, float, float]:
-        """(low, high, back)."""
-        raise NotImplementedError
-
-    def value(self, result: Mapping[str, Any], failed: int, lost: int) -> float:
-        """What is compared; NaN where the result does not have it.
+    def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:
+        """Return what is compared of a result.
 
         failed: epochs in a row; lost: epochs that were taken and not kept since the last result.
         """
         raise NotImplementedError
-
-    def words(self, value: float) -> str:
-        """The value in words."""
-        raise NotImplementedError
-
-    def beyond(self, value: float) -> float:
-        """The bound that a value has passed, NaN if none."""
-        low, high, _ = self.limits
-        return low if value < low else high if value > high else math.nan
-
-    def inside(self, value: float) -> bool:
-        """Whether the value is clearly within the bounds again."""
-        low, high, back = self.limits
-        low_kept = math.isnan(low) or value >= low + back
-        return low_kept and (math.isnan(high) or value <= high - back)
-
-    def text(self, value: float, bound: float) -> str:
-        """The value and its bound in words."""
-        if math.isnan(bound):
-            return f"{self.words(value)}: within its limits again"
-        return f"{self.words(value)} (limit {bound + self.step:g}{self.unit})"
 
 
 Amount = Annotated[float, Field(ge=1e-6, le=1e6)]
@@ -117,10 +123,6 @@ class Drift(Condition):
     sds: Amount | None = None
     from_mm: Annotated[float, Field(ge=-1e4, le=1e4)] | None = None
 
-    @property
-    def unit(self) -> str:
-        return " sds" if self.px is None else " px"
-
     @model_validator(mode="after")
     def _one_unit(self) -> Self:
         if (self.px is None) == (self.sds is None):
@@ -129,28 +131,23 @@ class Drift(Condition):
 
     @property
     def name(self) -> str:
-        return f"drift_{self.drift}_{self.unit.strip()}"
+        return f"drift_{self.drift}_{'sds' if self.px is None else 'px'}"
 
-    @property
-    def limits(self) -> tuple[float, float, float]:
-        high = float(self.px or self.sds or math.nan)
-        return math.nan, high, (1 - _BACK) * high
-
-    def value(self, result: Mapping[str, Any], failed: int, lost: int) -> float:  # noqa: ARG002
+    def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
         drift = _number(result.get(f"drift_{self.drift}_px"))
         sd = _number(result.get(f"sd_drift_{self.drift}_px"))
+        start = "the start of the series"
         if self.from_mm is not None:
+            start = f"{self.from_mm:g} mm"
             pitch = _number(result.get("pixel_pitch"))
             pitch = pitch if pitch > 0 else math.nan
             drift = (_number(result.get(self.drift)) - self.from_mm) / pitch
             sd = _number(result.get(f"sd_{self.drift}")) / pitch
-        if self.px is not None:
-            return abs(drift)
-        return abs(drift) / sd if sd > 0 else math.nan
-
-    def words(self, value: float) -> str:
-        start = "the start of the series" if self.from_mm is None else f"{self.from_mm:g} mm"
-        return f"{self.drift} is {value:.3g}{self.unit} from {start}"
+        unit, value, high = " px", abs(drift), float(self.px or self.sds or math.nan)
+        if self.px is None:
+            unit, value = " sds", abs(drift) / sd if sd > 0 else math.nan
+        words = f"{self.drift} is {value:.3g}{unit} from {start}"
+        return Measured(value, math.nan, high, (1 - _BACK) * high, words, unit)
 
 
 class Temperature(Condition):
@@ -163,10 +160,10 @@ class Temperature(Condition):
 
     @model_validator(mode="after")
     def _something_between(self) -> Self:
-        low, high, back = self.limits
+        low, high = self._limits
         if math.isnan(low) and math.isnan(high):
             raise ConfigurationError(f"temperature {self.temperature} needs above_c or below_c")
-        if high - low <= 2 * back:
+        if high - low <= 2 * self.hysteresis_k:
             raise ConfigurationError(
                 f"temperature {self.temperature}: nothing is left between the limits"
             )
@@ -177,65 +174,44 @@ class Temperature(Condition):
         return self.temperature
 
     @property
-    def unit(self) -> str:
-        return " °C"
+    def _limits(self) -> tuple[float, float]:
+        low, high = self.below_c, self.above_c
+        return math.nan if low is None else low, math.nan if high is None else high
 
-    @property
-    def limits(self) -> tuple[float, float, float]:
-        low = math.nan if self.below_c is None else self.below_c
-        return low, math.nan if self.above_c is None else self.above_c, self.hysteresis_k
-
-    def value(self, result: Mapping[str, Any], failed: int, lost: int) -> float:  # noqa: ARG002
-        return _number(result.get(self.temperature))
-
-    def words(self, value: float) -> str:
-        return f"{self.temperature} is {value:.1f} °C"
+    def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
+        value = _number(result.get(self.temperature))
+        words = f"{self.temperature} is {value:.1f} °C"
+        return Measured(value, *self._limits, self.hysteresis_k, words, " °C")
 
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
-class _Counted(Condition):
-    """Epochs: out from the count on, in again at none."""
-
-    step: ClassVar[int] = 1
-    count: ClassVar[str]
-    said: ClassVar[str]
-
-    @property
-    def name(self) -> str:
-        return self.count
-
-    @property
-    def limits(self) -> tuple[float, float, float]:
-        most = getattr(self, self.count) - 1
-        return math.nan, most, most
-
-    def words(self, value: float) -> str:
-        return f"{value:.0f} epochs {self.said}"
+def _counted(count: int, most: int, said: str) -> Measured:
+    """Return epochs as they are compared: out from `most` on, in again at none."""
+    words = f"{count} epochs {said}"
+    return Measured(float(count), math.nan, most - 1, most - 1, words, step=1)
 
 
-class NoResult(_Counted):
+class NoResult(Condition):
     """Epochs in a row without a result."""
 
-    count: ClassVar[str] = "no_result"
-    said: ClassVar[str] = "in a row without a result"
     no_result: Count
+    called: ClassVar[str] = "no_result"
 
-    def value(self, result: Mapping[str, Any], failed: int, lost: int) -> float:  # noqa: ARG002
-        return float(failed)
+    def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
+        return _counted(failed, self.no_result, "in a row without a result")
 
 
-class Lost(_Counted):
+class Lost(Condition):
     """Epochs that were taken and not kept since the last result."""
 
-    count: ClassVar[str] = "lost"
-    said: ClassVar[str] = "were taken and not kept"
     per_device: ClassVar[bool] = False
     lost: Count
+    called: ClassVar[str] = "lost"
 
-    def value(self, result: Mapping[str, Any], failed: int, lost: int) -> float:  # noqa: ARG002
-        return float(lost)
+    def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
+        return _counted(lost, self.lost, "were taken and not kept")
 
 
 class FreeDisk(Condition):
@@ -244,28 +220,15 @@ class FreeDisk(Condition):
     per_device: ClassVar[bool] = False
     free_disk_gb: Amount
     path: support.Text = "."
+    called: ClassVar[str] = "free_disk"
 
-    @property
-    def name(self) -> str:
-        return "free_disk"
-
-    @property
-    def unit(self) -> str:
-        return " GB"
-
-    @property
-    def limits(self) -> tuple[float, float, float]:
-        return self.free_disk_gb, math.nan, (_DISK_BACK - 1) * self.free_disk_gb
-
-    def value(self, result: Mapping[str, Any], failed: int, lost: int) -> float:  # noqa: ARG002
-        try:
+    def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
+        low, value = self.free_disk_gb, math.nan
+        with suppress(OSError):
             disk = os.statvfs(self.path)
-        except OSError:
-            return math.nan
-        return disk.f_bavail * disk.f_frsize / 1e9
-
-    def words(self, value: float) -> str:
-        return f"{value:.2f} GB are free at {self.path}"
+            value = disk.f_bavail * disk.f_frsize / 1e9
+        words = f"{value:.2f} GB are free at {self.path}"
+        return Measured(value, low, math.nan, (_DISK_BACK - 1) * low, words, " GB")
 
 
 _KINDS: dict[str, type[Condition]] = {
@@ -275,7 +238,7 @@ _KINDS: dict[str, type[Condition]] = {
 
 
 def condition_of(stanza: Mapping[str, Any]) -> Condition:
-    """A condition from an entry of `when`; ConfigurationError names what is wrong in it."""
+    """Return a condition of an entry of `when`; ConfigurationError names what is wrong in it."""
     kind = next((kind for key, kind in _KINDS.items() if key in stanza), None)
     if kind is None:
         raise ConfigurationError(f"when: {dict(stanza)} has none of {', '.join(_KINDS)}")
@@ -293,7 +256,7 @@ class Watch:
         self._lost = 0
 
     def changes(self, result: Mapping[str, Any], device: str) -> list[Alert]:
-        """What this result changes; the same result again changes nothing."""
+        """Return what this result changes; the same result again changes nothing."""
         moment = (result.get("series"), result.get("epoch"))
         if moment[1] is not None and self._seen.get(device) == moment:
             return []
@@ -301,35 +264,30 @@ class Watch:
         failed = 0 if result.get("status") in WITH_VALUES else self._failed.get(device, 0) + 1
         self._failed[device] = failed
         before, self._lost = self._lost, int(result.get("lost", self._lost))
-        lost = max(0, self._lost - before)
         changes = []
         for condition in self.conditions:
             key = (device if condition.per_device else "", condition.name)
-            value = condition.value(result, failed, lost)
-            bound = condition.beyond(value)
-            if key not in self._out and not math.isnan(bound):
-                self._out.add(key)
-                changes.append(_alert(condition, "out", value, bound, result, device))
-            elif key in self._out and math.isnan(bound) and condition.inside(value):
-                self._out.discard(key)
-                changes.append(_alert(condition, "in", value, math.nan, result, device))
+            found = condition.measure(result, failed, max(0, self._lost - before))
+            if math.isnan(found.beyond) and not (key in self._out and found.inside):
+                continue
+            if key in self._out and not math.isnan(found.beyond):
+                continue
+            self._out ^= {key}
+            state = "out" if key in self._out else "in"
+            changes.append(_alert(condition.name, state, found, result, device))
         return changes
 
 
-def _alert(
-    condition: Condition, state: str, value: float, bound: float, result: Mapping[str, Any],
-    device: str,
-) -> Alert:  # fmt: skip
-    low, high, _ = condition.limits
-    limit = high if math.isnan(bound) and math.isnan(low) else bound
+def _alert(name: str, state: str, found: Measured, result: Mapping[str, Any], device: str) -> Alert:
     utc, epoch = _number(result.get("frame_time")), result.get("epoch")
+    bounds = (bound for bound in (found.beyond, found.low, found.high) if not math.isnan(bound))
     return Alert(
         device,
-        condition.name,
+        name,
         state,
-        f"{device}: {condition.text(value, bound)}",
-        value,
-        low if math.isnan(limit) else limit,
+        f"{device}: {found.text}",
+        found.value,
+        next(bounds),
         str(result.get("series", "")),
         int(epoch) if isinstance(epoch, int) else None,
         None if math.isnan(utc) else utc,
@@ -357,7 +315,6 @@ class AlertOutput(Output):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.timeout_s = self.options.timeout_s
         conditions = [condition_of(stanza) for stanza in self.options.when]
         names = [condition.name for condition in conditions]
         if twice := {name for name in names if names.count(name) > 1}:
@@ -393,11 +350,13 @@ class AlertOutput(Output):
 
 
 def secret(name: str, path: str | None) -> str | None:
-    """The text of a file that holds a password or a token, None without a file."""
+    """Return the text of a file that holds a password or a token, None without a file."""
     if path is None:
         return None
     try:
-        return Path(path).read_text().strip()
+        text = Path(path).read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         problem = error if isinstance(error, OSError) else OSError(0, "is not text")
         raise support.fault(problem, f"{name} {path}", seen=False) from None
+    hide(text)
+    return text

@@ -156,12 +156,14 @@ class ExecAlert(AlertOutput):
         except OSError as error:
             raise support.fault(error, self.where, seen=True) from error
         try:
-            child.communicate(json.dumps(alert.document()).encode(), self.timeout_s)
+            child.communicate(json.dumps(alert.document()).encode(), self.options.timeout_s)
         except subprocess.TimeoutExpired as error:
             with suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
             child.communicate()
-            raise DeviceTimeout(f"{self.where}: not done in {self.timeout_s:g} s") from error
+            raise DeviceTimeout(
+                f"{self.where}: not done in {self.options.timeout_s:g} s"
+            ) from error
         if child.returncode:
             raise BadReading(f"{self.where}: ended with exit status {child.returncode}")
 
@@ -199,7 +201,7 @@ class WebhookAlert(AlertOutput):
     def reach(self) -> None:
         self._token()
         try:
-            socket.create_connection(self._address, self.timeout_s).close()
+            socket.create_connection(self._address, self.options.timeout_s).close()
         except OSError as error:
             raise DeviceGone(f"{self.where}: cannot connect ({support.reason(error)})") from None
 
@@ -210,7 +212,7 @@ class WebhookAlert(AlertOutput):
         document = json.dumps(alert.document()).encode()
         request = urllib.request.Request(self.options.url, document, headers, method="POST")
         try:
-            with self._open(request, timeout=self.timeout_s):
+            with self._open(request, timeout=self.options.timeout_s):
                 return
         except urllib.error.HTTPError as error:
             error.close()
@@ -282,8 +284,8 @@ class MailAlert(AlertOutput):
     def _connect(self) -> smtplib.SMTP:
         o = self.options
         if o.security == "tls":
-            return smtplib.SMTP_SSL(o.host, o.port, timeout=self.timeout_s, context=self._context())
-        return smtplib.SMTP(o.host, o.port, timeout=self.timeout_s)
+            return smtplib.SMTP_SSL(o.host, o.port, timeout=o.timeout_s, context=self._context())
+        return smtplib.SMTP(o.host, o.port, timeout=o.timeout_s)
 
     def _context(self) -> ssl.SSLContext:
         return ssl.create_default_context(cafile=self.options.ca)

@@ -27,11 +27,16 @@ open, since a restart would focus again. A photograph is the one new file of the
 when its size no longer changes, all bytes were received and the JPEG is complete. Its time is that
 of EXIF, with the phone's clock compared to this machine's at each open, or the trigger's if EXIF
 has none.
+Source: CIPA DC-008 (Exif 2.32), Android's `dumpsys media.camera`.
 """
 
 from __future__ import annotations
 
+import io
+import math
+import re
 import time
+from datetime import UTC, datetime, timedelta, timezone
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
@@ -46,11 +51,11 @@ from thermocald.errors import (
     WrongDevice,
 )
 from thermocald.hal import Camera, Found, Frame
-from thermocald_drivers import photograph, pixel_formats, support
+from thermocald_drivers import pixel_formats, support
 from thermocald_drivers.android_phone import ADB_CLASSES, AdbPhone, PhoneOptions, list_devices
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 KEYS = {"camera": 27, "volume": 24}
 WAKE_KEY = 224
@@ -62,6 +67,25 @@ STATE = (
 )
 POLL_S = 0.1
 CLOCKS_DIFFER_S = 5.0
+EXIF_IFD = 0x8769
+TAGS = {
+    0x829A: "exposure_s",
+    0x829D: "f_number",
+    0x8827: "iso",
+    0x9003: "time",
+    0x9011: "zone",
+    0x9206: "subject_distance_m",
+    0x920A: "focal_length_mm",
+    0x9291: "subsecond",
+    0xA402: "exposure_mode",
+    0xA403: "white_balance",
+    0xA404: "digital_zoom",
+}
+EXPOSURE = ("exposure_s", "iso")
+LENS = ("f_number", "focal_length_mm", "digital_zoom")
+FOCUS = ("subject_distance_m", "focus_distance_dioptres")
+SETTINGS = (*EXPOSURE, *LENS, *FOCUS)
+"""What a photograph reports of its camera's settings, stored with its epoch."""
 
 
 class CameraOptions(PhoneOptions):
@@ -90,7 +114,6 @@ class AndroidCamera(Camera):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         o = self.options
-        self.timeout_s: float = o.timeout_s
         self.phone = AdbPhone(o)
         if o.trigger != "tap":
             self.command = f"input keyevent {KEYS[o.trigger]}"
@@ -101,11 +124,11 @@ class AndroidCamera(Camera):
         self.folder = o.folder.rstrip("/")
         self._unchecked = ""
         self._first: dict[str, Any] | None = None
-        self._offset, self._zone, self._offset_half = 0.0, "", 0.0
+        self._offset, self._zone = 0.0, ""
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """Phones that the adb server lists, whatever their state."""
+        """List the phones of the adb server, whatever their state."""
         return [
             Found({"serial": serial, "width": 4032, "height": 3024}, f"{serial} {state}")
             for serial, state in list_devices()
@@ -115,7 +138,7 @@ class AndroidCamera(Camera):
         self.phone.connect()
         self._wake()
         self._require_space()
-        self._offset, self._zone, self._offset_half = self.phone.clock_offset()
+        self._offset, self._zone, _ = self.phone.clock_offset()
         self.phone.shell(OPEN_APP)
 
     def close(self) -> None:
@@ -144,15 +167,15 @@ class AndroidCamera(Camera):
         self.phone.shell(self.command)
         triggered = (triggered + time.time()) / 2.0
         path, jpeg = self._new_photograph(set(before))
-        tags = photograph.exif(jpeg)
+        tags = exif(jpeg)
         if (tags["width"], tags["height"]) != (self.options.width, self.options.height):
             raise WrongDevice(
                 f"{self.phone.where}: the photograph has {tags['width']}×{tags['height']} px, not "
                 f"{self.options.width}×{self.options.height}; set the camera app to its full size"
             )
-        tags |= photograph.focus_state(self.phone.shell("dumpsys media.camera"))
-        locked, why = self._lock(tags)
-        start, source = self._exposure_start(tags, triggered)
+        tags |= focus_state(self.phone.shell("dumpsys media.camera"))
+        self._require_lock(tags)
+        start = self._exposure_start(tags, triggered)
         image, _ = pixel_formats.decode(
             memoryview(jpeg), "JPEG", self.options.width, self.options.height
         )
@@ -160,17 +183,13 @@ class AndroidCamera(Camera):
             self.phone.shell(f"rm -f '{path}'")
         middle = start + float(tags.get("exposure_s", 0.0)) / 2.0
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
-        metadata = {**tags, "file": path, "locked": locked, "locked_why": why, "time_from": source}
-        metadata["phone_clock_offset_s"] = self._offset
-        metadata["phone_clock_uncertainty_s"] = self._offset_half
         return Frame(
             image=image,
             encoded=jpeg,
             monotonic=monotonic,
             utc=utc,
             exposure=tags.get("exposure_s"),
-            metadata=metadata,
-            settings=photograph.settings(tags),
+            settings=photograph_settings(tags),
         )
 
     def _wake(self) -> None:
@@ -198,64 +217,167 @@ class AndroidCamera(Camera):
                 )
 
     def _new_photograph(self, before: set[str]) -> tuple[str, bytes]:
-        """(path, bytes) of the one new photograph, once it is complete."""
-        deadline = time.monotonic() + self.timeout_s
+        """Return (path, bytes) of the one new photograph, once it is complete."""
+        deadline = time.monotonic() + self.options.timeout_s
         last_size, name, short = -1, "", ""
         while time.monotonic() < deadline:
             new = {
-                n: entry
-                for n, entry in self.phone.listing(self.folder).items()
-                if n not in before
-                and n.lower().endswith((".jpg", ".jpeg"))
-                and not n.startswith((".pending", ".trashed"))
+                name: size
+                for name, size in self.phone.listing(self.folder).items()
+                if name not in before
+                and name.lower().endswith((".jpg", ".jpeg"))
+                and not name.startswith((".pending", ".trashed"))
             }
             if len(new) > 1:
                 raise BadReading(
                     f"{self.phone.where}: {len(new)} new photographs ({', '.join(sorted(new))}); "
                     "switch off burst, HDR and RAW+JPEG copies, and touch nothing"
                 )
-            for name, entry in new.items():
-                if entry.size > 0 and entry.size == last_size:
+            for name, size in new.items():
+                if size > 0 and size == last_size:
                     jpeg = self.phone.pull(f"{self.folder}/{name}")
-                    if len(jpeg) == entry.size and pixel_formats.jpeg_end(jpeg):
+                    if len(jpeg) == size and pixel_formats.jpeg_end(jpeg):
                         return f"{self.folder}/{name}", jpeg
-                    short = f"{name} has {len(jpeg)} of {entry.size} bytes and no end"
-                last_size = entry.size
+                    short = f"{name} has {len(jpeg)} of {size} bytes and no end"
+                last_size = size
             time.sleep(POLL_S)
         if short or name:
             raise BadReading(f"{self.phone.where}: partial photograph, {short or name}")
         self._require_space()
         self._wake()
         raise DeviceTimeout(
-            f"{self.phone.where}: no new photograph in {self.folder} {self.timeout_s:g} s after "
-            "the trigger; is the camera app open, is the trigger right (camera, volume, tap)?"
+            f"{self.phone.where}: no new photograph in {self.folder} {self.options.timeout_s:g} s "
+            "after the trigger; is the camera app open, is the trigger right (camera, volume, tap)?"
         )
 
-    def _lock(self, tags: dict[str, Any]) -> tuple[bool | None, str]:
-        if self._first is None:
-            self._first = dict(tags)
-        locked, why = photograph.lock_verdict(self._first, tags)
-        self._unchecked = why if locked is None else ""
-        moved = photograph.image_moved(self._first, tags)
-        if "SCAN" in str(self._first.get("af_state", "")):
-            self._first = None  # nothing to compare with: it was still focusing
-        if (locked is False and self.options.refuse_unlocked) or (
-            moved and self.options.refuse_unlocked is None
-        ):
+    def _require_lock(self, tags: dict[str, Any]) -> None:
+        """Compare a photograph with the first; BadReading where what moved is refused."""
+        first = self._first or tags
+        # nothing can be compared with one that was still focusing
+        self._first = None if "SCAN" in str(first.get("af_state", "")) else first
+        refuse = self.options.refuse_unlocked
+        moved = image_moved(first, tags)
+        changed = exposure_changed(first, tags)
+        self._unchecked = "" if moved or changed else unreported(tags)
+        why = {None: moved, True: moved or changed, False: ""}[refuse]
+        if why:
             raise BadReading(
                 f"{self.phone.where}: focus or exposure moved, {why}; set the camera app to manual "
                 "(refuse_unlocked: false accepts it)"
             )
-        return locked, why
 
-    def _exposure_start(self, tags: Mapping[str, Any], triggered: float) -> tuple[float, str]:
-        """(start of the exposure, s UTC on this machine's clock; where that comes from)."""
-        exif = photograph.exposure_start(tags, self._zone)
+    def _exposure_start(self, tags: Mapping[str, Any], triggered: float) -> float:
+        """Return the start of the exposure, s UTC on this machine's clock."""
+        exif = exposure_start(tags, self._zone)
         if exif is None:
-            return triggered, "trigger"
-        start = exif.utc - self._offset
+            return triggered
+        utc, resolution_s = exif
+        start = utc - self._offset
         if abs(start - triggered) > CLOCKS_DIFFER_S:
-            return triggered, f"trigger (EXIF is {start - triggered:+.1f} s off)"
-        if exif.resolution_s >= 1.0:  # whole seconds: the trigger, within that second
-            return min(max(triggered, start), start + 1.0), "trigger within EXIF's second"
-        return start, "exif"
+            return triggered
+        if resolution_s >= 1.0:  # whole seconds: the trigger, within that second
+            return min(max(triggered, start), start + 1.0)
+        return start
+
+
+def exif(jpeg: bytes) -> dict[str, Any]:
+    """Return those of TAGS that the photograph has, and `width`, `height`, `make`, `model`."""
+    image_module = support.library("PIL.Image", "android")
+    try:
+        with image_module.open(io.BytesIO(jpeg)) as image:
+            base = image.getexif()
+            found = {name: _plain(base.get_ifd(EXIF_IFD).get(tag)) for tag, name in TAGS.items()}
+            found |= {"make": _plain(base.get(0x010F)), "model": _plain(base.get(0x0110))}
+            found |= {"width": image.width, "height": image.height}
+    except (OSError, ValueError, SyntaxError) as error:
+        raise BadReading(f"these {len(jpeg)} bytes are not a photograph") from error
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _plain(value: Any) -> Any:
+    """Rationals as floats, texts without their padding."""
+    if value is None or isinstance(value, int):
+        return value
+    if isinstance(value, str):
+        return value.strip("\0 ") or None
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return str(value)
+    return number if number == number else None
+
+
+def exposure_start(tags: Mapping[str, Any], zone: str) -> tuple[float, float] | None:
+    """Return when the exposure began, s UTC by the phone's clock, and the resolution of that, s.
+
+    zone: +hhmm, used if the photograph has none.
+    """
+    text = tags.get("time")
+    if not isinstance(text, str):
+        return None
+    try:
+        naive = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
+    sign = re.fullmatch(r"([-+])(\d\d):?(\d\d)", str(tags.get("zone", zone)))
+    offset = timedelta()
+    if sign:
+        offset = timedelta(hours=int(sign[2]), minutes=int(sign[3])) * (-1 if sign[1] == "-" else 1)
+    seconds = naive.replace(tzinfo=timezone(offset) if sign else UTC).timestamp()
+    digits = str(tags.get("subsecond", ""))
+    if re.fullmatch(r"\d+", digits):
+        return seconds + int(digits) / 10 ** len(digits), 10.0 ** -len(digits)
+    return seconds, 1.0
+
+
+def focus_state(dump: str) -> dict[str, Any]:
+    """Lens position and autofocus state from `dumpsys media.camera`, where it reports them."""
+    found: dict[str, Any] = {}
+    distance = re.search(
+        r"android\.lens\.focusDistance \([^)]*\):[^\n]*\n\s*\[\s*([-\d.eE]+)", dump
+    )
+    if distance:
+        found["focus_distance_dioptres"] = float(distance[1])
+    state = re.search(r"android\.control\.afState \([^)]*\):[^\n]*\n\s*\[\s*(\w+)", dump)
+    if state:
+        found["af_state"] = state[1]
+    return found
+
+
+def image_moved(first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return what moved the image since the first photograph (focus, focal length, zoom), or ""."""
+    if "SCAN" in str(now.get("af_state", "")):
+        return f"autofocus is at work ({now['af_state']})"
+    return _changed((*LENS, *FOCUS), first, now)
+
+
+def photograph_settings(tags: Mapping[str, Any]) -> dict[str, float]:
+    """Return the numbers among SETTINGS that the photograph reports."""
+    found = {name: tags[name] for name in SETTINGS if name in tags}
+    return {
+        name: float(value)
+        for name, value in found.items()
+        if isinstance(value, int | float) and math.isfinite(value)
+    }
+
+
+def _changed(names: Iterable[str], first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    for name in names:
+        if name in first and now.get(name) != first[name]:
+            return f"{name} was {first[name]} and is {now.get(name)}"
+    return ""
+
+
+def exposure_changed(first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return what changed of the exposure since the first photograph, or ""."""
+    return _changed(EXPOSURE, first, now)
+
+
+def unreported(now: Mapping[str, Any]) -> str:
+    """Return what would have to be reported to know whether it stayed, or ""."""
+    missing = [name for name in EXPOSURE if name not in now]
+    if missing:
+        return f"the photographs do not report {', '.join(missing)}"
+    if not any(name in now for name in FOCUS):
+        return "neither the photographs nor the camera service report the focus"
+    return ""

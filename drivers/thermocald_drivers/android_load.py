@@ -57,7 +57,6 @@ class AndroidLoadOutput(Output):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.timeout_s = self.options.timeout_s
         self.phone = AdbPhone(self.options)
         self.programme = HeatingProgramme(self.options, "battery")
 

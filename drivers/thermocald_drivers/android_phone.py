@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import socket
+import stat
 import struct
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import (
@@ -40,14 +40,6 @@ ADB_CLASSES = ("char-usb_device",)
 """Opened by the adb server where this driver starts it."""
 
 
-@dataclass(frozen=True)
-class FileEntry:
-    """One file of a listing: size in bytes."""
-
-    name: str
-    size: int
-
-
 class PhoneOptions(DriverOptions):
     """The phone, and the adb server behind which it is."""
 
@@ -59,7 +51,7 @@ class PhoneOptions(DriverOptions):
 
 
 def list_devices(timeout_s: float = 1.0) -> list[tuple[str, str]]:
-    """(serial, state) of what a running adb server lists; [] without one."""
+    """Return (serial, state) of what a running adb server lists; [] without one."""
     adbutils = support.library("adbutils", "android")
     try:
         nobody = PhoneOptions(serial="none", timeout_s=timeout_s, start_server=False)
@@ -70,7 +62,7 @@ def list_devices(timeout_s: float = 1.0) -> list[tuple[str, str]]:
 
 
 def _devices(client: Any) -> list[tuple[str, str]]:
-    """(serial, state) of `host:devices`; adbutils' own list cuts both at blanks."""
+    """Return (serial, state) of `host:devices`; adbutils' own list cuts both at blanks."""
     with client.make_connection() as line:
         line.send_command("host:devices")
         line.check_okay()
@@ -149,24 +141,24 @@ class AdbPhone:
         self._device = None
 
     def shell(self, command: str) -> str:
-        """The command's output (both streams); its exit status is ignored."""
+        """Return the command's output (both streams); its exit status is ignored."""
         device = self._connected()
         answer = self._call(lambda: device.shell2(command, timeout=self._timeout_s, v2=True))
         return str(answer.output)
 
-    def listing(self, folder: str) -> dict[str, FileEntry]:
-        """{name: entry} of the plain files of a folder."""
+    def listing(self, folder: str) -> dict[str, int]:
+        """Return {name: bytes} of the plain files of a folder."""
         device = self._connected()
         entries = self._call(lambda: list(device.sync.iter_directory(folder)))
-        return {e.path: FileEntry(e.path, e.size) for e in entries if e.mode & 0o170000 == 0o100000}
+        return {e.path: e.size for e in entries if stat.S_ISREG(e.mode)}
 
     def pull(self, path: str) -> bytes:
-        """A file's bytes; BadReading if the phone ends it early."""
+        """Return a file's bytes; BadReading if the phone ends it early."""
         device = self._connected()
         return bytes(self._call(lambda: device.sync.read_bytes(path)))
 
     def clock_offset(self, tries: int = 12) -> tuple[float, str, float]:
-        """(phone minus this machine in s, the phone's time zone as +hhmm, uncertainty in s).
+        """Return (phone minus this machine in s, the phone's time zone as +hhmm, uncertainty in s).
 
         Each round trip bounds the offset by its two ends; the result is the middle of the interval
         that satisfies all bounds, as soon as it is within 2 ms. If the clock is set meanwhile, no

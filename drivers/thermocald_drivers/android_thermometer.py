@@ -24,18 +24,19 @@ forged (`UPDATES STOPPED`, after `dumpsys battery unplug` or `set`).
 `dumpsys thermalservice`: only the live section "Current temperatures from HAL" is used; the cache
 before it may be hours old. The section also lists volts, currents and percent (types 6 to 8), and
 differences or flags in any unit (type −1); 0.0 is a sensor that is not fitted, and `lmh-dcvs` is a
-limit of the processor. Thermal zones: see `zones`.
+limit of the processor. Thermal zones: see `kernel`.
 Source: android.hardware.thermal TemperatureType, AOSP BatteryService; dumps of eleven phones.
 """
 
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from thermocald.errors import BadReading, ConfigurationError
 from thermocald.hal import Found, Thermometer
-from thermocald_drivers import chips, support, zones
+from thermocald_drivers import chips, kernel, support
 from thermocald_drivers.android_phone import ADB_CLASSES, AdbPhone, PhoneOptions, list_devices
 
 if TYPE_CHECKING:
@@ -103,13 +104,13 @@ class AndroidThermometer(Thermometer):
                 raise ConfigurationError(
                     f"units.{channel}: there is no battery or zone of that name in sensors"
                 )
-        self._watch = zones.UnitWatch(self.clock)
-        self._neighbours = support.Neighbours(self.clock)
+        self._watch = kernel.UnitWatch(self.clock)
+        self._believed = support.Channels(self.clock, *PHONE_RANGE_C)
         self._scales = self._stated()
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """Phones that the adb server lists."""
+        """List the phones of the adb server."""
         return [Found({"serial": serial}, f"{serial} {state}") for serial, state in list_devices()]
 
     def open(self) -> None:
@@ -117,7 +118,7 @@ class AndroidThermometer(Thermometer):
 
     def close(self) -> None:
         self.phone.disconnect()
-        self._neighbours.clear()
+        self._believed.clear()
         self._scales = self._stated()
 
     def named_channels(self) -> list[str]:
@@ -131,25 +132,27 @@ class AndroidThermometer(Thermometer):
         kinds = {source.partition(":")[0] for source in self.sensors.values()}
         texts = {kind: self.phone.shell(DUMPS[kind]) for kind in sorted(kinds)}
         found = self._battery(texts) | self._service(texts) | self._zones(texts)
-        values, missing = {}, {}
-        for channel, source in self.sensors.items():
-            value = found.get(source, "the phone does not report it")
-            where = f"{self.phone.where}: {source}"
-            try:
-                if isinstance(value, str):
-                    state = STATE_UNIT.format(channel=channel)
-                    raise BadReading(f"{where}: {value.format(state=state)}")
-                support.believable(value, *PHONE_RANGE_C, where)
-                idle = "as of a sensor that is not fitted" if chips.is_idle("", value) else ""
-                values[channel] = self._neighbours.judge(source, value, where, idle)
-            except BadReading as error:
-                missing[channel] = str(error)
-        return support.partial_reading(self.clock, values, missing, start)
+        measures = {
+            channel: (source, partial(self._judge, channel, source, found.get(source)))
+            for channel, source in self.sensors.items()
+        }
+        return self._believed.reading(measures, start)
+
+    def _judge(self, channel: str, source: str, value: float | str | None) -> float:
+        where = f"{self.phone.where}: {source}"
+        if value is None:
+            raise BadReading(f"{where}: the phone does not report it")
+        if isinstance(value, str):
+            state = STATE_UNIT.format(channel=channel)
+            raise BadReading(f"{where}: {value.format(state=state)}")
+        idle = "as of a sensor that is not fitted" if chips.is_idle("", value) else ""
+        return self._believed.judge(source, value, where, idle)
 
     def _stated(self) -> dict[str, float]:
-        """{source: factor to °C} of the units in the stanza."""
+        """Return {source: factor to °C} of the units in the stanza."""
         return {
-            self.sensors[channel]: zones.UNITS[unit] for channel, unit in self.options.units.items()
+            self.sensors[channel]: kernel.UNITS[unit]
+            for channel, unit in self.options.units.items()
         }
 
     def _in_unit(self, source: str, number: float, scale: float) -> float | str:
@@ -162,7 +165,7 @@ class AndroidThermometer(Thermometer):
         if "battery" not in texts:
             return {}
         known = self._scales.get("battery")
-        unit = next((word for word, scale in zones.UNITS.items() if scale == known), "")
+        unit = next((word for word, scale in kernel.UNITS.items() if scale == known), "")
         found = battery(texts["battery"], unit)
         if found is None:
             return {"battery": NO_BATTERY}
@@ -174,16 +177,16 @@ class AndroidThermometer(Thermometer):
         return {f"thermal:{name}": value for name, value in found.items()}
 
     def _zones(self, texts: Mapping[str, str]) -> dict[str, float | str]:
-        raw = zones.raw_zones(texts.get("zone", ""))
+        raw = kernel.raw_zones(texts.get("zone", ""))
         known = {s.removeprefix("zone:"): f for s, f in self._scales.items() if s != "battery"}
-        scales = zones.zone_scales(raw, known)
+        scales = kernel.zone_scales(raw, known)
         self._scales |= {f"zone:{name}": scale for name, scale in scales.items()}
         found: dict[str, float | str] = {}
         for name, value in raw.items():
             source = f"zone:{name}"
             if name in scales:
                 found[source] = self._in_unit(source, value, scales[name])
-            elif not zones.is_temperature(name):
+            elif not kernel.is_temperature(name):
                 found[source] = f"{value} is not a temperature; if it is, {{state}}"
             elif value == 0:
                 found[source] = "0, as of a sensor not fitted; if not, {state}"
@@ -193,7 +196,7 @@ class AndroidThermometer(Thermometer):
 
 
 def battery(text: str, unit: str = "") -> tuple[float, float] | None:
-    """(number, factor to °C) of `dumpsys battery`; None where there is none to be believed.
+    """Return (number, factor to °C) of `dumpsys battery`; None where there is none to be believed.
 
     unit: a word of UNITS, where it is known.
     """
@@ -207,7 +210,7 @@ def battery(text: str, unit: str = "") -> tuple[float, float] | None:
     if raw is None or fields.get("present") == "false" or (raw == 0 and not volts):
         return None
     if unit:
-        scale = zones.UNITS[unit]
+        scale = kernel.UNITS[unit]
         return (raw, scale) if abs(raw) * scale <= HOTTEST_BATTERY_C else None
     if raw == 0 and volts not in CELL_MV:  # a board that runs from the mains
         return None
@@ -225,7 +228,7 @@ def _whole(text: str | None) -> int | None:
 
 
 def thermalservice(text: str) -> dict[str, float]:
-    """{sensor: °C} of the live section; empty where the phone does not print one."""
+    """Return {sensor: °C} of the live section; empty where the phone does not print one."""
     text = text.replace("\r", "")
     _, found, rest = text.partition(LIVE_SECTION)
     if not found or "HAL Ready: false" in text:
@@ -244,7 +247,7 @@ def thermalservice(text: str) -> dict[str, float]:
             continue  # NaN
         name = " ".join(record["name"].split())
         # 0.0 is the HAL's way to say "not fitted"
-        if value == 0.0 or zones.is_limit(name):
+        if value == 0.0 or kernel.is_limit(name):
             continue
         if values.setdefault(name, value) != value:
             ambiguous.add(name)

@@ -9,6 +9,7 @@ temperature (`support.Neighbours`). The words are those before offset, scale and
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 # words of any chip: no conversion yet, a bus that is held low, a bus that nothing drives
@@ -19,6 +20,10 @@ ANY_WORDS = frozenset(
 )
 # °C of any input of the kernel: not connected, and the ends of the commonest scale
 ANY_C = (0.0, -40.0, 125.0)
+ALL_ONES_C = (-0.5, -0.25, -0.125, -0.0625, -0.03125, -0.015625, -0.0078125)
+"""What 9 to 15 bits that nothing drives mean."""
+ENDS_C = (-99.0, -99.9, -99.99, -100.0, 99.9, 199.9, 999.9, -200.0, 850.0, -270.0, 1372.0)
+"""What displays, transmitters (PT100, type K) and loggers give beyond their ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +61,7 @@ CHIPS = (
          (-40.0, -40.5, 124.99, 124.997, 125.0), (),
          "TI SNAS643, SNAS649, SNAS678: −40 (−40.5) + 165 S/65536"),
     Chip("hih6130 hih6131 hih7130 hih8120 hih9130 hyt221 hyt271 hyt939 cc2 chipcap2 hs3001 hs3002 "
-         "hs3003 hs3004 htu31", (-40.0, 125.0), (),
+         "hs3003 hs3004 htu31", (-40.0, 124.99, 125.0), (),
          "Honeywell TN 009061; IST HYT; Amphenol CC2; Renesas HS300x 6.4: 165 S/16382 − 40"),
     Chip("aht10 aht15 aht20 aht21 aht25 aht30 dht20 am2301b", (-50.0, 150.0), (),
          "Aosong AHT20 6.2: 200 S/2²⁰ − 50"),
@@ -94,7 +99,7 @@ CHIPS = (
     Chip("mcp9701 mcp9701a", (-20.5, -20.51), (), "Microchip DS21942: 0 V"),
     Chip("ad22100", (-61.1,), (), "Analog Devices AD22100: 0 V"),
     # pressure
-    Chip("ms5611 ms5607 ms5637 ms5803 ms5805 ms5837", (20.0,), (),
+    Chip("ms5611 ms5607 ms5637 ms5803 ms5805 ms5837 ms8607-temppressure", (20.0,), (),
          "TE MS5611-01BA03: coefficients that read 0 give 20.00 °C"),
     Chip("bmp180 bmp280 bme280 bmp388 bme680", (-145.75, 179.55), (0x80000, 0x8000),
          "Bosch BST-BME280-DS002 5.4.8; Adafruit_BME280_Library issue 112"),
@@ -126,39 +131,49 @@ CHIPS = (
 )  # fmt: skip
 _BY_NAME = {name: chip for chip in CHIPS for name in chip.names.split()}
 
-LOWEST_LIKELY_C, HIGHEST_LIKELY_C = -39.0, 84.0
+LOWEST_LIKELY_C, HIGHEST_LIKELY_C, HIGHEST_OF_A_PROCESSOR_C = -39.0, 84.0, 110.0
 FIRMWARE_C = tuple(
     sorted(
         {c for chip in CHIPS for c in chip.celsius if not LOWEST_LIKELY_C < c < HIGHEST_LIKELY_C}
     )
 )
 """What firmware prints without a sensor, whatever the sensor: hardly temperatures."""
+UNLIKELY_C = tuple(c for c in FIRMWARE_C if not LOWEST_LIKELY_C < c < HIGHEST_OF_A_PROCESSOR_C)
 
 
 def names() -> list[str]:
-    """All chips of the table, sorted."""
+    """Return all chips of the table, sorted."""
     return sorted(_BY_NAME)
 
 
 def idle_celsius(name: str) -> tuple[float, ...]:
-    """°C that a chip gives without having measured; () for one that is not in the table."""
-    chip = _BY_NAME.get(name.lower())
+    """Return the °C that a chip gives without having measured; () if it is not in the table."""
+    chip = _chip(name)
     return () if chip is None else chip.celsius
 
 
+def _chip(name: str) -> Chip | None:
+    """A chip by its name, or the kernel's, which may go on (ms8607-temppressure, bq27541_0)."""
+    return _BY_NAME.get(name.lower()) or _BY_NAME.get(re.split("[-_]", name.lower())[0])
+
+
 def is_idle(name: str, celsius: float) -> bool:
-    """Whether a chip, by the kernel's name, gives this without having measured (to 1/1000 °C)."""
-    return any(abs(celsius - one) < 1e-3 for one in (*ANY_C, *idle_celsius(name)))
+    """Whether a chip, by the kernel's name, gives this without having measured (to 1/1000 °C).
+
+    Of a chip that is not in the table, whatever is hardly a temperature is doubted.
+    """
+    idle = idle_celsius(name) if _chip(name) else (*UNLIKELY_C, *ALL_ONES_C)
+    return any(abs(celsius - one) < 1e-3 for one in (*ANY_C, *idle))
 
 
 def is_idle_word(name: str, word: float) -> bool:
     """Whether a word, before offset and scale, is one that a chip has without a measurement."""
-    chip = _BY_NAME.get(name.lower())
+    chip = _chip(name)
     return word in ANY_WORDS or (chip is not None and word in chip.words)
 
 
 def prints(number: float, decimals: int, value: float) -> bool:
-    """Whether a number of so many decimals can be `value`, rounded either way or cut off."""
+    """Return whether a number of so many decimals can be `value`, rounded either way or cut off."""
     step = 10.0**-decimals
     low = math.floor(value / step + 1e-6)
     high = math.ceil(value / step - 1e-6)

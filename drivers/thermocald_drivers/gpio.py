@@ -64,7 +64,7 @@ class RelayOptions(HeatingOptions, PinOptions):
 
 
 def _pin(kind: str, options: PinOptions) -> Any:
-    """A gpiozero device; its errors are translated."""
+    """Return a gpiozero device; translate its errors."""
     pin = options.pin
     gpiozero = support.library("gpiozero", "gpio")
     try:
@@ -166,7 +166,7 @@ class RelayOutput(Output):
             watchdog.join()
 
     def _starve(self) -> None:
-        """No result for `watchdog_s`: off until the next one."""
+        """Switch off until the next result: there was none for `watchdog_s`."""
         with self._lock:
             if self._relay is not None:
                 self._relay.off()

@@ -19,21 +19,14 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from thermocald.errors import ConfigurationError
-from thermocald.hal import DriverOptions
-
-
-class Step(DriverOptions):
-    """Hold a temperature (°C; None: do not heat) for a time (s)."""
-
-    seconds: Annotated[float, Field(ge=1.0, le=1e6)]
-    hold_c: Annotated[float, Field(ge=-40.0)] | None
+from thermocald.hal import DriverOptions, HeatingStep
 
 
 class HeatingOptions(DriverOptions):
     """What every output that heats has."""
 
     limit_c: Annotated[float, Field(ge=-40.0, le=150.0)]
-    programme: Annotated[list[Step], Field(min_length=1)]
+    programme: Annotated[list[HeatingStep], Field(min_length=1)]
     unknown_s: Annotated[float, Field(ge=1.0, le=3600.0)] = 60.0
     hysteresis_k: Annotated[float, Field(ge=0.0, le=20.0)] = 0.5
 
@@ -65,8 +58,8 @@ class HeatingProgramme:
         self.tripped = ""
         self._known_at = 0.0
 
-    def step_at(self, elapsed_s: float) -> Step | None:
-        """The current step; None after the last one."""
+    def step_at(self, elapsed_s: float) -> HeatingStep | None:
+        """Return the current step; None after the last one."""
         for step in self.options.programme:
             elapsed_s -= step.seconds
             if elapsed_s < 0:
@@ -74,7 +67,7 @@ class HeatingProgramme:
         return None
 
     def decide(self, elapsed_s: float, temperature_c: float | None) -> bool:
-        """Whether to heat now; sets `tripped` (a sentence) once the limit was reached."""
+        """Return whether to heat now; sets `tripped` (a sentence) once the limit was reached."""
         limit = self.options.limit_c
         if temperature_c is not None and not math.isfinite(temperature_c):
             temperature_c = None
@@ -86,7 +79,7 @@ class HeatingProgramme:
         )
         return self.heating
 
-    def _wanted(self, step: Step, temperature_c: float | None, elapsed_s: float) -> bool:
+    def _wanted(self, step: HeatingStep, temperature_c: float | None, elapsed_s: float) -> bool:
         if temperature_c is not None:
             self._known_at = elapsed_s
         if step.hold_c is None:

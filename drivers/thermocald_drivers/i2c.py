@@ -20,7 +20,7 @@ nothing drives. `channel` (temperature) names the value.
   same grid (LM75B rev. 6.1, TMP75 SBOS288, TMP102 SBOS397H).
 * SHT3x: a single shot with high repeatability; each word has a CRC (SHT3x-DIS v6, 4.3 … 4.13).
 * BME280: a forced measurement; it warms itself and measures its board (BST-BME280-DS002 1.23, 4.2,
-  8.1). Humidity and pressure go into the metadata.
+  8.1).
 
 MCP9808 and the LM75 family convert all the time: in shut-down they would repeat their last value
 for ever, so they are woken and one conversion awaited. What they hold from power-up (see `chips`)
@@ -30,7 +30,6 @@ is read again after one conversion, and then accepted only if a recent reading l
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -41,7 +40,7 @@ from thermocald.hal import DriverOptions, Found, Thermometer
 from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from thermocald.hal import Reading
 
@@ -52,12 +51,6 @@ class I2cOptions(DriverOptions):
     bus: Annotated[int, Field(ge=0, le=255)] = 1
     address: int | None = None
     channel: support.Text = "temperature"
-
-
-class Lm75Options(I2cOptions):
-    """The family has several chips."""
-
-    chip: Literal["lm75", "lm75b", "tmp75", "tmp102"] = "lm75"
 
 
 class I2cThermometer(Thermometer):
@@ -81,11 +74,11 @@ class I2cThermometer(Thermometer):
         self.where = f"{self.chip} at 0x{self.address:02x} on /dev/i2c-{self.options.bus}"
         self._smbus: Any = None
         self._seen = False
-        self._neighbours = support.Neighbours(self.clock)
+        self._channels = support.Channels(self.clock, *self.range_c)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
-        """Buses a chip could be on; scanning addresses could upset other chips."""
+        """List the buses a chip could be on; scanning addresses could upset other chips."""
         return [
             Found(
                 {"bus": int(path.name.split("-")[1]), "address": cls.addresses[0]},
@@ -122,20 +115,18 @@ class I2cThermometer(Thermometer):
     def read(self) -> Reading:
         if self._smbus is None:
             raise DeviceGone(f"{self.where}: not open")
-        start = self.clock.monotonic()
-        try:
-            value, about = self._measure()
-        except OSError as error:
-            raise support.fault(error, self.where, seen=True) from error
-        support.believable(value, *self.range_c, self.where)
-        return support.middle_reading(self.clock, {self.options.channel: value}, start, about)
+        return self._channels.reading({self.options.channel: (self.where, self._believed)})
+
+    def _believed(self) -> float:
+        value, idle = self._measure()
+        return self._channels.judge("", value, self.where, idle)
 
     def _identify(self) -> None:
         """Check that it is this chip and make it convert; WrongDevice if it is another."""
         raise NotImplementedError
 
-    def _measure(self) -> tuple[float, Mapping[str, Any]]:
-        """One fresh value in °C and what else the chip reports."""
+    def _measure(self) -> tuple[float, str]:
+        """Return a fresh value in °C; in words, if the chip may not have measured it."""
         raise NotImplementedError
 
     def _byte(self, register: int) -> int:
@@ -146,12 +137,16 @@ class I2cThermometer(Thermometer):
         value = int(self._smbus.read_word_data(self.address, register))
         return (value & 0xFF) << 8 | value >> 8
 
+    def _reader(self, mask: int) -> Callable[[int], int]:
+        """Return what reads a register that has the bits of a mask."""
+        return self._word if mask > 0xFF else self._byte
+
     def _write_word(self, register: int, value: int) -> None:
         swapped = (value & 0xFF) << 8 | value >> 8
         self._smbus.write_word_data(self.address, register, swapped)
 
     def _driven(self, word: int) -> int:
-        """A measurement's word; 0xFFFF is a bus that nothing drives, and is refused."""
+        """Return a measurement's word; 0xFFFF is a bus that nothing drives, and is refused."""
         if word == 0xFFFF:
             raise BadReading(f"{self.where}: reads 0xFFFF, nothing drives the bus")
         return word
@@ -169,9 +164,9 @@ class I2cThermometer(Thermometer):
 
     def _await(self, register: int, mask: int, wanted: int, poll_s: float) -> None:
         """Poll a status until its bits are as wanted; DeviceTimeout after 20 looks."""
-        size = self._word if mask > 0xFF else self._byte
+        read = self._reader(mask)
         for _ in range(20):
-            if size(register) & mask == wanted:
+            if read(register) & mask == wanted:
                 return
             self._wait(poll_s)
         raise DeviceTimeout(f"{self.where}: the conversion did not end in {20 * poll_s:g} s")
@@ -189,7 +184,7 @@ class Tmp117Thermometer(I2cThermometer):
     def _identify(self) -> None:
         self._expect("the device identity", self._word(self.DEVICE) & 0x0FFF, 0x0117)
 
-    def _measure(self) -> tuple[float, Mapping[str, Any]]:
+    def _measure(self) -> tuple[float, str]:
         self._word(self.CONFIGURATION)  # reading it clears a Data_Ready left over from before
         self._write_word(self.CONFIGURATION, self.ONE_SHOT_8_AVERAGES)
         self._wait(0.1245)
@@ -197,7 +192,7 @@ class Tmp117Thermometer(I2cThermometer):
         raw = self._driven(self._word(self.TEMPERATURE))
         if raw == 0x8000:
             raise BadReading(f"{self.where}: 0x8000, the power-on value; no conversion took place")
-        return signed(raw, 16) / 128.0, {}
+        return signed(raw, 16) / 128.0, ""
 
 
 class _ConvertingThermometer(I2cThermometer):
@@ -209,31 +204,31 @@ class _ConvertingThermometer(I2cThermometer):
 
     def _wake(self) -> None:
         """Leave shut-down, and wait for a conversion."""
-        configuration = self._configuration()
+        read = self._reader(self.SHUTDOWN)
+        configuration = read(self.CONFIGURATION)
         if not configuration & self.SHUTDOWN:
             return
-        self._configure(configuration & ~self.SHUTDOWN)
-        if self._configuration() & self.SHUTDOWN:
+        if self.SHUTDOWN > 0xFF:
+            self._write_word(self.CONFIGURATION, configuration & ~self.SHUTDOWN)
+        else:
+            self._smbus.write_byte_data(
+                self.address, self.CONFIGURATION, configuration & ~self.SHUTDOWN
+            )
+        if read(self.CONFIGURATION) & self.SHUTDOWN:
             raise BadReading(f"{self.where}: does not leave shut-down (locked registers?)")
         self._wait(self.conversion_s)
 
-    def _configuration(self) -> int:
-        return self._byte(self.CONFIGURATION)
-
-    def _configure(self, value: int) -> None:
-        self._smbus.write_byte_data(self.address, self.CONFIGURATION, value)
-
-    def _measure(self) -> tuple[float, Mapping[str, Any]]:
+    def _measure(self) -> tuple[float, str]:
         self._wake()
-        value, about = self._decode(self._driven(self._word(self.TEMPERATURE)))
+        value = self._decode(self._driven(self._word(self.TEMPERATURE)))
         if value == 0.0:
             self._wait(self.conversion_s)
-            value, about = self._decode(self._driven(self._word(self.TEMPERATURE)))
-        idle = "" if value else "its power-up value: it lost its supply, or does not convert"
-        return self._neighbours.judge("", value, self.where, idle), about
+            value = self._decode(self._driven(self._word(self.TEMPERATURE)))
+        idle = "its power-up value: it lost its supply, or does not convert"
+        return value, "" if value else idle
 
-    def _decode(self, word: int) -> tuple[float, Mapping[str, Any]]:
-        """°C of a temperature word, and what else it says."""
+    def _decode(self, word: int) -> float:
+        """Return the °C of a temperature word."""
         raise NotImplementedError
 
 
@@ -252,14 +247,14 @@ class Mcp9808Thermometer(_ConvertingThermometer):
         self._expect("the device register", self._word(self.DEVICE) >> 8, 0x04)
         self._wake()
 
-    def _configuration(self) -> int:
-        return self._word(self.CONFIGURATION)
+    def _decode(self, word: int) -> float:
+        return signed(word, 13) / 16.0
 
-    def _configure(self, value: int) -> None:
-        self._write_word(self.CONFIGURATION, value)
 
-    def _decode(self, word: int) -> tuple[float, Mapping[str, Any]]:
-        return signed(word, 13) / 16.0, {"alert_flags": word >> 13}
+class Lm75Options(I2cOptions):
+    """The family has several chips."""
+
+    chip: Literal["lm75", "lm75b", "tmp75", "tmp102"] = "lm75"
 
 
 class Lm75Thermometer(_ConvertingThermometer):
@@ -295,15 +290,15 @@ class Lm75Thermometer(_ConvertingThermometer):
                 )
         self._wake()
 
-    def _decode(self, word: int) -> tuple[float, Mapping[str, Any]]:
+    def _decode(self, word: int) -> float:
         if self.options.chip == "tmp102" and word & 1:
-            return signed(word >> 3, 13) / 16.0, {"extended": True}
+            return signed(word >> 3, 13) / 16.0
         unused = 16 - self.bits
         if word & ((1 << unused) - 1):
             raise BadReading(
                 f"{self.where}: 0x{word:04x} has bits set that a {self.options.chip} leaves zero"
             )
-        return signed(word >> unused, self.bits) / (1 << (self.bits - 8)), {}
+        return signed(word >> unused, self.bits) / (1 << (self.bits - 8))
 
 
 class Sht3xThermometer(I2cThermometer):
@@ -319,12 +314,11 @@ class Sht3xThermometer(I2cThermometer):
         self._command(self.SERIAL_NUMBER, 0.001)
         self._words(2)
 
-    def _measure(self) -> tuple[float, Mapping[str, Any]]:
+    def _measure(self) -> tuple[float, str]:
         self._command(self.SINGLE_SHOT_HIGH, 0.0155)
         temperature, humidity = self._words(2)
         self._driven(temperature & humidity)
-        value = -45.0 + 175.0 * temperature / 65535.0
-        return value, {"humidity_percent": 100.0 * humidity / 65535.0}
+        return -45.0 + 175.0 * temperature / 65535.0, ""
 
     def _command(self, command: int, wait_s: float) -> None:
         self._smbus.write_i2c_block_data(self.address, command >> 8, [command & 0xFF])
@@ -349,86 +343,38 @@ class Bme280Thermometer(I2cThermometer):
     chip = "BME280"
     addresses = (0x76, 0x77)
     range_c = (-40.0, 85.0)
-    CALIBRATION_TP, IDENTITY, CALIBRATION_H = 0x88, 0xD0, 0xE1
+    CALIBRATION, IDENTITY = 0x88, 0xD0
     CONTROL_HUMIDITY, STATUS, CONTROL, DATA = 0xF2, 0xF3, 0xF4, 0xF7
     FORCED_X2_X1, MEASURING = 0b010 << 5 | 0b001 << 2 | 0b01, 1 << 3
 
     def _identify(self) -> None:
         self._expect("the identity", self._byte(self.IDENTITY), 0x60)
-        low = self._block(self.CALIBRATION_TP, 26)
-        if low in (bytes(26), b"\xff" * 26):
+        table = self._block(self.CALIBRATION, 26)
+        if table in (bytes(26), b"\xff" * 26):
             raise BadReading(f"{self.where}: the calibration registers are empty")
-        self._compensation = Compensation.from_registers(low, self._block(self.CALIBRATION_H, 7))
+        self._calibration = struct.unpack("<Hhh", table[:6])
 
     def _block(self, register: int, size: int) -> bytes:
         return bytes(self._smbus.read_i2c_block_data(self.address, register, size))
 
-    def _measure(self) -> tuple[float, Mapping[str, Any]]:
+    def _measure(self) -> tuple[float, str]:
         self._smbus.write_byte_data(self.address, self.CONTROL_HUMIDITY, 0b001)
         self._smbus.write_byte_data(self.address, self.CONTROL, self.FORCED_X2_X1)
         self._wait(0.012)
         self._await(self.STATUS, self.MEASURING, 0, 0.005)
         data = self._block(self.DATA, 8)
-        pressure = data[0] << 12 | data[1] << 4 | data[2] >> 4
-        temperature = data[3] << 12 | data[4] << 4 | data[5] >> 4
-        humidity = self._driven(data[6] << 8 | data[7])
-        if chips.is_idle_word("bme280", temperature):
-            raise BadReading(f"{self.where}: 0x{temperature:05x}, the temperature was not measured")
-        fine = self._compensation.fine(temperature)
-        about: dict[str, Any] = {}
-        pascal = self._compensation.pressure(pressure, fine)
-        if pascal is not None and pressure != 0x80000:
-            about["pressure_pa"] = pascal
-        if humidity != 0x8000:
-            about["humidity_percent"] = self._compensation.humidity(humidity, fine)
-        return fine / 5120.0, about
+        self._driven(data[6] << 8 | data[7])
+        raw = data[3] << 12 | data[4] << 4 | data[5] >> 4
+        if chips.is_idle_word("bme280", raw):
+            raise BadReading(f"{self.where}: 0x{raw:05x}, the temperature was not measured")
+        return bme280_celsius(raw, self._calibration), ""
 
 
-@dataclass(frozen=True)
-class Compensation:
-    """The BME280's factory calibration: dig_T (3), dig_P (9) and dig_H (6) of the data sheet."""
-
-    t: tuple[int, ...]
-    p: tuple[int, ...]
-    h: tuple[int, ...]
-
-    @classmethod
-    def from_registers(cls, low: bytes, high: bytes) -> Compensation:
-        """low: 0x88 … 0xA1 (26 bytes), high: 0xE1 … 0xE7 (7 bytes)."""
-        h4 = signed(high[3] << 4 | high[4] & 0x0F, 12)
-        h5 = signed(high[5] << 4 | high[4] >> 4, 12)
-        return cls(
-            t=struct.unpack("<Hhh", low[:6]),
-            p=struct.unpack("<Hhhhhhhhh", low[6:24]),
-            h=(low[25], *struct.unpack("<hB", high[:3]), h4, h5, *struct.unpack("<b", high[6:7])),
-        )
-
-    def fine(self, adc: int) -> float:
-        """t_fine of a raw temperature; t_fine / 5120 is °C."""
-        t1, t2, t3 = self.t
-        first = (adc / 16384.0 - t1 / 1024.0) * t2
-        return first + (adc / 131072.0 - t1 / 8192.0) ** 2 * t3
-
-    def pressure(self, adc: int, fine: float) -> float | None:
-        """Pa; None where the calibration would divide by zero."""
-        p1, p2, p3, p4, p5, p6, p7, p8, p9 = self.p
-        v1 = fine / 2.0 - 64000.0
-        v2 = v1 * v1 * p6 / 32768.0 + v1 * p5 * 2.0
-        v2 = v2 / 4.0 + p4 * 65536.0
-        v1 = (1.0 + (p3 * v1 * v1 / 524288.0 + p2 * v1) / 524288.0 / 32768.0) * p1
-        if v1 == 0.0:
-            return None
-        p = (1048576.0 - adc - v2 / 4096.0) * 6250.0 / v1
-        return p + (p9 * p * p / 2147483648.0 + p * p8 / 32768.0 + p7) / 16.0
-
-    def humidity(self, adc: int, fine: float) -> float:
-        """% relative humidity, within 0 … 100."""
-        h1, h2, h3, h4, h5, h6 = self.h
-        x = fine - 76800.0
-        x = (adc - (h4 * 64.0 + h5 / 16384.0 * x)) * (
-            h2 / 65536.0 * (1.0 + h6 / 67108864.0 * x * (1.0 + h3 / 67108864.0 * x))
-        )
-        return min(100.0, max(0.0, x * (1.0 - h1 * x / 524288.0)))
+def bme280_celsius(raw: int, calibration: tuple[int, ...]) -> float:
+    """Return the °C of a raw temperature; calibration: dig_T1 … dig_T3 (data sheet 8.1)."""
+    t1, t2, t3 = calibration
+    first = (raw / 16384.0 - t1 / 1024.0) * t2
+    return (first + (raw / 131072.0 - t1 / 8192.0) ** 2 * t3) / 5120.0
 
 
 def crc8(data: bytes) -> int:
@@ -442,6 +388,6 @@ def crc8(data: bytes) -> int:
 
 
 def signed(value: int, bits: int) -> int:
-    """Two's complement of the lowest `bits` bits."""
+    """Return two's complement of the lowest `bits` bits."""
     value &= (1 << bits) - 1
     return value - (1 << bits) if value >> (bits - 1) else value

@@ -25,6 +25,7 @@ from pydantic import Field
 
 from thermocald.errors import DeviceGone, DeviceTimeout, TransientDeviceError
 from thermocald.hal import DriverOptions, Output
+from thermocald.result import jsonable
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 
 
 def encode(result: Mapping[str, Any]) -> bytes:
-    """One result as JSON; numpy scalars as numbers, NaN and infinities as null."""
-    return json.dumps(support.plain(dict(result))).encode()
+    """Return a result as JSON; numpy scalars as numbers, NaN and infinities as null."""
+    return json.dumps(jsonable(dict(result)), default=str).encode()
 
 
 class JsonLinesOptions(DriverOptions):
@@ -51,7 +52,6 @@ class JsonLinesOutput(Output):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.path = Path(self.options.path)
-        self.timeout_s = self.options.timeout_s
         self._file = -1
         self._seen = False
 
@@ -105,7 +105,7 @@ class JsonLinesOutput(Output):
     def _write(self, line: bytes) -> None:
         """Write the whole line; on failure remove what was written of it."""
         start = os.fstat(self._file).st_size
-        deadline = time.monotonic() + self.timeout_s
+        deadline = time.monotonic() + self.options.timeout_s
         written = 0
         try:
             while written < len(line):

@@ -13,35 +13,61 @@ are. The kernel renumbers its devices at every plug: they are looked up by name 
 the name is checked at each read.
 
 What a chip gives without having measured (`chips`: 0, the ends of its scale, all ones, its value at
-power-up; of iio the raw word before offset and scale) is accepted only if a recent reading lay
-within 5 K. A zone of −40 °C is one that is not fitted, and the hwmon entry of a 1-wire sensor is
-refused at its power-on value: use the driver ds18b20, which sees the CRC.
+power-up; of iio the raw word before offset and scale; of a chip that is not listed what is hardly
+a temperature) is accepted only if a recent reading lay within 5 K. A zone of −40 °C is one that is
+not fitted, and the hwmon entry of a 1-wire sensor is refused at its power-on value: use the driver
+ds18b20, which sees the CRC.
 
 A zone of a vendor's kernel may be in °C or tenths: a number up to 1250 is refused until one above
 has shown that it is in thousandths, and then believed only within 5 K of a recent reading, or
 `unit` states it. It is refused where the number fits the last reading in another unit only: the
 unit has switched. Within 0.125 °C of zero only a reading close by tells thousandths from degrees.
-Source: Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio, driver-api/thermal.
+
+Of a phone's zones, the unit is taken from the zone's family where only one fits, else from the
+phone's other zones, and is otherwise unknown: 37000, 370 and 37 all mean 37 °C, a zone may hold
+percent, mA or mV, and a wrong temperature is worse than none.
+Source: Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio, driver-api/thermal; qcom
+tsens and qpnp-adc-tm of kernels 3.10 to 4.9, MediaTek mtk_ts_*, power_supply class; zones of eleven
+phones.
 """
 
 from __future__ import annotations
 
 import errno
+import re
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, WrongDevice
 from thermocald.hal import DriverOptions, Found, Thermometer, channel_fault
-from thermocald_drivers import chips, support, zones
+from thermocald_drivers import chips, support
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
-    from thermocald.hal import Reading
+    from thermocald.hal import Clock, Reading
 
 NOT_FITTED_C = -40.0
 LARGEST_OF_TENTHS = 1250  # 125 °C; what is larger can only be thousandths
 LARGEST_OF_DEGREES = 125
+UNITS = {"degC": 1.0, "tenths": 0.1, "thousandths": 0.001}
+"""The option's words: what a zone's number is multiplied by to be °C."""
+
+LOWEST_C, HIGHEST_C = -30.0, 125.0
+SWITCH_K, SWITCH_S = 5.0, 600.0
+COOLER_K = 10.0
+"""No zone of a phone is colder than its coldest other zone by more than this."""
+
+_OTHER_QUANTITIES = re.compile(
+    r"soc|socd|(?:batt?(?:ery)?|bms|maxfg|fg)[-_]?soc"
+    r"|(?:.*[-_ ])?(?:ibat|vbat|vph|bcl|icl|ocp|vsys|vbus|ibus|curr|current|volt"
+    r"|voltage|power|pwr|percent|pct|capacity|cycle|cycles|level|duty|pwm|fan|minus|smpl|reduce"
+    r"|lvl[0-9]*|mv|ma|uv|ua|mw)(?:[-_ ].*)?|batoilo[0-9]*|vdroop[0-9]*|smpl_gm",
+    re.IGNORECASE,
+)
+_LIMIT = re.compile(r"lmh[-_]dcvs.*", re.IGNORECASE)  # always 75 or 95 °C
 
 
 class KernelOptions(DriverOptions):
@@ -85,17 +111,17 @@ class _KernelThermometer(Thermometer):
         self.chip = getattr(o, self.key)
         self.sysfs = Path(o.sysfs)
         self._seen = False
-        self._neighbours = support.Neighbours(self.clock)
+        self._believed = support.Channels(self.clock, o.minimum_c, o.maximum_c)
         self._device: Path | None = None
         self._channels: dict[str, str] = {}
         self._name = ""
 
     @classmethod
     def devices(cls, sysfs: Path) -> Iterator[tuple[Path, str, str]]:
-        """(folder, name, bus address) of each device of the class."""
+        """Yield (folder, name, bus address) of each device of the class."""
         for folder in sorted((sysfs / cls.folder).glob(cls.prefix + "*")):
             try:
-                name = (folder / cls.name_file).read_text().strip()
+                name = support.read_line(folder / cls.name_file)
             except OSError:
                 continue  # unplugged between the listing and the reading
             device = folder / "device"
@@ -103,7 +129,7 @@ class _KernelThermometer(Thermometer):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
-        """Configuration stanzas of what is there, for `thermocald devices`."""
+        """List what is there as stanzas, for `thermocald devices`."""
         found = list(cls.devices(Path(sysfs)))
         names = [name for _, name, _ in found]
         return [
@@ -128,11 +154,11 @@ class _KernelThermometer(Thermometer):
             raise WrongDevice(f"{matches[0]}: this device has no temperature input")
         self._channels = self._select(inputs, matches[0])
         self._device, self._seen = matches[0], True
-        self._name = (matches[0] / self.name_file).read_text().strip()
+        self._name = support.read_line(matches[0] / self.name_file)
 
     def close(self) -> None:
         self._device = None
-        self._neighbours.clear()
+        self._believed.clear()
 
     def named_channels(self) -> list[str]:
         return list(self.options.channels)
@@ -141,7 +167,7 @@ class _KernelThermometer(Thermometer):
         return {"chip": self.chip, "path": str(self._device or "")}
 
     def _select(self, inputs: dict[str, str], folder: Path) -> dict[str, str]:
-        """{our channel: kernel's input}, from the option `channels`."""
+        """Return {our channel: kernel's input}, from the option `channels`."""
         if not self.options.channels:
             if len(inputs) == 1:
                 return {"temperature": next(iter(inputs))}
@@ -163,39 +189,26 @@ class _KernelThermometer(Thermometer):
     def read(self) -> Reading:
         if self._device is None:
             raise DeviceGone(f"{self.chip}: not open")
-        start = self.clock.monotonic()
-        values: dict[str, float] = {}
-        missing: dict[str, str] = {}
+        folder, measures = self._device, {}
         for channel, key in self._channels.items():
-            where = f"{self._device.name} ({self.chip}) {key}"
-            try:
-                value, idle = self._convert(self._device, key)
-                support.believable(value, self.options.minimum_c, self.options.maximum_c, where)
-                values[channel] = self._neighbours.judge(key, value, where, idle)
-            except BadReading as error:
-                missing[channel] = str(error)
-            except ValueError as error:
-                missing[channel] = f"{where}: not a number ({error})"
-            except OSError as error:
-                problem = support.fault(error, where, seen=True)
-                if not isinstance(problem, BadReading):
-                    raise problem from error
-                missing[channel] = str(problem)
-        self._same_device(self._device)
-        return support.partial_reading(self.clock, values, missing, start)
-
-    def _same_device(self, folder: Path) -> None:
-        """A kernel name is handed on: hwmon3 may be another chip after a re-plug."""
+            where = f"{folder.name} ({self.chip}) {key}"
+            measures[channel] = where, partial(self._measure, folder, key, where)
+        reading = self._believed.reading(measures)
         try:
-            name = (folder / self.name_file).read_text().strip()
+            name = support.read_line(folder / self.name_file)
         except OSError as error:
             raise DeviceGone(f"{folder}: unplugged ({error.strerror})") from error
-        if name != self._name:
+        if name != self._name:  # a kernel name is handed on: hwmon3 may be another after a re-plug
             raise DeviceGone(f"{folder} is {name!r} now and was {self._name!r}")
+        return reading
+
+    def _measure(self, folder: Path, key: str, where: str) -> float:
+        value, idle = self._convert(folder, key)
+        return self._believed.judge(key, value, where, idle)
 
     @classmethod
     def _inputs(cls, folder: Path) -> dict[str, str]:
-        """{kernel's input: label or ''}."""
+        """Return {kernel's input: label or ''}."""
         raise NotImplementedError
 
     def _convert(self, folder: Path, key: str) -> tuple[float, str]:
@@ -210,12 +223,12 @@ UNMEASURED = "what such an input gives without a sensor or before it has measure
 
 
 def _number(path: Path) -> float:
-    return support.parse_number(path.read_text())
+    return support.parse_number(support.read_line(path))
 
 
 def _label(folder: Path, key: str) -> str:
     try:
-        return (folder / f"{key}_label").read_text().strip()
+        return support.read_line(folder / f"{key}_label")
     except OSError:
         return ""
 
@@ -275,7 +288,7 @@ class IioThermometer(_KernelThermometer):
 
     @staticmethod
     def _shared(folder: Path, key: str, what: str, default: float | None) -> float:
-        """A channel's own attribute, or the one that all temperature channels share."""
+        """Return a channel's own attribute, or the one that all temperature channels share."""
         for path in (folder / f"{key}_{what}", folder / f"in_temp_{what}"):
             if path.exists():
                 return _number(path)
@@ -297,8 +310,8 @@ class ThermalZoneThermometer(_KernelThermometer):
         super().__init__(**options)
         self.unit = self.options.unit or "thousandths"
         self._certain = False
-        self._watch = zones.UnitWatch(self.clock)
-        if self.options.unit is None and not zones.is_temperature(self.chip):
+        self._watch = UnitWatch(self.clock)
+        if self.options.unit is None and not is_temperature(self.chip):
             raise ConfigurationError(
                 f"zone: {self.chip!r} holds percent, mA or mV on the machines that have it; if "
                 "yours is a temperature, write unit: thousandths (or degC, tenths)"
@@ -310,8 +323,8 @@ class ThermalZoneThermometer(_KernelThermometer):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
-        """Configuration stanzas of what is there, for `thermocald devices`."""
-        return [found for found in super().attached(sysfs) if zones.is_temperature(
+        """List what is there as stanzas, for `thermocald devices`."""
+        return [found for found in super().attached(sysfs) if is_temperature(
             str(found.options["zone"]))]  # fmt: skip
 
     @classmethod
@@ -325,7 +338,7 @@ class ThermalZoneThermometer(_KernelThermometer):
             if error.errno in (errno.EAGAIN, errno.ENODATA, errno.EINVAL):
                 raise BadReading(f"{folder.name}: the zone is disabled or asleep") from error
             raise
-        scale = zones.UNITS[self.unit]
+        scale = UNITS[self.unit]
         value = round(number * scale, 6)
         larger = abs(number) > LARGEST_OF_TENTHS
         self._certain |= larger and abs(value) <= LARGEST_OF_TENTHS / 10
@@ -342,8 +355,126 @@ class ThermalZoneThermometer(_KernelThermometer):
                 f"{folder.name}: {number:g} is {value:g} °C in {self.unit} and fits the last "
                 "reading in another unit only; the kernel has switched it"
             )
-        if not stated and not larger and not self._neighbours.support(key, value):
+        if not stated and not larger and not self._believed.support(key, value):
             return value, f"{number:g} in a unit that is not certain (write unit: {self.unit})"
         if self.unit == "thousandths" and 0 < abs(number) <= LARGEST_OF_DEGREES:
             return value, f"{number:g} in thousandths, or in degrees"
         return value, self._idle(value)
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Zones whose names match: the units seen, by the size of the number.
+
+    whole_c, tenths_c: the highest temperature in that unit that such a zone can have, °C; None if
+    the family does not use the unit. thousandths_from: the smallest |number| that is read as
+    1/1000 °C, below 1251 from which on it can be nothing else.
+    """
+
+    pattern: str
+    whole_c: float | None
+    tenths_c: float | None
+    thousandths_from: int
+
+
+_FAMILIES = (
+    # qcom tsens: tenths on msm8909 … msm8998, whole degrees before
+    _Family(r"tsens_tz_sensor\d*", 105.0, HIGHEST_C, 1251),
+    # power supply class: tenths; fuel gauges: thousandths; a battery above 70 °C is on fire
+    _Family(r"(?:.*[-_])?(?:batt?|battery|bms|maxfg|fg)(?:[-_].*)?", 70.0, 70.0, 500),
+    # MediaTek: thousandths, mtktsAP of some kernels whole degrees
+    _Family(r"mtkts(?:batt).*", 70.0, None, 126),
+    _Family(r"mtkts.*", 105.0, None, 126),
+    # qcom ADC thermistors of kernels 3.x: whole degrees
+    _Family(r".*_therm(?:\d|_.*)?", 105.0, None, 1251),
+)
+_ANY = _Family(r".*", 105.0, HIGHEST_C, 500)
+
+
+class UnitWatch:
+    """The last temperature of each source, by which a unit that switches is noticed.
+
+    Kernels give 45000 for 45 °C and, after an update of the fuel gauge or a suspend, 45.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._last: dict[str, tuple[float, float]] = {}
+
+    def switched(self, source: str, number: float, scale: float) -> bool:
+        """Return whether the number agrees with the last temperature in another unit only."""
+        value, now = number * scale, self._clock.monotonic()
+        at, last = self._last.get(source, (now, value))
+        other = None
+        if now - at <= SWITCH_S and abs(value - last) > SWITCH_K:
+            rest = [number * unit for unit in UNITS.values() if unit != scale]
+            other = next((c for c in rest if abs(c - last) <= SWITCH_K), None)
+        self._last[source] = (now, value if other is None else other)
+        return other is not None
+
+
+def is_temperature(zone: str) -> bool:
+    """Return whether a zone of that name holds a temperature, not percent, mA, mV or a limit."""
+    return _OTHER_QUANTITIES.fullmatch(zone) is None and not is_limit(zone)
+
+
+def is_limit(name: str) -> bool:
+    """Whether a zone or sensor of that name holds a limit of the hardware, not a temperature."""
+    return _LIMIT.fullmatch(name) is not None
+
+
+def raw_zones(text: str) -> dict[str, int]:
+    """Return {zone: number} of lines "type number"; a name that is used twice is left out."""
+    values: dict[str, int] = {}
+    ambiguous = set()
+    for line in text.replace("\r", "").split("\n"):
+        name, _, number = line.strip().rpartition(" ")
+        name = name.strip()
+        if not name or not re.fullmatch(r"-?[0-9]{1,9}", number):
+            continue
+        if values.setdefault(name, int(number)) != int(number):
+            ambiguous.add(name)
+    return {name: value for name, value in values.items() if name not in ambiguous}
+
+
+def zone_scales(raw: Mapping[str, int], known: Mapping[str, float]) -> dict[str, float]:
+    """Return {zone: factor to °C} of those whose unit is certain.
+
+    raw: all zones of the phone at one time; known: factors that were stated or found before.
+    """
+    found = {name: known[name] for name in raw if name in known}
+    temperatures = {n: v for n, v in raw.items() if v != 0 and n not in known and is_temperature(n)}
+    choices = {name: _candidates(name, value) for name, value in temperatures.items()}
+    found |= {name: fits[0] for name, fits in choices.items() if len(fits) == 1}
+    others = [raw[name] * scale for name, scale in found.items()]
+    others = [celsius for celsius in others if LOWEST_C <= celsius <= HIGHEST_C]
+    whole = any(scale == 1.0 for scale in found.values())
+    for name, fits in choices.items():
+        if len(fits) > 1 and (scale := _among(raw[name], fits, others, whole)) is not None:
+            found[name] = scale
+    return found
+
+
+def _candidates(name: str, value: int) -> list[float]:
+    """Return the factors that make a possible temperature of a zone's number, by its name."""
+    family = next((f for f in _FAMILIES if re.fullmatch(f.pattern, name, re.IGNORECASE)), _ANY)
+    fits = []
+    if family.whole_c is not None and LOWEST_C <= value <= family.whole_c:
+        fits.append(1.0)
+    if family.tenths_c is not None and LOWEST_C <= value * 0.1 <= family.tenths_c:
+        fits.append(0.1)
+    if abs(value) >= family.thousandths_from and LOWEST_C <= value * 0.001 <= HIGHEST_C:
+        fits.append(0.001)
+    return fits
+
+
+def _among(value: int, fits: list[float], others: Iterable[float], whole: bool) -> float | None:
+    """The one factor that agrees with the phone's other zones; None if that does not decide."""
+    coldest = min(others, default=None)
+    if coldest is None:
+        return None
+    near = [scale for scale in fits if value * scale >= coldest - COOLER_K]
+    if len(near) == 1:
+        return near[0]
+    # colder than everything else in any unit: as its neighbours are written
+    return 1.0 if not near and whole and 1.0 in fits else None

@@ -39,7 +39,6 @@ no driver can detect). A test may also call `inject` while the device is open.
 from __future__ import annotations
 
 import itertools
-import math
 from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -48,7 +47,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
-from thermocald.hal import Camera, Device, DriverOptions, Frame, KnownScene, Output, Thermometer
+from thermocald.hal import Camera, Device, DriverOptions, Frame, Output, Thermometer
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
@@ -225,7 +224,7 @@ class MockDevice(Device):
             raise DeviceGone(f"{self.name}: it is not open")
 
     def _elapsed(self, monotonic: float) -> float:
-        """Seconds from the first opening to a time of the monotonic clock; 0 before it."""
+        """Return seconds from the first opening to a time of the monotonic clock; 0 before it."""
         started = self.faults.started
         return monotonic - (monotonic if started is None else started)
 
@@ -273,8 +272,8 @@ class MockCamera(MockDevice, Camera):
             self._scene = Scene(self._model.sensor, field)
         return self._scene
 
-    def known_scene(self) -> KnownScene:
-        return KnownScene(self.model.sensor, self.field)
+    def known_scene(self) -> tuple[Any, Any]:
+        return self.model.sensor, self.field
 
     @property
     def field(self) -> TestField:
@@ -301,7 +300,7 @@ class MockCamera(MockDevice, Camera):
         return Frame(self._last, monotonic, utc, exposure=exposure, sequence=self._sequence)
 
     def truth(self, monotonic: float) -> Prediction:
-        """The true orientation and effects at a time of the monotonic clock."""
+        """Return the true orientation and effects at a time of the monotonic clock."""
         from thermocald.physics.history import History
 
         times, values = self._programme()
@@ -347,11 +346,22 @@ class MockThermometer(MockDevice, Thermometer):
         return support.middle_reading(self.clock, self._last, start)
 
     def truth(self, monotonic: float) -> float:
-        """The programme's temperature (°C) at a time of the monotonic clock."""
-        return lagged(self._times, self._values, 0.0, self._elapsed(monotonic))
+        """Return the programme's temperature (°C) at a time of the monotonic clock."""
+        return self._followed(0.0, monotonic)
+
+    def _followed(self, lag_s: float, at: float) -> float:
+        """Return the programme behind a first-order lag; in equilibrium before its first point."""
+        elapsed, times, values = self._elapsed(at), self._times, self._values
+        if lag_s == 0.0:
+            return float(np.interp(elapsed, times, values))
+        from thermocald.physics.operators import lag
+
+        later = max(elapsed, times[-1]) + 1.0  # the last value is held
+        knots, held = np.append(times, later), np.append(values, values[-1])
+        return float(lag(knots, held, lag_s, np.array([max(elapsed, times[0])]))[0])
 
     def _value(self, number: int, channel: Channel, at: float) -> float:
-        true = lagged(self._times, self._values, channel.lag_s, self._elapsed(at))
+        true = self._followed(channel.lag_s, at)
         value = self._values[0] + channel.gain * (true - self._values[0]) + channel.offset_k
         seed = [self.options.seed, number, round(at * 1e6) & 2**63 - 1]
         value += channel.noise_k * float(np.random.default_rng(seed).standard_normal())
@@ -367,35 +377,9 @@ class MockOutput(MockDevice, Output):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.timeout_s = self.options.timeout_s
         self.results: deque[dict[str, Any]] = deque(maxlen=self.options.keep)
 
     def emit(self, result: Mapping[str, Any]) -> None:
         self._require_open()
         self.faults.refuse(self.faults.on_call(), "acknowledgement")
         self.results.append(dict(result))
-
-
-def lagged(
-    times: NDArray[np.float64], values: NDArray[np.float64], lag_s: float, at: float
-) -> float:
-    """The response of a first-order lag to a piecewise linear temperature, at a time.
-
-    times (n,) s, values (n,) °C; in equilibrium before the first. On a line of slope m the response
-    is value - m·lag plus the decaying rest of the state before (closed form, no step size).
-    """
-    if lag_s == 0.0:
-        return float(np.interp(at, times, values))
-    state, now = float(values[0]), float(times[0])
-    pieces = zip(times, np.append(times[1:], math.inf), values, strict=True)
-    for i, (start, end, value) in enumerate(pieces):
-        if at <= start:
-            break
-        slope = 0.0 if math.isinf(end) else (values[i + 1] - value) / (end - start)
-        until = min(at, end)
-        settled_before, settled = value - slope * lag_s, value + slope * (until - start - lag_s)
-        state = settled + (state - settled_before) * math.exp(-(until - start) / lag_s)
-        now = until
-        if now >= at:
-            break
-    return state

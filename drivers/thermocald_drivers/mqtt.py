@@ -33,7 +33,8 @@ import json
 import re
 import ssl
 import threading
-from typing import TYPE_CHECKING, Annotated, Any
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field
 
@@ -71,7 +72,7 @@ SENSORS: Mapping[str, tuple[str, str | None, str | None, int | None]] = {
 
 
 def node_of(device: str) -> str:
-    """A device's name as topics and identifiers may hold it; two names are never one."""
+    """Return a device's name as topics and identifiers may hold it; two names are never one."""
     node = re.sub(r"[^A-Za-z0-9_-]", "_", device)
     if node != device:  # `cam.1` must not be `cam_1`
         node += "-" + hashlib.sha256(device.encode()).hexdigest()[:6]
@@ -81,7 +82,7 @@ def node_of(device: str) -> str:
 def discovery_messages(
     prefix: str, topic: str, device: str, speaker: str
 ) -> dict[str, dict[str, Any]]:
-    """{topic: configuration} with which Home Assistant shows the device's sensors.
+    """Return {topic: configuration} with which Home Assistant shows the device's sensors.
 
     speaker: the name under which the last will is left: a connection has one, so that all devices
     are available only while it is.
@@ -112,7 +113,7 @@ def discovery_messages(
 
 
 def _topic(topic: str) -> str:
-    """A topic to publish under: no wildcards, none of the broker's own."""
+    """Return a topic to publish under; refuse wildcards and the broker's own."""
     if not topic.strip("/") or any(c in topic for c in "+#\0") or topic.startswith("$"):
         raise ConfigurationError(f"{topic!r} is not a topic: no +, no #, no $ at its beginning")
     return topic.strip("/")
@@ -142,21 +143,21 @@ class MqttAlertOptions(BrokerOptions, AlertOptions):
     """A broker's, and `when`."""
 
 
-class MqttLine:
-    """A connection to a broker, kept alive by the library's thread.
+class _Broker(Output):
+    """A connection to a broker, kept alive by the library's thread."""
 
-    Raises ConfigurationError for options that do not go together.
-    """
+    Options: ClassVar[type[DriverOptions]] = BrokerOptions
 
-    def __init__(self, options: BrokerOptions) -> None:
-        self.options = options
-        self.tls = options.tls or bool(options.ca or options.cert)
-        self.port = options.port or (8883 if self.tls else 1883)
-        if options.password_file and not options.username:
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        o = self.options
+        self.tls = o.tls or bool(o.ca or o.cert)
+        self.port = o.port or (8883 if self.tls else 1883)
+        if o.password_file and not o.username:
             raise ConfigurationError("password_file: needs a username")
-        if options.key and not options.cert:
+        if o.key and not o.cert:
             raise ConfigurationError("key: needs its certificate, cert")
-        self.where = f"MQTT broker {options.host}:{self.port}"
+        self.where = f"MQTT broker {o.host}:{self.port}"
         self._client: Any = None
         self._answered = threading.Event()
         self._refusal = ""
@@ -191,14 +192,17 @@ class MqttLine:
         self._client = client
         client.loop_start()
         if not self._answered.wait(self.options.timeout_s):
-            self.disconnect()
+            self._disconnect()
             raise DeviceTimeout(f"{self.where}: no answer in {self.options.timeout_s:g} s")
         if self._refusal:
-            self.disconnect()
+            self._disconnect()
             raise DeviceDenied(f"{self.where}: {self._refusal}; check username and password_file")
 
-    def disconnect(self) -> None:
-        """End the connection; may be called twice."""
+    def close(self) -> None:
+        super().close()
+        self._disconnect()
+
+    def _disconnect(self) -> None:
         client, self._client = self._client, None
         if client is not None:
             client.disconnect()
@@ -242,75 +246,57 @@ class MqttLine:
         self._answered.set()
 
 
-class MqttOutput(Output):
+class MqttOutput(_Broker):
     """Every result as a message; devices are announced with their first."""
-
-    Options = BrokerOptions
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.timeout_s = self.options.timeout_s
-        self._line = MqttLine(self.options)
         self._announced: set[str] = set()
 
     def open(self) -> None:
         self._announced = set()
-        self._line.connect(self._available_topic(self.options.device))
+        self.connect(self._available_topic(self.options.device))
 
     def close(self) -> None:
-        if self._line.connected:
-            for device in self._announced or {self.options.device}:
-                try:
-                    self._line.publish(self._available_topic(device), b"offline", retain=True)
-                except DeviceError:
-                    break  # the connection broke: the broker sends the last will
-        self._line.disconnect()
+        if self.connected:
+            with suppress(DeviceError):  # the connection broke: the broker sends the last will
+                for device in self._announced or {self.options.device}:
+                    self.publish(self._available_topic(device), b"offline", retain=True)
+        super().close()
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        self._line.require_connected()
+        self.require_connected()
         device = str(result.get("device", self.options.device))
         if device not in self._announced:
             self._announce(device)
-        self._line.publish(f"{self._base(device)}/result", encode(result), retain=False)
+        topic = f"{self.options.topic}/{node_of(device)}/result"
+        self.publish(topic, encode(result), retain=False)
 
     def _announce(self, device: str) -> None:
-        if self.options.discovery:
-            messages = discovery_messages(
-                self.options.discovery, self.options.topic, device, self.options.device
-            )
+        o = self.options
+        if o.discovery:
+            messages = discovery_messages(o.discovery, o.topic, device, o.device)
             for topic, message in messages.items():
-                self._line.publish(topic, json.dumps(message).encode(), retain=True)
-        for name in dict.fromkeys((self.options.device, device)):
-            self._line.publish(self._available_topic(name), b"online", retain=True)
-        self._announced |= {self.options.device, device}
-
-    def _base(self, device: str) -> str:
-        return f"{self.options.topic}/{node_of(device)}"
+                self.publish(topic, json.dumps(message).encode(), retain=True)
+        for name in dict.fromkeys((o.device, device)):
+            self.publish(self._available_topic(name), b"online", retain=True)
+        self._announced |= {o.device, device}
 
     def _available_topic(self, device: str) -> str:
-        return f"{self._base(device)}/available"
+        return f"{self.options.topic}/{node_of(device)}/available"
 
 
-class MqttAlert(AlertOutput):
+class MqttAlert(_Broker, AlertOutput):
     """One retained message for each change."""
 
     Options = MqttAlertOptions
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self._line = MqttLine(self.options)
-        self.where = self._line.where
-
     def reach(self) -> None:
-        self._line.connect(None)
-
-    def close(self) -> None:
-        super().close()
-        self._line.disconnect()
+        self.connect(None)
 
     def emit(self, result: Mapping[str, Any]) -> None:
         if self._opened:
-            self._line.require_connected()
+            self.require_connected()
         super().emit(result)
 
     def deliver(self, alert: Alert) -> None:
@@ -330,11 +316,11 @@ class MqttAlert(AlertOutput):
                 "device": _about(alert.device),
             }
             config = f"{self.options.discovery}/binary_sensor/{name}/config"
-            self._line.publish(config, json.dumps(document).encode(), retain=True)
-        self._line.publish(state, json.dumps(alert.document()).encode(), retain=True)
+            self.publish(config, json.dumps(document).encode(), retain=True)
+        self.publish(state, json.dumps(alert.document()).encode(), retain=True)
 
 
 def _about(device: str) -> dict[str, Any]:
-    """The device as Home Assistant groups its sensors."""
+    """Return the device as Home Assistant groups its sensors."""
     identifiers = [f"thermocald-{node_of(device)}"]
     return {"identifiers": identifiers, "name": device, "manufacturer": "thermocald"}

@@ -25,6 +25,7 @@ w1_therm.c, C. Petrich's survey of counterfeit DS18B20.
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
     from thermocald.hal import Reading
 
 POWER_ON = "the power-on value (the sensor lost its supply, or has not converted yet)"
-POWER_ON_C = 85.0
-COUNTERFEIT_POWER_ON_C = 25.0
 _FILE = re.compile(
     r"(?P<pad>[0-9a-f]{2}(?: [0-9a-f]{2}){8}) : crc=[0-9a-f]{2} (?P<verdict>YES|NO)\s*\n"
     r"[0-9a-f ]*t=(?P<milli>-?[0-9]{1,7})"
@@ -61,7 +60,7 @@ def crc8(data: bytes) -> int:
 
 
 def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
-    """(°C, scratchpad) of a `w1_slave` file; BadReading says what is wrong with it."""
+    """Return (°C, scratchpad) of a `w1_slave` file; BadReading says what is wrong with it."""
     if not content.strip():
         raise BadReading(f"{where}: empty: no answer, or one whose CRC the kernel refused")
     match = _FILE.fullmatch(content.strip())
@@ -80,24 +79,22 @@ def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
     # kernels before 5.10 do not know the further bits of GX20MH01 and MAX31850
     if milli not in (computed, int(int.from_bytes(pad[:2], "little", signed=True) * 1000 / 16)):
         raise BadReading(f"{where}: t={milli} does not follow from the bytes {match['pad']!r}")
-    return support.believable(computed / 1000.0, -55.0, 125.0, where), pad
+    return computed / 1000.0, pad
 
 
-def power_on_value(pad: bytes, family: str) -> float | None:
-    """°C that this scratchpad holds if the chip has not converted yet; None if it has."""
+def is_power_on(pad: bytes, family: str) -> bool:
+    """Return whether a scratchpad is one of a chip that has not converted yet."""
     raw = int.from_bytes(pad[:2], "little")
     if family == "3b" and pad[4] & 0x80:
         raw &= ~3
     if raw == (0x00AA if family == "10" else 0x0550):
-        return POWER_ON_C
+        return True
     counterfeit = pad[5] != 0xFF or pad[7] != 0x10
-    if family == "28" and raw == 0x0190 and counterfeit:
-        return COUNTERFEIT_POWER_ON_C
-    return None
+    return family == "28" and raw == 0x0190 and counterfeit
 
 
 def _kernel_millidegrees(pad: bytes, family: str) -> int:
-    """What w1_therm.c computes from the scratchpad, in 1/1000 °C, rounded towards zero."""
+    """Return what w1_therm.c computes from the scratchpad, in 1/1000 °C, rounded towards zero."""
     raw = int.from_bytes(pad[:2], "little", signed=True)
     if family == "10":
         return (raw >> 1) * 1000 - 250 + int(1000 * (pad[7] - pad[6]) / pad[7])
@@ -130,14 +127,14 @@ class Ds18b20Thermometer(Thermometer):
         self._seen = False
         self._open = False
         self._pending: dict[str, Future[float]] = {}
-        self._neighbours = support.Neighbours(self.clock)
+        self._believed = support.Channels(self.clock, -55.0, 125.0)
 
     def named_channels(self) -> list[str]:
         return list(self.sensors)
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
-        """Configuration stanzas of what is there, for `thermocald devices`."""
+        """List what is there as a stanza, for `thermocald devices`."""
         ids = sorted(
             path.name
             for family in FAMILIES
@@ -162,7 +159,7 @@ class Ds18b20Thermometer(Thermometer):
 
     def close(self) -> None:
         self._open = False
-        self._neighbours.clear()
+        self._believed.clear()
 
     def identity(self) -> Mapping[str, str]:
         return {"sensors": ", ".join(self.sensors.values())}
@@ -170,51 +167,50 @@ class Ds18b20Thermometer(Thermometer):
     def read(self) -> Reading:
         if not self._open:
             raise DeviceGone("1-wire: not open")
-        start = self.clock.monotonic()
-        patience_s = self.options.timeout_s * len(self.sensors)
+        deadline = self.clock.monotonic() + self.options.timeout_s * len(self.sensors)
         for channel in self.sensors:
-            self._start(channel)
-        values: dict[str, float] = {}
-        missing: dict[str, DeviceError] = {}
-        for channel, rom in self.sensors.items():
-            left = max(0.0, patience_s - (self.clock.monotonic() - start))
-            try:
-                values[channel] = self._pending[channel].result(timeout=left)
-                del self._pending[channel]
-            except DeviceError as error:
-                missing[channel] = error
-                del self._pending[channel]
-            except TimeoutError:
-                missing[channel] = DeviceTimeout(f"1-wire {rom}: no answer in {patience_s:g} s")
-        if not values:
-            raise next(iter(missing.values()))
-        about = {"missing": {k: str(v) for k, v in missing.items()}} if missing else {}
-        return support.middle_reading(self.clock, values, start, about)
+            late = self._pending.get(channel)
+            if late is None or late.done():  # one that still hangs is not read twice
+                # an answer that came after its epoch is dropped here
+                self._pending[channel] = support.in_thread(
+                    partial(self._read_one, channel), f"w1-{channel}"
+                )
+        return self._believed.reading(
+            {
+                channel: (f"1-wire {rom}", partial(self._await, channel, deadline))
+                for channel, rom in self.sensors.items()
+            }
+        )
 
-    def _start(self, channel: str) -> None:
-        """Start reading a sensor; one that still hangs from the last time is not read twice."""
-        late = self._pending.get(channel)
-        if late is not None and not late.done():
-            return
-        # an answer that came after its epoch is dropped here
-        self._pending[channel] = support.in_thread(lambda: self._read_one(channel), f"w1-{channel}")
+    def _await(self, channel: str, deadline: float) -> float:
+        """Return what a sensor's thread found, as soon as it has."""
+        task = self._pending[channel]
+        try:
+            return task.result(max(0.0, deadline - self.clock.monotonic()))
+        except TimeoutError:
+            if task.done():
+                raise
+            patience_s = self.options.timeout_s * len(self.sensors)
+            raise DeviceTimeout(
+                f"1-wire {self.sensors[channel]}: no answer in {patience_s:g} s"
+            ) from None
 
     def _read_one(self, channel: str) -> float:
         rom = self.sensors[channel]
-        problem: DeviceError = BadReading(f"1-wire {rom}: not read")
+        problem: DeviceError | None = None
         for _ in range(self.options.attempts):
             try:
-                content = (self.root / rom / "w1_slave").read_text()
+                content = (self.root / rom / "w1_slave").read_text(
+                    encoding="ascii", errors="replace"
+                )
                 value, pad = decode(content, f"1-wire {rom}", rom[:2])
-                untouched = power_on_value(pad, rom[:2]) is not None
-                idle = POWER_ON if untouched else ""
-                return self._neighbours.judge(channel, value, f"1-wire {rom}", idle)
+                idle = POWER_ON if is_power_on(pad, rom[:2]) else ""
+                return self._believed.judge(channel, value, f"1-wire {rom}", idle)
             except BadReading as error:
                 problem = error
-                continue
             except OSError as error:
                 problem = support.fault(error, f"1-wire {rom}", seen=True)
                 if isinstance(problem, DeviceGone):
                     raise DeviceGone(f"1-wire {rom}: vanished from the bus") from error
-                continue
+        assert problem is not None
         raise problem

@@ -25,8 +25,9 @@ comes from Raspberry Pi OS (`apt install python3-picamera2`; the environment nee
 `--system-site-packages`).
 
 libcamera's SensorTimestamp is on CLOCK_BOOTTIME, when the first line began to be read out: half an
-exposure later than the middle of that line's exposure. SensorTemperature is kept only where it is
-plausible: the IMX219 gives none; others give their lower limit (−20) or 0.0 until it is measured.
+exposure later than the middle of that line's exposure. SensorTemperature is stored with an epoch
+where it is plausible: the IMX219 gives none; others give their lower limit (−20) or 0.0 until it is
+measured.
 Source: libcamera control_ids_core.yaml, Picamera2 manual (Raspberry Pi Ltd), appendix C.
 """
 
@@ -92,7 +93,7 @@ class PicameraOptions(DriverOptions):
 
 
 def _current_settings(library: Any, number: int) -> dict[str, Any]:
-    """Size and lens position of a camera that nobody uses; {} otherwise."""
+    """Return the size and lens position of a camera that nobody uses; {} otherwise."""
     try:
         camera = library.Picamera2(number)
     except RuntimeError:
@@ -132,7 +133,7 @@ class Picamera2Camera(Camera):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """Cameras that libcamera lists."""
+        """List the cameras that libcamera knows."""
         library = support.library("picamera2")
         found = []
         for k, info in enumerate(library.Picamera2.global_camera_info()):
@@ -195,7 +196,7 @@ class Picamera2Camera(Camera):
         self._lock(camera)
 
     def _controls(self, focuses: bool) -> dict[str, Any]:
-        """The controls of the configuration; what is left out is locked by `_lock`."""
+        """Return the controls of the configuration; what is left out is locked by `_lock`."""
         automatic = AUTO in (self.options.exposure_s, self.options.gain)
         controls: dict[str, Any] = {
             "AeEnable": automatic,
@@ -260,19 +261,16 @@ class Picamera2Camera(Camera):
         sleep_s = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()  # since booting
         middle = metadata["SensorTimestamp"] * 1e-9 - sleep_s - exposure / 2.0
         monotonic, utc = support.on_clock(self.clock, middle)
-        kept = support.plain(dict(metadata))
-        kept["sensor_temperature_c"] = sensor_temperature(metadata)
         return Frame(
             image=plane,
             monotonic=monotonic,
             utc=utc,
             exposure=exposure,
-            metadata=kept,
             settings=frame_settings(metadata) | self._modes(metadata),
         )
 
     def _fresh(self, camera: Any, called_ns: int) -> tuple[Any, Mapping[str, Any]]:
-        """(grey plane, metadata) of the first frame whose exposure began after the call."""
+        """Return (grey plane, metadata) of the first frame that began after the call."""
         deadline = time.monotonic() + self.options.timeout_s
         while time.monotonic() < deadline and self._camera is camera:
             request = camera.capture_request()
@@ -326,15 +324,6 @@ class Picamera2Camera(Camera):
             ) from error
 
 
-def sensor_temperature(metadata: Mapping[str, Any]) -> float | None:
-    """°C of the sensor; None where it is absent or a value that means "unknown"."""
-    value = metadata.get("SensorTemperature")
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    idle = chips.idle_celsius("imx708")  # its lower and upper limit, and 0
-    return float(value) if min(idle) < value < max(idle) and value not in idle else None
-
-
 def agrees(asked: Any, got: Any, tolerance: float) -> bool:
     """Whether a value, or each of several, was reported as it was set, to a relative tolerance."""
     if isinstance(asked, tuple | list):
@@ -346,7 +335,7 @@ def agrees(asked: Any, got: Any, tolerance: float) -> bool:
 
 
 def frame_settings(metadata: Mapping[str, Any]) -> dict[str, float]:
-    """What moves the image, as the sensor reports it, under the names of the stanza."""
+    """Return what moves the image, as the sensor reports it, under the names of the stanza."""
     found = {
         name: round(float(metadata[key]) * unit, 9)
         for name, key, unit in _NUMBERS
@@ -355,4 +344,15 @@ def frame_settings(metadata: Mapping[str, Any]) -> dict[str, float]:
     gains = metadata.get("ColourGains")
     if isinstance(gains, tuple | list) and len(gains) == 2:
         found["colour_gain_red"], found["colour_gain_blue"] = map(float, gains)
+    if (celsius := sensor_temperature(metadata)) is not None:
+        found["sensor_temperature_c"] = celsius
     return found
+
+
+def sensor_temperature(metadata: Mapping[str, Any]) -> float | None:
+    """Return the sensor's °C; None where it is absent or a value that means "unknown"."""
+    value = metadata.get("SensorTemperature")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    idle = chips.idle_celsius("imx708")  # its lower and upper limit, and 0
+    return float(value) if min(idle) < value < max(idle) and value not in idle else None

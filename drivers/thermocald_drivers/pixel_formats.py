@@ -14,8 +14,6 @@ import numpy as np
 from thermocald.errors import BadReading
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     Grey = NDArray[np.uint8] | NDArray[np.uint16]
@@ -27,8 +25,10 @@ BAYER_ORDERS = {
     "GBRG": "GBRG", "GB10": "GBRG", "GB12": "GBRG", "GB16": "GBRG", "pGAA": "GBRG",
     "GRBG": "GRBG", "BA10": "GRBG", "BA12": "GRBG", "GR16": "GRBG", "pgAA": "GRBG",
 }  # fmt: skip
-_BAYER_8 = {"RGGB", "BA81", "GBRG", "GRBG"}
-_BAYER_PACKED = {"pRAA", "pBAA", "pGAA", "pgAA"}
+_ONE_BYTE = {"GREY", "NV12", "YU12", "RGGB", "BA81", "GBRG", "GRBG"}  # a pixel, in the first plane
+_TWO_PIXELS = {"YUYV": 0, "UYVY": 1}  # in four bytes: where Y is
+_PACKED = {"pRAA", "pBAA", "pGAA", "pgAA"}
+FORMATS = ("GREY", "Y10 ", "Y12 ", "Y16 ", "YUYV", "UYVY", "NV12", "YU12", *BAYER_ORDERS)
 
 
 def _plane(data: memoryview, height: int, row_bytes: int, stride: int) -> NDArray[np.uint8]:
@@ -42,22 +42,6 @@ def _plane(data: memoryview, height: int, row_bytes: int, stride: int) -> NDArra
     return rows.copy()  # the camera writes into its buffer again as soon as it is given back
 
 
-def _grey8(data: memoryview, width: int, height: int, stride: int) -> Grey:
-    return _plane(data, height, width, stride)
-
-
-def _grey16(data: memoryview, width: int, height: int, stride: int) -> Grey:
-    return _plane(data, height, 2 * width, stride).view("<u2")
-
-
-def _yuyv(data: memoryview, width: int, height: int, stride: int) -> Grey:
-    return np.ascontiguousarray(_plane(data, height, 2 * width, stride)[:, 0::2])
-
-
-def _uyvy(data: memoryview, width: int, height: int, stride: int) -> Grey:
-    return np.ascontiguousarray(_plane(data, height, 2 * width, stride)[:, 1::2])
-
-
 def unpack_10(packed: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """MIPI RAW10: four high bytes, then one byte with the four pairs of low bits."""
     high = packed.reshape(packed.shape[0], -1, 5)
@@ -66,50 +50,37 @@ def unpack_10(packed: NDArray[np.uint8]) -> NDArray[np.uint16]:
     return pixels.reshape(packed.shape[0], -1).astype(np.uint16)
 
 
-def _bayer(order: str, mosaic: Grey) -> Grey:
+def _grey(data: memoryview, fourcc: str, width: int, height: int, stride: int) -> Grey:
+    """Return the grey image in the bytes of one buffer."""
+    image: Grey
+    if fourcc in _TWO_PIXELS:
+        first = _TWO_PIXELS[fourcc]
+        return np.ascontiguousarray(_plane(data, height, 2 * width, stride)[:, first::2])
+    if fourcc in _ONE_BYTE:
+        image = _plane(data, height, width, stride)
+    elif fourcc in _PACKED:
+        image = unpack_10(_plane(data, height, width * 5 // 4, stride))
+    else:
+        image = _plane(data, height, 2 * width, stride).view("<u2")
+    if fourcc not in BAYER_ORDERS:
+        return image
     import cv2
 
-    grey = cv2.cvtColor(mosaic, getattr(cv2, f"COLOR_Bayer{order}2GRAY"))
-    return cast("Grey", grey)
-
-
-def _bayer_reader(fourcc: str) -> Callable[[memoryview, int, int, int], Grey]:
-    order = BAYER_ORDERS[fourcc]
-
-    def read(data: memoryview, width: int, height: int, stride: int) -> Grey:
-        if fourcc in _BAYER_8:
-            return _bayer(order, _grey8(data, width, height, stride))
-        if fourcc in _BAYER_PACKED:
-            return _bayer(order, unpack_10(_plane(data, height, width * 5 // 4, stride)))
-        return _bayer(order, _grey16(data, width, height, stride))
-
-    return read
-
-
-FORMATS: dict[str, Callable[[memoryview, int, int, int], Grey]] = {
-    "GREY": _grey8,
-    "Y10 ": _grey16,
-    "Y12 ": _grey16,
-    "Y16 ": _grey16,
-    "YUYV": _yuyv,
-    "UYVY": _uyvy,
-    "NV12": _grey8,
-    "YU12": _grey8,
-    **{fourcc: _bayer_reader(fourcc) for fourcc in BAYER_ORDERS},
-}
+    conversion = getattr(cv2, f"COLOR_Bayer{BAYER_ORDERS[fourcc]}2GRAY")
+    return cast("Grey", cv2.cvtColor(image, conversion))
 
 
 def jpeg_end(data: bytes) -> bool:
-    """Whether the bytes start and end as a JPEG; cameras pad the end with zeros."""
+    """Return whether the bytes start and end as a JPEG; cameras pad the end with zeros."""
     return data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
 
 
 def decode(
     data: memoryview, fourcc: str, width: int, height: int, stride: int = 0
 ) -> tuple[Grey, bytes | None]:
-    """(grey image, the JPEG as it came or None) of one buffer; copies, so the buffer is free."""
+    """Return (grey image, the JPEG as it came or None) of one buffer, which is free after it."""
     if fourcc not in ("MJPG", "JPEG"):
-        return FORMATS[fourcc](data, width, height, stride), None
+        return _grey(data, fourcc, width, height, stride), None
     import simplejpeg
 
     encoded = bytes(data)

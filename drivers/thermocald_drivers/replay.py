@@ -9,9 +9,8 @@
 DeviceFinished. An epoch that has no frame, or no temperature, is a BadReading.
 
 Frames keep their recorded time: `utc` is as recorded, `monotonic` the same on the clock's monotonic
-scale. A JPEG is delivered as recorded, in `encoded`. A recording of measurements gives frames
-without an image, whose `metadata["observations"]` hold what
-`thermocald.photogrammetry.field.planes` reads. `metadata["epoch"]` is the epoch's number.
+scale; `sequence` is the epoch's number. A JPEG is delivered as recorded, in `encoded`. A recording
+of measurements gives frames without an image, with `observations`.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ class _Replay(Device):
         epoch = next(self._epochs, None)
         if epoch is None and self.options.loop:
             times = self._recording.columns.frame_time
-            self._shift_s += float(times[-1] - times[0]) + self._recording.interval
+            self._shift_s += float(times[-1] - times[0]) + self._recording.head.interval
             self._epochs = self._recording.iter_epochs()
             epoch = next(self._epochs)
         if epoch is None:
@@ -83,7 +82,7 @@ class _Replay(Device):
         return epoch
 
     def _times(self, recorded: float) -> tuple[float, float]:
-        """(monotonic, utc) of a recorded UTC time."""
+        """Return (monotonic, utc) of a recorded UTC time."""
         utc = recorded + self._shift_s
         return utc - self.clock.utc() + self.clock.monotonic(), utc
 
@@ -94,26 +93,27 @@ class ReplayCamera(_Replay, Camera):
     def capture(self) -> Frame:
         epoch = self._next()
         monotonic, utc = self._times(epoch.frame_time)
-        metadata: dict[str, Any] = {"epoch": epoch.number}
+        observations = image = encoded = None
         if epoch.observations is not None and self._recording is not None:
             from thermocald.photogrammetry.field.testfield import observations_to_lists
 
-            field = self._recording.testfield
-            metadata["observations"] = observations_to_lists(epoch.observations, field)
-        if epoch.frame is None:
-            if epoch.observations is None:
-                raise BadReading(f"{self._path}: epoch {epoch.number} has no frame")
-            return Frame(None, monotonic, utc, sequence=epoch.number, metadata=metadata)
-        try:
-            data = epoch.frame.read_bytes()
-        except OSError as error:
-            raise BadReading(f"{epoch.frame}: cannot be read: {error.strerror}") from error
-        if data.startswith(b"\xff\xd8"):
-            return Frame(
-                None, monotonic, utc, sequence=epoch.number, encoded=data, metadata=metadata
-            )
+            observations = observations_to_lists(epoch.observations, self._recording.testfield)
+        elif epoch.frame is None:
+            raise BadReading(f"{self._path}: epoch {epoch.number} has no frame")
+        if epoch.frame is not None:
+            try:
+                encoded = epoch.frame.read_bytes()
+            except OSError as error:
+                raise BadReading(f"{epoch.frame}: cannot be read: {error.strerror}") from error
+            if not encoded.startswith(b"\xff\xd8"):
+                image, encoded = _decoded(encoded, epoch.frame), None
         return Frame(
-            _decoded(data, epoch.frame), monotonic, utc, sequence=epoch.number, metadata=metadata
+            image,
+            monotonic,
+            utc,
+            sequence=epoch.number,
+            encoded=encoded,
+            observations=observations,
         )
 
 
@@ -126,11 +126,11 @@ class ReplayThermometer(_Replay, Thermometer):
         if not values:
             raise BadReading(f"{self._path}: epoch {epoch.number} has no temperature")
         monotonic, utc = self._times(epoch.temperature_time)
-        return Reading(values, monotonic, utc, {"epoch": epoch.number})
+        return Reading(values, monotonic, utc)
 
 
 def _decoded(data: bytes, path: Path) -> Any:
-    """The grey values (H, W) of an image file; BadReading if it cannot be read."""
+    """Return the grey values (H, W) of an image file; BadReading if it cannot be read."""
     import cv2
     import numpy as np
 

@@ -27,7 +27,9 @@ Firmware prints a fixed number where its sensor does not answer: −127 and 85 (
 −46.85 (SHT), −50 (an input at 0 V), −40 and 125 (ends of a scale), all in `chips`. With `pattern`
 they are refused as **printed**, before scale and offset, rounded or cut off as the line shows them
 (`refuse_c` instead of the table's; [] accepts all), and 0, what all ones give, and with `chip` its
-further values (25.00 of an LSM6DS3) only with a recent reading within 5 K. With `instrument` the
+further values (25.00 of an LSM6DS3) only with a recent reading within 5 K; so are the ends of
+displays and transmitters (-99.9, -200, 850). A number with fewer decimals than lines before, or
+that begins or ends with its point, lost digits on its way and is refused. With `instrument` the
 instrument's own error texts are known. A loop in mA below 3.6 or above 21 is broken (NAMUR NE 43).
 
 A line that was in the queue before the reading was requested is never used: with `command` the
@@ -40,12 +42,13 @@ Source: the instruments' manuals, named with each.
 from __future__ import annotations
 
 import contextlib
-import functools
-import operator
 import re
 import termios
 import time
+from dataclasses import replace
 from decimal import Decimal
+from functools import partial, reduce
+from operator import xor
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -69,12 +72,13 @@ NO_SENSOR_STEP_K = 0.006
 LOOP_MA = (3.6, 21.0)
 CORRECTION = (0.5, 2.0)
 """A scale within these corrects a temperature; another one is the number's format."""
-ALL_ONES_C = (-0.0625, -0.0078125)
+ENDS_OF_WORDS = {32767, 32768, 65535}
+"""Digits of 16 bits at their end, wherever the decimal point stands (655.35)."""
 FULL_SCALE = {-1.0, 1023.0, 4095.0, 16383.0, 32767.0, 65535.0}
 
 
 def _instrument(pattern: str, **options: Any) -> dict[str, Any]:
-    """The options of an instrument; its own error texts say that nothing was measured."""
+    """Return the options of an instrument; its own error texts say that nothing was measured."""
     return {
         "pattern": pattern, "minimum_c": -100.0, "maximum_c": 300.0, "refuse_c": [], **options
     }  # fmt: skip
@@ -104,15 +108,10 @@ INSTRUMENTS = {
 }
 
 
-def _xor(text: bytes) -> int:
-    return functools.reduce(operator.xor, text, 0)
-
-
 CHECKSUMS: Mapping[str, Callable[[bytes], int]] = {
-    "none": len,  # not called
-    "xor": _xor,
+    "xor": lambda text: reduce(xor, text, 0),
     "sum8": lambda text: sum(text) & 0xFF,
-    "nmea": lambda text: _xor(text.strip(b"$*")),
+    "nmea": lambda text: reduce(xor, text.strip(b"$*"), 0),
 }
 # °C = factor · (number − zero)
 UNITS: Mapping[str, tuple[float, float]] = {
@@ -185,14 +184,15 @@ class SerialThermometer(Thermometer):
             raise ConfigurationError("pattern: a checksum needs a group (?P<checksum>…)")
         self._serial: Any = None
         self._seen = False
-        self._neighbours = support.Neighbours(self.clock)
+        self._believed = support.Channels(self.clock, o.minimum_c, o.maximum_c)
+        self._decimals: dict[str, tuple[int, bool, int]] = {}
         self._line = b""
         self._synchronous = False
         self._owed = True
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """Serial ports by their permanent names; what is connected cannot be known."""
+        """List the serial ports by their permanent names; what is connected cannot be known."""
         ports = support.library("serial.tools.list_ports").comports(include_links=True)
         links = [p for p in ports if "/by-id/" in p.device]
         return [
@@ -226,9 +226,10 @@ class SerialThermometer(Thermometer):
             hint = "is it plugged in, and the user in the group dialout?"
             raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
         self._seen = self._owed = True
+        self._decimals.clear()
         if not self.command:
             self._line, self._synchronous = b"", False
-        self._neighbours.clear()
+        self._believed.clear()
 
     def close(self) -> None:
         port, self._serial = self._serial, None
@@ -244,23 +245,23 @@ class SerialThermometer(Thermometer):
     def read(self) -> Reading:
         if self._serial is None:
             raise DeviceGone(f"{self.where}: not open")
-        start = self.clock.monotonic()
         try:
             if self.command:
                 self._ask()
-                start = self.clock.monotonic()
             else:
                 self._skip_queue()
-            values, ended, line = self._next_values()
+            start = self.clock.monotonic()
+            match, ended = self._next_match()
             self._owed = False
         except (OSError, termios.error) as error:  # a termios.error is no OSError
             if isinstance(error, BadReading | DeviceTimeout):
                 raise
             raise self._lost(error) from error
+        reading = self._reading(match, start)
         if self.command:
-            return support.middle_reading(self.clock, values, start, {"line": line})
+            return reading
         monotonic, utc = support.on_clock(self.clock, ended)
-        return Reading(values=values, monotonic=monotonic, utc=utc, metadata={"line": line})
+        return replace(reading, monotonic=monotonic, utc=utc)
 
     def _lost(self, error: Exception) -> Exception:
         """Pyserial reports an unplug without an errno, or with EIO."""
@@ -294,12 +295,12 @@ class SerialThermometer(Thermometer):
         self._line = tail if mark else head + tail
 
     def _match(self, line: bytes) -> re.Match[str] | None:
-        """The line against the pattern, in each encoding that it may have."""
+        """Return the line against the pattern, in each encoding that it may have."""
         matches = (self.pattern.fullmatch(text) for text in _decodings(line))
         return next((match for match in matches if match is not None), None)
 
-    def _next_values(self) -> tuple[dict[str, float], float, str]:
-        """Channels, the machine's monotonic time, and the text of the next matching line."""
+    def _next_match(self) -> tuple[re.Match[str], float]:
+        """Return the next line that matches, and the machine's monotonic time."""
         deadline = time.monotonic() + self.options.timeout_s
         skipped: list[str] = []
         problem = ""
@@ -318,7 +319,7 @@ class SerialThermometer(Thermometer):
                     continue
                 problem = self._checksum_problem(match, line)
                 if not problem:
-                    return self._values(match), time.monotonic(), match.string
+                    return match, time.monotonic()
                 skipped.append(match.string)
             if len(self._line) > LONGEST_LINE:
                 skipped.append(self._line[:40].decode("ascii", "backslashreplace"))
@@ -328,7 +329,7 @@ class SerialThermometer(Thermometer):
             self._line += _one_end(self._serial.read(max(1, self._serial.in_waiting)))
 
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
-        """The error for a time-out: what was wrong with the lines that came."""
+        """Return the error for a time-out: what was wrong with the lines that came."""
         rest = self._line.decode("ascii", "backslashreplace")
         # with a command, the next one drops the end of this line
         self._line, self._synchronous = self._line[-1:] if self.command else b"", False
@@ -356,33 +357,29 @@ class SerialThermometer(Thermometer):
             return ""
         return f"checksum {given} in {match.string!r}, computed {computed:02X}"
 
-    def _values(self, match: re.Match[str]) -> dict[str, float]:
-        """{channel: °C} of a line; a channel without a usable number is absent."""
-        values, problems = {}, []
-        for channel in self.channels:
-            if match[channel] is None:
-                continue
-            try:
-                values[channel] = self._celsius(channel, match[channel])
-            except ValueError as error:
-                problems.append(f"{self.where}, {channel}: {error}")
-            except BadReading as error:
-                problems.append(str(error))
-        if not values:
-            raise BadReading("; ".join(problems) or f"{self.where}: {match.string!r} has no value")
-        return values
+    def _reading(self, match: re.Match[str], start: float) -> Reading:
+        """Return the channels of a line; one without a usable number is absent."""
+        there = [channel for channel in self.channels if match[channel] is not None]
+        if not there:
+            raise BadReading(f"{self.where}: {match.string!r} has no value")
+        measures = {
+            channel: (f"{self.where}, {channel}", partial(self._celsius, channel, match[channel]))
+            for channel in there
+        }
+        return self._believed.reading(measures, start)
 
     def _celsius(self, channel: str, text: str) -> float:
-        """°C of a number as printed; BadReading where it means that nothing was measured."""
+        """Return the °C of a printed number; BadReading if it means that nothing was measured."""
         number = support.parse_number(text, comma=True)
         where = f"{self.where}, {channel}: {text}"
+        exponent = Decimal(text.strip().replace(",", ".")).as_tuple().exponent
+        decimals = max(0, -int(exponent))
+        self._require_whole(channel, re.split("[eE]", text.strip())[0], where)
         factor, zero = UNITS[self.options.unit]
         celsius = factor * (number * self.options.scale + self.options.offset - zero)
         if self.options.unit == "mA" and not LOOP_MA[0] <= number <= LOOP_MA[1]:
             raise BadReading(f"{where} mA is a broken loop, not within 3.6 … 21 mA (NAMUR NE 43)")
-        support.believable(celsius, self.options.minimum_c, self.options.maximum_c, where)
-        exponent = Decimal(text.strip().replace(",", ".")).as_tuple().exponent
-        decimals = max(0, -int(exponent))
+        self._believed.require_range(celsius, where)
         if any(
             self._printed(number, decimals, refused) or abs(celsius - refused) < NO_SENSOR_STEP_K
             for refused in self.options.refuse_c
@@ -392,21 +389,37 @@ class SerialThermometer(Thermometer):
                 "refuse_c: []"
             )
         idle = self._idle(number, decimals) if self.options.refuse_c else ""
-        return self._neighbours.judge(channel, celsius, where, idle)
+        return self._believed.judge(channel, celsius, where, idle)
+
+    def _require_whole(self, channel: str, mantissa: str, where: str) -> None:
+        """Raise BadReading for a number that lost digits: firmware prints as many each time.
+
+        Where trailing zeros are left out (21.5 after 21.56) two readings are given up at most.
+        """
+        whole, point, digits = mantissa.replace(",", ".").partition(".")
+        if point and not (digits and whole.strip("+-")):
+            raise BadReading(f"{where} begins or ends with its decimal point; was the line cut?")
+        most, zeros, fewer = self._decimals.get(channel, (len(digits), False, 0))
+        short = len(digits) < most
+        zeros |= len(digits) >= max(most, 2) and digits.endswith("0")
+        self._decimals[channel] = max(most, len(digits)), zeros, fewer + short
+        if short and (zeros or fewer < 2):
+            raise BadReading(f"{where} has fewer decimals than lines before; was the line cut?")
 
     def _printed(self, number: float, decimals: int, celsius: float) -> bool:
-        """Whether the number is this temperature before the offset, or before the scale."""
+        """Return whether the number is this temperature before the offset, or before the scale."""
         factor, zero = UNITS[self.options.unit]
         scales = {self.options.scale, 1.0} if self._corrects else {self.options.scale}
         return any(chips.prints(number, decimals, (celsius / factor + zero) / s) for s in scales)
 
     def _idle(self, number: float, decimals: int) -> str:
         """In words, if this is a number that a chip gives without having measured."""
-        idle = (0.0, *chips.idle_celsius(self.options.chip or ""))
+        idle = (0.0, *chips.ENDS_C, *chips.idle_celsius(self.options.chip or ""))
         if decimals >= 2:
-            idle += ALL_ONES_C
+            idle += chips.ALL_ONES_C[3::3]
         if (
             number == 0.0
+            or round(abs(number) * 10**decimals) in ENDS_OF_WORDS
             or any(self._printed(number, decimals, one) for one in idle)
             or (not self._corrects and number in FULL_SCALE)
         ):
@@ -415,7 +428,7 @@ class SerialThermometer(Thermometer):
 
 
 def _decodings(line: bytes) -> Iterator[str]:
-    """The line as text: UTF-8 if it is, Latin-1, and Latin-1 with every degree sign as °."""
+    """Yield the line as text: UTF-8 if it is, Latin-1, and Latin-1 with every degree sign as °."""
     with contextlib.suppress(UnicodeDecodeError):
         text = line.decode("utf-8")
         yield text

@@ -12,7 +12,6 @@ import time
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from thermocald.errors import (
@@ -30,6 +29,7 @@ from thermocald.hal import Reading
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from pathlib import Path
 
     from thermocald.hal import Clock
 
@@ -51,8 +51,6 @@ CLOCK_TRIES = 10
 CLOCK_SPREAD_S = 1e-4
 NEIGHBOUR_AGE_S = 60.0
 NEIGHBOUR_STEP_K = 5.0
-LARGEST = 1e15
-LOWEST_C, HIGHEST_C = -273.15, 2000.0
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)(?:[eE][-+]?[0-9]{1,2})?")
 _GONE = {errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EREMOTEIO, errno.ENOTCONN, errno.ESHUTDOWN}
 
@@ -66,26 +64,8 @@ def library(module: str, extra: str = "") -> Any:
         raise DriverMissing(f"the library {module!r} is not installed{hint} ({error})") from error
 
 
-def number(
-    name: str, value: object, low: float, high: float, unit: str = "", *, whole: bool = False
-) -> float:
-    """An option as a number within its bounds; ConfigurationError names option, value, limits."""
-    suffix = f" {unit}" if unit else ""
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
-        raise ConfigurationError(f"{name}: {value!r} is not a number{suffix and ' in' + suffix}")
-    if abs(value) > LARGEST:  # also infinity, and integers that no float can hold
-        raise ConfigurationError(f"{name}: the number is too large{suffix and ' for' + suffix}")
-    if not low <= value <= high:
-        raise ConfigurationError(
-            f"{name}: {value:g}{suffix} is not within {low:g} … {high:g}{suffix}"
-        )
-    if whole and value != int(value):
-        raise ConfigurationError(f"{name}: {value:g} is not a whole number")
-    return value
-
-
 def or_auto(low: float, high: float) -> AfterValidator:
-    """The check of an option that is a number within bounds or the word AUTO; None if left out."""
+    """Return the check of an option: a number within bounds, the word AUTO, or None."""
 
     def check(value: float | str | None) -> float | str | None:
         if isinstance(value, str) and value != AUTO:
@@ -98,12 +78,12 @@ def or_auto(low: float, high: float) -> AfterValidator:
 
 
 def absent(message: str, *, seen: bool) -> DeviceError:
-    """A missing device: gone (retried) if it was open before, otherwise not found (reported)."""
+    """Return the error of a missing device: gone if it was open before, else not found."""
     return DeviceGone(message) if seen else DeviceNotFound(message)
 
 
 def denied(message: str, *, seen: bool) -> DeviceError:
-    """A device that may not be used: permanent, unless it was open before.
+    """Return the error of a device that may not be used: permanent, unless it was open before.
 
     A device that has just been plugged in again belongs to root until udev has seen it, and other
     programs probe it; a phone is unauthorized until it has recognised the host's key.
@@ -112,7 +92,7 @@ def denied(message: str, *, seen: bool) -> DeviceError:
 
 
 def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceError:
-    """The device error that a system call's errno stands for.
+    """Return the device error that a system call's errno stands for.
 
     where: the device as the user knows it.
     seen: whether it was open before.
@@ -147,19 +127,6 @@ def reason(error: BaseException) -> str:
     return type(cause).__name__
 
 
-def plain(value: Any) -> Any:
-    """A value as JSON has it: NumPy's as numbers, tuples as lists, NaN and infinities as null."""
-    if isinstance(value, np.generic | np.ndarray):
-        value = value.tolist()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    return value if isinstance(value, str | int | bool | None) else str(value)
-
-
 def in_thread(work: Callable[[], Any], name: str) -> Future[Any]:
     """Start work in a thread of its own, which is left behind if it hangs."""
     task: Future[Any] = Future()
@@ -175,7 +142,7 @@ def in_thread(work: Callable[[], Any], name: str) -> Future[Any]:
 
 
 def on_clock(clock: Clock, monotonic: float) -> tuple[float, float]:
-    """A time of the machine's CLOCK_MONOTONIC (s) on the clock's (monotonic, utc) scales.
+    """Return a time of the machine's CLOCK_MONOTONIC (s) on the clock's (monotonic, utc) scales.
 
     The three clocks are read one after another; a thread that is preempted in between would be
     off by that pause (76 ms on a busy machine), so the closest of several attempts counts.
@@ -196,40 +163,22 @@ def middle_reading(
     clock: Clock,
     values: Mapping[str, float],
     start: float,
-    metadata: Mapping[str, Any] | None = None,
+    missing: Mapping[str, str] | None = None,
 ) -> Reading:
-    """A reading timed half-way between `start` (clock's monotonic, s) and now."""
+    """Return a reading timed half-way between `start` (clock's monotonic, s) and now."""
     now = time.monotonic()
     half = (clock.monotonic() - start) / 2.0
     monotonic, utc = on_clock(clock, now)
-    return Reading(
-        values=dict(values),
-        monotonic=monotonic - half,
-        utc=utc - half,
-        metadata=dict(metadata or {}),
-    )
+    return Reading(dict(values), monotonic - half, utc - half, missing or {})
 
 
-def partial_reading(
-    clock: Clock, values: Mapping[str, float], missing: Mapping[str, str], start: float
-) -> Reading:
-    """A reading of the channels that gave a value; BadReading with all reasons if none did."""
-    if not values:
-        raise BadReading("; ".join(missing.values()))
-    return middle_reading(clock, values, start, {"missing": dict(missing)} if missing else {})
-
-
-def believable(value_c: float, low_c: float, high_c: float, where: str) -> float:
-    """The temperature if it is finite and within the sensor's range; otherwise BadReading."""
-    if not math.isfinite(value_c) or not low_c <= value_c <= high_c:
-        raise BadReading(
-            f"{where}: {value_c:g} °C is outside the sensor's range {low_c:g} … {high_c:g} °C"
-        )
-    return value_c
+def read_line(path: Path) -> str:
+    """Return what a file of the kernel says, whatever the locale; bytes that are no UTF-8 as �."""
+    return path.read_text(encoding="utf-8", errors="replace").strip()
 
 
 def parse_number(text: str, *, comma: bool = False) -> float:
-    """The number in a text from a device: ASCII digits, one decimal point, nothing else.
+    """Return the number in a text from a device: ASCII digits, one decimal point, nothing else.
 
     float() also takes `2_5.0`, `nan`, `infinity` and digits of any script, which a damaged line
     may hold. comma: whether a decimal comma is accepted. Raises ValueError.
@@ -240,30 +189,44 @@ def parse_number(text: str, *, comma: bool = False) -> float:
     return float(plain.replace(",", "."))
 
 
-class Neighbours:
-    """The last reading of each channel that was certainly measured.
+class Channels:
+    """The channels of one thermometer: which temperatures are believed, and the reading of all.
 
-    What a chip gives without having measured (see `chips`) is a temperature too. It is accepted
-    only where a reading less than NEIGHBOUR_AGE_S old and within NEIGHBOUR_STEP_K makes it likely;
-    it never supports itself.
+    low_c, high_c: the sensor's range. What a chip gives without having measured (see `chips`) is a
+    temperature too. It is accepted only where a reading less than NEIGHBOUR_AGE_S old and within
+    NEIGHBOUR_STEP_K makes it likely; it never supports itself.
     """
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, low_c: float, high_c: float) -> None:
         self._clock = clock
+        self._low_c, self._high_c = low_c, high_c
         self._last: dict[str, tuple[float, float]] = {}
 
     def clear(self) -> None:
-        """Forget everything: the device was closed."""
+        """Forget the last readings: the device was closed."""
         self._last.clear()
 
     def support(self, channel: str, value_c: float) -> bool:
-        """Whether a recent reading of the channel lay near enough."""
+        """Return whether a recent reading of the channel lay near enough."""
         at, last_c = self._last.get(channel, (-math.inf, math.nan))
         recent = self._clock.monotonic() - at <= NEIGHBOUR_AGE_S
         return recent and abs(last_c - value_c) <= NEIGHBOUR_STEP_K
 
+    def require_range(self, value_c: float, where: str) -> None:
+        """Raise BadReading for what is not a number within the sensor's range."""
+        if not math.isfinite(value_c) or not self._low_c <= value_c <= self._high_c:
+            raise BadReading(
+                f"{where}: {value_c:g} °C is outside the sensor's range {self._low_c:g} … "
+                f"{self._high_c:g} °C"
+            )
+
     def judge(self, channel: str, value_c: float, where: str, idle: str = "") -> float:
-        """The temperature; BadReading if it is `idle`, in words, and no neighbour supports it."""
+        """Return a temperature that is believed; raise BadReading for others.
+
+        Those are what lies outside the range, and what is `idle`, in words, without a neighbour
+        that supports it.
+        """
+        self.require_range(value_c, where)
         if not idle:
             self._last[channel] = (self._clock.monotonic(), value_c)
         elif not self.support(channel, value_c):
@@ -271,3 +234,29 @@ class Neighbours:
                 f"{where}: {value_c:g} °C is {idle}, and no recent reading was near it"
             )
         return value_c
+
+    def reading(
+        self, measures: Mapping[str, tuple[str, Callable[[], float]]], start: float | None = None
+    ) -> Reading:
+        """Measure every channel; {channel: (where, what returns its °C)}.
+
+        Timed half-way between `start` (s, by default the call) and the end. Where no channel gives
+        a value their errors are raised as one.
+        """
+        start = self._clock.monotonic() if start is None else start
+        values: dict[str, float] = {}
+        missing: dict[str, TransientDeviceError] = {}
+        for channel, (where, measure) in measures.items():
+            try:
+                values[channel] = measure()
+            except ValueError as error:
+                missing[channel] = BadReading(f"{where}: not a number ({error})")
+            except OSError as error:
+                problem = fault(error, where, seen=True)
+                if not isinstance(problem, TransientDeviceError):
+                    raise problem from error
+                missing[channel] = problem
+        if not values:
+            first = next(iter(missing.values()))
+            raise type(first)("; ".join(map(str, missing.values()))) from first
+        return middle_reading(self._clock, values, start, {k: str(e) for k, e in missing.items()})

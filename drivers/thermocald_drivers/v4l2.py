@@ -26,11 +26,15 @@ epoch; a camera that does not obey, or that falls back to automatic, is an error
 
 The frame's time is that of its buffer, moved to the middle of the exposure; frames that were
 exposed before `capture` was called are discarded.
+Source: Linux Documentation/userspace-api/media/v4l/ext-ctrls-camera.rst, control.rst.
 """
 
 from __future__ import annotations
 
+import errno
 import time
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -48,22 +52,50 @@ from thermocald.errors import (
 )
 from thermocald.hal import Camera, DriverOptions, Found, Frame
 from thermocald_drivers import pixel_formats, support
-from thermocald_drivers.v4l2_controls import LOCKS, CameraControls
-from thermocald_drivers.v4l2_stream import (
-    BUFFERS,
-    OLDEST_S,
-    Grab,
-    LinuxpyStream,
-    OpenCvStream,
-    Stream,
-    current_settings,
-)
+from thermocald_drivers.support import AUTO
+from thermocald_drivers.v4l2_stream import BUFFERS, OLDEST_S, LinuxpyStream, OpenCvStream
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from thermocald_drivers.v4l2_stream import Control, Grab, Stream
+
+    Wanted = float | str | None
+
 FUTURE_S = 1.0
 """A time stamp may be this far ahead (vivid: up to a frame); beyond, it is another clock's."""
+EXPOSURE = 0x009A0902
+EXPOSURE_UNIT_S = 1e-4
+_UNREADABLE = {errno.EINVAL, errno.EACCES, errno.ENOTTY}
+
+
+@dataclass(frozen=True)
+class Lock:
+    """One setting: its option, the automatic mode and its values, the control and its unit."""
+
+    option: str
+    automatic: int
+    manual: int
+    automatic_values: tuple[int, ...]
+    control: int
+    unit: float = 1.0
+
+    @property
+    def flag(self) -> str:
+        """The name of the automatic mode among a frame's settings."""
+        return f"{self.option.rsplit('_', 1)[0] if '_' in self.option else self.option}_auto"
+
+
+LOCKS = (
+    # V4L2_EXPOSURE_MANUAL is 1; aperture priority, automatic, shutter priority are 3, 0, 2
+    Lock("exposure_s", 0x009A0901, 1, (3, 0, 2), EXPOSURE, EXPOSURE_UNIT_S),
+    Lock("gain", 0x00980912, 0, (1,), 0x00980913),
+    Lock("focus", 0x009A090C, 0, (1,), 0x009A090A),
+    Lock("white_balance_k", 0x0098090C, 0, (1,), 0x0098091A),
+)
+HELD = (0x009A0908, 0x009A0909, 0x009A090D, 0x009A0911)  # pan, tilt, zoom, iris
+OFF = (0x009A0916,)  # image stabilisation
+MODES = {lock.automatic: lock for lock in LOCKS}
 
 
 Whole = Annotated[int | str | None, support.or_auto(0, 1e6)]
@@ -114,12 +146,12 @@ class V4l2Camera(Camera):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[Found]:
-        """Capture nodes by their permanent names (by-id, by-path), else /dev/videoN."""
+        """List capture nodes by their permanent names (by-id, by-path), else /dev/videoN."""
         found = []
         for node in sorted(Path(sysfs).glob("class/video4linux/video*")):
             try:
-                name = (node / "name").read_text().strip()
-                if (node / "index").read_text().strip() != "0":
+                name = support.read_line(node / "name")
+                if support.read_line(node / "index") != "0":
                     continue  # a UVC camera's second node carries metadata, not frames
             except OSError:
                 continue
@@ -141,7 +173,11 @@ class V4l2Camera(Camera):
         path = self._path()
         try:
             self._stream = self._open_stream(path)
-            self._check_card(path)
+            size = self.options.width, self.options.height
+            self._stream.set_format(self.options.pixel_format.ljust(4), *size)
+            card = self._stream.card
+            if self.options.card is not None and self.options.card not in card:
+                raise WrongDevice(f"{path}: this is {card!r}, not {self.options.card!r}")
             self._controls.apply(self._stream, strict=self.options.strict)
             self._stream.start()
         except DeviceError as error:
@@ -177,11 +213,11 @@ class V4l2Camera(Camera):
         called = time.monotonic()
         deadline = called + self.options.timeout_s
         try:
-            exposure = self._exposure(self._controls.values(self._stream))
-            grab, stamp, dropped = self._fresh(self._stream, called, deadline, exposure)
+            settings = self._controls.settings(self._controls.values(self._stream))
+            # where the camera is in manual exposure and reports it
+            exposure = None if settings.get("exposure_auto") else settings.get("exposure_s")
+            grab, stamp = self._fresh(self._stream, called, deadline, exposure or 0.0)
             values = self._controls.values(self._stream)
-        except DeviceError:
-            raise
         except OSError as error:
             raise support.fault(error, self.where, seen=True) from error
         disobeyed = self._controls.deviations(values)
@@ -189,13 +225,6 @@ class V4l2Camera(Camera):
             raise BadReading(f"{self.where}: {'; '.join(disobeyed)}")
         middle = stamp + (0.5 if grab.start_of_exposure else -0.5) * (exposure or 0.0)
         monotonic, utc = support.on_clock(self.clock, middle)
-        metadata: dict[str, Any] = {
-            "timestamp": "buffer" if stamp == grab.stamp else "arrival",
-            "stale_frames_dropped": dropped,
-            "controls": self._controls.configured(values),
-        }
-        if disobeyed:
-            metadata["disobeyed"] = disobeyed
         return Frame(
             image=grab.image,
             encoded=grab.encoded,
@@ -203,14 +232,13 @@ class V4l2Camera(Camera):
             utc=utc,
             exposure=exposure,
             sequence=grab.sequence,
-            metadata=metadata,
             settings=self._controls.settings(values),
         )
 
     def _fresh(
-        self, stream: Stream, called: float, deadline: float, exposure: float | None
-    ) -> tuple[Grab, float, int]:
-        """(frame, its time stamp in s, stale frames dropped): exposed after the call."""
+        self, stream: Stream, called: float, deadline: float, exposure_s: float
+    ) -> tuple[Grab, float]:
+        """Return a frame that was exposed after the call, and its time stamp in s."""
         dropped = 0
         broken: BadReading | None = None
         arrived = 0.0
@@ -225,7 +253,7 @@ class V4l2Camera(Camera):
                 )
             if stamp is None or stamp > arrived:
                 return dropped >= BUFFERS  # no information: take the first that cannot have waited
-            return stamp - (0.0 if start_of_exposure else exposure or 0.0) >= called
+            return stamp - (0.0 if start_of_exposure else exposure_s) >= called
 
         while True:
             try:
@@ -244,11 +272,11 @@ class V4l2Camera(Camera):
                 ) from error
             if grab is not None:
                 stamp = arrived if grab.stamp is None else grab.stamp
-                return grab, min(stamp, arrived), dropped
+                return grab, min(stamp, arrived)
             dropped += 1
 
     def _path(self) -> str:
-        """The node; a serial number is looked up among udev's names."""
+        """Return the node; a serial number is looked up among udev's names."""
         if self.options.device is not None:
             return str(self.options.device)
         links = sorted(
@@ -265,28 +293,183 @@ class V4l2Camera(Camera):
         return str(links[0])
 
     def _open_stream(self, path: str) -> Stream:
-        arguments = (
-            path,
-            self.options.pixel_format.ljust(4),
-            self.options.width,
-            self.options.height,
-        )
-        if self.options.backend == "opencv":
-            return OpenCvStream(*arguments)
+        if self.options.backend != "opencv":
+            try:
+                return LinuxpyStream(path)
+            except DriverMissing:
+                if self.options.backend == "linuxpy":
+                    raise
+        return OpenCvStream(path)
+
+
+class CameraControls:
+    """The settings of one camera, kept while it is closed and opened again.
+
+    wanted: {option of LOCKS: value, AUTO, or None to lock what is there}; named: {control by its
+    name: value}. Raises WrongDevice where the camera does not have or hold them.
+    """
+
+    def __init__(self, where: str, wanted: Mapping[str, Wanted], named: Mapping[str, int]) -> None:
+        self._where = where
+        self._wanted = wanted
+        self._named = named
+        self._held: dict[int, int] = {}
+        self._asked: dict[int, int] = {}
+        self._automatic: list[Lock] = []
+        self._available: dict[int, Control] = {}
+
+    def warnings(self) -> list[str]:
+        """Return a sentence for each automatic mode that the stanza asks for."""
+        return [
+            f"{lock.option}: auto lets the camera change it; every change is another camera"
+            for lock in LOCKS
+            if self._wanted.get(lock.option) == AUTO
+        ]
+
+    def apply(self, stream: Stream, *, strict: bool) -> None:
+        """Set all, automatic modes first; strict: raise where it does not read back."""
+        self._available = stream.controls()
+        self._asked, self._automatic = {}, []
+        locked = self._collect(stream)
+        for control, value in self._asked.items():
+            self._set(stream, control, value, locked)
+        for control in locked & set(self._asked):
+            if control not in MODES:
+                # the camera rounds: what it took is what is locked
+                self._asked[control] = self._held[control] = stream.get(control)
+        problems = self.deviations(self.values(stream))
+        if problems and strict:
+            raise WrongDevice(f"{self._where}: {'; '.join(problems)}")
+
+    def _collect(self, stream: Stream) -> set[int]:
+        """Fill `_asked` and `_automatic`; the controls that nobody configured are returned."""
+        locked = set()
+        for lock in LOCKS:
+            wanted = self._wanted.get(lock.option)
+            if wanted == AUTO:
+                self._ask_automatic(stream, lock)
+                continue
+            if wanted is not None and lock.control not in self._available:
+                raise WrongDevice(
+                    f"{self._where}: {lock.option}: it has no control 0x{lock.control:08x} to set"
+                )
+            if wanted is None:
+                locked |= {lock.automatic, lock.control}
+                value = self._standing(stream, lock.control)
+            else:
+                value = round(float(wanted) / lock.unit)
+            if lock.automatic in self._available:
+                self._asked[lock.automatic] = lock.manual
+            if value is not None:
+                self._asked[lock.control] = value
+        for control in HELD:
+            if (value := self._standing(stream, control)) is not None:
+                self._asked[control] = value
+                locked.add(control)
+        self._asked |= {control: 0 for control in OFF if control in self._available}
+        by_name = {control.name: number for number, control in self._available.items()}
+        for name, number in self._named.items():
+            if name not in by_name:
+                known = ", ".join(sorted(by_name)) or "none"
+                raise WrongDevice(f"{self._where}: there is no control {name!r}; it has {known}")
+            self._asked[by_name[name]] = number
+            locked.discard(by_name[name])
+        return locked
+
+    def _ask_automatic(self, stream: Stream, lock: Lock) -> None:
+        if lock.automatic not in self._available:
+            raise WrongDevice(f"{self._where}: {lock.option}: auto, but it has no automatic mode")
+        self._automatic.append(lock)
+        if stream.get(lock.automatic) != lock.manual:
+            return
+        for value in lock.automatic_values:
+            try:
+                stream.set(lock.automatic, value)
+            except OSError:
+                continue
+            return
+        raise WrongDevice(f"{self._where}: {lock.option}: auto is not accepted")
+
+    def _standing(self, stream: Stream, control: int) -> int | None:
+        """The value to hold: that of before a re-plug, else the current one; None without it."""
+        if control not in self._available:
+            return None
+        if control not in self._held:
+            try:
+                value = stream.get(control)
+            except OSError as error:
+                if error.errno not in _UNREADABLE:
+                    raise
+                return None
+            self._held[control] = _bounded(value, self._available[control])
+        return self._held[control]
+
+    def _set(self, stream: Stream, control: int, value: int, locked: set[int]) -> None:
         try:
-            support.library("linuxpy.video.device", "v4l2")
-        except DriverMissing:
-            if self.options.backend == "linuxpy":
-                raise
-            return OpenCvStream(*arguments)
-        return LinuxpyStream(*arguments)
+            if control in locked and stream.get(control) == value:
+                return  # some cameras refuse a value that they already have
+            stream.set(control, value)
+        except OSError as error:
+            if control in locked and control not in MODES:
+                return  # it cannot be set, so it stays; every frame is checked
+            remedy = self._remedy(control) or f"it takes {self._limits(control)}"
+            raise WrongDevice(
+                f"{self._where}: does not take {self._name(control)} = {value} "
+                f"({error.strerror}); {remedy}"
+            ) from error
 
-    def _check_card(self, path: str) -> None:
-        card = self._stream.card if self._stream else ""
-        if self.options.card is not None and self.options.card not in card:
-            raise WrongDevice(f"{path}: this is {card!r}, not {self.options.card!r}")
+    def values(self, stream: Stream) -> dict[int, int]:
+        """Return the current values of everything that is locked, and of what is automatic."""
+        automatic = [c for lock in self._automatic for c in (lock.automatic, lock.control)]
+        watched = [*self._asked, *(c for c in automatic if c in self._available)]
+        return {control: stream.get(control) for control in dict.fromkeys(watched)}
 
-    def _exposure(self, values: Mapping[int, int]) -> float | None:
-        """s, where the camera is in manual exposure and reports it."""
-        settings = self._controls.settings(values)
-        return None if settings.get("exposure_auto") else settings.get("exposure_s")
+    def deviations(self, values: Mapping[int, int]) -> list[str]:
+        """Return a sentence for each control that does not read back as it was set."""
+        return [
+            f"{self._name(control)} was set to {asked} and is {values[control]} "
+            f"({self._remedy(control) or self._limits(control)})"
+            for control, asked in self._asked.items()
+            if values[control] != asked
+        ]
+
+    def settings(self, values: Mapping[int, int]) -> dict[str, float]:
+        """Return the values under the options' names and units; automatic modes as 1.0 and 0.0."""
+        found: dict[str, float] = {}
+        named = set()
+        for lock in LOCKS:
+            named |= {lock.automatic, lock.control}
+            if lock.automatic in values:
+                found[lock.flag] = float(values[lock.automatic] != lock.manual)
+            if lock.control in values:
+                found[lock.option] = round(values[lock.control] * lock.unit, 9)
+        others = {c: v for c, v in values.items() if c not in named}
+        return found | {self._name(control): float(value) for control, value in others.items()}
+
+    def _name(self, control: int) -> str:
+        return self._available[control].name
+
+    def _limits(self, control: int) -> str:
+        c = self._available[control]
+        return f"{c.minimum} … {c.maximum} in steps of {c.step}"
+
+    def _remedy(self, control: int) -> str:
+        lock = MODES.get(control)
+        return f"to let it change, write {lock.option}: auto" if lock else ""
+
+
+def current_settings(path: str) -> dict[str, float]:
+    """Return {option: value} of a camera as it is now, {} if it cannot be opened; set nothing."""
+    found: dict[str, float] = {}
+    with suppress(OSError, DriverMissing), closing(LinuxpyStream(path)) as stream:
+        available = stream.controls()
+        for lock in LOCKS:
+            if lock.control in available:
+                with suppress(OSError):
+                    value = _bounded(stream.get(lock.control), available[lock.control])
+                    found[lock.option] = round(value * lock.unit, 9) if lock.unit != 1 else value
+    return found
+
+
+def _bounded(value: int, limits: Control) -> int:
+    return min(max(value, limits.minimum), limits.maximum)

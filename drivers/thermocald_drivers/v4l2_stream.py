@@ -1,7 +1,9 @@
 """One V4L2 capture stream: buffers with the kernel's time stamps, with a time-out on every wait.
 
 Two implementations of one contract: linuxpy's ioctls, and OpenCV where linuxpy is not installed.
-linuxpy's own frame iterator waits for ever after an unplug, hence the poll here.
+`grab` returns the next buffer, or None if `accept(stamp, start_of_exposure)` is false (an old frame
+is not decoded), and raises BadReading for a damaged one. linuxpy's own frame iterator waits for
+ever after an unplug, hence the poll here.
 """
 
 from __future__ import annotations
@@ -12,11 +14,10 @@ import os
 import select
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import BadReading, DeviceGone, DeviceTimeout, DriverMissing, WrongDevice
+from thermocald.errors import BadReading, DeviceGone, DeviceTimeout, WrongDevice
 from thermocald_drivers import pixel_formats, support
-from thermocald_drivers.v4l2_controls import Control, standing_values
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -56,44 +57,31 @@ class Grab:
     sequence: int | None
 
 
-class Stream(Protocol):
-    """What the camera needs of a stream.
+@dataclass(frozen=True)
+class Control:
+    """A setting of the camera; `name` is its name in lower case with underscores."""
 
-    `grab` returns the next buffer, or None if `accept(stamp, start_of_exposure)` is false (an old
-    frame is not decoded); it raises BadReading for a damaged buffer.
-    """
-
-    card: str
-
-    def controls(self) -> dict[int, Control]:
-        """By V4L2 identity."""
-
-    def get(self, control: int) -> int: ...
-    def set(self, control: int, value: int) -> None: ...
-    def start(self) -> None: ...
-    def grab(self, deadline: float, accept: Accept) -> Grab | None: ...
-    def close(self) -> None: ...
+    name: str
+    minimum: int
+    maximum: int
+    step: int
 
 
 class LinuxpyStream:
-    """Memory-mapped capture through linuxpy's ioctl wrappers."""
+    """Memory-mapped capture through linuxpy's ioctl wrappers; open, with its format still unset."""
 
-    def __init__(self, path: str, fourcc: str, width: int, height: int) -> None:
-        self._path, self._fourcc = path, fourcc
+    def __init__(self, path: str) -> None:
+        self._path = path
         self._video = support.library("linuxpy.video.device", "v4l2")
         logging.getLogger("linuxpy").setLevel(logging.WARNING)  # it logs each open and close
         self._device = self._video.Device(path)
         self._capture: Any = None
-        self._size, self._stride = (width, height), 0
         self._device.open()
-        try:
-            self._set_format(width, height)
-        except OSError:
-            self._device.close()
-            raise
+        self.card = ""
 
-    def _set_format(self, width: int, height: int) -> None:
-        path, fourcc = self._path, self._fourcc
+    def set_format(self, fourcc: str, width: int, height: int) -> None:
+        """Ask for a format; WrongDevice if the camera gives another."""
+        path, self._fourcc, self._size = self._path, fourcc, (width, height)
         self.card = self._device.info.card
         capabilities = self._device.info.device_capabilities
         if self._video.Capability.VIDEO_CAPTURE not in capabilities:
@@ -112,7 +100,11 @@ class LinuxpyStream:
         self._stride = int(pixels.bytesperline)
 
     def controls(self) -> dict[int, Control]:
-        return _controls(self._video, self._device)
+        """Return the camera's controls by their V4L2 numbers."""
+        return {
+            c.id: Control(plain_name(c.name.decode()), c.minimum, c.maximum, c.step)
+            for c in self._video.iter_read_controls(self._device)
+        }
 
     def get(self, control: int) -> int:
         return int(self._video.get_control(self._device, control))
@@ -174,9 +166,11 @@ class LinuxpyStream:
 class OpenCvStream:
     """OpenCV's V4L2 back end; a grab that blocks (10 s) is left behind in its own thread."""
 
-    def __init__(self, path: str, fourcc: str, width: int, height: int) -> None:
+    card = "unknown: OpenCV does not report it"
+
+    def __init__(self, path: str) -> None:
         self._cv2 = cv2 = support.library("cv2")
-        self._path, self._fourcc, self._size = path, fourcc, (width, height)
+        self._path = path
         self._pending: Future[Grab] | None = None
         if not os.access(path, os.F_OK):
             raise FileNotFoundError(errno.ENOENT, "No such file or directory", path)
@@ -185,7 +179,10 @@ class OpenCvStream:
         self._capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
         if not self._capture.isOpened():
             raise DeviceGone(f"{path}: OpenCV cannot open it (busy, or no capture device)")
-        self.card = "unknown: OpenCV does not report it"
+
+    def set_format(self, fourcc: str, width: int, height: int) -> None:
+        """Ask for a format; WrongDevice if the camera gives another size."""
+        cv2, self._fourcc, self._size = self._cv2, fourcc, (width, height)
         # OpenCV resets a device to 640×480 on open; order matters: format, then size
         self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*fourcc))
         self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
@@ -197,14 +194,13 @@ class OpenCvStream:
             int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
         )
         if got != (width, height):
-            self._capture.release()
             raise WrongDevice(
-                f"{path}: asked for {width}×{height}, the camera gives {got[0]}×{got[1]}"
+                f"{self._path}: asked for {width}×{height}, the camera gives {got[0]}×{got[1]}"
             )
 
     def controls(self) -> dict[int, Control]:
         return {
-            number: Control(number, name.removeprefix("CAP_PROP_").lower(), -(2**31), 2**31 - 1, 1)
+            number: Control(name.removeprefix("CAP_PROP_").lower(), -(2**31), 2**31 - 1, 1)
             for number, name in OPENCV_PROPERTIES.items()
             if self._capture.get(getattr(self._cv2, name)) != -1
         }
@@ -247,26 +243,9 @@ class OpenCvStream:
         self._capture.release()
 
 
-def _controls(video: Any, device: Any) -> dict[int, Control]:
-    return {
-        c.id: Control(c.id, _plain_name(c.name.decode()), c.minimum, c.maximum, c.step)
-        for c in video.iter_read_controls(device)
-    }
+Stream = LinuxpyStream | OpenCvStream
 
 
-def current_settings(path: str) -> dict[str, float]:
-    """{option: value} of a camera as it is now, {} if it cannot be opened; sets nothing."""
-    try:
-        video = support.library("linuxpy.video.device", "v4l2")
-        logging.getLogger("linuxpy").setLevel(logging.WARNING)
-        with video.Device(path) as device:
-            return standing_values(
-                _controls(video, device), lambda number: int(video.get_control(device, number))
-            )
-    except (OSError, DriverMissing):
-        return {}
-
-
-def _plain_name(name: str) -> str:
-    """`Exposure Time, Absolute` as v4l2-ctl writes it: exposure_time_absolute."""
+def plain_name(name: str) -> str:
+    """Return `Exposure Time, Absolute` as v4l2-ctl writes it: exposure_time_absolute."""
     return "_".join("".join(c if c.isalnum() else " " for c in name.lower()).split())

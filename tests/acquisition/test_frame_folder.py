@@ -65,9 +65,10 @@ def test_retention_by_age_and_by_size_takes_the_oldest_and_says_so(folder_of):
     deleted = folder.enforce(now - 1.0)
     left = sorted(p.stem for p in folder.root.rglob("*.jpg"))
     assert left == ["0000005", "0000006"]
-    assert [d.frames for d in deleted] == [1, 3]
-    assert "older than 10 days" in deleted[0].text
-    assert "more than 2.5e-06 GB" in deleted[1].text
+    assert deleted == [
+        "1 frames (0.0 MB) were deleted: older than 10 days",
+        "3 frames (0.0 MB) were deleted: more than 2.5e-06 GB",
+    ]
     assert folder.enforce(now - 1.0) == []
 
 
@@ -91,7 +92,7 @@ def test_without_a_trusted_clock_nothing_is_deleted_for_its_age(folder_of):
     path = folder.root / folder.keep("cam", "M1", 1, frame())
     os.utime(path, (1.75e9, 1.75e9))
     assert folder.enforce(None) == []
-    assert [d.frames for d in folder.enforce(1.76e9)] == [1]
+    assert len(folder.enforce(1.76e9)) == 1
 
 
 def test_frames_taken_before_the_clock_was_set_are_as_old_as_they_are(folder_of):
@@ -107,7 +108,7 @@ def test_frames_taken_before_the_clock_was_set_are_as_old_as_they_are(folder_of)
     os.utime(older, (now - wrong - 7200.0,) * 2)  # of the run before
     folder.restamp(wrong)
     assert [abs(p.stat().st_mtime - (now - 10.0)) < 5.0 for p in paths] == [True, True]
-    assert [d.frames for d in folder.enforce(now)] == [1]
+    assert folder.enforce(now)[0].startswith("1 frames ")
     assert not older.exists()
 
 
@@ -136,7 +137,7 @@ def test_photographs_of_somebody_else_are_never_deleted(folder_of, name):
     ours = folder.root / folder.keep("cam", "M1", 7, frame(b"\xff\xd8" + bytes(998)))
     cut_off = ours.with_name("0000008.jpg.partial")
     cut_off.write_bytes(bytes(9))
-    assert sum(d.frames for d in folder.enforce(time.time())) == 2
+    assert len(folder.enforce(time.time())) == 1
     assert path.exists()
     assert not ours.exists()
     assert not cut_off.exists()

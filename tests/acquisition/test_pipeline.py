@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.acquisition.pipeline import Pipeline, Readings
+from thermocald.acquisition.pipeline import Pipeline
+from thermocald.acquisition.thermometers import Thermometers
 from thermocald.epoch import Epoch
 from thermocald.hal import Frame, SystemClock
 from thermocald.photogrammetry.epoch.adjustment import failed
@@ -59,9 +61,9 @@ class ListKeeper:
 @pytest.fixture
 def pipeline():
     keeper, calibrator = ListKeeper(), SlowCalibrator()
-    made = Pipeline(
-        "cam", calibrator, Readings({}), (), keeper, SystemClock(), depth=3, patience_s=0.0
-    )
+    clock = SystemClock()
+    none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), clock)
+    made = Pipeline("cam", calibrator, none, (), keeper, clock, depth=3, patience_s=0.0)
     made.start()
     yield made, keeper, calibrator
     calibrator.gate.set()

@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from typer.testing import CliRunner
 
 from tests.blind.case import SINGLE, Case
 from tests.blind.generator import generate, write
+from tests.commands import succeed
 from thermocald.analysis.thermal.prediction_test import predicted_error
-from thermocald.cli import application
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import read_model
 from thermocald.store.recording.reader import read_recording
@@ -99,7 +98,4 @@ def _with_true_noise(model: ThermalModel, truth: dict) -> ThermalModel:
 
 
 def _run(*arguments: object) -> str:
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
-    if result.exit_code != 0:
-        raise RuntimeError(f"{' '.join(map(str, arguments))}: {result.exception}")
-    return result.stdout
+    return succeed(*arguments).stdout

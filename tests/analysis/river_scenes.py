@@ -22,6 +22,7 @@ from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.gauge import GaugeCalibrator
 from thermocald.analysis.thermal.places import Places, measure_places
 from thermocald.analysis.thermal.scene import follow_scene
+from thermocald.analysis.thermal.timed_rows import RowBlock
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.epoch.measuring import Plane, place_on
 from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -278,10 +279,9 @@ def _measured(river: River, thermal, first, uv: np.ndarray, k: int) -> Places:
     observed = np.column_stack([uv, np.full(uv.shape, LINE_PX)])
     when = river.moments[int(7200 / STEP_S)]
     times = np.full(len(uv), river.moments[k])
-    names = [str(i) for i in range(len(uv))]
-    return measure_places(
-        thermal, river.log, control, when, river.plane, names, times, observed, NOISE_K
-    )
+    lines = list(range(len(uv)))
+    rows = RowBlock([], lines, [{} for _ in uv], times, observed, [])
+    return measure_places(thermal, river.log, control, when, river.plane, [rows])
 
 
 def _drift(river: River, thermal, first, begin: int, last: int) -> tuple[float, float]:

@@ -127,7 +127,7 @@ def test_sixteen_bits_become_a_jpeg(thermal):
 @pytest.mark.parametrize(
     ("encoded", "words"),
     [(png(np.zeros((60, 80), np.uint8)), "80×60 px, the model's camera 820×616"),
-     (b"\xff\xd8 no image", "cannot be decoded")],
+     (b"\xff\xd8 no image", "the JPEG is cut off")],
 )  # fmt: skip
 def test_what_cannot_be_corrected_is_said(thermal, encoded, words):
     with pytest.raises(ImageError, match=words):

@@ -10,13 +10,14 @@ import pytest
 import thermocald as tc
 from benchmarks.adjustment import EXTERIOR, INTERIOR
 from benchmarks.long_recording import write_long_recording
+from tests.blocks import InBlocks
 from thermocald.analysis.series import adjusted, recorded
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.photogrammetry.series.blocks import GridBlocks, gathered
 from thermocald.photogrammetry.series.long_series import adjust_long_series
+from thermocald.photogrammetry.series.normals import gathered
 from thermocald.photogrammetry.series.result import SeriesSettings
-from thermocald.series import RecordedSeries
+from thermocald.series import Series
 from thermocald.store.recording.reader import Recording, open_recording
 from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.source import condensed
@@ -35,7 +36,7 @@ class Day:
 
     def blocks(self, size):
         """The observations, `size` epochs at a time."""
-        return GridBlocks(self.grid, size)
+        return InBlocks(self.grid, size)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ def test_the_study(day, monkeypatch):
         monkeypatch.setattr(
             Recording, "blocks", lambda _, windows=None, b=blocks: b.blocks(windows)
         )
-        measured = RecordedSeries(day.recording).measured()
+        measured = Series(day.recording).measured()
         (camera,) = study([measured], StudySettings(sets=1000)).cameras
         found.append(camera)
     one, many = found

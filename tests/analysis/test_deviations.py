@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.analysis.study.deviations import deviation, image_displacement
+from thermocald.analysis.study.series_study import deviation, image_displacement
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)

@@ -15,7 +15,7 @@ from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.physics.model import ModelEffect
-from thermocald.thermal.basis import choose_distortion
+from thermocald.thermal.fit import choose_distortion
 from thermocald.thermal.reduce import reduce_series
 
 SEEDS = range(1, 7)
@@ -24,7 +24,7 @@ SEEDS = range(1, 7)
 def off(f, s):
     """Errors of the rates of c, x0, y0 over their standard deviations."""
     return np.array(
-        [(f.model.rates[n] - s.model.rates[n]) / f.sd(f"rates.{n}") for n in NAMES]
+        [(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
     )  # fmt: skip
 
 
@@ -34,7 +34,7 @@ def test_the_rates_of_an_opencv_camera_whose_f_changes():
         s = simulated(seed, ())
         f = fitted(seen_by_opencv(s))
         assert f.model.distortion == "angle"
-        assert f.missing.found is False
+        assert f.model.evidence["fit"]["effect_missing"] is False
         errors.append(off(f, s))
     assert np.abs(errors).max() < 3.0
     # eighteen numbers know a standard deviation to 17 %

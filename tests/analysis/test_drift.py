@@ -17,6 +17,7 @@ from thermocald.analysis.series.epochs import Epochs
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.physics.testfields import corner_field, demonstration_model
 from thermocald.store.database.store import Store
@@ -52,7 +53,8 @@ def series(seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int =
         "per_epoch",
     )  # fmt: skip
     head = SimpleNamespace(name="test", camera=SimpleNamespace(sensor=model.sensor))
-    return table_of_series(head, field, apart, observations, SeriesSettings(exterior="auto"))
+    grid = ObservationGrid.from_observations(field, observations)
+    return table_of_series(head, field, apart, grid, SeriesSettings(exterior="auto"))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from tests.marks import mostly_slow
 from thermocald.analysis.statistics.dependence import holm, slope_p_value
 from thermocald.analysis.statistics.noise_models import drift_test
 
@@ -26,7 +27,7 @@ def noise(rng, coloured, phi, n=N):
     return np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * white
 
 
-@pytest.mark.parametrize("size", [1.0, 3.0])
+@pytest.mark.parametrize("size", mostly_slow([1.0, 3.0], 3.0))
 @pytest.mark.parametrize(("coloured", "phi"), NOISES)
 def test_at_most_one_in_twenty_driftless_series_drifts(coloured, phi, size):
     """Noise of any memory, as large as stated or three times that; 200 series each.
@@ -58,9 +59,12 @@ def flicker(rng, exponent, n):
     return y / y.std()
 
 
-@pytest.mark.parametrize(("exponent", "white"), [(1.0, 0.0), (1.5, 0.0), (1.0, 0.7)])
-def test_flicker_noise_is_no_drift(exponent, white):
+@pytest.mark.parametrize(
+    "exponent_and_white", mostly_slow([(1.0, 0.0), (1.5, 0.0), (1.0, 0.7)], (1.0, 0.0))
+)
+def test_flicker_noise_is_no_drift(exponent_and_white):
     """Among autoregressive models alone, three parameters of 400 epochs of 1/f drifted in 57 %."""
+    exponent, white = exponent_and_white
     rng = np.random.default_rng(16)
     found = []
     for _ in range(200):

@@ -137,20 +137,20 @@ def test_a_camera_outside_the_family(outside, name):
     second = simulated(51, "M2", listed=(hidden(name),), power=6.5)
 
     f = fit_thermal_model([reduced(first)], [])
-    error = predicted_error(f.model, reduced(second), f.series[0].thermometer_sd)
+    error = predicted_error(f.model, reduced(second), f.fitted["series"][0].thermometer_sd)
 
-    assert f.missing.found
-    assert f.missing.misfit_px > 2 * 0.004
+    assert f.model.evidence["fit"]["effect_missing"]
+    assert f.model.evidence["fit"]["misfit_px"] > 2 * 0.004
     assert f.model.misses_an_effect
     # the noise is not what the model lacks: neither the image's nor the thermometer's
-    assert abs(f.sigma0 - 1.0) < 0.03
-    assert f.series[0].thermometer_sd < 0.06
+    assert abs(f.fitted["sigma0"] - 1.0) < 0.03
+    assert f.fitted["series"][0].thermometer_sd < 0.06
     assert error.floor_px < 1.2 * NOISE_PX
     assert error.rms_px > 2 * error.floor_px
     assert np.isnan(error.coverage)
     if name != "tanh":  # whose linear part is a rate like any other
         for n in ("c", "x0", "y0"):
-            assert abs(f.model.rates[n] - first.model.rates[n]) < 3 * f.sd(f"rates.{n}"), n
+            assert abs(f.model.rates[n] - first.model.rates[n]) < 3 * f.model.sd(f"rates.{n}"), n
 
 
 @pytest.mark.parametrize("kind", OTHERS)
@@ -161,15 +161,15 @@ def test_no_band_that_does_not_hold(outside, kind):
         first = simulated(100 + k, "M1", listed=(effect,))
         second = simulated(151 + k, "M2", listed=(effect,), power=6.5)
         f = fit_thermal_model([reduced(first)], [])
-        error = predicted_error(f.model, reduced(second), f.series[0].thermometer_sd)
+        error = predicted_error(f.model, reduced(second), f.fitted["series"][0].thermometer_sd)
         assert np.isnan(error.coverage) or error.coverage > 0.9
-        assert f.missing.found or error.rms_px < 1.1 * error.floor_px
+        assert f.model.evidence["fit"]["effect_missing"] or error.rms_px < 1.1 * error.floor_px
 
 
 def test_inside_the_family_nothing_is_missing():
     for listed in ((), (LAG,)):
         f = fit_thermal_model([reduced(simulated(3, listed=listed))], listed)
-        assert not f.missing.found
+        assert not f.model.evidence["fit"]["effect_missing"]
         assert not f.model.misses_an_effect
 
 
@@ -207,11 +207,12 @@ def level_pulls(draws, epochs, noise=0.1, field=0.02):
         true = s.model.interior.as_array() + 5.0 * s.model.rate_vector
         names = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
         pull = [
-            (getattr(f.model.interior, n) - t) / f.sd(f"interior.{n}")
+            (getattr(f.model.interior, n) - t) / f.model.sd(f"interior.{n}")
             for n, t in zip(names, true, strict=False)
         ]
         pull += [
-            (f.model.rates[n] - s.model.rates[n]) / f.sd(f"rates.{n}") for n in ("c", "x0", "y0")
+            (f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}")
+            for n in ("c", "x0", "y0")
         ]
         pulls.append(pull)
     return np.array(pulls)
@@ -263,8 +264,8 @@ def test_short_series_are_examined_together():
     lag = ModelEffect("thermal_lag", {"tau": 60.0})
     for effects, missing in (((), False), ((lag,), True)):
         series = [reduced(short(k, f"M{k}", effects, 20, 9.0 - k)) for k in (1, 2)]
-        assert fit_thermal_model(series, []).missing.found is missing
-        assert fit_thermal_model(series[:1], []).missing.found is None
+        assert fit_thermal_model(series, []).model.evidence["fit"]["effect_missing"] is missing
+        assert fit_thermal_model(series[:1], []).model.evidence["fit"]["effect_missing"] is None
 
 
 def on_a_mount(s, px):
@@ -285,13 +286,13 @@ def test_a_mount_that_wanders_is_said_beside_a_missing_effect(px):
     """`discover` finds nothing but the mount there: `fit` claims no effect that is none."""
     for seed in (1, 2):
         f = fit_thermal_model([for_fit(on_a_mount(simulated(seed, listed=()), px))], [])
-        assert f.missing.found
+        assert f.model.evidence["fit"]["effect_missing"]
         assert f.model.evidence["fit"]["trembles"]
         document = ThermalCamera(f.model).as_dict()
         assert "or the mount moves" in model_lines(document)[1]
     still = fit_thermal_model([for_fit(on_a_mount(simulated(1, listed=()), 0.0))], [])
-    assert still.missing.found is False
+    assert still.model.evidence["fit"]["effect_missing"] is False
     assert "trembles" not in still.model.evidence["fit"]
     lag = fit_thermal_model([reduced(simulated(1, listed=[LAG]))], [])
-    assert lag.missing.found
+    assert lag.model.evidence["fit"]["effect_missing"]
     assert "trembles" not in lag.model.evidence["fit"]

@@ -9,8 +9,14 @@ import pytest
 from benchmarks.montecarlo import CORRELATION, IOP, SDS, SENSOR
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study import montecarlo
-from thermocald.analysis.study.montecarlo import draw_root, plane_errors, simulate_errors
-from thermocald.analysis.study.object_plane import on_plane, plane_jacobian, propagate
+from thermocald.analysis.study.montecarlo import (
+    draw_root,
+    on_plane,
+    plane_errors,
+    plane_jacobian,
+    propagate,
+    simulate_errors,
+)
 from thermocald.errors import GeometryError
 
 

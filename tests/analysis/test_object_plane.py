@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.analysis.study.object_plane import (
-    DistanceLaw,
-    on_plane,
-    plane_jacobian,
-    propagate,
-)
+from thermocald.analysis.study.montecarlo import DistanceLaw, on_plane, plane_jacobian
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)
@@ -47,18 +42,3 @@ def test_law_of_distances_is_that_of_a_million_draws(axes):
     np.testing.assert_allclose(law.cumulative(limits)[0], shares, atol=2e-3)
     largest = distance[:1_000_000].reshape(200, 5000).max(axis=1).mean()
     assert law.expected_maximum(5000)[0] == pytest.approx(largest, rel=0.02)
-
-
-def test_propagation_is_the_scatter_of_small_errors():
-    rng = np.random.default_rng(2)
-    points = image_grid(SENSOR)
-    sds = STEPS * 0.1
-    jacobian = plane_jacobian(SENSOR, IOP, points, 1e4)
-    covariance = propagate(jacobian, np.diag(sds**2))
-    drawn = [
-        on_plane(SENSOR, IOP + sds * rng.standard_normal(10), points, 1e4) for _ in range(4000)
-    ]
-    scatter = np.var(drawn, axis=0, ddof=1)
-    # 4000 draws: a variance is known to 2.2 %.
-    np.testing.assert_allclose(scatter[:, 0], covariance[:, 0, 0], rtol=0.09)
-    np.testing.assert_allclose(scatter[:, 1], covariance[:, 1, 1], rtol=0.09)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import CalibratedEpoch
-from thermocald.analysis.online.field_errors import FieldErrors
-from thermocald.analysis.online.filter import FilterSettings, OnlineFilter, chi2_quantile
+from thermocald.analysis.online.filter import FieldErrors, OnlineFilter, chi2_quantile
 from thermocald.analysis.online.observer import OnlineObserver, given_exterior
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import (
@@ -136,7 +136,7 @@ def test_chi2_quantiles():
 def test_an_epoch_without_a_result_changes_nothing(camera):
     from thermocald.photogrammetry.epoch.adjustment import failed
 
-    found = OnlineFilter(camera.sensor, FilterSettings())
+    found = OnlineFilter(camera.sensor)
     assert found.update(failed("bad_frame", ""), 25.0) is None
     assert found.epochs == 0
 
@@ -180,8 +180,8 @@ class Surveyed:
         return found, take
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.1])
-@pytest.mark.parametrize("sigma_mm", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("missing", mostly_slow([0.0, 0.1], 0.1))
+@pytest.mark.parametrize("sigma_mm", mostly_slow([0.0, 0.01, 0.05], 0.0, 0.05))
 def test_innovations_are_as_large_as_their_covariance_whatever_the_field(sigma_mm, missing):
     """With the field's errors as noise of each epoch chi-square per degree of freedom was 0.09."""
     ratios = []
@@ -194,7 +194,7 @@ def test_innovations_are_as_large_as_their_covariance_whatever_the_field(sigma_m
     assert 0.9 < np.mean(ratios) < 1.1
 
 
-@pytest.mark.parametrize("sigma_mm", [0.01, 0.05])
+@pytest.mark.parametrize("sigma_mm", mostly_slow([0.01, 0.05], 0.05))
 def test_the_sds_of_the_estimate_hold_the_field_whatever_the_number_of_epochs(sigma_mm):
     deviations, sds = [], []
     for seed in range(200):
@@ -212,7 +212,7 @@ def test_the_sds_of_the_estimate_hold_the_field_whatever_the_number_of_epochs(si
     assert np.all(np.mean(sds, axis=0)[1:] / pitch > 0.4)  # px, where 0.1 used to be stated
 
 
-@pytest.mark.parametrize("sigma_mm", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("sigma_mm", mostly_slow([0.0, 0.01, 0.05], 0.05))
 def test_a_knock_of_a_tenth_of_a_pixel_is_noticed(sigma_mm):
     noticed = 0
     for seed in range(20):

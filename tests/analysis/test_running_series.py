@@ -17,6 +17,7 @@ from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.physics.testfields import corner_field, demonstration_model
 from thermocald.store.recording.head import CameraSpec, Head
@@ -79,10 +80,11 @@ def replayed(sensor, field, epochs, exterior="auto", c=3.04):
     """The table of the same epochs, by `replay`."""
     head = Head("replay", "M1", 10.0, CameraSpec("camera", sensor, c, None), {})
     calibrator = Calibrator(sensor, field, nominal_c=c)
-    temperature = {e.number: next(iter(e.temperatures.values()), np.nan) for e in epochs}
+    temperature = np.array([next(iter(e.temperatures.values()), np.nan) for e in epochs])
     apart, seen = calibrate_epochs(iter(epochs), calibrator, temperature)
     settings = SeriesSettings.of(AdjustmentSettings(), exterior)
-    return table_of_series(head, field, apart, seen, settings)
+    grid = ObservationGrid.from_observations(field, seen)
+    return table_of_series(head, field, apart, grid, settings)
 
 
 def assert_like_replay(columns, table, values=0.05, sds=0.02):
@@ -115,7 +117,8 @@ def test_the_series_is_replay_of_the_epochs_so_far(name):
         assert_like_replay(results[n - 1][1], replayed(scene.sensor, scene.field, epochs[:n]))
 
 
-@pytest.mark.parametrize("name", quick("badly surveyed"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_every_epoch_has_its_own_result_with_a_true_standard_deviation(name):
     """About the mean of 60 epochs: the level is that of the field's errors, stated apart."""
     z = []
@@ -126,10 +129,11 @@ def test_every_epoch_has_its_own_result_with_a_true_standard_deviation(name):
         error = np.array([r.values[:3] for r, _ in results]) - truth[:, :3]
         z.append((error - error.mean(axis=0)) / [r.sd[:3] for r, _ in results])
         share = np.mean([len(r.rejected) / r.n_observations for r, _ in results])
-    # the last scene: what is rejected is what `replay` rejects of its epochs, or less
+    # the last scene: what is rejected is what `replay` rejects of its epochs, or less, or chance
     scene = Scene(seed, **SCENES[name])
     table = replayed(scene.sensor, scene.field, [scene.epoch(k)[0] for k in range(60)])
-    assert share < 1.2 * table.adjustment.rejected.sum() / table.adjustment.observed.sum()
+    replays = table.adjustment.rejected.sum() / table.adjustment.observed.sum()
+    assert share < max(1.2 * replays, 1e-3)
     rms = np.sqrt(np.mean(np.square(z), axis=(0, 1)))
     assert rms == pytest.approx(np.ones(3), abs=0.15)
 
@@ -188,13 +192,13 @@ def test_a_camera_that_is_carried_elsewhere_begins_another_series():
 
 def test_a_program_started_again_goes_on_where_it_was():
     scene = Scene(7)
-    _, results, alone, _ = take(scene, 60)
+    _, results, alone, _ = take(scene, 40)
     again = RunningSeries(
         scene.sensor, scene.field, AdjustmentSettings(), exterior="auto", offsets=True
     )
-    for calibrated, (result, _) in zip(alone[:35], results, strict=False):
+    for calibrated, (result, _) in zip(alone[:25], results, strict=False):
         again.remember(calibrated, calibrated.epoch.observations, result.values)
-    for calibrated, (whole, columns) in zip(alone[35:], results[35:], strict=True):
+    for calibrated, (whole, columns) in zip(alone[25:], results[25:], strict=True):
         result, after = again.refine(calibrated, calibrated.epoch.observations)
         assert (np.abs(result.values - whole.values)[:3] < 0.1 * whole.sd[:3]).all()
         for name in MAIN:
@@ -285,14 +289,15 @@ def real(shared):
     return read_recording(Path(shared) / "data" / "aviary-cam6")
 
 
-@pytest.mark.parametrize("n", [1, 3, 10, 20, 27])
-def test_a_real_camera_is_live_what_replay_finds(real, n):
+def test_a_real_camera_is_live_what_replay_finds(real):
     calibrator = Calibrator(real.camera.sensor, real.testfield, nominal_c=12.7)
     running = RunningSeries(
         real.camera.sensor, real.testfield, AdjustmentSettings(), exterior="auto", offsets=True
     )
-    epochs = list(real.epochs)[:n]
-    for epoch in epochs:
+    epochs = list(real.epochs)[:27]
+    for n, epoch in enumerate(epochs, 1):
         result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
         assert result.ok
-    assert_like_replay(columns, replayed(real.camera.sensor, real.testfield, epochs, c=12.7))
+        if n in (1, 3, 10, 20, 27):
+            table = replayed(real.camera.sensor, real.testfield, epochs[:n], c=12.7)
+            assert_like_replay(columns, table)

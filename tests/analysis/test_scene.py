@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates, spline_filter
 
+import thermocald as tc
 from tests.analysis.test_gauge import RATES, SD_RATE, START, thermal_camera
 from tests.commands import call
 from thermocald.analysis.thermal.scene import (
@@ -17,6 +20,7 @@ from thermocald.analysis.thermal.scene import (
     common_movement,
     follow_scene,
 )
+from thermocald.analysis.thermal.scene_recording import write_scene
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import project, rotation
 from thermocald.physics.model import ModelEffect
@@ -135,6 +139,59 @@ def day(folder, seed: int, lacks: str = "") -> SceneCourse:
     return course
 
 
+C_SD = 0.4e-3  # mm, of a frame's c in these days, 0.03 px in the corners
+HOURS = np.arange(0, 12.01, 1 / 12)
+WARMTH = 10 + 25 * np.sin(np.pi * HOURS / 12) ** 1.5
+
+
+@cache
+def course_of(lacks: str) -> np.ndarray:
+    """What an effect does to c in the thirteen frames of a day, mm, the largest is 1."""
+    times, known = START + 3600 * HOURS, camera()
+    true = replace(known, model=replace(known.model, effects=LACKING[lacks]))
+    c = [one.along(times, {"housing": WARMTH}, times[::12]).values[:, 0] for one in (true, known)]
+    beside = (c[0] - c[0][0]) - (c[1] - c[1][0])
+    return beside / np.abs(beside).max()
+
+
+def drawn(rng: np.random.Generator, lacks: str, size: float, noise: float = 1.0) -> SceneCourse:
+    """A day's course of c beside the model, drawn: an effect of so many sds of a frame.
+
+    noise: what it is over what is stated.
+    """
+    T = WARMTH[::12]
+    beside = size * C_SD * course_of(lacks) if lacks else np.zeros(len(T))
+    slope = rng.normal(0, SD_RATE) * (T - T[0])
+    values = np.zeros((len(T), 4))
+    values[:, 3] = beside + slope + noise * C_SD * (rng.normal(0, 1, len(T)) - rng.normal())
+    values[0] = np.nan  # the reference
+    covariance = np.tile(np.diag([1e-10, 1e-10, 1e-10, C_SD**2]), (len(T), 1, 1))
+    unsure = np.outer(np.abs(T - T[0]) * SD_RATE, [0, 0, 0, 1.0])
+    n = len(T)
+    return SceneCourse(
+        "", ("",) * n, START + 3600 * HOURS[::12], T, values, covariance, unsure,
+        np.zeros(n, dtype=np.int64), ("",) * n, np.zeros(4), 3e-3,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("noise", "most"), [(0.7, 4), (1.0, 4), (2.0, 35)])
+def test_false_alarms_are_as_rare_as_they_are_said_to_be(noise, most):
+    """Of 1000 days at one in a thousand; of noise that is twice what is stated, three in a hundred.
+
+    That of twelve frames contradicts what is stated, but not always.
+    """
+    rng = np.random.default_rng(31)
+    assert sum(drawn(rng, "", 0.0, noise).model_misses for _ in range(1000)) <= most
+
+
+@pytest.mark.parametrize("lacks", [name for name in LACKING if name])
+def test_an_effect_of_the_size_of_a_frame_s_noise_is_found_in_the_day(lacks):
+    """Of 8 and 16 sds, 0.27 and 0.54 px in the corners; `python -m benchmarks.river` has more."""
+    rng = np.random.default_rng(32)
+    for size, fewest in ((8.0, 27), (16.0, 35)):
+        assert sum(drawn(rng, lacks, size).model_misses for _ in range(40)) >= fewest
+
+
 @pytest.mark.slow
 def test_courses_of_other_effects_are_found_too(tmp_path):
     """Of `python -m benchmarks.river`, whose hundred days say how often."""
@@ -217,3 +274,68 @@ def test_nothing_to_follow_is_said(tmp_path):
         SceneTracker(np.full((HEIGHT, WIDTH), 90, np.uint8))
     with pytest.raises(DataError, match="at least one more"):
         follow_scene(camera(), TemperatureLog(np.array([START]), {}), [])
+
+
+def warm_day(count: int, lag_s: float):
+    """A camera with a lag that the model lacks, over a day: times, temperatures, true states."""
+    known = camera()
+    lag = ModelEffect("thermal_lag", {"tau": lag_s})
+    hours = np.linspace(0, 10, 4 * count - 3)
+    T = 10 + 25 * np.sin(np.pi * hours / 10) ** 1.5
+    times = START + 3600 * hours
+    true = replace(known, model=replace(known.model, effects=(lag,)))
+    return times, T, true.along(times, {"housing": T}, times[::4])
+
+
+def test_what_does_not_move_is_a_recording(tmp_path):
+    """Its c, x0 and y0 change as the camera's did, within their sds; features that leave go."""
+    rng = np.random.default_rng(41)
+    times, T, states = warm_day(40, 1800.0)
+    features = rng.uniform([5, 5], [WIDTH - 5, HEIGHT - 5], (150, 2))
+    tracks = []
+    for state in states:
+        at = states[0].as_seen_by(features, state.interior) + rng.normal(0, 0.04, features.shape)
+        rows = np.flatnonzero(np.arange(150) % 10 != 0) if len(tracks) > 4 else np.arange(150)
+        tracks.append((rows, at[rows]))
+    tracks[7] = None
+    log = TemperatureLog(times, {"housing": T})
+    kept = write_scene(tmp_path / "R", "bank", states[0], log, times[::4], features, tracks)
+    series = tc.open(tmp_path / "R")
+    epochs = series.calibrate(exterior="series")
+    assert (kept, len(series), len(series.testfield), int(epochs.ok.sum())) == (135, 40, 135, 39)
+    good = epochs.ok
+    truth = np.array([state.values[:3] for state in states])[good]
+    error = epochs.values[good, :3] - truth
+    ratio = (error - error.mean(axis=0)) / epochs.sd[good, :3]
+    # the sds hold a trend, of which one day is a single draw
+    assert 0.5 < np.sqrt(np.mean(ratio**2)) < 1.1
+    short = [None if t is None else (t[0][:11], t[1][:11]) for t in tracks]
+    with pytest.raises(DataError, match="11 features"):
+        write_scene(tmp_path / "S", "bank", states[0], log, times[::4], features, short)
+    assert not (tmp_path / "S").exists()
+
+
+@pytest.mark.slow
+def test_discover_names_what_the_model_lacks_from_the_scene_alone(tmp_path):
+    """Photographs with half of the frame moving by itself, by the commands."""
+    bank = Bank(900)
+    times, T, states = warm_day(41, 1800.0)
+    bank.cold = states[0]
+    for k, state in enumerate(states):
+        moment = datetime.fromtimestamp(times[4 * k], UTC)
+        (tmp_path / "photographs").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / f"photographs/{moment:%Y%m%d-%H%M%S}.png"), bank.frame(state))
+    warm = T + bank.rng.normal(0, 0.05, T.size)
+    rows = [f"{t:.3f},{v:.3f}" for t, v in zip(times, warm, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["unix_time,housing", *rows]) + "\n")
+    camera().save(tmp_path / "camera.yaml")
+    out = tmp_path / "bank"
+    done = call(
+        "replay", tmp_path / "photographs", "--model", tmp_path / "camera.yaml", "--log",
+        tmp_path / "log.csv", "--times", "name", "--timezone", "UTC", "--recording-out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = tc.discover(tc.open(out)).as_dict()
+    assert found["effects"][0]["effect"] == "thermal_lag"
+    tau = found["effects"][0]["estimates"]["tau"]
+    assert abs(tau["value"] - 1800.0) < 4 * tau["sd"] + 30.0, tau  # names tell whole seconds

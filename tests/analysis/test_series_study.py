@@ -66,7 +66,7 @@ def test_a_single_epoch_says_so_and_computes_nothing(warm_up):
     [
         (np.full(150, 25.0), "stayed at 25.00 °C"),
         (25 + 0.05 * np.random.default_rng(1).standard_normal(150), "which its noise of 0.050 K"),
-        (np.full(150, np.nan), "was read at 0 epochs"),
+        (np.full(150, np.nan), "has too few readings (0)"),
     ],
     ids=["constant", "noise only", "never read"],
 )

@@ -6,12 +6,11 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from tests.blind.case import Case
 from tests.blind.field_motion import BOARD, TARGET
 from tests.blind.generator import generate, write
-from thermocald.cli import application
+from tests.commands import succeed
 
 EPOCHS = 50
 
@@ -25,9 +24,7 @@ def recorded(tmp_path, field_motion):
 
 
 def replayed(folder):
-    result = CliRunner().invoke(application(), ["replay", str(folder), "--json", "-"])
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
+    return json.loads(succeed("replay", folder, "--json", "-").stdout)
 
 
 @pytest.mark.parametrize(
@@ -57,9 +54,8 @@ def test_the_study_notes_it(tmp_path):
     moved, _ = recorded(tmp_path, "knock")
     out = tmp_path / "study.json"
 
-    result = CliRunner().invoke(application(), ["study", str(moved), "--json", str(out)])
+    succeed("study", moved, "--json", out)
 
-    assert result.exit_code == 0, result.output
     text = out.read_text()
     assert '"kind": "knock"' in text
     assert "The test field moved" in text

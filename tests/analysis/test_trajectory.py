@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from thermocald.analysis.study.montecarlo import correlations_over_time, trajectories
 from thermocald.analysis.study.study import StudySettings, study_camera
-from thermocald.analysis.study.trajectory import correlations_over_time, trajectories
-from thermocald.output.study.summary import summary
+from thermocald.output.study.summary import answer_sentences
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 CLUSTERS = (15.0, 50.0, 100.0)
@@ -41,7 +41,7 @@ def test_correlations_over_time_are_about_each_series_mean(warm_up):
 
 def test_the_summary_says_what_the_draws_are_and_what_the_camera_did(warm_up):
     camera = study_camera("nexus", [warm_up()()], StudySettings(sets=500))
-    text = " ".join(summary(camera))
+    text = " ".join(answer_sentences(camera))
     assert "drawn from independent normal distributions about the series' mean" in text
     assert "along its own path" in text
     assert "x₀ and y₀ −0.999" in text or "x₀ and y₀ −1" in text
@@ -60,7 +60,7 @@ def test_a_camera_that_heats_and_cools_is_told_by_its_range(warm_up):
     camera = study_camera("rpi", [cycle], StudySettings(sets=500))
     change = camera.series[0].deviations
     assert change["c"].range > 0.006
-    text = summary(camera)[1]
+    text = answer_sentences(camera)[1]
     assert "did not change" not in text
     assert "the principal distance grew by up to" in text
     assert "ended where it started" in text

@@ -7,19 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from tests.analysis.test_thermal_model import for_fit, reduced
+from tests.commands import answer, succeed
 from thermocald.analysis.thermal.camera_fit import fit_with_type, type_model, weight_of_type
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.cli import application
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.physics.model_file import read_model, write_model
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.recording.reader import open_recording
-from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.source import epochs_input, series_input
 
 RATES = {"c": (3.0e-4, 5e-5), "x0": (-4.0e-4, 8e-5), "y0": (2.0e-4, 5e-5)}  # mean, scatter
@@ -68,12 +67,6 @@ def at_three_temperatures(cycle, interval, epochs):
     return replace(cycle, programme=programme, seed=5)
 
 
-def reduced(simulation):
-    epochs = list(simulation.epochs())
-    found = epochs_input(simulation.head, simulation.field, epochs, "M1")
-    return reduce_series(found, affinity=False, strict=False)
-
-
 def at_rest_only(cycle, seed=5):
     """Four frames at rest at each of three temperatures; the thermometer runs all the time."""
     rows = {*range(26, 30), *range(56, 60), *range(116, 120)}
@@ -81,7 +74,7 @@ def at_rest_only(cycle, seed=5):
     epochs = [e if i in rows else replace(e, observations=None)
               for i, e in enumerate(simulation.epochs())]  # fmt: skip
     found = epochs_input(cycle.head, cycle.field, epochs, "M1")
-    return reduce_series(found, affinity=False, strict=False)
+    return for_fit(found)
 
 
 @pytest.mark.slow
@@ -136,7 +129,7 @@ def test_three_temperatures_with_the_middle_one_taken_on_the_way_are_enough(worl
     epochs = [e if i in rows else replace(e, observations=None)
               for i, e in enumerate(simulation.epochs())]  # fmt: skip
     found = epochs_input(cycle.head, cycle.field, epochs, "M1")
-    few = fit_with_type([reduce_series(found, affinity=False, strict=False)], kind)
+    few = fit_with_type([for_fit(found)], kind)
     full, other = reduced(cycle), reduced(replace(cycle, seed=cycle.seed + 1))
     own = fit_thermal_model([full], [ModelEffect("thermal_lag", {"tau": 80.0})], T0)
     of_own, of_few = (predicted_error(f.model, other, 0.05) for f in (own, few))
@@ -167,8 +160,7 @@ def test_the_command_takes_the_type(world, tmp_path):
     at_three_temperatures(cycle, 100.0, 45).write(tmp_path / "M1")
     arguments = ["fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--type",
                  tmp_path / "type.yaml", "--json", tmp_path / "r.json"]  # fmt: skip
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
-    assert result.exit_code == 0, result.exception
+    result = succeed(*arguments)
     assert "with what 10 cameras of the type rpi-v2.1 say of it" in result.stdout
     assert "show little" not in result.stdout
     found = json.loads((tmp_path / "r.json").read_text())["type"]
@@ -192,8 +184,7 @@ def test_the_command_says_what_is_the_types(world, tmp_path):
     path.write_text(first + "".join(one for one in lines if int(one.split(",")[0]) in rows))
     arguments = ["fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--type",
                  tmp_path / "type.yaml"]  # fmt: skip
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
-    assert result.exit_code == 0, result.exception
+    result = succeed(*arguments)
     assert (
         "show little of thermal_lag.tau: value and standard deviation are the type's"
         in " ".join(result.stdout.split())
@@ -202,8 +193,7 @@ def test_the_command_says_what_is_the_types(world, tmp_path):
 
 def test_a_type_that_is_none_is_said(tmp_path):
     def error(*arguments):
-        command = ["fit", str(tmp_path / "M1"), "-o", "m", *map(str, arguments)]
-        return CliRunner().invoke(application(), command)
+        return answer("fit", tmp_path / "M1", "-o", "m", *arguments)
 
     assert "no such file" in str(error("--type", tmp_path / "type.yaml").exception)
     preset_simulation("rpi-v2.1-heating", 3).write(tmp_path / "M1")

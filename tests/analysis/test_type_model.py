@@ -40,19 +40,27 @@ def values_of(model):
     return np.array([model.interior.c, model.rates["c"], model.rates["x0"], tau])
 
 
+def of_its_type(rng):
+    """A new camera, its true values, and what it is with what ten others say."""
+    _, fleet = cameras(rng, 10, 0.1)
+    true, (new,) = cameras(rng, 1, 1.0)
+    return new, true[0], shrunk_to_type(new, type_model(fleet, "rpi-v2.1"))
+
+
+def pull(true, found):
+    sd = np.sqrt(np.diag(np.array(found.covariance)))
+    rows = [found.covariance_names.index(n) for n in NAMES]
+    return (values_of(found) - true) / sd[rows]
+
+
 def test_few_temperatures_and_the_type_are_better_than_few_temperatures():
     rng = np.random.default_rng(8)
     pulls, own, shrunk = [], [], []
     for _ in range(60):
-        _, fleet = cameras(rng, 10, 0.1)
-        kind = type_model(fleet, "rpi-v2.1")
-        true, (new,) = cameras(rng, 1, 1.0)
-        found = shrunk_to_type(new, kind)
-        sd = np.sqrt(np.diag(np.array(found.covariance)))
-        rows = [found.covariance_names.index(n) for n in NAMES]
-        pulls.append((values_of(found) - true[0]) / sd[rows])
-        own.append((values_of(new) - true[0]) / SCATTER)
-        shrunk.append((values_of(found) - true[0]) / SCATTER)
+        new, true, found = of_its_type(rng)
+        pulls.append(pull(true, found))
+        own.append((values_of(new) - true) / SCATTER)
+        shrunk.append((values_of(found) - true) / SCATTER)
     assert np.mean(np.abs(pulls) < 1.96) == pytest.approx(0.95, abs=0.04)
     assert np.std(shrunk) < 0.8 * np.std(own)
     assert found.evidence["shrunk_to_type"] == "rpi-v2.1"
@@ -64,14 +72,7 @@ def test_few_temperatures_and_the_type_are_better_than_few_temperatures():
 def test_intervals_hold_over_a_thousand_fleets():
     """A new camera that knows as much of itself as its type does: where shrinking is hardest."""
     rng = np.random.default_rng(5)
-    pulls = []
-    for _ in range(1000):
-        _, fleet = cameras(rng, 10, 0.1)
-        true, (new,) = cameras(rng, 1, 1.0)
-        found = shrunk_to_type(new, type_model(fleet, "t"))
-        sd = np.sqrt(np.diag(np.array(found.covariance)))
-        rows = [found.covariance_names.index(n) for n in NAMES]
-        pulls.append((values_of(found) - true[0]) / sd[rows])
+    pulls = [pull(*of_its_type(rng)[1:]) for _ in range(1000)]
     assert np.mean(np.abs(pulls) < 1.96) == pytest.approx(0.95, abs=0.01)
 
 

@@ -19,7 +19,7 @@ from thermocald.errors import DataError, StoreError, UsageError
 
 DOCUMENTED = (
     "api", "series", "results", "analysis.series.epochs", "analysis.camera.camera",
-    "analysis.thermal.thermal_camera", "analysis.thermal.live_camera", "toolbox",
+    "analysis.thermal.thermal_camera", "toolbox",
 )  # fmt: skip
 
 

@@ -12,7 +12,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 DEEPER = re.compile(r"thermocald\.[a-z_]+\.[a-z]")
 OF_DEVELOPERS = {"docs/reference/drivers.md", "docs/reference/effects.md"}
-SHOWN = ("how-to/notebook.md", "how-to/thermal-model.md", "reference/store.md")
+SHOWN = ("how-to/thermal-model.md", "reference/store.md")
+"""Quick ones; all pages are run by tests/docs/test_commands.py."""
 
 
 def test_nothing_deeper_is_imported():

@@ -21,6 +21,7 @@ from tests.blind.field_motion import moved_field
 from tests.blind.hidden import fresh, hide, left_over, make_camera, true_parameters
 from tests.blind.outside import trajectories
 from tests.blind.world import climate, corner_field, image, smooth_unknown
+from tests.recordings import write_recording
 
 _PARAMETERS = (
     "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2",
@@ -260,39 +261,29 @@ def _measure(
 
 
 def write(series: Series, folder: Path) -> None:
-    """The recording as CONVENTIONS §3 has it."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write the recording as CONVENTIONS §3 has it."""
     width, height, pitch, c, _ = CAMERAS[series.camera]
-    lines = [
-        "format: thermocald-recording/1", f"name: {series.camera}-{series.name}",
-        f"series: {series.name}", f"interval: {series.interval}",
-        (f"camera: {{name: {series.camera}, width: {width}, height: {height}, "
-        f"pixel_pitch: {pitch}, principal_distance: {c}}}"),
-        "temperatures:",
-        *(f"  {k}: {{unit: degC, resolution: 0.0625}}" for k in series.temperatures),
-    ]  # fmt: skip
-    (folder / "recording.yaml").write_text("\n".join(lines) + "\n")
-    head = ["epoch", "frame_time", "temperature_time", *series.temperatures, "frame"]
-    rows = [",".join(head)]
+    head = {
+        "name": f"{series.camera}-{series.name}", "series": series.name,
+        "interval": series.interval,
+        "camera": {"name": series.camera, "width": width, "height": height, "pixel_pitch": pitch,
+                   "principal_distance": c},
+        "temperatures": {k: {"unit": "degC", "resolution": 0.0625} for k in series.temperatures},
+    }  # fmt: skip
+    epochs = []
     for i, number in enumerate(series.epoch):
-        values = [series.temperatures[k][i] for k in series.temperatures]
-        cells = ["" if np.isnan(v) else f"{v:.4f}" for v in values]
-        rows.append(
-            f"{number},{series.frame_time[i]:.3f},{series.temperature_time[i]:.3f},"
-            + ",".join(cells)
-            + ","
-        )
-    (folder / "epochs.csv").write_text("\n".join(rows) + "\n")
-    rows = ["epoch,target,x,y,sx,sy"]
-    for i, j, (x, y) in zip(series.row_epoch, series.row_target, series.xy, strict=True):
-        rows.append(f"{series.epoch[i]},{j + 1},{x:.4f},{y:.4f},{series.sigma},{series.sigma}")
-    (folder / "observations.csv").write_text("\n".join(rows) + "\n")
-    rows = ["target,X,Y,Z,diameter,sX,sY,sZ"]
-    rows += [
-        f"{j + 1},{x:.4f},{y:.4f},{z:.4f},12.0,0.02,0.02,0.02"
-        for j, (x, y, z) in enumerate(series.field_nominal)
+        times = f"{series.frame_time[i]:.3f}", f"{series.temperature_time[i]:.3f}"
+        read = (values[i] for values in series.temperatures.values())
+        epochs.append([number, *times, *("" if np.isnan(v) else f"{v:.4f}" for v in read), ""])
+    observations = [
+        [series.epoch[i], j + 1, f"{x:.4f}", f"{y:.4f}", series.sigma, series.sigma]
+        for i, j, (x, y) in zip(series.row_epoch, series.row_target, series.xy, strict=True)
     ]
-    (folder / "testfield.csv").write_text("\n".join(rows) + "\n")
+    field = [
+        [j, *(f"{v:.4f}" for v in place), "12.0", 0.02, 0.02, 0.02]
+        for j, place in enumerate(series.field_nominal, 1)
+    ]
+    write_recording(folder, head, epochs, observations, field)
 
 
 def main() -> None:

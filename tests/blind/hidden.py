@@ -37,7 +37,7 @@ def _view(rng: np.random.Generator, c: float) -> np.ndarray:
 
 
 def make_camera(rng: np.random.Generator, case: Case) -> tuple[str, Camera]:
-    name = case.camera or rng.choice(sorted(CAMERAS))
+    name = case.camera or str(rng.choice(sorted(CAMERAS)))
     width, height, pitch, c, A1 = CAMERAS[name]
     base = np.zeros(16)
     base[0] = c * rng.uniform(0.99, 1.01)

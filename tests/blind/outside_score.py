@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from tests.blind.case import OUTSIDE, Case
 from tests.blind.generator import Unseen
 from tests.blind.outside import HUMID, RECORDED, UNRECORDED
-from tests.blind.score import examine_case
+from tests.blind.score import discover_case
 
 DESCRIBED = 0.6
 """Share of recorded influences that get a transferable description."""
@@ -45,7 +45,7 @@ class Described:
 def describe(kind: str, seed: int, px: float = 0.3) -> Described:
     """One recorded or unrecorded influence, hidden and looked for."""
     case = Case((OUTSIDE,), px, seed, influence=kind, record_humidity=kind in HUMID)
-    found, _, seconds = examine_case(case)
+    found, _, seconds = discover_case(case)
     first = found.effects[0] if found.effects else None
     proposed = first is not None and first.effect == "unnamed" and first.term is not None
     return Described(

@@ -36,7 +36,8 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def examine_case(case: Case) -> tuple[Discovery, dict, float]:
+def discover_case(case: Case) -> tuple[Discovery, dict, float]:
+    """Return what discovery says of a case, the truth, and the seconds of processor."""
     series, truth = generate(case)
     begin = time.process_time()
     first = reduce_series(series_input(series[0]))
@@ -46,7 +47,12 @@ def examine_case(case: Case) -> tuple[Discovery, dict, float]:
 
 
 def judge(case: Case) -> Outcome:
-    discovery, truth, seconds = examine_case(case)
+    """Run one case and judge it."""
+    return judge_discovery(case, *discover_case(case))
+
+
+def judge_discovery(case: Case, discovery: Discovery, truth: dict, seconds: float) -> Outcome:
+    """Compare what was discovered with what is hidden."""
     found = tuple(sorted(e.effect for e in discovery.effects))
     listed = tuple(a for e in discovery.effects for a in e.alternative_names)
     hidden = tuple(sorted(case.effects))

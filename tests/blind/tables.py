@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.blind.case import OUTSIDE, SINGLE
+from tests.blind.case import OUTSIDE
 from tests.blind.outcome import Outcome
 
 HEAD = (
@@ -57,22 +57,6 @@ def confusion(found: dict[str, list[Outcome]]) -> str:
             wrong = ", ".join(f"{c} × {n}" for c, n in sorted(said.items()) if c != own)
             if wrong:
                 lines.append(f"| {part} | `{name}` | {said[own]} of {said.total()} | {wrong} |")
-    return "\n".join(lines)
-
-
-def power_table(found: dict[str, list[Outcome]]) -> str:
-    """Right names per effect against strength."""
-    parts = sorted((p for p in found if p.startswith("single-")), key=_strength)
-    lines = [
-        "| hidden | " + " | ".join(f"{_strength(p):g} px" for p in parts) + " |",
-        "|---|" + "---|" * len(parts),
-    ]
-    for effect in SINGLE:
-        cells = []
-        for part in parts:
-            own = [o for o in found[part] if o.case.effects == (effect,)]
-            cells.append(f"{sum(o.right for o in own)} of {len(own)}")
-        lines.append(f"| `{effect}` | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -133,18 +117,20 @@ def write(
     path.write_text(
         f"""# How well discovery names hidden effects
 
-Blind recordings from a generator (`tests/blind/generator.py`) that shares no code with the program;
-the number of a part is the strength in px: the RMS of image points that the base model, fitted,
-leaves over. None of these seeds was looked at while the program was made. Written, and repeated, by
+After this page you know how often a name that `discover` gives is right, and from what strength
+on. The recordings come from a generator that shares no code with the program, with seeds that were
+not looked at while the program was made.
 
 ```bash
 {_command(found, seeds)}
 ```
 
-with one thread; `--store` keeps what is done, so that it can be interrupted. {note}`hard`: cadence
-jitter, missing epochs and temperatures, wrong coordinates, correlated noise, people walking by, M2
-under another programme. `none2`: thermometer noise doubled. `lists`: alternatives that the data
-cannot exclude were listed.
+writes this page, on one core; `--store FILE` lets it be interrupted. {note}
+
+The number of a part is the strength: the RMS of image points, in px, that the fitted base model
+leaves over. `hard`: irregular cadence, missing epochs and temperatures, wrong coordinates,
+correlated noise, people walking by, M2 under another programme. `none2`: the thermometer's noise
+doubled. `lists`: alternatives that the data cannot exclude were listed.
 
 {HEAD}
 {parts}
@@ -155,11 +141,9 @@ cannot exclude were listed.
 
 Bars: 68 % limits of the share.
 
-{power_table(found)}
-
 ## What was said instead
 
-All names that are not in this table were right.
+All other names were right, at every strength.
 
 {confusion(found)}
 

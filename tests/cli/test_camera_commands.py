@@ -217,7 +217,7 @@ def test_the_logger_tells_the_temperature_of_photographs(tmp_path):
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert [c["temperature"] for c in document["calibrations"]] == [20.0, 45.0]
-    assert list(document["validity"]) == ["Celsius"]
+    assert list(document["validity"]) == ["temperature"]
     asked = call(*arguments)
     assert asked.returncode == 2
     assert "at which temperature? Write 21.5=" in asked.stderr
@@ -262,7 +262,7 @@ def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen():
 
     for _ in range(400):
         fit = calibrations()
-        alarms += fit.effect_missing
+        alarms += fit.model.misses_an_effect
         errors.append([
             (fit.model.rates[n] - RATES[n]) / fit.model.sds[f"rates.{n}"] for n in RATED
         ])  # fmt: skip
@@ -271,4 +271,4 @@ def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen():
     assert alarms <= 4
     drift = np.zeros(10)
     drift[IOP_NAMES.index("A1")] = 2e-5
-    assert calibrations(drift).effect_missing
+    assert calibrations(drift).model.misses_an_effect

@@ -14,8 +14,8 @@ import pytest
 from gpiozero.pins.mock import MockFactory
 
 from thermocald.config import parse_config
-from thermocald.daemon.given_config import mock_config
-from thermocald.daemon.separating import Heating, separating
+from thermocald.daemon.desk import plan_separation
+from thermocald.daemon.plan import mock_config
 from thermocald.daemon.session import Session
 from thermocald.epoch import Epoch
 from thermocald.hal import VirtualClock, open_device
@@ -94,9 +94,8 @@ class Box:
 def test_the_loop_heats_within_the_limits_and_ends_when_separated(config, pin, hidden, capfd):
     asked = Session(camera="mock", series="M1", epochs=EPOCHS, check=False)
     names = ",".join(ALTERNATIVES)
-    heating = Heating(None, RATE, 0.8)
 
-    text, session, watch = separating(config, asked, names, None, heating, print)
+    text, session, watch = plan_separation(config, asked, names, None, print, None, RATE, 0.8)
     assert "programme:" in text
     assert not config.store.path.exists()  # a plan does nothing
     programme = [{"seconds": s.seconds, "hold_c": s.hold_c} for s in session.programme]

@@ -12,9 +12,10 @@ from typer.testing import CliRunner
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
 from thermocald.cli.check import devices as command
 from thermocald.config import parse_config
-from thermocald.daemon import probe as devices
+from thermocald.daemon import soundness as devices
 from thermocald.errors import ConfigurationError, DeviceError
 from thermocald.hal import load_driver, option_names
+from thermocald.result import jsonable
 
 
 @pytest.fixture
@@ -88,16 +89,13 @@ def test_a_probe_takes_one_of_each_and_names_what_fails(sysfs, tmp_path):
         ]
     }
     config = parse_config(document, tmp_path / "config.yaml", option_names)
-    good, bad = devices.probe(config)
+    good, bad = devices.probe_devices(config)
     assert good.values == {"temperature_c": 21.0}
-    assert good.shows == "temperature_c 21.0"
+    assert good.text.endswith(" ms: temperature_c 21.0")
     assert "'tmp421' is not there" in bad.error
-    lines = list(devices.probe_lines([good, bad]))
-    assert lines[0].startswith("thermometer lens (hwmon), ")
-    assert lines[0].endswith("temperature_c 21.0")
-    assert "FAILED: " in lines[1]
-    entries = devices.probe_document([good, bad])["devices"]
-    assert [entry["error"] is None for entry in entries] == [True, False]
+    assert good.text.startswith("thermometer lens (hwmon), ")
+    assert "FAILED: " in bad.text
+    assert [entry["error"] is None for entry in jsonable([good, bad])] == [True, False]
 
 
 @pytest.fixture

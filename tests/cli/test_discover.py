@@ -6,14 +6,12 @@ import json
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from tests.blind.case import Case
 from tests.blind.generator import generate, write
-from thermocald.cli import application
+from tests.commands import answer
 from thermocald.errors import DataError, UsageError
 
-run = CliRunner()
 PROGRAMME = """
 format: thermocald-programme/1
 name: one lamp cycle
@@ -37,7 +35,7 @@ def recordings(tmp_path_factory):
 
 
 def discover(*arguments):
-    return run.invoke(application(), ["discover", *map(str, arguments)])
+    return answer("discover", *arguments)
 
 
 def test_everything_is_written(recordings, tmp_path):
@@ -55,7 +53,7 @@ def test_everything_is_written(recordings, tmp_path):
     assert document["model"] == str(model)
     assert yaml.safe_load(model.read_text())["effects"][0]["effect"] == "thermal_lag"
     page = report.read_text()
-    assert page.count("<svg") == 6
+    assert page.count("<figure") == 6
     assert "http://" not in page.replace("http://www.w3.org", "").replace(
         "http://purl.org", ""
     ).replace("http://creativecommons.org", "")

@@ -18,14 +18,13 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
+from tests.commands import succeed as run
 from tests.docs.blocks import blocks
 from tests.drivers.fakes.adb_server import AdbServer, FakePhone
 from tests.photogrammetry import board_images
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import photograph, put_up
-from thermocald.cli import application
 from thermocald.output.testfield.layout import TRIM, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.store.recording.testfield_file import read_testfield
@@ -39,13 +38,6 @@ RATE_C, RATE_X0 = 0.2e-3, -0.4e-3
 """What the camera does, mm/K."""
 EPOCHS = 12
 START = datetime(2026, 6, 14, 12, 0, 0)
-
-
-def run(*arguments):
-    """One command; its standard output and error."""
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
-    assert result.exit_code == 0, result.output
-    return result
 
 
 def camera_at(temperature):

@@ -7,9 +7,8 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from thermocald.cli import application
+from tests.commands import invoke, succeed
 from thermocald.errors import ThermocaldError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.recording.reader import read_recording
@@ -20,10 +19,7 @@ START = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()
 
 
 def run(*arguments):
-    result = CliRunner().invoke(application(), ["import", *(str(a) for a in arguments)])
-    if isinstance(result.exception, ThermocaldError):
-        raise result.exception
-    return result
+    return invoke("import", *arguments)
 
 
 def photograph(path, local, subsec="", offset="", size=(64, 48), focal=(304, 100), f35=29):
@@ -71,7 +67,7 @@ def test_photographs_and_a_german_log_become_a_recording(place):
     assert "guessed" in result.stderr
     recording = read_recording(place / "M1")
     assert recording.columns.frame_time.tolist() == [START + 0.25 + 10 * i for i in range(6)]
-    at_frame = recording.columns.at_frame("Temperatur °C")
+    at_frame = recording.columns.at_frame("Temperatur")
     assert at_frame == pytest.approx([21 + (0.25 + 10 * i) / 60 for i in range(6)])
     assert recording.camera.principal_distance == pytest.approx(3.04)
     assert recording.camera.sensor.pixel_pitch == pytest.approx(43.2666 * 3.04 / 29 / 80)
@@ -86,7 +82,7 @@ def test_every_reading_of_the_log_is_kept(place):
     columns = read_recording(place / "M1").columns
     expected = [START - 10, *(START + 15 * i for i in range(8))]
     assert columns.readings.times.tolist() == expected
-    assert columns.readings.channels["Temperatur °C"].tolist() == [
+    assert columns.readings.channels["Temperatur"].tolist() == [
         20.5, *(21 + 0.25 * i for i in range(8))
     ]  # fmt: skip
     (place / "M1" / "observations.csv").write_text(
@@ -96,7 +92,7 @@ def test_every_reading_of_the_log_is_kept(place):
     assert len(source.frame_times) == 6
     within = [t for t in expected if t <= START + 0.25 + 50 + 15]
     assert source.reading_times.tolist() == within
-    (place / "M1" / "readings.csv").write_text("time,Temperatur °C\n5,20\n4,20\n")
+    (place / "M1" / "readings.csv").write_text("time,Temperatur\n5,20\n4,20\n")
     with pytest.raises(ThermocaldError, match=r"readings\.csv, line 3, column time: times must"):
         read_recording(place / "M1")
 
@@ -220,8 +216,7 @@ def test_the_readme_leads_to_a_plot_in_ten_commands():
     for command in commands[1:]:
         words = command.split()
         names = words[1:3] if words[1] == "testfield" else words[1:2]
-        told = CliRunner().invoke(application(), [*names, "--help"], env={"COLUMNS": "200"})
-        assert told.exit_code == 0, command
+        told = succeed(*names, "--help", COLUMNS="200")
         for option in (w for w in words if w.startswith("--")):
             assert option in told.output, command
     assert "study.html" in commands[-1]
@@ -294,7 +289,7 @@ def test_what_the_logger_did_not_measure_is_left_empty(place, values, left):
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
     assert f"doubtful: {left} of 'Temp °C' are what a thermometer gives without" in result.stderr
     columns = read_recording(place / "M1").columns
-    at_frame = columns.at_frame("Temp °C")
+    at_frame = columns.at_frame("Temp")
     assert np.nanmax(at_frame) < 22
     assert np.nanmin(at_frame) > 20
     if values[0] < 85:

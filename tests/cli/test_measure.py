@@ -153,6 +153,7 @@ def level(folder, seed: int):
     return called(folder, "--json", "-")
 
 
+@pytest.mark.slow
 def test_the_level_of_the_water_has_a_true_sd(tmp_path_factory):
     """Two banks, sixty gauges; both heights share camera and pose, and their mean knows it."""
     done = [level(tmp_path_factory.mktemp("level"), 500 + seed) for seed in range(60)]

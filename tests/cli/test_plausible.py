@@ -11,11 +11,12 @@ import thermocald as tc
 from tests.cli.test_import import arguments, photograph, place, run
 from tests.commands import invoke
 from thermocald.analysis.camera.photographs import calibrate_observations
-from thermocald.output.printed import calibration_document, calibration_lines
 from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.camera_files import CameraFile
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
+from thermocald.results import Calibration
 
 __all__ = ["place"]
 
@@ -57,10 +58,10 @@ def test_photographs_of_another_focal_length_are_flagged_at_calibrate(tmp_path, 
     found = calibrate_observations(
         names, measured, {}, field, model.sensor, AdjustmentSettings(), model.interior.c
     )
-    document = calibration_document(found, "camera", model.sensor, assumed=False)
-    assert len(document["doubts"]) == doubts
-    said = "\n".join(calibration_lines(document))
+    calibration = Calibration(found, CameraFile("camera", model.sensor, None, None))
+    assert len(calibration.as_dict()["doubts"]) == doubts
+    said = str(calibration)
     assert ("doubtful: the principal distance is" in said) == bool(doubts)
     # what the camera file says comes before EXIF
-    document = calibration_document(found, "camera", model.sensor, False, found.interior.c)
-    assert document["doubts"] == []
+    stated = CameraFile("camera", model.sensor, found.interior.c, None)
+    assert Calibration(found, stated).as_dict()["doubts"] == []

@@ -7,22 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from thermocald.cli import application, common
+from tests.commands import succeed as run
+from thermocald.cli import common
 from thermocald.daemon.desk import Progress
 from thermocald.errors import ThermocaldError
 from thermocald.numbers import duration, with_sd
 from thermocald.physics.presets import preset_simulation
 from thermocald.physics.testfields import corner_field
-
-
-def run(*arguments, **environment):
-    result = CliRunner().invoke(application(), [str(a) for a in arguments], env=environment)
-    if isinstance(result.exception, ThermocaldError):
-        raise result.exception
-    assert result.exit_code == 0, (result.output, result.exception)
-    return result
 
 
 @pytest.fixture(scope="module")

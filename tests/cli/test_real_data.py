@@ -28,7 +28,10 @@ def run(*arguments):
 @pytest.mark.parametrize("exterior", ["auto", "series", "per_epoch"])
 @pytest.mark.parametrize("camera", [0, 1, 2, 6])
 def test_fixed_cameras(shared, camera, exterior):
-    """Scatter explained by the stated sds, 0.8 to 1.3, and no drift: nothing happens in 50 s."""
+    """Scatter explained by the stated sds, and no drift: nothing happens in 50 s.
+
+    Within a tenth as the program chooses; a mode asked for against it may be conservative.
+    """
     path = shared / "data" / f"aviary-cam{camera}"
     done = run("replay", path, "--exterior", exterior, "--json", "-")
     assert done.returncode == 0
@@ -39,7 +42,8 @@ def test_fixed_cameras(shared, camera, exterior):
     assert document["ok"] >= 99
     assert all(w["reason"] for w in document["without_result"])
     for parameter in document["parameters"]:
-        assert 0.8 <= parameter["scatter_over_sd"] <= 1.3, parameter
+        low, high = (0.9, 1.1) if exterior == "auto" else (0.75, 1.3)
+        assert low <= parameter["scatter_over_sd"] <= high, parameter
         assert not parameter["drift"], parameter
     assert [p["name"] for p in document["parameters"]] == ["c", "x0", "y0"]
 
@@ -137,6 +141,7 @@ def test_a_hand_held_board_is_called_weak(shared):
     assert not result.estimated
 
 
+@pytest.mark.slow
 def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     """Every photograph has its word and none ends the others; the camera is the one of the rest."""
     folder = tmp_path / "photographs"

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from thermocald.cli import application
+from tests.commands import answer
 from thermocald.config import parse_config
-from thermocald.daemon.desk import take_on_the_desk
-from thermocald.daemon.given_config import mock_config
-from thermocald.daemon.separating import Watch
+from thermocald.daemon.desk import Watch, take_on_the_desk
+from thermocald.daemon.plan import mock_config
 from thermocald.daemon.session import Session
 from thermocald.discovery.experiment import Separation
 from thermocald.store.database.store import Store
@@ -35,7 +33,7 @@ def config(tmp_path, monkeypatch):
 
 
 def run(*arguments):
-    return CliRunner().invoke(application(), ["session", "start", "--epochs", "4500", *arguments])
+    return answer("session", "start", "--epochs", 4500, *arguments)
 
 
 def test_a_dry_run_prints_a_programme_that_a_session_takes(config, tmp_path):
@@ -72,9 +70,7 @@ def test_without_a_heater_there_is_nothing_to_plan(config, tmp_path):
 
 
 def test_a_session_that_is_too_short_is_refused(config):
-    result = CliRunner().invoke(
-        application(), ["session", "start", "--epochs", "50", "--until-separated", "creep,slip"]
-    )
+    result = answer("session", "start", "--epochs", 50, "--until-separated", "creep,slip")
     assert "50 epochs of 0.4 s are 0 min; heat needs 15 min" in str(result.exception)
 
 
@@ -88,7 +84,7 @@ def test_the_session_heats_and_ends_when_they_are_separated(config, tmp_path, mo
         programme=[{"seconds": 600.0, "hold_c": 44.0}],
     )  # fmt: skip
     seen, heated = [], []
-    monkeypatch.setattr("thermocald.daemon.separating._FEWEST", 4)
+    monkeypatch.setattr("thermocald.daemon.desk._FEWEST", 4)
     watch = Watch(config.store.path, session, ("creep", "slip"), None, print)
 
     def compared():

@@ -65,7 +65,7 @@ def test_labels_make_cameras_and_a_report_is_written(run, recording, tmp_path):
 
 
 def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
-    from thermocald.analysis.series.stored import replay_into
+    from thermocald.analysis.series.recorded import replay_into
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.store.recording.reader import open_recording
 

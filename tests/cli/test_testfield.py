@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.commands import invoke
+from tests.commands import invoke as run
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
@@ -17,13 +18,7 @@ from thermocald.physics.scene import Scene
 from thermocald.store.recording.testfield_file import read_testfield
 
 
-@pytest.fixture(scope="module")
-def run():
-    """Run a command; returns its result, raises what the program would report."""
-    return invoke
-
-
-def test_print_writes_files_and_says_what_to_measure(run, tmp_path):
+def test_print_writes_files_and_says_what_to_measure(tmp_path):
     result = run("testfield", "print", "--paper", "A4", "--out", tmp_path / "field")
     assert result.exit_code == 0, result.output
     assert sorted(p.name for p in (tmp_path / "field").iterdir()) == [
@@ -34,21 +29,22 @@ def test_print_writes_files_and_says_what_to_measure(run, tmp_path):
     assert f"{sum(bool(c) for c in field.codes)} coded" in result.stdout
 
 
-def test_a_printed_field_is_not_overwritten(run, tmp_path):
+def test_a_printed_field_is_not_overwritten(tmp_path):
     folder = tmp_path / "not" / "there" / "yet"
-    run("testfield", "print", "--paper", "A4", "--out", folder)
+    printed = partial(run, "testfield", "print", "--paper", "200x150", "--flat", "--out", folder)
+    printed()
     before = (folder / "testfield.csv").read_bytes()
     with pytest.raises(UsageError, match="--force"):
-        run("testfield", "print", "--paper", "A4", "--first-code", 9, "--out", folder)
+        printed("--first-code", 9)
     assert (folder / "testfield.csv").read_bytes() == before
-    run("testfield", "print", "--paper", "A4", "--first-code", 9, "--out", folder, "--force")
+    printed("--first-code", 9, "--force")
     assert (folder / "testfield.csv").read_bytes() != before
 
 
 @pytest.mark.parametrize(
     ("arguments", "calibrates"), [((), True), (("--paper", "A4"), True), (("--flat",), False)]
 )
-def test_check_says_before_printing_whether_a_series_gets_a_result(run, arguments, calibrates):
+def test_check_says_before_printing_whether_a_series_gets_a_result(arguments, calibrates):
     """The same bounds as the adjustment's, on what `print` would draw."""
     result = run("testfield", "check", *arguments)
     assert ("NOT ENOUGH" in result.stdout) is not calibrates
@@ -58,7 +54,7 @@ def test_check_says_before_printing_whether_a_series_gets_a_result(run, argument
         assert any("correlate at" in reason for reason in document["weak"])
 
 
-def test_print_json_is_the_only_thing_on_standard_output(run, tmp_path):
+def test_print_json_is_the_only_thing_on_standard_output(tmp_path):
     result = run(
         "testfield", "print", "--paper", "200x150", "--diameter", 5, "--markers",
         "DICT_4X4_50", "--no-plain", "--out", tmp_path, "--json", "-",
@@ -71,14 +67,14 @@ def test_print_json_is_the_only_thing_on_standard_output(run, tmp_path):
     assert document["targets"] == document["coded"] + 4 * document["markers"]
 
 
-def test_print_that_cannot_be_is_refused(run, tmp_path):
+def test_print_that_cannot_be_is_refused(tmp_path):
     with pytest.raises(UsageError, match="smaller discs"):
         run("testfield", "print", "--diameter", 100, "--out", tmp_path / "x")
     assert run("testfield", "print", "--paper", "A4").exit_code == 2
 
 
 @pytest.fixture(scope="module")
-def photographs(run, tmp_path_factory):
+def photographs(tmp_path_factory):
     """A printed A3 sheet, a little bent, as JPEG photographs in a folder."""
     folder = tmp_path_factory.mktemp("survey")
     run(
@@ -111,7 +107,7 @@ def photographs(run, tmp_path_factory):
     return folder, truth, model, (a, b, f"{length:.4f}")
 
 
-def test_survey_writes_the_field_and_everything_about_it(run, photographs, tmp_path):
+def test_survey_writes_the_field_and_everything_about_it(photographs, tmp_path):
     folder, truth, model, scale = photographs
     out, camera_file = tmp_path / "surveyed.csv", tmp_path / "camera.json"
     result = run(
@@ -143,7 +139,7 @@ def test_survey_writes_the_field_and_everything_about_it(run, photographs, tmp_p
     assert found.covariance[0, 0] == pytest.approx(document["camera"]["sd_c"] ** 2)
 
 
-def test_survey_with_a_known_camera_held(run, photographs, tmp_path):
+def test_survey_with_a_known_camera_held(photographs, tmp_path):
     from thermocald.photogrammetry import camera_files
 
     folder, _, model, scale = photographs
@@ -178,7 +174,7 @@ def test_survey_with_a_known_camera_held(run, photographs, tmp_path):
     ],
 )
 def test_wrong_surveys_are_refused_and_write_nothing(
-    run, photographs, tmp_path, arguments, error, reason
+    photographs, tmp_path, arguments, error, reason
 ):
     folder = photographs[0]
     places = {"PHOTOS": folder / "photos", "NOWHERE": folder / "no.jpg",
@@ -189,14 +185,14 @@ def test_wrong_surveys_are_refused_and_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_wrong_distances_file_names_the_row(run, photographs, tmp_path):
+def test_wrong_distances_file_names_the_row(photographs, tmp_path):
     (tmp_path / "d.csv").write_text("a,b,length,sigma\nR65,R71,100,0.1\nR65,R75,much,0.1\n")
     with pytest.raises(UsageError, match=r"d\.csv, row 3"):
         run("testfield", "survey", photographs[0] / "photos", "--distances", tmp_path / "d.csv",
             "--out", tmp_path / "o.csv")  # fmt: skip
 
 
-def test_check_says_what_is_seen_and_what_to_add(run, photographs):
+def test_check_says_what_is_seen_and_what_to_add(photographs):
     result = run("testfield", "check", photographs[0] / "testfield.csv")
     assert result.exit_code == 0, result.output
     assert "standard deviations in px" in result.stdout
@@ -205,7 +201,7 @@ def test_check_says_what_is_seen_and_what_to_add(run, photographs):
     assert "Raspberry Pi camera v2.1" in result.stderr
 
 
-def test_check_json_from_a_place(run, photographs):
+def test_check_json_from_a_place(photographs):
     result = run(
         "testfield", "check", photographs[0] / "testfield.csv", "--from", 700, 150, 400, "--roll",
         20, "--json", "-",
@@ -222,7 +218,7 @@ def test_check_json_from_a_place(run, photographs):
             "--at", 200, 150, -900)  # fmt: skip
 
 
-def test_camera_convert(run, tmp_path):
+def test_camera_convert(tmp_path):
     model = CameraModel(Sensor(640, 480, 0.003), InteriorOrientation(2.0, 0.01, 0.02, -1e-2))
     from thermocald.photogrammetry import camera_files
 

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from thermocald.cli import application
+from tests.commands import answer as run
 from thermocald.errors import ThermocaldError
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation, Sensor
@@ -71,10 +70,6 @@ def with_columns(source, out, order):
     head = yaml.safe_load((source / "recording.yaml").read_text())
     head["temperatures"] = {name: head["temperatures"][name] for name in order}
     (out / "recording.yaml").write_text(yaml.safe_dump(head, sort_keys=False))
-
-
-def run(*arguments):
-    return CliRunner().invoke(application(), [str(a) for a in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -341,8 +336,8 @@ def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
     result = run("correct", tmp_path / "i.csv", "--model", folder / "cam.yaml", "--log",
                  folder / "M1" / "epochs.csv", "--size", "410x308", "--out", tmp_path / "out",
                  "--json", "-")  # fmt: skip
-    assert "1 of 2 rows were not corrected: lines 2" in str(result.exception)
-    assert "is not a readable image" in json.loads(result.stdout)["refused"][0]["reason"]
+    assert "1 of 2 rows were not corrected: line 2" in str(result.exception)
+    assert "is not an image" in json.loads(result.stdout)["refused"][0]["reason"]
     with image_module.open(tmp_path / "out" / f"a.{kind}") as written:
         told = written.getexif()
         assert told[0x0110] == "imx219"
@@ -391,7 +386,7 @@ def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
     (tmp_path / "p.csv").write_text(points)
     told = ["--model", str(folder / "cam.yaml"), "--log", str(folder / "M1" / "epochs.csv")]
     of_file = run("correct", tmp_path / "p.csv", *told)
-    piped = CliRunner().invoke(application(), ["correct", "-", *told], input=points)
+    piped = run("correct", "-", *told, given=points)
     assert piped.exit_code == 0, piped.exception
     assert piped.stdout == of_file.stdout
     assert len(piped.stdout.splitlines()) == len(times) + 1

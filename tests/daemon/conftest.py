@@ -103,7 +103,7 @@ class Daemon:
     def stored(self) -> tuple[list[int], list[str]]:
         """(numbers, statuses) of the one series; the store must be sound."""
         with Store.open(self.store) as store:
-            store.check()
+            assert store.examine().damaged == ()
             columns = store.series_columns(store.find_series(), ["epoch", "status"])
             return columns["epoch"].astype(int).tolist(), columns["status"].tolist()
 
@@ -138,14 +138,6 @@ def spawn():
         if process.poll() is None:
             process.kill()
         process.communicate()
-
-
-@pytest.fixture(scope="session")
-def forker():
-    """What starts daemons, with everything imported."""
-    forker = Forker(ENVIRONMENT)
-    yield forker
-    forker.close()
 
 
 @pytest.fixture

@@ -12,14 +12,13 @@ import pytest
 from thermocald.acquisition.device_loop import Link
 from thermocald.acquisition.pipeline import AcquiredEpoch
 from thermocald.config import parse_config
-from thermocald.daemon.camera_line import link_status
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import plan_cameras
+from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.hal import Camera, Frame, VirtualClock
 from thermocald.output.status_text import status_warnings
-from thermocald.store.database.store import Store
 from thermocald.store.series import EpochResult
 
 CAMERA = {"name": "river", "driver": "v4l2", "device": "/dev/video0", "width": 64, "height": 48}
@@ -32,29 +31,17 @@ def plan_of(**changes):
 
 
 def test_every_epoch_keeps_its_settings_also_when_it_is_calibrated_later(tmp_path):
-    with Store.open(tmp_path / "k.db", "append") as store:
-        guard = SimpleNamespace(
-            store=store,
-            all_series=store.all_series,
-            event=lambda event: None,
-            thin=False,
-            away=False,
-        )
-
-        def begun(one):
-            there = [s for s in store.all_series() if s.name == one.name]
-            return there[0] if there else store.create_series(one.head, one.testfield)
-
-        guard.series = begun
-        guard.append = lambda row: store.append(row.series, row.epoch, row.result, extra=row.extra)
-        frames = SimpleNamespace(wanted=lambda number, eventful: False)
-        keeper = EpochKeeper(plan_of(), guard, frames, lambda acquired, row: None)
-        frame = Frame(np.zeros((48, 64), np.uint8), 1.0, 1e9, settings={"focus": 30.0, "gain": 4.0})
-        for number in (1, 2):
-            epoch = Epoch(number, 1e9 + number, 1e9 + number, {"air": 20.0})
-            keeper.keep(AcquiredEpoch(number, replace(frame, utc=1e9 + number), True, epoch))
-        store.amend(keeper.series, 1, EpochResult("ok"), extra={"blur": 0.7})
-        columns = store.series_columns(keeper.series, ["camera_focus", "camera_gain", "blur"])
+    guard = StoreGuard(tmp_path / "k.db", durable=False)
+    frames = SimpleNamespace(wanted=lambda number, eventful: False)
+    keeper = EpochKeeper(plan_of(), guard, frames, lambda acquired, row: None)
+    frame = Frame(np.zeros((48, 64), np.uint8), 1.0, 1e9, settings={"focus": 30.0, "gain": 4.0})
+    for number in (1, 2):
+        epoch = Epoch(number, 1e9 + number, 1e9 + number, {"air": 20.0})
+        keeper.keep(AcquiredEpoch(number, replace(frame, utc=1e9 + number), True, epoch))
+    guard.store.amend(keeper.series, 1, EpochResult("ok"), extra={"blur": 0.7})
+    wanted = ["camera_focus", "camera_gain", "blur"]
+    columns = guard.store.series_columns(keeper.series, wanted)
+    guard.close()
     assert columns["camera_focus"].tolist() == [30.0, 30.0]
     assert columns["camera_gain"].tolist() == [4.0, 4.0]
     assert columns["blur"][0] == 0.7
@@ -66,7 +53,7 @@ def test_a_setting_that_harms_is_in_the_status():
             return ["focus: auto lets the camera focus by itself"]
 
     link = Link("camera", "river", Focusing(clock=VirtualClock()), VirtualClock())
-    status = link_status(link, 0.0, 60.0)
+    status = link.status(0.0, 60.0)
     document = {
         "stalled": [], "store": {"state": "ok", "lost": 0}, "frames": {"paused": ""},
         "clock": {"trusted": True}, "thermometers": {}, "outputs": {},

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
-from thermocald.analysis.series.stored import table_of_stored
+from thermocald.analysis.series.recorded import table_of_stored
+from thermocald.names import channel_fault
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.physics.testfields import demonstration_field, demonstration_model
@@ -117,3 +118,19 @@ def test_every_epoch_has_its_own_result_before_and_after_a_knock(store):
     assert (columns["status"] == "ok").all()
     moved = columns["X0"][-1] - columns["X0"][WHEN - 2]
     assert moved == pytest.approx(2.0, abs=4 * np.hypot(*columns["sd_X0"][[WHEN - 2, -1]]))
+
+
+@pytest.mark.parametrize("epochs", [40, pytest.param(600, marks=pytest.mark.slow)])
+def test_the_mock_at_half_a_second_tells_nothing_and_every_column_is_ours(daemon, devices, epochs):
+    """No knock that nobody put in; and no name of a column can be a channel's, which loses it."""
+    daemon.configure(**devices(period_s=0.5))
+    daemon.start("--epochs", str(epochs))
+    assert daemon.wait(560.0) == 0
+    assert daemon.events() == ["started", "series_begun", "stopped"]
+    with Store.open(daemon.store) as store:
+        kept = list(store.epochs(store.find_series()))
+    assert len(kept) == epochs
+    columns = set().union(*(epoch.extra for epoch in kept))
+    assert {"series_c", "level_sd_c", "series_epochs", "skew_s"} < columns
+    ours = {name for name in columns if not name.startswith("camera_")}  # those give way
+    assert not [name for name in ours if not channel_fault(name)]

@@ -19,7 +19,7 @@ DAY = 86400.0
 def content(daemon, folder):
     """(columns, clock steps, archived times) of the one series."""
     with Store.open(daemon.store) as store:
-        store.check()
+        assert store.examine().damaged == ()
         series = store.find_series()
         names = ["epoch", "frame_time", "temperature_time", "clock_trusted"]
         columns = store.series_columns(series, names)

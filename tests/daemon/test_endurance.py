@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
+from thermocald.files import read_json
 from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
@@ -62,7 +63,7 @@ def watched(daemon, run):
         time.sleep(1.0)
         try:
             status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
-            live = json.loads((daemon.folder / "thermocald.db.live/status.json").read_text())
+            live = read_json(daemon.folder / "thermocald.db.live/status.json")
             epoch = live["cameras"]["rpi"]["stored"]
             files = len(list((proc / "fd").iterdir()))
             used = sum(map(int, (proc / "stat").read_text().rpartition(")")[2].split()[11:13]))
@@ -175,7 +176,7 @@ def test_a_day_of_epochs_on_a_disk_of_50_mb_loses_no_result(daemon, replayed, tm
     )  # fmt: skip
     assert "observations no more" in done.stderr
     with Store.open(daemon.store) as store:
-        store.check()
+        assert store.examine().damaged == ()
         series = store.find_series()
         columns = store.series_columns(series, ["epoch", "c", "sd_c", "status"])
         assert columns["epoch"].astype(int).tolist() == list(range(1, 8641))
@@ -200,10 +201,11 @@ thread = threading.Thread(target=work)
 thread.start()
 schedule, late = Schedule(SystemClock(), 0.05), []
 for _ in range(400):
-    late.append(schedule.wait().late_s)
+    tick = schedule.wait()
+    late.append(time.monotonic() - schedule.due(tick))
     time.sleep(0.01)
 stop.set(); thread.join()
-print(json.dumps([late, schedule.stats().skipped]))
+print(json.dumps([late, schedule.stats()["skipped"]]))
 """
     bare = """
 import json, time

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import resource
 import shutil
 import signal
@@ -12,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+from thermocald.files import read_json
 from thermocald.store.database.store import Store
 
 
@@ -67,7 +67,7 @@ def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, dev
     # on a busy machine it may take long to open or to calculate, which passes
     daemon.until(lambda: sum(r["device"] == "one" for r in daemon.results()) == 7)
     status = daemon.folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: json.loads(status.read_text())["stalled"] == ["camera one hangs"])
+    daemon.until(lambda: read_json(status)["stalled"] == ["camera one hangs"])
     supervisor.listen(0.5)
     assert "WATCHDOG=1" not in supervisor.listen(2.5)
     count = len([r for r in daemon.results() if r["device"] == "two"])
@@ -86,7 +86,7 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
     daemon.until(lambda: "results wait in memory" in daemon.log())
     status = daemon.folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: json.loads(status.read_text())["store"]["waiting"] >= 5)
+    daemon.until(lambda: read_json(status).get("store", {}).get("waiting", 0) >= 5)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
     daemon.until(lambda: "can be written again" in daemon.log())
     # the output's file was closed for it too, and gets what waited when it is opened again
@@ -115,7 +115,7 @@ def test_a_disk_that_fails_beneath_the_store_loses_nothing(
     asked.write_text(failing)
     daemon.until(lambda: "results wait in memory" in daemon.log())
     status = daemon.folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: json.loads(status.read_text())["store"]["waiting"] >= 5)
+    daemon.until(lambda: read_json(status).get("store", {}).get("waiting", 0) >= 5)
     told = daemon.results()[-1]["epoch"]
     asked.unlink()
     daemon.until(lambda: "can be written again" in daemon.log())
@@ -200,7 +200,7 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
     daemon.until(lambda: daemon.results()[-1]["device"] == "one")
     assert daemon.stop() == 0
     with Store.open(daemon.store) as store:
-        store.check()
+        assert store.examine().damaged == ()
         for series in store.all_series():
             numbers = store.series_columns(series, ["epoch"])["epoch"].tolist()
             assert numbers == list(range(1, len(numbers) + 1))

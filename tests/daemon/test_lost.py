@@ -15,7 +15,8 @@ from thermocald_drivers.alert import Watch, condition_of
 from tests.commands import call
 from tests.daemon.conftest import make_recording
 from tests.daemon.test_store_file import guard, path  # noqa: F401
-from thermocald.acquisition.pipeline import Pipeline, Readings
+from thermocald.acquisition.pipeline import Pipeline
+from thermocald.acquisition.thermometers import Thermometers
 from thermocald.cli.run import status
 from thermocald.daemon.live_state import LiveState
 from thermocald.errors import DataError, StoreError
@@ -125,8 +126,9 @@ def test_an_epoch_that_is_not_handed_over_is_lost(how):
         gate.wait(20.0)
 
     keeper = SimpleNamespace(keep=keep, amend=None, backlog=lambda below: None)
+    none = Thermometers(SimpleNamespace(cameras=(), thermometers=()), SystemClock())
     pipeline = Pipeline(
-        "cam", None, Readings({}), (), keeper, SystemClock(), depth=1, patience_s=0.0,
+        "cam", None, none, (), keeper, SystemClock(), depth=1, patience_s=0.0,
         on_lost=told.append,
     )  # fmt: skip
     pipeline.start()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import subprocess
 import sys
@@ -15,6 +14,7 @@ import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
 from thermocald.epoch import Epoch
+from thermocald.files import read_json
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
@@ -144,7 +144,7 @@ def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, devices):
         daemon.until(lambda: len(daemon.results()) > count + 3)
         assert daemon.log().count("in use by another program") == 1
         assert "the page is at" not in daemon.log()
-        status = json.loads((daemon.folder / "thermocald.db.live/status.json").read_text())
+        status = read_json(daemon.folder / "thermocald.db.live/status.json")
         assert "cannot be used" in status["dashboard"]["why"]
         assert daemon.stop() == 0
 

@@ -33,7 +33,7 @@ DAEMON = """
 import json, os, sys
 from pathlib import Path
 from thermocald.config import load_config
-from thermocald.daemon.service import Service
+from thermocald.daemon import service as module
 
 os.nice(-5)
 path, out = map(Path, sys.argv[1:])
@@ -47,18 +47,16 @@ class Late(list):
     def copy(self):
         return self[-1000:]
 
-service = Service(load_config(path), path, hang_after_s=120.0,
-)
-build = service._build
+build = module.Station
 
-def recorded(config):
-    station = build(config)
+def recorded(config, ground):
+    station = build(config, ground)
     for camera in station.cameras:
         camera.loop.schedule._late = Late()
     return station
 
-service._build = recorded
-service.run()
+module.Station = recorded
+module.Service(load_config(path), path, hang_after_s=120.0).run()
 """
 
 

@@ -13,6 +13,7 @@ import yaml
 from thermocald.daemon.control import ask
 from thermocald.daemon.session import Session
 from thermocald.errors import DataError, UsageError
+from thermocald.files import read_json
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 
@@ -47,7 +48,7 @@ def command(daemon, spawn):
 def series_of(path) -> dict[str, tuple[str, list[int]]]:
     """{name: (start, epoch numbers)}"""
     with Store.open(path) as store:
-        store.check()
+        assert store.examine().damaged == ()
         return {
             s.name: (s.start, store.series_columns(s, ["epoch"])["epoch"].astype(int).tolist())
             for s in store.all_series()
@@ -117,7 +118,7 @@ def test_a_camera_without_a_series_rests_until_a_session(live, daemon):
     """A phone that is to be measured from cold must not be warmed by its own frames."""
     live(series=None)
     time.sleep(1.0)
-    status = json.loads((daemon.live / "status.json").read_text())
+    status = read_json(daemon.live / "status.json")
     assert status["cameras"]["phone-1"]["device"] == "closed"
     daemon.ask("session start", session={**SESSION, "epochs": 3})
     daemon.until(lambda: daemon.session()["state"] == "done")
@@ -128,7 +129,7 @@ def test_a_camera_without_a_series_rests_until_a_session(live, daemon):
 
 
 def status_of(daemon) -> dict:
-    return json.loads((daemon.live / "status.json").read_text())
+    return read_json(daemon.live / "status.json")
 
 
 @pytest.mark.slow
@@ -214,8 +215,7 @@ def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, 
     """Planned and watched by the command, taken by the daemon; `test_closed_loop` compares."""
     pytest.importorskip("gpiozero")
     from thermocald.config import parse_config
-    from thermocald.daemon.desk import take_in_the_daemon
-    from thermocald.daemon.separating import Heating, separating
+    from thermocald.daemon.desk import plan_separation, take_in_the_daemon
     from thermocald.discovery.experiment import Separation
 
     sections = devices(period_s=0.3, name="phone-1")
@@ -225,8 +225,8 @@ def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, 
     config = parse_config(yaml.safe_load(daemon.config.read_text()), daemon.config)
     asked = Session.model_validate({**SESSION, "epochs": 4000, "check": False})
     said: list[str] = []
-    _, session, watch = separating(
-        config, asked, "creep,slip", None, Heating(40.0, 2.0, 0.8), said.append
+    _, session, watch = plan_separation(
+        config, asked, "creep,slip", None, said.append, 40.0, 2.0, 0.8
     )
     assert max(s.hold_c for s in session.programme if s.hold_c) <= 40.0
     watch._store = daemon.store

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -17,6 +17,7 @@ from tests.daemon.conftest import ENVIRONMENT
 from thermocald.daemon.store_guard import FollowedStore, Row, StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
+from thermocald.files import read_json
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
@@ -49,9 +50,7 @@ def keeping(path, durable=False) -> StoreGuard:
     def keep(number: int, time_s: float = 1e9) -> None:
         values = EpochResult("ok", "", np.full(16, float(number)), np.eye(16), 1.0, 5, 9)
         epoch = Epoch(number, time_s + number, time_s + number, {"t": 20.0})
-        row = Row(series, epoch, values, {}, True)
-        row.told = lambda stored: guard.told.__setitem__(number, stored)
-        guard.append(row)
+        guard.told[number] = guard.append(Row(series, epoch, values, {}, True))
 
     guard.keep = keep
     for number in (1, 2, 3):
@@ -61,7 +60,7 @@ def keeping(path, durable=False) -> StoreGuard:
 
 def numbers(path) -> list[int]:
     with Store.open(path) as store:
-        store.check()
+        assert store.examine().damaged == ()
         return [s.epoch.number for s in store.epochs(store.find_series())]
 
 
@@ -163,7 +162,7 @@ while time.monotonic() < end:
 for reader in readers:
     reader.join()
 guard.close()
-print(len(guard.notice) > 0)
+print(len(guard.status()["notice"]) > 0)
 """
 
 
@@ -199,7 +198,7 @@ def test_a_store_that_was_moved_away_stays_whole_and_a_new_one_is_begun(guard, p
     guard.keep(4)
     assert numbers(path) == [4]
     assert numbers(path.with_name("old.db")) == [1, 2, 3]
-    assert "moved away" in guard.notice
+    assert "moved away" in guard.status()["notice"]
 
 
 def test_another_file_in_its_place_is_used_and_the_old_one_is_rescued(guard, path, tmp_path):
@@ -210,7 +209,7 @@ def test_another_file_in_its_place_is_used_and_the_old_one_is_rescued(guard, pat
     assert numbers(path) == [1, 2, 3, 5]
     (rescued,) = path.parent.glob("t-rescued-*.db")
     assert numbers(rescued) == [1, 2, 3, 4]
-    assert str(rescued) in guard.notice
+    assert str(rescued) in guard.status()["notice"]
 
 
 def test_a_file_that_is_no_store_is_left_alone_and_results_wait(guard, path):
@@ -285,7 +284,7 @@ def test_the_running_daemon_says_so_and_loses_nothing(daemon, devices):
     count = len(daemon.results())
     daemon.until(lambda: len(daemon.results()) > count + 3)
     status = daemon.folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: "was deleted" in json.loads(status.read_text())["store"]["notice"])
+    daemon.until(lambda: "was deleted" in read_json(status)["store"]["notice"])
     daemon.kill()
     stored = {r["epoch"] for r in daemon.results() if r["stored"]}
     numbers, _ = daemon.stored()
@@ -349,3 +348,22 @@ def test_a_disk_that_becomes_read_only_while_the_daemon_writes(ext4):
     assert (guard.waiting, guard.lost) == (0, 0)
     guard.close()
     assert numbers(path) == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemon, devices):
+    folder, broken, mended = ext4
+    daemon.store = folder / "thermocald.db"
+    daemon.configure(**devices())
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 3)
+    broken()
+    daemon.until(lambda: "results wait in memory" in daemon.log())
+    daemon.until(lambda: not daemon.results()[-1]["stored"])
+    daemon.signal(signal.SIGSTOP)  # it sees the mended card in the place of the broken one
+    mended()
+    daemon.signal(signal.SIGCONT)
+    daemon.until(lambda: daemon.results()[-1]["stored"])
+    assert daemon.stop() == 0
+    numbers, _ = daemon.stored()
+    assert numbers == [r["epoch"] for r in daemon.results()] == list(range(1, len(numbers) + 1))
+    assert "Traceback" not in daemon.log()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thermocald.config import parse_config
-from thermocald.daemon.given_config import demo_config
+from thermocald.daemon.plan import demo_config
 from thermocald.daemon.service import Service
 from thermocald.hal import VirtualClock
 from thermocald.store.database.store import Store

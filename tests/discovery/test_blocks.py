@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-from datetime import UTC, datetime
 
 import pytest
 
 from thermocald.discovery import examination
 from thermocald.discovery.result import discover_series
-from thermocald.discovery.unnamed import resolve
 from thermocald.output.discovery import report_html
 from thermocald.thermal.series import in_blocks
 
@@ -27,9 +25,9 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     first, last = found.effects[0].where["epochs"]
     assert 0 <= first < last <= evidence[0].source.numbers[-1]
     assert last > 60  # epochs, not rows
-    page = report_html(found, "long", datetime(2026, 6, 14, 12, 30, tzinfo=UTC))
+    page = report_html(found, "long")
     assert "<svg" in page
-    assert "Made on 2026-06-14 at 12:30 UTC with thermocald" in page
+    assert re.search(r"Made on \d{4}-\d\d-\d\d at \d\d:\d\d UTC with thermocald", page)
     source = evidence[0].source
     assert f"{source.camera}, {source.sensor.width} × {source.sensor.height} px of" in page
     links = re.findall(r'href="#(chapter-1-\d)"', page)
@@ -37,11 +35,11 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     assert len(links) >= 4
 
 
+@pytest.mark.slow
 def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
     """The rate of the temperature is of all epochs, the misfit of blocks: np.gradient of both."""
     evidence, _ = evidence_of("outside", px=0.3, seed=24, with_m2=False)
     found = discover_series(evidence)
-    rows = {what: sigmas for what, _, sigmas in resolve(found.examination).rows}
-    assert "rate of temperature" in rows
-    assert found.as_dict()["effects"][0]["evidence"]["base_misfit"]["against"]
+    rows = found.as_dict()["effects"][0]["evidence"]["base_misfit"]["against"]
+    assert "rate of temperature" in [row["what"] for row in rows]
     assert "<svg" in report_html(found, "long")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.blocks import InBlocks
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.series.blocks import GridBlocks
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.thermal.series import SeriesInput
 from thermocald.thermal.source import condensed
@@ -42,7 +42,7 @@ def recorded():
 
 def test_rows_are_weighted_means(recorded):
     whole, grid = recorded
-    out = condensed(whole, GridBlocks(grid, 911), most=500)
+    out = condensed(whole, InBlocks(grid, 911), most=500)
     assert out.counts.sum() == E
     assert len(out.counts) <= 550
     first = out.numbers - 1
@@ -59,7 +59,7 @@ def test_rows_are_weighted_means(recorded):
 
 def test_the_blocks_that_are_read_do_not_matter(recorded):
     whole, grid = recorded
-    one, other = (condensed(whole, GridBlocks(grid, size), most=500) for size in (E, 480))
+    one, other = (condensed(whole, InBlocks(grid, size), most=500) for size in (E, 480))
     # but for points at the limit of what is gross
     assert np.mean(np.abs(one.grid.points - other.grid.points) > 1e-9) < 0.002
     np.testing.assert_array_equal(one.counts, other.counts)
@@ -67,7 +67,7 @@ def test_the_blocks_that_are_read_do_not_matter(recorded):
 
 def test_a_gross_error_is_left_out(recorded):
     whole, grid = recorded
-    out = condensed(whole, GridBlocks(grid, 911), most=300)
+    out = condensed(whole, InBlocks(grid, 911), most=300)
     row = int(np.searchsorted(out.numbers, 4002, side="right")) - 1
     fine = np.nanmedian(grid.points[4001 - 100 : 4001 + 100, 3], axis=0)
     np.testing.assert_allclose(out.grid.points[row, 3], fine, atol=0.1)
@@ -75,6 +75,6 @@ def test_a_gross_error_is_left_out(recorded):
 
 def test_what_is_fast_keeps_short_rows(recorded):
     whole, grid = recorded
-    out = condensed(whole, GridBlocks(grid, 911), most=500)
+    out = condensed(whole, InBlocks(grid, 911), most=500)
     fast = (out.frame_times > 20 * 3600) & (out.frame_times < 21 * 3600)
     assert np.mean(out.counts[fast]) * 2 < np.median(out.counts[~fast])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.marks import mostly_slow
 from thermocald.discovery.evidence import find_displaced_targets
 from thermocald.discovery.result import discover_series
 from thermocald.discovery.search import Search
@@ -27,14 +28,10 @@ KEYS = {
 }
 
 
-def slow(effect: str):
-    return pytest.param(effect, marks=pytest.mark.slow)
+NAMED = ("thermal_lag", "softening", "housing_tilt", "target_displacement", "defocus")
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [slow("thermal_lag"), "softening", slow("housing_tilt"), "target_displacement", "defocus"],
-)
+@pytest.mark.parametrize("effect", mostly_slow(NAMED, "target_displacement", "defocus"))
 def test_a_hidden_effect_is_named(evidence_of, effect):
     evidence, _ = evidence_of(effect, px=0.1, seed=21)
 
@@ -44,6 +41,7 @@ def test_a_hidden_effect_is_named(evidence_of, effect):
     assert [e.effect for e in found.effects] == [effect]
 
 
+@pytest.mark.slow
 def test_the_gap_shrinks_to_the_floor(evidence_of):
     evidence, _ = evidence_of("permanent_set", px=0.1, seed=22)
     found = discover_series(evidence)
@@ -83,6 +81,7 @@ def test_a_small_lag_and_a_small_delay_stay_alternatives(evidence_of):
     assert "experiment" in found.effects[0].alternatives[0]
 
 
+@pytest.mark.slow
 def test_a_delay_is_no_lag_because_the_temperature_was_smooth(evidence_of):
     """A lag smooths the thermometer's noise, and a smooth image would speak for it: d is 10 s."""
     evidence, _ = evidence_of("time_offset", px=0.3, seed=330)
@@ -90,6 +89,7 @@ def test_a_delay_is_no_lag_because_the_temperature_was_smooth(evidence_of):
     assert [e.effect for e in found.effects] == ["time_offset"]
 
 
+@pytest.mark.slow
 def test_under_a_steady_ramp_lag_and_delay_stay_alternatives(evidence_of):
     evidence, _ = evidence_of("time_offset", px=0.3, seed=321)
     found = discover_series(evidence)
@@ -97,6 +97,7 @@ def test_under_a_steady_ramp_lag_and_delay_stay_alternatives(evidence_of):
     assert {"thermal_lag", "time_offset"} <= names
 
 
+@pytest.mark.slow
 def test_a_play_shorter_than_an_interval_is_named(evidence_of):
     """Where it turns nobody saw the extreme; taken for sure, that spoke against every play."""
     evidence, truth = evidence_of("hysteresis", px=0.1, seed=360)
@@ -128,7 +129,7 @@ def test_document(evidence_of):
         assert set(gap) == {"rms_px", "chi2_reduced", "object_mm_at_10m"}
     page = report_html(found, "M1")  # the name beside what noise alone reaches
     assert "Could noise do this?" in page
-    assert page.count("<svg") == 6
+    assert page.count("<figure") == 6
     assert "≤ 1/120" in page
     assert f"UTC, {len(evidence[0].source.frame_times)} epochs." in page
     assert "&lt;" not in page  # no object in place of its text

@@ -80,7 +80,7 @@ def test_the_error_of_a_second_thermometer_is_part_of_the_noise(above):
     whole = fitter.fit((term,), start, 1)
     fitter.further_operators = lambda *_: []
     alone = fitter.fit((term,), start, 1)
-    assert len(whole.weightings[0].operators) == len(alone.weightings[0].operators) + 1
+    assert len(whole.weightings[0].errors) == len(alone.weightings[0].errors) + 1
     assert whole.covariance[-1, -1] > 1.05 * alone.covariance[-1, -1]
 
 

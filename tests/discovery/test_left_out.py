@@ -5,24 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.blind.bridge import series_input
-from tests.blind.case import Case
-from tests.blind.generator import generate
 from thermocald.discovery.validation import cross_validation, is_confirmed, measure_block_gains
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
-from thermocald.thermal.reduce import reduce_series
 
 
-def fitter(effect, seed=91):
-    series, truth = generate(Case((effect,), 0.2, seed, epochs=90))
-    first = reduce_series(series_input(series[0]))
-    second = reduce_series(series_input(series[1]), first.T0, first.scale)
-    return HypothesisFitter([first, second]), truth
-
-
-def test_the_cause_predicts_every_block():
-    lab, _ = fitter("nonlinear_expansion")
+def test_the_cause_predicts_every_block(evidence_of):
+    lab = HypothesisFitter(evidence_of("nonlinear_expansion", px=0.2, seed=91, epochs=90)[0])
     fit = lab.refine(lab.fit([Term("nonlinear_expansion")]))
 
     (gain,) = measure_block_gains(lab, fit)
@@ -45,10 +34,9 @@ def test_what_confirms(gain, expected):
     assert is_confirmed(np.array(gain)) == expected
 
 
-def test_a_course_that_follows_the_noise_predicts_nothing():
+def test_a_course_that_follows_the_noise_predicts_nothing(evidence_of):
     """A cycle fitted to a recording without effects, at the period that suits it best."""
-    series, _ = generate(Case((), 0.2, 92, epochs=90, with_m2=False))
-    lab = HypothesisFitter([reduce_series(series_input(series[0]))])
+    lab = HypothesisFitter(evidence_of(px=0.2, seed=92, epochs=90, with_m2=False)[0])
     trials = [
         lab.fit([Term("cyclic_interference", nonlinear=(("P", p),))])
         for p in np.geomspace(40, 400, 60)
@@ -59,9 +47,10 @@ def test_a_course_that_follows_the_noise_predicts_nothing():
     assert gain.sum() < 12  # of six coefficients
 
 
-def test_a_step_within_the_block_left_out_is_no_fault():
+def test_a_step_within_the_block_left_out_is_no_fault(evidence_of):
     """Where a slip comes early in M2, the block with it leaves its height undetermined."""
-    lab, truth = fitter("slip")
+    evidence, truth = evidence_of("slip", px=0.2, seed=91, epochs=90)
+    lab = HypothesisFitter(evidence)
     times = [s["time"] for (s,) in truth["effects"] if s["happens"]]
     own = [
         (("time", float(e.times[np.searchsorted(e.times, t)])),)

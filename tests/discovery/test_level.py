@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.test_thermal_model import simulated
-from thermocald.discovery.model import estimate_level
+from thermocald.discovery.result import estimate_level
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import make_known_term
 from thermocald.thermal.noise import calibrate_thermometers

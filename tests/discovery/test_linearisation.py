@@ -60,7 +60,7 @@ def test_the_scatter_of_long_series(tmp_path):
         sds = fitted.model.sds
         ratios.append([(fitted.model.rates[n] - RATES[k]) / sds[f"rates.{n}"]
                        for k, n in enumerate(NAMES)])  # fmt: skip
-        noise.append(fitted.series[0].thermometer_sd)
+        noise.append(fitted.fitted["series"][0].thermometer_sd)
     # thirty numbers know a standard deviation to 13 %
     assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.25
     assert np.median(noise) == pytest.approx(0.02, rel=0.15)

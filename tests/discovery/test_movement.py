@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from tests.blind.bridge import series_input
-from tests.blind.case import Case
-from tests.blind.generator import generate
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import (
     Mount,
@@ -16,20 +11,15 @@ from thermocald.thermal.movement import (
     find_combinations,
     guess_mount_motion,
 )
-from thermocald.thermal.reduce import reduce_series
 
 
-def test_slow_drifts_in_weak_directions_are_movement():
+def test_slow_drifts_in_weak_directions_are_movement(evidence_of):
     """Moments of rough half-waves do not show them; left at zero they were told as effects."""
-    series, _ = generate(Case((), 0.3, 7, epochs=60, with_m2=False))
-    e = reduce_series(series_input(series[0]))
+    (e,), _ = evidence_of(seed=7, epochs=60, with_m2=False)
     W = find_combinations([e])
     half_wave = np.cos(np.pi * np.linspace(0, 1, len(e.times)))
     drift = np.outer(2.0 * half_wave, W[:, 3:11].sum(axis=1))
-    values = e.values + drift
-    b = e.b + np.einsum("epq,eq->ep", e.N, drift)
-    moved = replace(e, b=b, values=values, yy=np.einsum("ek,ek->e", values, b))
-    fitter = HypothesisFitter([moved])
+    fitter = HypothesisFitter([e.with_values(e.values + drift)])
     start = fitter.fit(())
 
     mount = Mount(W, guess_mount_motion(fitter, start, W), 0.0)

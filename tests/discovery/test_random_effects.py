@@ -40,10 +40,9 @@ def test_targets_seen_in_one_epoch_say_nothing():
     assert np.sqrt(np.diag(b.covariance)) / scale == pytest.approx(sd, rel=0.03)
 
 
-def test_movement_is_the_dense_covariance():
+def test_movement_is_the_dense_covariance(evidence_of):
     """Inner products with a movement equal those of the covariance matrix written out."""
-    series, _ = generate(Case((), 0.3, 5, epochs=24, with_m2=False))
-    e = reduce_together([series_input(series[0])])[0]
+    (e,), _ = evidence_of(seed=5, epochs=24, with_m2=False)
     size, U = np.linalg.eigh(e.N.mean(axis=0))
     keep = U[:, size > 1e-3 * np.median(size)]
     directions = keep[:, -2:]

@@ -49,7 +49,7 @@ def test_kinks_get_a_latent_instant(readings):
 
 def test_course_is_closer_than_readings(readings):
     t, y = readings
-    c = smooth_channel(t, y, np.zeros(len(t), dtype=bool), 0.0625)
+    c = smooth_channel(t, y, np.ones(len(t), bool), np.zeros(len(t), bool), 0.0625)
     assert np.std(c.trajectory - trajectory(t)) < 0.7 * np.std(y - trajectory(t))
     assert c.trajectory + c.deviation == pytest.approx(y)
 
@@ -58,7 +58,7 @@ def test_a_missing_reading_is_uncertain(readings):
     t, y = readings
     y = y.copy()
     y[50] = np.nan
-    c = smooth_channel(t, y, np.zeros(len(t), dtype=bool), 0.0625)
+    c = smooth_channel(t, y, np.ones(len(t), bool), np.zeros(len(t), bool), 0.0625)
     assert c.deviation[50] == 0.0
     assert c.sd[50] > 2 * c.sd[100]
 

@@ -30,9 +30,10 @@ def test_two_equal_lags_are_said_by_their_sum(lagging):
 
     found = find_trade_off(lagging, fit, 0)
 
-    assert found.value == pytest.approx(60.0)
-    assert 0.0 < found.sd < 5.0
-    assert "not separable, their sum is 60" in found.sentence
+    document, sentence = found
+    assert document["sum"] == pytest.approx(60.0)
+    assert 0.0 < document["sd"] < 5.0
+    assert "not separable, their sum is 60" in sentence
 
 
 def test_a_short_and_a_long_lag_are_separate(lagging):
@@ -61,8 +62,9 @@ def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alon
     """Its tail is an exponential: middle and size are one number."""
     found = find_ridge(lagging, saturating(lagging, 3783.7, 288.2), 0)
 
-    assert found.names == ("k",)
-    assert "only their product" in found.sentence
+    document, sentence = found
+    assert document == {"parameters": ["k"]}
+    assert "only their product" in sentence
 
 
 def test_a_saturation_within_the_recorded_range_is_known(lagging):

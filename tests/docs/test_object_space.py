@@ -9,7 +9,7 @@ import pytest
 from benchmarks.object_space import BOUND, HEADER, measure
 from tests.docs.blocks import ROOT
 from thermocald.analysis.study.reference import QUOTED
-from thermocald.physics.presets import preset_names
+from thermocald.physics.presets import PRESETS
 
 PAGE = (ROOT / "docs/explanation/object-space.md").read_text()
 
@@ -22,15 +22,12 @@ def shown(preset: str) -> list[float]:
 
 def test_the_page_has_every_preset_in_the_benchmarks_columns():
     assert HEADER in PAGE
-    assert len(re.findall(r"^\| `", PAGE, re.M)) == len(preset_names())
+    assert len(re.findall(r"^\| `", PAGE, re.M)) == len(PRESETS)
 
 
 @pytest.mark.parametrize(
     "preset",
-    [
-        pytest.param(p, marks=() if p == "galaxy-s8-warm" else pytest.mark.slow)
-        for p in preset_names()
-    ],
+    [pytest.param(p, marks=() if p == "galaxy-s8-warm" else pytest.mark.slow) for p in PRESETS],
 )
 def test_a_tenth_is_left_and_the_table_is_true(preset):
     """Fitted to M1, applied to M2's readings; other seeds than the table's hold the bound too."""

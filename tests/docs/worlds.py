@@ -12,12 +12,11 @@ import cv2
 import numpy as np
 import yaml
 from PIL import Image
-from typer.testing import CliRunner
 
+from tests.commands import succeed as run
 from tests.docs.blocks import ROOT, blocks
 from tests.photogrammetry import network_cases
 from tests.photogrammetry.printed_sheets import photograph, put_up
-from thermocald.cli import application
 from thermocald.output.testfield.layout import TRIM, paper_size
 from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
@@ -31,13 +30,6 @@ from thermocald.physics.presets import preset_simulation
 from thermocald.physics.scene import Scene
 from thermocald.physics.testfields import corner_field, demonstration_field, demonstration_model
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
-
-
-def run(*arguments: object) -> None:
-    """One command of the program, in this process."""
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
-    assert result.exit_code == 0, result.output
-
 
 LAG = ModelEffect("thermal_lag", {"tau": 70.0})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from thermocald_drivers import android_thermometer
 from thermocald_drivers.android_thermometer import thermalservice
-from thermocald_drivers.zones import is_temperature, raw_zones, zone_scales
+from thermocald_drivers.kernel import is_temperature, raw_zones, zone_scales
 
 
 def battery(text, unit=""):

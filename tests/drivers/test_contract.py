@@ -10,7 +10,6 @@ import ast
 import importlib
 import inspect
 import itertools
-import json
 import math
 import sys
 import time
@@ -203,7 +202,7 @@ def test_frames_keep_the_contract(device, bench):
     with device:
         frames = [device.capture() for _ in range(3)]
     for frame in frames:
-        assert frame.image is not None or frame.encoded or "observations" in frame.metadata
+        assert frame.image is not None or frame.encoded or frame.observations
         if frame.image is not None:
             assert frame.image.ndim == 2
             assert frame.image.dtype in (np.uint8, np.uint16)
@@ -212,7 +211,6 @@ def test_frames_keep_the_contract(device, bench):
         assert frame.monotonic <= bench.clock.monotonic() + 1e-6
         assert math.isfinite(frame.utc)
         assert frame.exposure is None or frame.exposure > 0
-        json.dumps(dict(frame.metadata))
         assert all(isinstance(value, float) for value in frame.settings.values())
         assert all(map(math.isfinite, frame.settings.values()))
         size = device.frame_size()
@@ -236,7 +234,6 @@ def test_readings_keep_the_contract(device, bench):
             assert -100 < value < 200
         assert reading.monotonic <= bench.clock.monotonic() + 1e-6
         assert math.isfinite(reading.utc)
-        json.dumps(dict(reading.metadata))
     # On a virtual clock that stands still, the system's instants are brought over to some µs.
     instants = [r.monotonic for r in readings]
     assert all(b > a - 1e-3 for a, b in itertools.pairwise(instants))
@@ -249,4 +246,4 @@ def test_outputs_take_any_result_in_time(device):
         begin = time.monotonic()
         for result in results:
             device.emit(result)
-        assert time.monotonic() - begin < 3 * getattr(device, "timeout_s", 5.0)
+        assert time.monotonic() - begin < 3 * getattr(device.options, "timeout_s", 5.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from thermocald.daemon.probe import KINDS
+from thermocald.daemon.soundness import KINDS
 from thermocald.hal import driver_names, load_driver
 
 SYSTEMD = Path(__file__).resolve().parents[2] / "systemd"

@@ -53,53 +53,37 @@ def test_the_led_tells_whether_there_are_results(pins):
     assert not pins.pin(17).state
 
 
-def test_the_programme(pins, clock):
-    with relay(clock) as lamp:
+# (s, °C, whether the lamp is on after it)
+HEATED = {
+    # off at the upper edge of the hysteresis, on at the lower; off before, between and after
+    "the programme": ({}, [(10, 20.0, 0), (110, 20.0, 1), (200, 44.9, 1), (300, 45.5, 0),
+                           (310, 45.0, 0), (320, 44.5, 1), (1150, 20.0, 0), (5000, 20.0, 0)]),
+    "the limit is for good": ({}, [(200, 20.0, 1), (200, 60.0, "60.00 °C reached the limit 60 °C"),
+                                   (200, 20.0, 0)]),
+    "no temperature": ({}, [(200, None, 0)]),
+    "not a number": ({}, [(200, float("nan"), 0)]),
+    "a word": ({}, [(200, "hot", 0)]),
+    "no temperature for long": ({"unknown_s": 30}, [(200, 20.0, 1), (210, None, 1),
+                                                    (231, None, 0)]),
+    "a board that switches at low": ({"active_high": False}, [(200, 20.0, 0)]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HEATED)
+def test_when_the_lamp_is_on(pins, clock, case):
+    options, steps = HEATED[case]
+    with relay(clock, **options) as lamp:
         pin = pins.pin(27)
-
-        def at(seconds, temperature):
+        assert pin.state == (options.get("active_high") is False)  # off
+        for seconds, temperature, expected in steps:
             clock.sleep_until(seconds)
-            lamp.emit({"temperature": temperature})
-            return bool(pin.state)
-
-        assert not pin.state
-        states = [at(10, 20.0), at(110, 20.0), at(200, 44.9), at(300, 45.5), at(310, 45.0)]
-        assert states == [False, True, True, False, False]  # off at the upper edge, on at the lower
-        assert at(320, 44.5)
-        assert not at(1150, 20.0)
-        assert not at(5000, 20.0)
-
-
-def test_the_limit_is_for_good(pins, clock):
-    with relay(clock) as lamp:
-        clock.sleep_until(200)
-        lamp.emit({"temperature": 20.0})
-        assert pins.pin(27).state
-        with pytest.raises(BadReading, match=r"60\.00 °C reached the limit 60 °C"):
-            lamp.emit({"temperature": 60.0})
-        assert not pins.pin(27).state
-        lamp.emit({"temperature": 20.0})
-        assert not pins.pin(27).state
-
-
-@pytest.mark.parametrize("value", [None, float("nan"), "hot"])
-def test_no_temperature_never_starts_the_lamp(pins, clock, value):
-    with relay(clock) as lamp:
-        clock.sleep_until(200)
-        lamp.emit({"temperature": value})
-        assert not pins.pin(27).state
-
-
-def test_no_temperature_for_long_stops_the_lamp(pins, clock):
-    with relay(clock, unknown_s=30) as lamp:
-        clock.sleep_until(200)
-        lamp.emit({"temperature": 20.0})
-        clock.sleep_until(210)
-        lamp.emit({"temperature": None})
-        assert pins.pin(27).state
-        clock.sleep_until(231)
-        lamp.emit({"temperature": None})
-        assert not pins.pin(27).state
+            if isinstance(expected, str):
+                with pytest.raises(BadReading, match=expected):
+                    lamp.emit({"temperature": temperature})
+                expected = 0
+            else:
+                lamp.emit({"temperature": temperature})
+            assert bool(pin.state) == bool(expected), seconds
 
 
 def test_no_result_for_long_stops_the_lamp(pins, clock):
@@ -123,14 +107,6 @@ def test_closing_switches_off(pins, clock):
     lamp.close()
     lamp.close()
     assert not pins.pin(27).state
-
-
-def test_a_board_that_switches_at_low(pins, clock):
-    with relay(clock, active_high=False) as lamp:
-        assert pins.pin(27).state  # high: off
-        clock.sleep_until(200)
-        lamp.emit({"temperature": 20.0})
-        assert not pins.pin(27).state
 
 
 def test_a_pin_in_use(pins, clock):

@@ -6,14 +6,11 @@ import errno
 
 import pytest
 import smbus2
-from thermocald_drivers.i2c import Compensation, crc8
+from thermocald_drivers.i2c import bme280_celsius, crc8
 
 from tests.drivers.fakes.chips import (
-    ADC_P,
     ADC_T,
-    CALIBRATION,
     CHIPS,
-    HUMIDITY,
     bme280,
     lm75,
     mcp9808,
@@ -125,24 +122,46 @@ def test_an_address_that_the_chip_cannot_have(name):
         thermometer(name, address=0x50)
 
 
-# MCP9808, DS25095A: flags in bits 15–13, sign in bit 12
-@pytest.mark.parametrize(
-    ("raw", "value"),
-    [(0x0194, 25.25), (0xC194, 25.25), (0x1FFF, -0.0625), (0xFE70, -25.0), (0x1D80, -40.0)],
-)
-def test_mcp9808_sign_and_flags(bus, raw, value):
-    bus.chips[0x18] = mcp9808(raw)
-    with thermometer("mcp9808") as device:
-        assert device.read().values == {"temperature": value}
+# what a chip holds: °C, or what is said of it; MCP9808 DS25095A: flags in bits 15–13, sign in 12;
+# TMP117 SNOSD82D table 7-1; LM75B rev. 6.1 table 10; TMP102 SBOS397H tables 6-2 and 6-3
+HELD = [
+    *(
+        ("mcp9808", {}, mcp9808(raw), value)
+        for raw, value in [(0x0194, 25.25), (0xC194, 25.25), (0x1FFF, -0.0625), (0xFE70, -25.0),
+                           (0x1D80, -40.0), (0x0FF0, "255 °C is outside")]
+    ),
+    *(
+        ("tmp117", {}, tmp117(raw), value)
+        for raw, value in [(0x0001, 0.0078125), (0x0C80, 25.0), (0xF380, -25.0), (0x3200, 100.0),
+                           (0xE480, -55.0), (0x8000, "0x8000")]
+    ),
+    ("tmp117", {}, tmp117(ready=False), "did not end"),
+    *(
+        ("lm75", {"chip": chip}, lm75(raw), value)
+        for chip, raw, value in [
+            ("lm75", 0x1900, 25.0), ("lm75", 0xE700, -25.0), ("lm75", 0x7D80, 125.5),
+            ("lm75", 0x1920, 25.125), ("lm75", 0x1960, 25.375),  # an LM75A or LM75B
+            ("lm75", 0x1910, "0x1910 has bits"), ("lm75b", 0x7EC0, 126.75),
+            ("lm75b", 0xE6E0, -25.125), ("tmp75", 0x1910, 25.0625), ("tmp102", 0x7FF0, 127.9375),
+            ("tmp102", 0xE700, -25.0), ("tmp102", 0x0C81, 25.0),  # extended: bit 0 set, 13 bits
+        ]
+    ),
+    ("sht3x", {}, sht3x(0x0000), "outside"),
+    ("sht3x", {}, sht3x(0xFFFE), "outside"),
+    ("bme280", {}, bme280(adc_t=0x80000), "0x80000"),
+    ("bme280", {}, bme280(status=0x08), "did not end"),
+]  # fmt: skip
 
 
-def test_mcp9808_out_of_range(bus):
-    bus.chips[0x18] = mcp9808(0x0FF0)  # 255 °C
-    with (
-        thermometer("mcp9808") as device,
-        pytest.raises(errors.BadReading, match="255 °C is outside"),
-    ):
-        device.read()
+@pytest.mark.parametrize(("name", "options", "chip", "expected"), HELD)
+def test_what_a_chip_holds_is_read_rightly_or_refused(bus, name, options, chip, expected):
+    bus.chips[CHIPS[name][0]] = chip
+    with thermometer(name, **options) as device:
+        if isinstance(expected, float):
+            assert device.read().values == {"temperature": expected}
+            return
+        with pytest.raises((errors.BadReading, errors.DeviceTimeout), match=expected):
+            device.read()
 
 
 def test_mcp9808_in_shut_down_is_woken_and_a_conversion_awaited(bus):
@@ -150,63 +169,6 @@ def test_mcp9808_in_shut_down_is_woken_and_a_conversion_awaited(bus):
     with thermometer("mcp9808") as device:
         assert chip.registers[1] == b"\x00\x00"
         assert device.clock.monotonic() >= 0.25
-
-
-def test_mcp9808_that_stays_in_shut_down(bus):
-    bus.chips[0x18] = mcp9808(configuration=0x0140)
-    bus.chips[0x18].on_write = lambda *_: None
-    with pytest.raises(errors.BadReading, match="shut-down"):
-        thermometer("mcp9808").open()
-
-
-# TMP117, SNOSD82D table 7-1
-@pytest.mark.parametrize(
-    ("raw", "value"),
-    [(0x0001, 0.0078125), (0x0C80, 25.0), (0xF380, -25.0), (0x3200, 100.0), (0xE480, -55.0)],
-)
-def test_tmp117_table_of_the_data_sheet(bus, raw, value):
-    bus.chips[0x48] = tmp117(raw)
-    with thermometer("tmp117") as device:
-        assert device.read().values == {"temperature": value}
-
-
-def test_tmp117_that_never_converted(bus):
-    bus.chips[0x48] = tmp117(0x8000)
-    with thermometer("tmp117") as device, pytest.raises(errors.BadReading, match="0x8000"):
-        device.read()
-
-
-def test_tmp117_that_hangs(bus):
-    bus.chips[0x48] = tmp117(ready=False)
-    with thermometer("tmp117") as device, pytest.raises(errors.DeviceTimeout):
-        device.read()
-
-
-# LM75B rev. 6.1 table 10; TMP102 SBOS397H table 6-2 and 6-3
-@pytest.mark.parametrize(
-    ("chip", "raw", "value"),
-    [
-        ("lm75", 0x1900, 25.0),
-        ("lm75", 0xE700, -25.0),
-        ("lm75", 0x7D80, 125.5),
-        ("lm75b", 0x7EC0, 126.75),
-        ("lm75b", 0xE6E0, -25.125),
-        ("tmp75", 0x1910, 25.0625),
-        ("tmp102", 0x7FF0, 127.9375),
-        ("tmp102", 0xE700, -25.0),
-        ("tmp102", 0x0C81, 25.0),  # extended mode: bit 0 set, 13 bits
-    ],
-)
-def test_lm75_family_words(bus, chip, raw, value):
-    bus.chips[0x48] = lm75(raw)
-    with thermometer("lm75", chip=chip) as device:
-        assert device.read().values == {"temperature": value}
-
-
-def test_lm75_with_bits_that_it_cannot_set(bus):
-    bus.chips[0x48] = lm75(0x1910)
-    with thermometer("lm75") as device, pytest.raises(errors.BadReading, match="0x1910 has bits"):
-        device.read()
 
 
 def test_lm75_in_shut_down_is_woken(bus):
@@ -219,20 +181,30 @@ def test_lm75_in_shut_down_is_woken(bus):
         assert device.clock.monotonic() - before >= 0.3
 
 
-def test_lm75_with_limits_of_another_chip(bus):
-    bus.chips[0x48] = lm75()
-    bus.chips[0x48].word(2, 0x4B37)
-    with pytest.raises(errors.WrongDevice, match="hysteresis reads 0x4b37"):
-        thermometer("lm75").open()
+def locked():
+    chip = mcp9808(configuration=0x0140)
+    chip.on_write = lambda *_: None
+    return chip
+
+
+def other_limits():
+    chip = lm75()
+    chip.word(2, 0x4B37)
+    return chip
 
 
 @pytest.mark.parametrize(
-    ("chip", "raw", "value"), [("lm75", 0x1920, 25.125), ("lm75", 0x1960, 25.375)]
+    ("name", "chip", "error", "message"),
+    [
+        ("mcp9808", locked(), errors.BadReading, "shut-down"),
+        ("lm75", other_limits(), errors.WrongDevice, "hysteresis reads 0x4b37"),
+        ("bme280", bme280(identity=0x58), errors.WrongDevice, "0x0058"),  # a BMP280
+    ],
 )
-def test_lm75a_and_b_under_lm75(bus, chip, raw, value):
-    bus.chips[0x48] = lm75(raw)
-    with thermometer("lm75", chip=chip) as device:
-        assert device.read().values == {"temperature": value}
+def test_a_chip_that_is_not_used(bus, name, chip, error, message):
+    bus.chips[CHIPS[name][0]] = chip
+    with pytest.raises(error, match=message):
+        thermometer(name).open()
 
 
 POWER_UP = [
@@ -280,13 +252,6 @@ def test_sht3x_crc_of_the_data_sheet():
     assert crc8(b"\xbe\xef") == 0x92
 
 
-@pytest.mark.parametrize("raw", [0x0000, 0xFFFE])
-def test_sht3x_ends_of_the_scale(bus, raw):
-    bus.chips[0x44] = sht3x(raw)
-    with thermometer("sht3x") as device, pytest.raises(errors.BadReading, match="outside"):
-        device.read()
-
-
 def test_sht3x_crc_error(bus):
     bus.chips[0x44] = sht3x()
     with thermometer("sht3x") as device:
@@ -295,53 +260,5 @@ def test_sht3x_crc_error(bus):
             device.read()
 
 
-def test_sht3x_humidity_is_metadata(bus):
-    bus.chips[0x44] = sht3x(humidity=0x8000)
-    with thermometer("sht3x") as device:
-        assert device.read().metadata["humidity_percent"] == pytest.approx(50.0, abs=0.01)
-
-
 def test_bme280_compensation_of_the_data_sheet():
-    table = Compensation.from_registers(CALIBRATION, HUMIDITY)
-    fine = table.fine(ADC_T)
-    assert round(fine) == 128422
-    assert round(fine / 5120.0, 2) == 25.08
-    assert table.pressure(ADC_P, fine) == pytest.approx(100653.27, abs=0.3)
-
-
-def test_bme280_calibration_bytes():
-    # 0xE4 = 0x14, 0xE5 = 0x53, 0xE6 = 0x03: H4 = 0x143, H5 = 0x035
-    assert Compensation.from_registers(CALIBRATION, HUMIDITY).h == (75, 361, 0, 0x143, 0x035, 30)
-
-
-def test_bme280_humidity_agrees_with_the_integer_formula():
-    """The data sheet's 32-bit integer formula (4.2.3), an independent form of the same law."""
-    table = Compensation.from_registers(CALIBRATION, HUMIDITY)
-    fine = table.fine(ADC_T)
-    h1, h2, h3, h4, h5, h6 = table.h
-    for adc in (22000, 26000, 30000, 34000):
-        v = round(fine) - 76800
-        v = ((((adc << 14) - (h4 << 20) - (h5 * v)) + 16384) >> 15) * (
-            (((((v * h6) >> 10) * (((v * h3) >> 11) + 32768)) >> 10) + 2097152) * h2 + 8192 >> 14
-        )
-        v -= ((((v >> 15) * (v >> 15)) >> 7) * h1) >> 4
-        integer = min(max(v, 0), 419430400) / 4096 / 1024
-        assert table.humidity(adc, fine) == pytest.approx(integer, abs=0.02)
-
-
-def test_bme280_that_is_a_bmp280(bus):
-    bus.chips[0x76] = bme280(identity=0x58)
-    with pytest.raises(errors.WrongDevice, match="0x0058"):
-        thermometer("bme280").open()
-
-
-def test_bme280_not_measured(bus):
-    bus.chips[0x76] = bme280(adc_t=0x80000)
-    with thermometer("bme280") as device, pytest.raises(errors.BadReading, match="0x80000"):
-        device.read()
-
-
-def test_bme280_that_hangs(bus):
-    bus.chips[0x76] = bme280(status=0x08)
-    with thermometer("bme280") as device, pytest.raises(errors.DeviceTimeout):
-        device.read()
+    assert round(bme280_celsius(ADC_T, (27504, 26435, -1000)), 2) == 25.08

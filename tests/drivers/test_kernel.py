@@ -27,23 +27,49 @@ def thermometer(driver, sysfs, **options):
     return open_device("thermometer", driver, {"sysfs": str(sysfs.root), **options}, VirtualClock())
 
 
-def test_a_single_input_is_called_temperature(sysfs):
-    sysfs.hwmon(0, "amdgpu", temp1_input="28000", temp1_crit="80000")
-    with thermometer("hwmon", sysfs, chip="amdgpu") as device:
-        assert device.read().values == {"temperature": 28.0}
+# lm-sensors issue 100: some folders hold temp2 and temp4 only
+IT87 = {"temp2_input": "51000", "temp4_input": "31000", "temp4_label": "board"}
+READ = [
+    ("hwmon", "amdgpu", {"temp1_input": "28000", "temp1_crit": "80000"}, {}, {"temperature": 28.0}),
+    ("hwmon", "it87", IT87, {}, {"temp2": 51.0, "board": 31.0}),
+    ("hwmon", "it87", IT87, {"channels": {"lens": "board"}}, {"lens": 31.0}),
+    ("hwmon", "it87", IT87, {"channels": {"lens": "temp2"}}, {"lens": 51.0}),
+    ("hwmon", "it87", {"temp1_input": "85000"}, {}, {"temperature": 85.0}),
+    ("hwmon", "w1_slave_temp", {"temp1_input": "85000"}, {}, "power-on"),
+    ("hwmon", "lm90", {"temp1_input": "21000", "temp1_fault": "1"}, {}, "fault"),
+    *(
+        ("hwmon", "lm75", {"temp1_input": text}, {}, "not a number")
+        for text in ("", "hot", "28000 mC", "nan", "inf", "28_000", "1e300", "28,5", "٢٨٠٠٠")
+    ),
+    # bmp280 family: raw only; ABI: (raw + offset) * scale in m°C
+    ("iio", "tmp006", {"in_temp_ambient_raw": "731", "in_temp_scale": "31.25",
+                       "in_temp_offset": "10"}, {}, {"temperature": 741 * 31.25 / 1000}),
+    ("iio", "bme280", {"in_temp_input": "21530", "in_temp_raw": "1", "in_temp_scale": "1"}, {},
+     {"temperature": 21.53}),
+    ("iio", "adc", {"in_temp_raw": "731"}, {}, "scale"),
+    ("zone", "cpu-thermal", "48312", {}, {"temperature": 48.312}),
+    ("zone", "gpu-thermal", "-274000", {}, "outside"),  # THERMAL_TEMP_INVALID
+    ("zone", "camera-therm-usr", "-40000", {}, "not fitted"),
+    ("zone", "soc", "310", {"unit": "tenths"}, {"temperature": 31.0}),
+]  # fmt: skip
 
 
-def test_inputs_are_called_by_their_labels(sysfs):
-    # lm-sensors issue 100: some folders hold temp2 and temp4 only
-    sysfs.hwmon(0, "it87", temp2_input="51000", temp4_input="-2500", temp4_label="board")
-    with thermometer("hwmon", sysfs, chip="it87") as device:
-        assert device.read().values == {"temp2": 51.0, "board": -2.5}
-
-
-def test_channels_are_chosen_by_input_or_label(sysfs):
-    sysfs.hwmon(0, "it87", temp2_input="51000", temp4_input="31000", temp4_label="board")
-    with thermometer("hwmon", sysfs, chip="it87", channels={"lens": "board"}) as device:
-        assert device.read().values == {"lens": 31.0}
+@pytest.mark.parametrize(("kind", "name", "files", "options", "expected"), READ)
+def test_what_the_kernel_says_is_read_rightly_or_refused(
+    sysfs, kind, name, files, options, expected
+):
+    if kind == "zone":
+        sysfs.zone(0, name, files)
+        device = thermometer("thermal_zone", sysfs, zone=name, **options)
+    else:
+        getattr(sysfs, kind)(0, name, **files)
+        device = thermometer(kind, sysfs, chip=name, **options)
+    with device:
+        if isinstance(expected, dict):
+            assert device.read().values == expected
+            return
+        with pytest.raises(BadReading, match=expected):
+            device.read()
 
 
 def test_a_channel_that_is_not_there(sysfs):
@@ -52,22 +78,18 @@ def test_a_channel_that_is_not_there(sysfs):
         thermometer("hwmon", sysfs, chip="it87", channels={"lens": "temp1"}).open()
 
 
+def test_a_zone_of_another_quantity_needs_its_unit(sysfs):
+    with pytest.raises(ConfigurationError, match="write unit: thousandths"):
+        thermometer("thermal_zone", sysfs, zone="pm8150b-vbat-lvl0")
+
+
 def test_an_open_diode_is_not_a_temperature(sysfs):
     # it87 issue 59: a disconnected diode reads +127.0
     sysfs.hwmon(0, "it87", temp1_input="51000", temp2_input="127000")
     with thermometer("hwmon", sysfs, chip="it87") as device:
         reading = device.read()
     assert reading.values == {"temp1": 51.0}
-    assert "127 °C is outside" in reading.metadata["missing"]["temp2"]
-
-
-def test_the_fault_flag_counts(sysfs):
-    sysfs.hwmon(0, "lm90", temp1_input="21000", temp1_fault="1")
-    with (
-        thermometer("hwmon", sysfs, chip="lm90") as device,
-        pytest.raises(BadReading, match="fault"),
-    ):
-        device.read()
+    assert "127 °C is outside" in reading.missing["temp2"]
 
 
 def test_an_input_of_a_sleeping_device_is_absent(sysfs):
@@ -77,15 +99,6 @@ def test_an_input_of_a_sleeping_device_is_absent(sysfs):
         (folder / "temp2_input").unlink()
         (folder / "temp2_input").mkdir()
         assert device.read().values == {"temp1": 28.0}
-
-
-@pytest.mark.parametrize(
-    "content", ["", "hot", "28000 mC", "nan", "inf", "28_000", "1e300", "٢٨٠٠٠", "28,5"]
-)
-def test_garbage_is_no_value(sysfs, content):
-    sysfs.hwmon(0, "lm75", temp1_input=content)
-    with thermometer("hwmon", sysfs, chip="lm75") as device, pytest.raises(BadReading):
-        device.read()
 
 
 def test_nothing_there_and_vanished_are_different(sysfs):
@@ -128,71 +141,11 @@ def test_permission_denied(sysfs, monkeypatch):
     with thermometer("hwmon", sysfs, chip="lm75") as device:
         original = type(folder).read_text
 
-        def read_text(path, *args):
+        def read_text(path, *args, **given):
             if path.name == "temp1_input":
                 raise PermissionError(13, "Permission denied")
-            return original(path, *args)
+            return original(path, *args, **given)
 
         monkeypatch.setattr(type(folder), "read_text", read_text)
         with pytest.raises(TransientDeviceError, match="Permission denied"):
             device.read()
-
-
-def test_iio_raw_offset_and_scale(sysfs):
-    # bmp280 family: raw only; ABI: (raw + offset) * scale in m°C
-    sysfs.iio(0, "tmp006", in_temp_ambient_raw="731", in_temp_scale="31.25", in_temp_offset="10")
-    with thermometer("iio", sysfs, chip="tmp006") as device:
-        assert device.read().values == {"temperature": (731 + 10) * 31.25 / 1000}
-
-
-def test_iio_processed_wins(sysfs):
-    sysfs.iio(0, "bme280", in_temp_input="21530", in_temp_raw="1", in_temp_scale="1")
-    with thermometer("iio", sysfs, chip="bme280") as device:
-        assert device.read().values == {"temperature": 21.53}
-
-
-def test_iio_raw_without_scale_is_refused(sysfs):
-    sysfs.iio(0, "adc", in_temp_raw="731")
-    with thermometer("iio", sysfs, chip="adc") as device, pytest.raises(BadReading, match="scale"):
-        device.read()
-
-
-def test_the_power_on_value_of_a_1_wire_sensor_under_hwmon(sysfs):
-    sysfs.hwmon(0, "w1_slave_temp", temp1_input="85000")
-    sysfs.hwmon(1, "it87", temp1_input="85000")
-    with (
-        thermometer("hwmon", sysfs, chip="w1_slave_temp") as device,
-        pytest.raises(BadReading, match="power-on"),
-    ):
-        device.read()
-    with thermometer("hwmon", sysfs, chip="it87") as device:
-        assert device.read().values == {"temperature": 85.0}
-
-
-def test_a_zone_of_another_quantity_needs_its_unit(sysfs):
-    with pytest.raises(ConfigurationError, match="write unit: thousandths"):
-        thermometer("thermal_zone", sysfs, zone="pm8150b-vbat-lvl0")
-    sysfs.zone(0, "soc", "310")
-    with thermometer("thermal_zone", sysfs, zone="soc", unit="tenths") as device:
-        assert device.read().values == {"temperature": 31.0}
-
-
-def test_a_zone_that_is_not_fitted(sysfs):
-    sysfs.zone(0, "camera-therm-usr", "-40000")
-    with (
-        thermometer("thermal_zone", sysfs, zone="camera-therm-usr") as device,
-        pytest.raises(BadReading, match="not fitted"),
-    ):
-        device.read()
-
-
-def test_thermal_zone_by_type(sysfs):
-    sysfs.zone(0, "cpu-thermal", "48312")
-    sysfs.zone(1, "gpu-thermal", "-274000")  # THERMAL_TEMP_INVALID
-    with thermometer("thermal_zone", sysfs, zone="cpu-thermal") as device:
-        assert device.read().values == {"temperature": 48.312}
-    with (
-        thermometer("thermal_zone", sysfs, zone="gpu-thermal") as device,
-        pytest.raises(BadReading, match="outside"),
-    ):
-        device.read()

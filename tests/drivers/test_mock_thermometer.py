@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from thermocald_drivers.mock import lagged
 
 from thermocald.errors import ConfigurationError
 from thermocald.hal import VirtualClock, open_device
@@ -41,8 +40,9 @@ def test_lag_against_the_differential_equation():
         atol=1e-10,
         max_step=5.0,
     )
-    ours = [lagged(times, values, lag, t) for t in instants]
-    assert ours == pytest.approx(solved.y[0], abs=1e-6)
+    programme = np.stack([times, values], 1).tolist()
+    options = {"programme": programme, "channels": {"t": {**QUIET, "lag_s": lag}}}
+    assert read(options, instants)["t"] == pytest.approx(solved.y[0], abs=1e-6)
 
 
 def test_offset_gain_and_quantisation():

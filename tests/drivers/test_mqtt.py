@@ -108,7 +108,7 @@ def test_a_line_that_breaks_leaves_the_will(broker):
     device.emit(RESULT)
     broker.close()
     deadline = time.monotonic() + 2
-    while device._line.connected and time.monotonic() < deadline:
+    while device.connected and time.monotonic() < deadline:
         time.sleep(0.01)
     with pytest.raises(DeviceGone):
         device.emit(RESULT)
@@ -116,9 +116,12 @@ def test_a_line_that_breaks_leaves_the_will(broker):
     assert broker.messages[-1] == ("thermocald/thermocald/available", b"offline", True)
 
 
-def test_a_password_needs_a_name():
-    with pytest.raises(ConfigurationError, match="username"):
-        open_device("output", "mqtt", {"host": "x", "password_file": "y"}, SystemClock())
+@pytest.mark.parametrize(
+    ("options", "message"), [({"password_file": "y"}, "username"), ({"key": "y"}, "cert")]
+)
+def test_options_that_need_one_another(options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        open_device("output", "mqtt", {"host": "x", **options}, SystemClock())
 
 
 # paho leaves the socket of a refused handshake to the garbage collector, which says so
@@ -136,11 +139,6 @@ def test_tls(tmp_path):
             output(broker, tls=True, timeout_s=5).open()
     finally:
         broker.close()
-
-
-def test_a_key_needs_its_certificate():
-    with pytest.raises(ConfigurationError, match="cert"):
-        open_device("output", "mqtt", {"host": "x", "key": "y"}, SystemClock())
 
 
 @pytest.mark.parametrize(

@@ -77,45 +77,31 @@ def test_what_is_not_believed(sysfs, content, why):
         device.read()
 
 
-def test_85_without_a_neighbour_is_the_power_on_value(sysfs):
-    sysfs.w1(ROM, w1_slave(21.5))
-    with thermometer(sysfs) as device:
-        assert device.read().values == {"temperature": 21.5}
-        sysfs.w1(ROM, POWER_ON)
-        with pytest.raises(BadReading, match="power-on value"):
-            device.read()
+NEAR, HOT = w1_slave(21.5), w1_slave(84.9375)
+# (content, s until the next): 85 °C is believed with a neighbour alone, which it is not itself
+AT_85 = {
+    "without a neighbour": ([(NEAR, 0), (POWER_ON, 0)], [21.5, "power-on"]),
+    "on a ramp": ([(HOT, 0), (POWER_ON, 0)], [84.937, 85.0]),
+    "long after a neighbour": ([(HOT, 61), (POWER_ON, 0)], [84.937, "power-on"]),
+    "vouching for itself": ([(HOT, 40), (POWER_ON, 40), (POWER_ON, 0)], [84.937, 85.0, "power-on"]),
+}
 
 
-def test_85_on_a_ramp_is_a_temperature(sysfs):
-    sysfs.w1(ROM, w1_slave(84.9375))
-    with thermometer(sysfs) as device:
-        device.read()
-        sysfs.w1(ROM, POWER_ON)
-        assert device.read().values == {"temperature": 85.0}
-
-
-def test_85_after_a_neighbour_long_ago_is_refused(sysfs):
+@pytest.mark.parametrize("case", AT_85)
+def test_85_needs_a_neighbour(sysfs, case):
+    steps, expected = AT_85[case]
+    found = []
     clock = VirtualClock()
-    sysfs.w1(ROM, w1_slave(84.9375))
+    sysfs.w1(ROM, NEAR)
     with thermometer(sysfs, clock) as device:
-        device.read()
-        clock.advance(61.0)
-        sysfs.w1(ROM, POWER_ON)
-        with pytest.raises(BadReading, match="power-on value"):
-            device.read()
-
-
-def test_85_does_not_vouch_for_itself(sysfs):
-    clock = VirtualClock()
-    sysfs.w1(ROM, w1_slave(84.9375))
-    with thermometer(sysfs, clock) as device:
-        device.read()
-        sysfs.w1(ROM, POWER_ON)
-        clock.advance(40.0)
-        device.read()
-        clock.advance(40.0)
-        with pytest.raises(BadReading, match="power-on value"):
-            device.read()
+        for content, pause_s in steps:
+            sysfs.w1(ROM, content)
+            try:
+                found.append(device.read().values["temperature"])
+            except BadReading as error:
+                found.append("power-on" if "power-on value" in str(error) else str(error))
+            clock.advance(pause_s)
+    assert found == expected
 
 
 def scratchpad(pad, milli):
@@ -165,7 +151,7 @@ def test_the_power_on_value_of_every_family(sysfs, family, pad, milli):
 
 
 @pytest.mark.parametrize(
-    ("family", "pad", "milli", "celsius"),
+    ("family", "pad", "milli", "expected"),
     [
         ("28", "90 01 4b 46 7f ff 10 10", 25000, 25.0),  # 25 °C of a chip that is not of family D
         ("28", "93 01 7f 80 7f ff 0d 10", 25187, 25.187),
@@ -175,32 +161,21 @@ def test_the_power_on_value_of_every_family(sysfs, family, pad, milli):
         ("3b", "94 01 98 19 f0 ff ff ff", 25250, 25.25),  # MAX31850
         ("10", "2a 00 4b 46 ff ff 0e 10", 20875, 20.875),
         ("10", "e6 ff 4b 46 ff ff 08 10", -12750, -12.75),
-    ],
-)
-def test_readings_of_the_family(sysfs, family, pad, milli, celsius):
-    rom = f"{family}-000000bfe244"
-    sysfs.w1(rom, scratchpad(pad, milli))
-    with thermometer(sysfs, sensors={"temperature": rom}) as device:
-        assert device.read().values == {"temperature": celsius}
-
-
-@pytest.mark.parametrize(
-    ("family", "pad", "milli", "why"),
-    [
         ("3b", "95 01 98 19 f0 ff ff ff", 25250, "reports a fault"),
         ("10", "2a 00 4b 46 ff ff 0e 00", 0, "COUNT_PER_C"),
         ("28", "ff 07 4b 46 7f ff 0c 10", 127937, "outside"),  # a failed conversion
         ("28", "6a fe 4b 46 7f ff 0c 10", -5625, "does not follow"),
     ],
 )
-def test_faults_of_the_family(sysfs, family, pad, milli, why):
+def test_readings_and_faults_of_the_family(sysfs, family, pad, milli, expected):
     rom = f"{family}-000000bfe244"
     sysfs.w1(rom, scratchpad(pad, milli))
-    with (
-        thermometer(sysfs, sensors={"temperature": rom}) as device,
-        pytest.raises(BadReading, match=why),
-    ):
-        device.read()
+    with thermometer(sysfs, sensors={"temperature": rom}) as device:
+        if isinstance(expected, float):
+            assert device.read().values == {"temperature": expected}
+            return
+        with pytest.raises(BadReading, match=expected):
+            device.read()
 
 
 @pytest.mark.parametrize("milli", ["2_1000", "٢١٠٠٠", "21000.0", "+21000", "nan"])
@@ -251,7 +226,7 @@ def test_one_dead_sensor_does_not_take_the_others_along(sysfs):
     with thermometer(sysfs, sensors=sensors) as device:
         reading = device.read()
     assert reading.values == {"air": -10.125}
-    assert re.search("CRC", reading.metadata["missing"]["camera"])
+    assert re.search("CRC", reading.missing["camera"])
 
 
 def feed(path, content, delay):
@@ -293,7 +268,7 @@ def test_a_kernel_that_converts_one_after_the_other(sysfs):
         reading = device.read()
     [thread.join() for thread in threads]
     assert len(reading.values) == 4
-    assert "missing" not in reading.metadata
+    assert not reading.missing
 
 
 def test_a_hanging_bus_times_out_and_its_late_answer_is_dropped(sysfs):

@@ -70,7 +70,7 @@ def test_measurements_come_without_a_picture(write):
     with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
         frame = camera.capture()
     field = TestField.build(["c", "b", "a"], np.eye(3))  # another order: names count, not rows
-    found = observations_from_lists(frame.metadata["observations"], field)
+    found = observations_from_lists(frame.observations, field)
     assert frame.image is None
     assert found.targets.tolist() == [0, 2]
     assert np.array_equal(found.points, seen.points)
@@ -110,7 +110,7 @@ def test_closed_and_opened_it_goes_on(write):
     numbers = []
     for _ in range(3):
         with camera:
-            numbers.append(camera.capture().metadata["epoch"])
+            numbers.append(camera.capture().sequence)
     assert numbers == [1, 2, 3]
 
 
@@ -138,6 +138,6 @@ def test_a_real_recording(shared):
     with open_device("camera", "replay", {"recording": str(path)}, VirtualClock()) as camera:
         for expected in recording.epochs:
             frame = camera.capture()
-            found = observations_from_lists(frame.metadata["observations"], recording.testfield)
+            found = observations_from_lists(frame.observations, recording.testfield)
             assert frame.utc == expected.frame_time
             assert np.array_equal(found.points, expected.observations.points)

@@ -62,7 +62,7 @@ def line_read(text, **options):
     device = SerialThermometer(clock=VirtualClock(), port="none", pattern=r"(?P<t>\S+)", **options)
     match = device.pattern.fullmatch(text)
     try:
-        return device._values(match)["t"]
+        return device._reading(match, 0.0).values["t"]
     except BadReading as error:
         one_line(error)
         return None

@@ -119,14 +119,9 @@ def test_an_answer_in_pieces(instrument):
         thread.join()
 
 
-def test_echo_is_skipped(instrument):
-    far = instrument({b"T?\r\n": b"T?\r\nT=20.50\r\n"})
-    with asked(far) as device:
-        assert device.read().values == {"temperature": 20.5}
-
-
-def test_garbage_before_the_answer_is_skipped(instrument):
-    far = instrument({b"T?\r\n": b"\xff\x00\x91~\r\nready\r\nT=20.50\r\n"})
+@pytest.mark.parametrize("before", [b"T?\r\n", b"\xff\x00\x91~\r\nready\r\n"])
+def test_echo_and_garbage_before_the_answer_are_skipped(instrument, before):
+    far = instrument({b"T?\r\n": before + b"T=20.50\r\n"})
     with asked(far) as device:
         assert device.read().values == {"temperature": 20.5}
 
@@ -146,17 +141,15 @@ def test_an_endless_line_does_not_grow(instrument):
         assert len(device._line) <= 1
 
 
-def test_half_a_line_then_silence(instrument):
-    far = instrument({b"T?\r\n": b"T=20."})
-    with asked(far) as device, pytest.raises(errors.BadReading, match=r"'T=20\.'"):
-        device.read()
-
-
-def test_silence(instrument):
-    with (
-        asked(instrument()) as device,
-        pytest.raises(errors.DeviceTimeout, match=r"silent for 0\.4 s"),
-    ):
+@pytest.mark.parametrize(
+    ("answers", "error", "said"),
+    [
+        ({b"T?\r\n": b"T=20."}, errors.BadReading, r"'T=20\.'"),
+        ({}, errors.DeviceTimeout, r"silent for 0\.4 s"),
+    ],
+)
+def test_half_a_line_and_silence(instrument, answers, error, said):
+    with asked(instrument(answers)) as device, pytest.raises(error, match=said):
         device.read()
 
 
@@ -325,3 +318,31 @@ def test_permission_denied(instrument, monkeypatch):
 def test_a_wrong_configuration(options, message):
     with pytest.raises(errors.ConfigurationError, match=message):
         open_device("thermometer", "serial", {"port": "/dev/null", **options}, SystemClock())
+
+
+CUT = {
+    "a decimal is lost": (["21.56", "21.57", "21.5"], [21.56, 21.57, None]),
+    "all decimals are lost": (["21.5", "21.4", "21"], [21.5, 21.4, None]),
+    "they end with the point": (["21.5", "21."], [21.5, None]),
+    "the first digits are lost": (["21.5", ".5", "-.5"], [21.5, None, None]),
+    "of a mantissa": (["2.156E+01", "2.15E+01"], [21.56, None]),
+    "again and again": (["21.50", "21.5", "21.4", "21.3", "21.51"], [21.5, *[None] * 3, 21.51]),
+    "trailing zeros are left out": (
+        ["21.56", "21.5", "21.4", "21", "21.3"], [21.56, None, None, 21.0, 21.3]),
+    "more decimals than before": (["9.5", "9.51"], [9.5, 9.51]),
+    "another sign and size": (["9.5", "10.5", "-1.5"], [9.5, 10.5, -1.5]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CUT)
+def test_a_number_that_lost_digits_is_none(instrument, case):
+    lines, expected = CUT[case]
+    far, found = instrument({}), []
+    with asked(far, pattern=r"T=(?P<temperature>\S+)") as device:
+        for line in lines:
+            far.answers[b"T?\r\n"] = f"T={line}\r\n".encode()
+            try:
+                found.append(device.read().values["temperature"])
+            except errors.BadReading:
+                found.append(None)
+    assert found == expected

@@ -8,13 +8,12 @@ import time
 from dataclasses import replace
 
 import pytest
-from typer.testing import CliRunner
 
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
-from thermocald.cli import application
+from tests.commands import succeed
 from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.writer import ServerWriter
 
@@ -25,9 +24,7 @@ RATES = [(3.0e-4 + 2e-5 * (i % 5 - 2), -4.0e-4 + 3e-5 * (i % 4 - 1.5), 2.0e-4 + 
 
 
 def run(*arguments):
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
-    assert result.exit_code == 0, (result.exception, result.output)
-    return result.stdout
+    return succeed(*arguments).stdout
 
 
 @pytest.fixture

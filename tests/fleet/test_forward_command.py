@@ -6,10 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.commands import answer as run
 from tests.fleet.conftest import count
-from thermocald.cli import application
 from thermocald.config import load_config
 from thermocald.errors import ConfigurationError
 from thermocald.store.database.store import Store
@@ -23,10 +22,6 @@ forward:
   station: gauge7
   frames: events
 """
-
-
-def run(*arguments):
-    return CliRunner().invoke(application(), [str(a) for a in arguments])
 
 
 @pytest.fixture

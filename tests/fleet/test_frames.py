@@ -62,7 +62,7 @@ def test_a_day_has_a_limit_and_the_next_goes_on(server, station):
     rule = FrameRule(folder, "all", daily_bytes=3500)
     forwarder = Forwarder(store, address(server), "bank", frames=rule)
     day = [1.7e9]
-    forwarder._frames._clock = lambda: day[0]
+    forwarder._clock = lambda: day[0]
     assert forwarder.send_waiting().sent["frame"] == 3
     assert forwarder.send_waiting().sent["frame"] == 0
     day[0] += 86400

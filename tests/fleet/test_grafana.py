@@ -8,13 +8,12 @@ import time
 from dataclasses import replace
 
 import pytest
-from typer.testing import CliRunner
 
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
-from thermocald.cli import application
+from tests.commands import succeed
 from thermocald.store.server.connection import ServerAddress, grant
 from thermocald.store.server.writer import ServerWriter
 
@@ -27,8 +26,7 @@ MACROS = {
 
 @pytest.fixture(scope="module")
 def dashboard():
-    result = CliRunner().invoke(application(), ["server", "dashboard"])
-    return json.loads(result.stdout)
+    return json.loads(succeed("server", "dashboard").stdout)
 
 
 def queries(dashboard):

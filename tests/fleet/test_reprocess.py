@@ -77,7 +77,7 @@ def test_series_are_analysed_one_by_one_and_done_ones_are_left(archive, tmp_path
 
 
 def test_an_unknown_analysis_and_a_server_to_calibrate_are_said(archive, tmp_path):
-    from thermocald.cli.reprocess import find_series_tasks
+    from thermocald.cli.server import find_series_tasks
 
     with pytest.raises(UsageError, match="there are calibrate, discover, study"):
         find_series_tasks([archive], tmp_path, "dream", 100)

@@ -6,10 +6,9 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import thermocald as tc
-from thermocald.cli import application
+from tests.commands import answer, succeed
 from thermocald.fleet.forward import Forwarder
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
@@ -18,9 +17,7 @@ from thermocald.store.server.connection import ServerAddress
 
 
 def run(*arguments):
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
-    assert result.exit_code == 0, result.exception
-    return result.stdout
+    return succeed(*arguments).stdout
 
 
 @pytest.fixture
@@ -87,7 +84,7 @@ def test_several_series_at_an_address_are_said(server, tmp_path):
         (server.address(name="thermocald"), "in the address"),
         (tmp_path / "k.db", "thermocald archive"),
     ):
-        result = CliRunner().invoke(application(), ["discover", str(place)])
+        result = answer("discover", place)
         assert "several series fit" in str(result.exception)
         assert str(result.exception).startswith(("postgresql://", str(tmp_path)))
         assert words in str(result.exception)
@@ -95,6 +92,6 @@ def test_several_series_at_an_address_are_said(server, tmp_path):
 
 
 def test_a_wrong_address_is_one_line():
-    result = CliRunner().invoke(application(), ["study", "postgresql://127.0.0.1:1/none"])
+    result = answer("study", "postgresql://127.0.0.1:1/none")
     assert result.exit_code == 1
     assert "cannot be reached" in str(result.exception)

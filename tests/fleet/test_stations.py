@@ -86,7 +86,7 @@ def test_epochs_calibrated_again_are_no_twins(server, two, make_result):
             store.amend(series, i, make_result(200 + i))
     Forwarder(two[0], place, "gauge-7").send_waiting()
     _, cameras = read_overview(place, Path("x"))
-    assert not cameras[0].record.copied
+    assert not cameras[0].copied
 
 
 def test_one_station_that_got_a_new_store_is_no_twin(server, two):
@@ -146,3 +146,115 @@ def test_a_restored_or_another_store_under_the_old_name_is_sent_from_its_start(s
     shutil.copyfile(two[1], two[0])
     Forwarder(two[0], place, "a").send_waiting()
     assert count(server, "epoch") == 10
+
+
+ONE = "postgresql://owner:secret@db.example:5432/thermocald?sslmode=require&host=/run/a"
+OTHERS = {
+    "host": ONE.replace("db.example", "db2.example"),
+    "port": ONE.replace(":5432", ":5433"),
+    "database": ONE.replace("/thermocald", "/Thermocald"),
+    "user": ONE.replace("owner:", "Owner:"),
+    "another socket": ONE.replace("/run/a", "/run/b"),
+    "database as an option": ONE + "&dbname=other",
+    "user as an option": ONE + "&user=other",
+    "port as an option": ONE + "&port=5433",
+    "a schema": ONE + "&options=-csearch_path%3Dother",
+    "an address beside the name": ONE + "&hostaddr=10.0.0.9",
+}
+SAME = {
+    "password": ONE.replace("secret", "other"),
+    "no password": ONE.replace(":secret", ""),
+    "scheme": ONE.replace("postgresql:", "postgres:"),
+    "order": ONE.replace("sslmode=require&host=/run/a", "host=%2Frun%2Fa&sslmode=require"),
+    "a selection to read": ONE + "&camera=rpi&series=M1",
+    "password as an option": ONE + "&password=other",
+    "as a path": ONE.replace("//", "/"),
+}
+
+
+@pytest.mark.parametrize("part", [*OTHERS, *SAME])
+def test_a_cursor_is_of_its_server_database_and_user(two, part):
+    path = two[0].with_name("cursor")
+    with Store.open(two[0]) as store:
+        cursor = Cursor.read(path, store, ServerAddress.parse(ONE).place, "a")
+        cursor.sent["epoch"] = 5
+        cursor.write(path)
+        there = ServerAddress.parse({**OTHERS, **SAME}[part]).place
+        assert Cursor.read(path, store, there, "a").sent["epoch"] == (5 if part in SAME else 0)
+        assert "secret" not in path.read_text()
+
+
+MOVES = {
+    "nothing": 5, "the folder is renamed": 5, "store and cursor are renamed": 5,
+    "a copy takes its place": 0, "another store takes its place": 0, "station is renamed": 0,
+    "the cursor is cut": 0, "the cursor is empty": 0, "the cursor is of another kind": 0,
+    "a count is no number": 0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", MOVES)
+def test_a_cursor_is_of_its_store_wherever_that_stands(two, tmp_path, what):
+    folder = tmp_path / "card"
+    folder.mkdir()
+    store_path, path, station = folder / "k.db", folder / "k.db.forwarded", "a"
+    two[0].rename(store_path)
+    with Store.open(store_path) as store:
+        cursor = Cursor.read(path, store, "postgresql://o@h/d", station)
+    cursor.sent["epoch"] = 5
+    cursor.write(path)
+    text = path.read_text()
+    if what == "the folder is renamed":
+        folder.rename(tmp_path / "new")
+        store_path, path = (tmp_path / "new" / p.name for p in (store_path, path))
+    elif what == "store and cursor are renamed":
+        store_path, path = store_path.rename(folder / "n.db"), path.rename(folder / "n.forwarded")
+    elif what == "a copy takes its place":
+        shutil.copyfile(store_path, folder / "copy")
+        (folder / "copy").replace(store_path)
+    elif what == "another store takes its place":
+        two[1].replace(store_path)
+    elif what == "station is renamed":
+        station = "b"
+    elif what.startswith(("the cursor", "a count")):
+        path.write_text(
+            {"cut": text[: len(text) // 2], "empty": "", "kind": "[1, 2]"}.get(
+                what.split()[-1], text.replace('"epoch": 5', '"epoch": "5"')
+            )
+        )
+    with Store.open(store_path) as store:
+        found = Cursor.read(path, store, "postgresql://o@h/d", station)
+    assert found.sent["epoch"] == MOVES[what]
+
+
+CLONES = ["copied", "by backup", "with its cursor", "before the first report", "the clone first"]
+
+
+@pytest.mark.parametrize("how", CLONES)
+def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, make_result, how):
+    """An image of a card has the cursor too, and the store's inode."""
+    place, one, clone = address(server), two[0], two[0].with_name("clone.db")
+    cursors = {path: path.with_suffix(".cursor") for path in (one, clone)}
+    if how != "before the first report":
+        Forwarder(one, place, "gauge-7", cursors[one]).send_waiting()
+    if how == "by backup":
+        with Store.open(one) as store:
+            store.copy_to(clone)
+    else:
+        shutil.copyfile(one, clone)
+    if how == "with its cursor":
+        inode = [f'"inode": {path.stat().st_ino}' for path in (one, clone)]
+        cursors[clone].write_text(cursors[one].read_text().replace(*inode))
+    for path, shift in ((one, 0.0), (clone, 4.0)):
+        with Store.open(path, "append", durable=False) as store:
+            (series,) = store.all_series()
+            for i in range(6, 9):
+                epoch = make_epoch(i)
+                moved = replace(epoch, frame_time=epoch.frame_time + shift)
+                store.append(series, moved, make_result(i))
+    order = (clone, one) if how == "the clone first" else (one, clone)
+    for path in (*order, *order):
+        Forwarder(path, place, "gauge-7", cursors[path]).send_waiting()
+    assert count(server, "epoch") == 11
+    now, cameras = read_overview(place, Path("x"))
+    add_findings(cameras, [], now)
+    assert "twins" in {finding.kind for camera in cameras for finding in camera.findings}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import threading
 from pathlib import Path
 
@@ -125,11 +124,11 @@ def test_an_overview_reads_the_summary_of_a_long_series(server, days):
     assert (record.epochs, record.results) == (days * 24, days * 24)
     assert record.last_time == record.last_ok == camera.end
     assert len(record.recent) == 60
-    times = np.array([s.frame_time for s in record.samples])
+    times = record.samples[:, 1]
     if days == 100:
         assert SPREAD / 1.5 <= len(times) <= 2 * SPREAD
         assert times[0] < camera.end - 98 * 86400
         assert (np.bincount((times // SLOT_S % 4).astype(int)) > len(times) / 5).all()
     else:
         assert times[0] >= camera.end - 86400 * 5
-    assert all(math.isfinite(s.temperature) for s in record.samples)
+    assert np.isfinite(record.samples[:, 2]).all()

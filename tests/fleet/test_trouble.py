@@ -15,7 +15,7 @@ pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
 from tests.fleet.conftest import address, count, new_cluster
-from thermocald.cli.reprocess import find_series_tasks
+from thermocald.cli.server import find_series_tasks
 from thermocald.errors import ServerError, ServerGone, StoreError, StoreVersionError
 from thermocald.fleet.forward import Forwarder
 from thermocald.store.database.store import Store

@@ -57,7 +57,7 @@ def main() -> int:
 def _corpora(update: bool) -> int:
     failed = 0
     for name in CORPORA:
-        different = check(name, update)
+        different, _ = check(name, update)
         failed += len(different)
         print(f"{name}: {len(different)} differences")
         for line in different:

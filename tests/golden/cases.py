@@ -15,8 +15,12 @@ ARITHMETIC = Bounds(1e-9, 1e-6, 1e-7)
 """Sums, and solutions in closed form or at convergence."""
 ESTIMATE = Bounds(1e-5, 1e-3, 1e-4)
 """What a search ends at: its last step is smaller than that, not zero."""
-REAL = Bounds(1e-7, 1e-5, 2e-3)
-"""Weakly determined: the same program on another kind of processor differs by 5e-4 in an sd."""
+REAL = Bounds(3e-6, 1e-5, 2e-3)
+"""Weakly determined: the same program on another kind of processor differs by 5e-4 in an sd, with
+the packages of Debian 13 by 4e-7 in a probability and in sigma0.
+"""
+REAL_ESTIMATE = Bounds(1e-4, 1e-3, 2e-3)
+"""A search on real corners: with the packages of Debian 13 scores differ by 2e-5."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ CASES = (
     Case("blind-pair", "discover pair/M1 --verify pair/M2 --json b2.json", ("b2.json",), (),
          ESTIMATE),
     Case("real-lag", "discover real/M1 --verify real/M2 --json real.json", ("real.json",), (),
-         ESTIMATE),
+         REAL_ESTIMATE),
     Case("camera-convert", "camera convert pi.json --to opencv -o cv.yaml", ("cv.yaml",)),
     Case("camera-ros", "camera convert cv.yaml --to ros -o ros.yaml", ("ros.yaml",),
          ("camera-convert",)),

@@ -11,33 +11,36 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from tests.blind import score as blind_score
 from tests.blind.case import SINGLE, Case
-from tests.blind.score import examine_case
 from tests.golden.compare import Bounds, differences
 from tests.golden.workshop import EXPECTED
+from tests.real_corners import score as real_score
 from tests.real_corners.generator import CAMERAS, NINE, RealCase
-from tests.real_corners.score import discovered
 
 BOUNDS = Bounds(1e-4, 1e-2, 1e-2)
 
 
-def blind() -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Sixty cases: their names, and how to judge them."""
+def blind() -> Iterator[tuple[str, Case]]:
+    """Yield sixty cases and their names."""
     for seed in (60, 61, 62):
         for effect in (*SINGLE, ""):
-            case = Case((effect,) if effect else (), 0.1, seed)
-            yield f"{effect or 'none'} {seed}", lambda case=case: examine_case(case)[0]
+            yield f"{effect or 'none'} {seed}", Case((effect,) if effect else (), 0.1, seed)
 
 
-def real() -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Forty cases on real corners."""
+def real() -> Iterator[tuple[str, RealCase]]:
+    """Yield forty cases on real corners and their names."""
     for camera in CAMERAS:
         for effect in (*NINE, ""):
             case = RealCase(camera, (effect,) if effect else (), 500)
-            yield f"{camera} {effect or 'none'}", lambda case=case: discovered(case)[0]
+            yield f"{camera} {effect or 'none'}", case
 
 
-CORPORA = {"blind": blind, "real-corners": real}
+CORPORA: dict[str, tuple[Callable[[], Iterator[tuple[str, Any]]], Any]] = {
+    "blind": (blind, blind_score),
+    "real-corners": (real, real_score),
+}
+"""By name: the cases, and the module that discovers and judges each."""
 
 
 def told(discovery: Any) -> dict[str, Any]:
@@ -71,15 +74,18 @@ def stored(name: str) -> dict[str, Any]:
     return {row.pop("case"): row for row in map(json.loads, lines)}
 
 
-def check(name: str, update: bool = False) -> list[str]:
-    """What is not as it is stored; with `update` it is stored as it is now."""
-    expected, found, wrong = stored(name), {}, []
-    for case, judge in CORPORA[name]():
-        found[case] = json.loads(
-            json.dumps(told(judge())), parse_float=lambda t: float(f"{float(t):.9g}")
+def check(name: str, update: bool = False) -> tuple[list[str], list[Any]]:
+    """Return what is not as it is stored, and the outcomes; `update` stores what is now."""
+    cases, score = CORPORA[name]
+    expected, found, wrong, outcomes = stored(name), {}, [], []
+    for case_name, case in cases():
+        discovery, truth, seconds = score.discover_case(case)
+        outcomes.append(score.judge_discovery(case, discovery, truth, seconds))
+        found[case_name] = json.loads(
+            json.dumps(told(discovery)), parse_float=lambda t: float(f"{float(t):.9g}")
         )
-        wrong += list(differences(expected.get(case), found[case], BOUNDS, case))
+        wrong += list(differences(expected.get(case_name), found[case_name], BOUNDS, case_name))
     if update:
         rows = [json.dumps({"case": c, **f}, separators=(",", ":")) for c, f in found.items()]
         path(name).write_text("\n".join(rows) + "\n")
-    return wrong
+    return wrong, outcomes

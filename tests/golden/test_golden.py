@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from tests.blind.tables import summary
 from tests.golden.cases import CASES, EXCUSED, Case
 from tests.golden.compare import Bounds, differences, shortened
 from tests.golden.corpora import CORPORA, check
 from tests.golden.workshop import DATA, EXPECTED, Workshop, wrong
+from tests.real_corners.score import missed
 from thermocald.cli.commands import COMMANDS
 
 
@@ -16,7 +18,17 @@ def workshop(tmp_path_factory):
     return Workshop(tmp_path_factory.mktemp("golden"))
 
 
-@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+CORPUS_TOO = ("blind-time-offset", "blind-pair")
+"""What the corpora of the slow suite hold sixty times over."""
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in CORPUS_TOO else ())
+        for c in CASES
+    ],
+)
 def test_golden(workshop, case: Case):
     if case.needs_data and not DATA.is_dir():
         pytest.skip("the reference data are absent")
@@ -58,9 +70,23 @@ def test_a_number_that_moved_is_seen():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CORPORA)
-def test_corpus(name):
-    if name.startswith("real") and not DATA.is_dir():
-        pytest.skip("the reference data are absent")
+def test_the_blind_corpus_is_as_it_was_and_right():
+    different, outcomes = check("blind")
 
-    assert check(name) == []
+    assert different == []
+    score = summary(outcomes)
+    assert score["exact_or_listed"] >= 0.95
+    assert score["within_3_sd"] >= 0.9
+    assert score["gap_closed_90"] >= 0.9
+
+
+@pytest.mark.slow
+def test_the_corpus_of_real_corners_is_as_it_was_and_reaches_its_goals():
+    if not DATA.is_dir():
+        pytest.skip("the reference data are absent")
+    different, outcomes = check("real-corners")
+
+    assert different == []
+    for part, some in (("nine", [o for o in outcomes if o.case.effects]),
+                       ("none", [o for o in outcomes if not o.case.effects])):  # fmt: skip
+        assert missed(part, some) == []

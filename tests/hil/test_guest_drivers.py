@@ -39,7 +39,6 @@ def test_v4l2_frames_are_new_and_their_times_right(captured, report, case):
     errors = []
     for frame in frames:
         assert frame["shape"] == [480, 640]
-        assert frame["timestamp"] == "buffer"
         before, after = frame["written"]
         errors.append(max(before - frame["monotonic"], frame["monotonic"] - after, 0.0))
         assert frame["monotonic"] >= frame["called"]  # exposed after the call
@@ -66,7 +65,8 @@ def test_v4l2_faults_of_the_kernel(video, report):
     result = check(video, "vivid")
     assert result["opened"]["error"] is None, result["opened"]["text"]
     assert result["captured"]["value"] == [360, 640]
-    assert result["controls"]["value"] == {"brightness": 77, "contrast": 100}
+    settings = result["controls"]["value"]
+    assert (settings["brightness"], settings["contrast"]) == (77.0, 100.0)
     assert result["no_control"]["error"] == "WrongDevice"
     assert result["no_size"]["error"] == "WrongDevice"
     assert result["output_node"]["error"] == "WrongDevice"

@@ -7,14 +7,13 @@ field is bent. The truth of each epoch is returned.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
+from tests.recordings import write_recording
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.scene import Scene
 from thermocald.physics.testfields import corner_field, corner_view
@@ -94,6 +93,16 @@ def smooth(rng: np.random.Generator, epochs: int, memory: float) -> np.ndarray:
     return out
 
 
+def head_of(name: str, camera: str, size: tuple[int, int], pitch: float) -> dict[str, object]:
+    """The head of a recording of one thermometer."""
+    return {
+        "name": name, "series": "M1", "interval": 10.0,
+        "camera": {"name": camera, "width": size[0], "height": size[1], "pixel_pitch": pitch,
+                   "principal_distance": 3.04},
+        "temperatures": {"temperature": {"unit": "degC", "resolution": 0.0625}},
+    }  # fmt: skip
+
+
 KINDS = ("surveyed", "badly_surveyed", "knocked", "trembling")
 
 
@@ -137,43 +146,23 @@ def write(folder: Path, kind: str, seed: int, epochs: int = 70) -> dict[str, np.
         for b in range(board.max() + 1):
             for first in rng.choice(epochs, 2):
                 hidden[first : first + rng.integers(3, 12), board == b] = True
-    folder.mkdir(parents=True)
-    (folder / "recording.yaml").write_text(
-        yaml.safe_dump(
-            {
-                "format": "thermocald-recording/1", "name": f"{kind}-{seed}", "series": "M1",
-                "interval": 10.0,
-                "camera": {"name": f"crooked-{kind}", "width": SIZE[0], "height": SIZE[1],
-                           "pixel_pitch": PITCH, "principal_distance": 3.04},
-                "temperatures": {"temperature": {"unit": "degC", "resolution": 0.0625}},
-            }
-        )
-    )  # fmt: skip
-    with (folder / "testfield.csv").open("w", newline="") as out:
-        rows = csv.writer(out)
-        rows.writerow(["target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ"])
-        for t in range(targets):
-            rows.writerow([f"t{t}", *(f"{v:.5f}" for v in known[t]), 20.0, *stated])
-    with (
-        (folder / "epochs.csv").open("w", newline="") as heads,
-        (folder / "observations.csv").open("w", newline="") as points,
-    ):
-        head, point = csv.writer(heads), csv.writer(points)
-        head.writerow(["epoch", "frame_time", "temperature_time", "temperature", "frame"])
-        point.writerow(["epoch", "target", "x", "y", "sx", "sy"])
-        for e in range(epochs):
-            moved = pose.copy()
-            moved[:2] += tremble[e]
-            if kind == "knocked" and e >= 2 * epochs // 3:
-                moved[0] += np.deg2rad(0.03)
-            read = np.round((temperature[e] + rng.normal(0, 0.03)) / 0.0625) * 0.0625
-            head.writerow([e + 1, f"{time[e]:.3f}", f"{time[e]:.3f}", read, ""])
-            image = project(field, moved, *(truth[p][e] for p in ("c", "x0", "y0")))
-            image += bias + wander[e] + rng.normal(0, NOISE_PX, (targets, 2))
-            inside = ((image > 5) & (image < np.array(SIZE) - 6)).all(axis=1)
-            for t in np.flatnonzero(inside & ~hidden[e]):
-                u, v = image[t]
-                point.writerow([e + 1, f"t{t}", f"{u:.4f}", f"{v:.4f}", NOISE_PX, NOISE_PX])
+    heads, observations = [], []
+    for e in range(epochs):
+        moved = pose.copy()
+        moved[:2] += tremble[e]
+        if kind == "knocked" and e >= 2 * epochs // 3:
+            moved[0] += np.deg2rad(0.03)
+        read = np.round((temperature[e] + rng.normal(0, 0.03)) / 0.0625) * 0.0625
+        heads.append([e + 1, f"{time[e]:.3f}", f"{time[e]:.3f}", read, ""])
+        image = project(field, moved, *(truth[p][e] for p in ("c", "x0", "y0")))
+        image += bias + wander[e] + rng.normal(0, NOISE_PX, (targets, 2))
+        inside = ((image > 5) & (image < np.array(SIZE) - 6)).all(axis=1)
+        for t in np.flatnonzero(inside & ~hidden[e]):
+            u, v = image[t]
+            observations.append([e + 1, f"t{t}", f"{u:.4f}", f"{v:.4f}", NOISE_PX, NOISE_PX])
+    rows = [[f"t{t}", *(f"{v:.5f}" for v in known[t]), 20.0, *stated] for t in range(targets)]
+    head = head_of(f"{kind}-{seed}", f"crooked-{kind}", SIZE, PITCH)
+    write_recording(folder, head, heads, observations, rows)
     return truth
 
 
@@ -195,25 +184,18 @@ def write_frames(folder: Path, epochs: int, seed: int) -> dict[str, np.ndarray]:
         "y0": -0.021 - 0.2e-3 * (temperature - 24),
     }
     (folder / "frames").mkdir(parents=True)
+    heads = []
+    for e in range(epochs):
+        iop = np.zeros(10)
+        iop[:3] = truth["c"][e], truth["x0"][e], truth["y0"][e]
+        iop[3] = CAMERA["A1"]
+        name = f"frames/{e + 1:04}.jpg"
+        picture = scene.render(iop, view, None, [seed, e])
+        cv2.imwrite(str(folder / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        time = 1.7e9 + 10.0 * e
+        heads.append([e + 1, time, time, f"{temperature[e]:.3f}", name])
+    head = head_of(f"frames-{seed}", "bent", (sensor.width, sensor.height), sensor.pixel_pitch)
+    head["temperatures"] = {"temperature": {"unit": "degC"}}  # as exact as it is written
+    write_recording(folder, head, heads)
     write_testfield(folder / "testfield.csv", known)
-    head = {
-        "format": "thermocald-recording/1", "name": f"frames-{seed}", "series": "M1",
-        "interval": 10.0,
-        "camera": {"name": "bent", "width": 1640, "height": 1232, "pixel_pitch": 2 * PITCH,
-                   "principal_distance": 3.04},
-        "temperatures": {"temperature": {"unit": "degC"}},
-    }  # fmt: skip
-    (folder / "recording.yaml").write_text(yaml.safe_dump(head))
-    with (folder / "epochs.csv").open("w", newline="") as out:
-        table = csv.writer(out)
-        table.writerow(["epoch", "frame_time", "temperature_time", "temperature", "frame"])
-        for e in range(epochs):
-            iop = np.zeros(10)
-            iop[:3] = truth["c"][e], truth["x0"][e], truth["y0"][e]
-            iop[3] = CAMERA["A1"]
-            name = f"frames/{e + 1:04}.jpg"
-            picture = scene.render(iop, view, None, [seed, e])
-            cv2.imwrite(str(folder / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
-            time = 1.7e9 + 10.0 * e
-            table.writerow([e + 1, time, time, f"{temperature[e]:.3f}", name])
     return truth

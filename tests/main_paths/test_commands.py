@@ -18,9 +18,10 @@ from PIL import Image
 
 from tests.commands import call
 from tests.main_paths import crooked
+from tests.marks import mostly_slow
 
 REAL = ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"]
-SOME = [c if c == "aviary-cam2" else pytest.param(c, marks=pytest.mark.slow) for c in REAL]
+SOME = mostly_slow(REAL, "aviary-cam2")
 
 
 def run(*arguments: object, status: int = 0):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import pytest
 
 from tests.commands import call
 from tests.main_paths import crooked
+from tests.marks import mostly_slow
 
 REAL = ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"]
 MAIN = ("c", "x0", "y0")
@@ -70,9 +70,8 @@ def agree(live: list[dict[str, str]], replayed: list[dict[str, str]]) -> None:
         assert abs(difference) <= 0.2 * float(b[-1][f"sd_{name}"]), f"last epoch's {name}"
 
 
-@pytest.mark.parametrize(
-    "camera", [c if c == "aviary-cam6" else pytest.param(c, marks=pytest.mark.slow) for c in REAL]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", REAL)
 def test_real_cameras(shared, program, tmp_path, camera):
     """Fixed cameras in whose 50 s nothing happens: the scatter is what the sds say."""
     live, replayed, said = live_and_replayed(program, shared / "data" / camera, tmp_path)
@@ -93,14 +92,10 @@ def test_real_cameras(shared, program, tmp_path, camera):
     assert 0.6 < spread < 1.5, f"c scatters {spread:.2f} of the usual sd"
 
 
-KINDS = [k if k == "surveyed" else pytest.param(k, marks=pytest.mark.slow) for k in crooked.KINDS]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_crooked_fields(program, tmp_path, kind, seed):
+@pytest.mark.parametrize("kind", mostly_slow(crooked.KINDS, "badly_surveyed"))
+def test_crooked_fields(program, tmp_path, kind):
     """Errors about their mean are what the sds say, for the live rows as for replay's."""
-    truth = crooked.write(tmp_path / kind, kind, seed)
+    truth = crooked.write(tmp_path / kind, kind, seed=1)
     live, replayed, said = live_and_replayed(program, tmp_path / kind, tmp_path)
     agree(live, replayed)
     assert len(good(live)) == 70
@@ -144,24 +139,15 @@ def test_a_part_of_a_real_camera(shared, program, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def beginning(tmp_path_factory):
+def beginning(program, tmp_path_factory):
     """The first epochs of the shipped configuration, one a second."""
     folder = tmp_path_factory.mktemp("shipped")
     text = (Path(__file__).parents[2] / "config.yaml").read_text()
     (folder / "config.yaml").write_text(text.replace("period_s: 10", "period_s: 1"))
-    command = [
-        sys.executable,
-        "-m",
-        "thermocald",
-        "run",
-        "--config",
-        "config.yaml",
-        "--epochs",
-        "6",
-    ]
     done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=120, check=False
-    )
+        [*program, "run", "--config", "config.yaml", "--epochs", "6"],
+        cwd=folder, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert call("export", folder / "thermocald.db", "-o", folder / "rows.csv").returncode == 0
     return rows(folder / "rows.csv")

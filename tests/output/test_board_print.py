@@ -7,14 +7,14 @@ import json
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from tests.commands import invoke, succeed
+from tests.marks import mostly_slow
 from tests.photogrammetry.network_cases import looking_at
 from tests.photogrammetry.printed_sheets import Sheet, photograph, put_up, rasterised
-from thermocald.cli import application
 from thermocald.errors import ThermocaldError
-from thermocald.output.testfield.board import Board
 from thermocald.output.testfield.layout import TRIM
+from thermocald.output.testfield.print import Board
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets import ring_code
@@ -59,14 +59,9 @@ def found_by_opencv(kind, image, document):
     return {f"C{i}": p for i, p in zip(numbers, corners.reshape(-1, 2), strict=True)}
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [pytest.param("old charuco", marks=pytest.mark.slow), "charuco", "chessboard", "aprilgrid"],
-)
+@pytest.mark.parametrize("kind", mostly_slow(BOARDS, "charuco", "aprilgrid"))
 def test_a_printed_board_is_found_where_its_csv_says(tmp_path, kind):
-    arguments = ["testfield", "print", *map(str, BOARDS[kind]), "--out", str(tmp_path)]
-    result = CliRunner().invoke(application(), [*arguments, "--json", "-"])
-    assert result.exit_code == 0, result.output
+    result = succeed("testfield", "print", *BOARDS[kind], "--out", tmp_path, "--json", "-")
     document = json.loads(result.stdout)
     field = read_testfield(tmp_path / "testfield.csv")
     image = rasterised(tmp_path / "testfield.pdf", 0, DPI)
@@ -105,7 +100,7 @@ def test_a_printed_board_is_found_where_its_csv_says(tmp_path, kind):
 def test_printed_rings_are_found_by_the_numbers_of_other_programs(tmp_path):
     """Printed here, listed as Metashape lists them, imported, detected in a photograph."""
     arguments = ["testfield", "print", "--flat", "--paper", "A4", "--bits", "12", "--no-plain"]
-    assert CliRunner().invoke(application(), [*arguments, "--out", str(tmp_path)]).exit_code == 0
+    succeed(*arguments, "--out", tmp_path)
     printed = read_testfield(tmp_path / "testfield.csv")
     numbers = [ring_code.codes(12).index(ring_code.parse(c)[1]) + 1 for c in printed.codes]
     lines = [
@@ -113,10 +108,8 @@ def test_printed_rings_are_found_by_the_numbers_of_other_programs(tmp_path):
     ]
     (tmp_path / "markers.txt").write_text("\n".join(lines))
     out = tmp_path / "rings.csv"
-    source = ["testfield", "import", str(tmp_path / "markers.txt"), "--rings", "12"]
-    arguments = [*source, "--diameter", str(printed.diameters[0]), "--out", str(out)]
-    result = CliRunner().invoke(application(), arguments)
-    assert result.exit_code == 0, result.output
+    source = ["testfield", "import", tmp_path / "markers.txt", "--rings", 12]
+    succeed(*source, "--diameter", printed.diameters[0], "--out", out)
     field = read_testfield(out)
     (sheet,) = put_up(tmp_path / "testfield.pdf", (210.0, 297.0), TRIM)
     middle = field.points.mean(axis=0)
@@ -150,8 +143,6 @@ def test_a_board_is_as_large_as_the_paper_allows():
     ],
 )  # fmt: skip
 def test_boards_that_cannot_be_are_refused(tmp_path, options, reason):
-    arguments = [str(a) for a in ("testfield", "print", *options, "--out", tmp_path / "new")]
-    result = CliRunner().invoke(application(), arguments)
-    assert isinstance(result.exception, ThermocaldError), result.output
-    assert reason in str(result.exception)
+    with pytest.raises(ThermocaldError, match=reason):
+        invoke("testfield", "print", *options, "--out", tmp_path / "new")
     assert not (tmp_path / "new").exists()

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+from urllib.parse import urljoin
 
 import httpx
 import numpy as np
@@ -254,8 +255,11 @@ def test_a_token_may_hold_any_mark(client_of, token):
 
 @pytest.mark.parametrize(
     ("value", "status"),
-    [("Bearer {}", 200), ("bearer {}", 200), ("BEARER  {}", 200), ("{}", 401), ("Basic {}", 401),
-     ("Bearer{}", 401), ("Token {}", 401)],
+    [("Bearer {}", 200), ("bearer {}", 200), ("BEARER  {}", 200), ("bEaReR {} ", 200), ("{}", 401),
+     ("Basic {}", 401), ("Bearer{}", 401), ("Token {}", 401), ("Digest {}", 401), ("Bearer", 401),
+     ("Bearer {} x", 401), ("Bearer Bearer {}", 401), ("Bearer,{}", 401), ("", 401),
+     ("XBearer {}", 401),
+     ("Bearer {0},{0}", 401)],
 )  # fmt: skip
 def test_authorization_needs_its_scheme(client_of, value, status):
     client = client_of(TOKEN, "0.0.0.0", "http://station.example")
@@ -263,7 +267,13 @@ def test_authorization_needs_its_scheme(client_of, value, status):
     assert found.status_code == status
 
 
-@pytest.mark.parametrize("path", ["//evil.com/", "///evil.com", "//evil.com/%2e%2e", "/\\evil.com"])
+@pytest.mark.parametrize(
+    "path",
+    ["//evil.com/", "///evil.com", "//evil.com/%2e%2e", "/\\evil.com", "/https:evil.com",
+     "/%09/evil.com", "/%5cevil.com", "/%2f%2fevil.com", "/%0d%0aLocation:%20//evil.com",
+     "/.//evil",
+     "/%09//evil.com", "//%5cevil.com", "/javascript:alert(1)", "/@evil.com", "//evil.com:80@x/"],
+)  # fmt: skip
 def test_the_token_leads_nowhere_else(client_of, path):
     client = client_of(TOKEN, "0.0.0.0", "http://station.example")
     url = f"http://station.example{path}?token={TOKEN}"
@@ -272,6 +282,8 @@ def test_the_token_leads_nowhere_else(client_of, path):
     location = moved.headers.get("location", "/")
     assert location.startswith("/")
     assert location[1:2] not in ("/", "\\")
+    assert location.isprintable()
+    assert urljoin("http://station.example/", location).startswith("http://station.example/")
 
 
 def test_another_host_name_is_refused(client_of):
@@ -335,13 +347,13 @@ def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
 def test_a_series_is_read_page_by_page(client_of, monkeypatch):
     """One page in memory, whatever the length; and no transaction is open between them."""
     from thermocald.output.dashboard import view
-    from thermocald.store.database import columns
+    from thermocald.store.database import store
 
     asked = []
-    page = columns.read_page
+    page = store.read_page
     monkeypatch.setattr(view, "_ROWS_AT_ONCE", 100)
-    monkeypatch.setattr(columns, "read_columns", None)
-    monkeypatch.setattr(columns, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1])
+    monkeypatch.setattr(store, "read_columns", None)
+    monkeypatch.setattr(store, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1])
     answer = client_of().get("/api/series.csv", params={"camera": "rpi", "series": "M1"})
     assert len(answer.text.splitlines()) == 1201
     assert asked == [(-1, 100), *((after, 100) for after in range(100, 1201, 100))]

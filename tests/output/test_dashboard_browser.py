@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from tests.output.test_pages import keep
+from tests.output.test_pages import _WIDER, keep
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
@@ -29,6 +29,8 @@ _SHOWN = """() => ({
   csv: new URL(document.querySelector('#download').href).searchParams.get('camera'),
   targets: document.querySelectorAll('#overlay circle').length,
 })"""
+_HIDDEN = """() => { const table = document.querySelector('.scroll:has(#devices)');
+  return table.scrollHeight - table.clientHeight; }"""
 _SETTLED = """name => document.querySelector('#course-note').textContent.startsWith(name + '/')
   && document.querySelector('#frame-caption').textContent.startsWith('epoch')"""
 
@@ -110,6 +112,12 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     )
     assert max(right) - min(r for r in right if r > 800) < 1  # no part of the width is left empty
     keep(page, f"dashboard-{cameras}-1280")
+    page.set_viewport_size({"width": 390, "height": 900})
+    page.wait_for_timeout(500)  # the curves are drawn anew
+    assert page.evaluate(_WIDER, 390) == []
+    assert page.evaluate(_HIDDEN) == 0  # a device's reason is not below the edge of its card
+    keep(page, f"dashboard-{cameras}-390")
+    page.set_viewport_size({"width": 1280, "height": 900})
 
     # answers of cameras that are no longer wanted come late
     slow, wanted = (_name(1), _name(cameras)) if first != 1 else (_name(cameras), _name(1))
@@ -124,7 +132,28 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     page.wait_for_function(_SETTLED, arg=wanted)
     page.wait_for_timeout(1000)
     assert page.evaluate(_SHOWN) == _all_of(int(wanted[-2:]))
-    assert "out since 2020-09-13 12:26:40 UTC no broker" in page.text_content("#devices")
+    assert "out since 2020-09-13 12:26:40 UTC: no broker" in page.text_content("#devices")
+
+
+def test_on_paper_the_curves_keep_to_their_card(page_with, page_of):
+    """And the page says whose they are."""
+    url, start = page_with(2)
+    page = page_of(url)
+    start()
+    page.wait_for_function("() => document.querySelector('#figures dd') !== null")
+    page.wait_for_function(_SETTLED, arg=page.input_value("#camera"))
+    page.set_viewport_size({"width": 703, "height": 1000})  # A4 less margins
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    page.wait_for_timeout(500)
+    right = page.evaluate(
+        """() => ['#course .main-svg', 'section.wide', '#camera'].map(
+        s => document.querySelector(s).getBoundingClientRect().right)"""
+    )
+    assert right[0] <= right[1] <= 703
+    assert page.locator("#camera").is_visible()
+    assert page.locator(".modebar:visible, #series:visible").count() == 0
+    keep(page, "dashboard-2-a4")
 
 
 def _all_of(k: int) -> dict:

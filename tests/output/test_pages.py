@@ -36,7 +36,9 @@ from thermocald.thermal.reduce import reduce_together
 
 LONG = "Temp °C LGR SN 20493821 SEN SN 20493821 of the northern river bank, behind the gauge"
 NAMES = (LONG, "相机外壳温度传感器", "درجة حرارة غلاف الكاميرا")
-_MARKS = re.compile(r"\d\.?\d*\)?e[+-]?\d+\b|mm-\d|<bound|object at 0x|\bnan\b|\bNone\b|np\.float")
+_MARKS = re.compile(
+    r"\d\.?\d*\)?e[+-]?\d+\b|mm-\d|<bound|object at 0x|\b(?:nan|inf|None)\b|np\.float"
+)
 _TEXT = """() => { const all = document.body.cloneNode(true);
   all.querySelectorAll('script, style').forEach(e => e.remove()); return all.textContent; }"""
 # Quadrilaterals of texts in one drawing that cross; a hair's breadth is none.
@@ -83,6 +85,15 @@ _EMPTY = """() => [...document.querySelectorAll('figure .panel svg')].filter(svg
       && !p.closest('[id*="matplotlib.axis"]'));
   return !marks.some(p => p.tagName === 'use' || p.getBBox().width > 2 || p.getBBox().height > 2);
 }).map(svg => svg.getAttribute('aria-label'))"""
+# Texts of a drawing that its edge cuts.
+_CUT = """() => [...document.querySelectorAll('svg text')].filter(t => {
+  const box = t.getBoundingClientRect(), all = t.closest('svg').getBoundingClientRect();
+  return t.textContent.trim() && (box.left < all.left - 2 || box.right > all.right + 2
+    || box.top < all.top - 2 || box.bottom > all.bottom + 2);
+}).map(t => t.textContent)"""
+# Tables that go on beyond the page.
+_SCROLLED = """() => [...document.querySelectorAll('.scroll')]
+  .filter(e => e.scrollWidth > e.clientWidth + 1).map(e => e.getAttribute('aria-label'))"""
 _WIDER = """width => [...document.querySelectorAll('body *')]
   .filter(e => !e.closest('.scroll, svg, .panel'))
   .filter(e => e.getBoundingClientRect().right > width + 1)
@@ -168,7 +179,7 @@ def _fleet(**_):
             {
                 "station": NAMES[k % 3] if k < 3 else f"gauge{k}", "camera": f"cam{k}",
                 "type": "rpi-v2.1", "lag_s": 60.0 * k, "on_the_way_s": 2.0, "waiting": None,
-                "ok": float("nan") if k == 5 else 0.99, "temperature": 20.0 + k,
+                "ok": None if k == 5 else 0.99, "temperature": 20.0 + k,
                 "temperature_range": None if k == 5 else [5.0, 40.0], "rates": rates,
                 "findings": [{"kind": "odd", "text": f"c follows {LONG} unlike the others"}]
                 if k in (2, 7) else [],
@@ -270,6 +281,7 @@ def _faults(page, width: int) -> dict:
         "marks": _MARKS.findall(page.evaluate(_TEXT)),
         "wider": page.evaluate(_WIDER, width),
         "overlapping": page.evaluate(_OVERLAPS),
+        "cut": page.evaluate(_CUT),
         "no unit": page.evaluate(_WITHOUT_UNIT),
         "no caption": page.evaluate(_WITHOUT_CAPTION),
         "empty": page.evaluate(_EMPTY),
@@ -277,8 +289,8 @@ def _faults(page, width: int) -> dict:
     }
 
 
-NONE = {"marks": [], "wider": [], "overlapping": [], "no unit": [], "no caption": 0, "empty": [],
-        "console": []}  # fmt: skip
+NONE = {"marks": [], "wider": [], "overlapping": [], "cut": [], "no unit": [], "no caption": 0,
+        "empty": [], "console": []}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -291,6 +303,8 @@ def test_a_report_as_a_page(name, page_text, open_page):
         page = open_page(html, width)
         assert _faults(page, width) == NONE
         keep(page, f"{name}-{width}")
+        if width == 1280 and name != "study-names":
+            assert page.evaluate(_SCROLLED) == []
     page = open_page(html, 794)  # A4 at 96 px per inch
     page.emulate_media(media="print")
     assert page.locator("button:visible, nav:visible").count() == 0
@@ -306,6 +320,29 @@ def test_a_candidate_is_blue_only_where_it_is_named(name, bars, page_text, open_
     blue = """() => [...document.querySelectorAll('#candidates svg g[id*="patch_"] path')]
       .filter(p => getComputedStyle(p).fill === 'rgb(0, 114, 178)').length"""
     assert page.evaluate(blue) == bars
+
+
+def test_the_epochs_report_opens_with_the_drift(page_text, open_page):
+    page = open_page(page_text("epochs"), 794)
+    sentence = page.text_content(".answer .sentence")
+    assert re.search(r"°C .*x₀ moves by −0\.4\d+ ± 0\.0\d+ µm/K; y₀ moves by −0\.\d+ ±", sentence)
+    page.emulate_media(media="print")
+    wide = "[...document.querySelectorAll('pre')].map(e => e.scrollWidth - e.clientWidth)"
+    assert max(page.evaluate(wide)) <= 0  # what the command prints stays on the paper
+
+
+@pytest.mark.parametrize("name", ["calibration", "field-check"])
+def test_down_in_a_figure_is_down_in_the_image(name, page_text, open_page):
+    """Where y is named as growing downwards, its ticks grow so."""
+    page = open_page(page_text(name), 1280)
+    axes = page.evaluate("""() => [...document.querySelectorAll('svg g[id*="matplotlib.axis_"]')]
+      .filter(a => a.textContent.includes('y in px, down'))
+      .map(a => [...a.querySelectorAll('g[id*="tick_"] text')].map(
+        t => [Number(t.textContent.replace('−', '-')), t.getBoundingClientRect().top]))""")
+    assert axes
+    for ticks in axes:
+        places = [top for _, top in sorted(ticks)]
+        assert places == sorted(places)
 
 
 def test_a_name_from_right_to_left_exchanges_no_numbers(page_text, open_page):
@@ -336,7 +373,8 @@ def test_every_fault_of_a_page_would_be_seen(open_page):
     html = """<body><p>x is <bound method A.b of <a object at 0x7f>, nan or None</p>
       <div style="width:2000px">wide</div><figure><div class="panel"><svg aria-label="drawing"
       width="300" height="100"><g id="matplotlib.axis_1"><g id="xtick_1"><text x="9" y="20">1</text>
-      </g></g><text x="90" y="20">one label</text><text x="100" y="22">another</text></svg></div>
+      </g></g><text x="90" y="20">one label</text><text x="100" y="22">another</text>
+      <text x="280" y="60">cut by the edge</text></svg></div>
       </figure><script>lost()</script></body>"""
     html = html.replace("<bound", "&lt;bound").replace("<a object", "&lt;a object")
     found = _faults(open_page(html, 1280), 1280)

@@ -21,7 +21,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.epoch.measuring import Line, on_line
+from thermocald.photogrammetry.epoch.measuring import Line, place_on
 from thermocald.photogrammetry.field.testfield import TestField
 
 RIVER = Path(__file__).resolve().parents[3] / "shared" / "data" / "river"
@@ -241,7 +241,7 @@ def test_levels_at_the_geul_have_true_sds(frame):
         pose = camera.resect(known, seen.select(seen.targets != row), 0.0)
         one, up = seen.select(seen.targets == row), np.array([0.0, 0.0, 1.0])
         staff = Line(known.points[row], up, 20.0 * factor)
-        X, C = on_line(camera.sensor, pose.values, pose.covariance, one.points, one.sigmas, staff)
+        X, C = place_on(camera.sensor, pose.values, pose.covariance, one.points, one.sigmas, staff)
         errors.append(X[0, 2] - known.points[row, 2])
         sds.append(np.hypot(np.sqrt(C[2, 2]), 20.0 * factor))
     ratio = np.array(errors) / sds

@@ -10,8 +10,6 @@ import pytest
 
 from thermocald.analysis.study.measured import Clip
 from thermocald.analysis.study.study import StudySettings, study
-from thermocald.errors import OutputError
-from thermocald.files import write_text
 from thermocald.output.study.report import cut_clip, render_study, save_figures
 from thermocald.output.study.summary import study_document
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
@@ -74,12 +72,6 @@ def test_every_figure_has_a_caption_in_words(html):
     assert "to the lower right" in everything
 
 
-def test_numbers_that_do_not_exist_are_not_shown(html, empty_study):
-    for page in (html, render_study(empty_study)):
-        words = " ".join(Page(page).words)
-        assert not re.search(r"\b(nan|inf|None)\b", words)
-
-
 def test_a_study_of_nearly_nothing_says_why(empty_study):
     words = " ".join(Page(render_study(empty_study)).words)
     assert "The series has a single epoch: nothing can be said about change." in words
@@ -135,14 +127,6 @@ def test_json_has_no_nan_and_a_standard_deviation_beside_each_value(warm_study, 
     assert sum(camera["object_space"]["fractions"]) == pytest.approx(1)
 
 
-def test_a_report_that_cannot_be_written_is_one_error_and_leaves_nothing(tmp_path):
-    target = tmp_path / "report.html"
-    target.mkdir()
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_text(target, "text")
-    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
-
-
 @pytest.mark.slow
 def test_image_clips_stand_side_by_side(warm_up, tmp_path):
     import cv2
@@ -178,9 +162,7 @@ def test_style_and_script_are_not_escaped(html):
 
 def test_matrices_name_their_rows_and_columns(html):
     """Every label twice, as a row and as a column, in each of three matrices."""
-    figures = re.findall(
-        r'<figure id="c0-[^"]*correlation[^"]*".*?</figure>', html, flags=re.DOTALL
-    )
+    figures = re.findall(r'<figure id="[^"]*correlation[^"]*".*?</figure>', html, flags=re.DOTALL)
     assert len(figures) == 3
     for figure in figures:
         texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)

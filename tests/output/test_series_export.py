@@ -8,9 +8,8 @@ import shutil
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from thermocald.cli import application
+from tests.commands import succeed as run
 from thermocald.errors import UsageError
 from thermocald.output.series_export import style_of
 from thermocald.physics.presets import preset_simulation
@@ -18,12 +17,6 @@ from thermocald.physics.testfields import corner_field
 from thermocald.store.database.store import Store
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.reader import read_recording
-
-
-def run(*arguments):
-    result = CliRunner().invoke(application(), [str(a) for a in arguments])
-    assert result.exit_code == 0, (result.output, result.exception)
-    return result
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from thermocald.cli import application
+from tests.commands import answer
 from thermocald.machine import Machine
 
 PI = "proc/device-tree/model"
@@ -107,7 +106,7 @@ def test_an_empty_folder_is_a_machine_without_anything(tmp_path):
 
 
 def test_the_command_works_on_this_machine():
-    done = CliRunner().invoke(application(), ["doctor", "--json", "-"])
+    done = answer("doctor", "--json", "-")
     document = json.loads(done.stdout)
     assert document["format"] == "thermocald-doctor/1"
     missing = any(f["state"] == "missing" for f in document["findings"])
@@ -118,7 +117,7 @@ def test_the_command_works_on_this_machine():
 def test_lines_are_for_people(tmp_path):
     (tmp_path / "proc/device-tree").mkdir(parents=True)
     (tmp_path / PI).write_text("Raspberry Pi 3 Model B")
-    done = CliRunner().invoke(application(), ["doctor", "--root", str(tmp_path)])
+    done = answer("doctor", "--root", tmp_path)
     assert done.exit_code == 1
     assert "MISSING  I2C" in done.stdout
     assert "→ sudo raspi-config nonint do_i2c 0" in done.stdout

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.marks import mostly_slow
 from tests.photogrammetry import board_images as images
 from tests.photogrammetry import exact_rendering
 from tests.photogrammetry.network_cases import looking_at
@@ -45,9 +46,11 @@ def april():
     return images.aprilgrid_sheet(6, 6, 40.0, 0.3), boards.aprilgrid(6, 6, 40.0, 0.3)
 
 
-@pytest.mark.parametrize(
-    "stand", [(0.0, 0.0, 420.0), (150.0, -120.0, 380.0), (-250.0, 60.0, 300.0)]
-)
+STANDS = [(0.0, 0.0, 420.0), (150.0, -120.0, 380.0), (-250.0, 60.0, 300.0)]
+OBLIQUE = [(0.0, 0.0, 300.0), (-200.0, 50.0, 220.0), (-260.0, 90.0, 180.0)]
+
+
+@pytest.mark.parametrize("stand", mostly_slow(STANDS, STANDS[2]))
 def test_all_corners_of_an_aprilgrid(april, stand, taken):
     found, errors, visible = seen(*april, stand, taken=taken)
     assert found.status.ok
@@ -78,7 +81,7 @@ def drawn_exactly(field, columns, rows, size, spacing):
     return scene
 
 
-@pytest.mark.parametrize("stand", [(0.0, 0.0, 300.0), (-200.0, 50.0, 220.0), (-260.0, 90.0, 180.0)])
+@pytest.mark.parametrize("stand", mostly_slow(OBLIQUE, OBLIQUE[2]))
 def test_standard_deviations_of_an_aprilgrid_are_true_however_obliquely_it_is_seen(stand):
     """384 coordinates of white noise: error over sd is 1 ± 0.036."""
     field = boards.aprilgrid(4, 4, 40.0, 0.3)
@@ -102,7 +105,7 @@ def test_the_tags_of_an_aprilgrid_are_those_of_its_makers():
     assert int(word, 2) == images.APRIL_TAG_0
 
 
-@pytest.mark.parametrize("turn", [1, 2, 3])
+@pytest.mark.parametrize("turn", mostly_slow([1, 2, 3], 2))
 def test_corners_in_another_order_are_not_ok(april, turn, taken):
     sheet, field = april
     codes = tuple(f"{c[:-1]}{(int(c[-1]) + turn) % 4}" for c in field.codes)
@@ -130,7 +133,7 @@ def test_all_corners_of_a_charuco_board(name, columns, rows, legacy):
     assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.4
 
 
-@pytest.mark.parametrize("roll", [0.0, 1.5, 3.1, 4.5])
+@pytest.mark.parametrize("roll", mostly_slow([0.0, 1.5, 3.1, 4.5], 1.5))
 def test_a_chessboard_is_numbered_however_it_is_turned(roll):
     field = boards.chessboard(9, 6, 25.0)
     sheet = images.chessboard_sheet(9, 6, 25.0)

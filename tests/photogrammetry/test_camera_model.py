@@ -13,10 +13,10 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
-    camera_coordinates,
     partials,
     project,
     rays,
+    rotation,
 )
 
 SENSOR = Sensor(3280, 2464, 0.00112)
@@ -77,7 +77,7 @@ def test_epochs_are_vectorised(points, per_epoch):
 
 def test_inverse_returns_the_ray(points):
     image = project(SENSOR, IOP, EOP, points)
-    q = camera_coordinates(EOP, points)
+    q = (points - EOP[3:]) @ rotation(EOP[:3])
     expected = q / np.linalg.norm(q, axis=1, keepdims=True)
     np.testing.assert_allclose(rays(SENSOR, IOP, image), expected, atol=1e-12)
 

@@ -6,12 +6,12 @@ import corner_camera as scene
 import numpy as np
 import pytest
 
+from tests.blocks import InBlocks
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.series.adjustment import adjust_series
-from thermocald.photogrammetry.series.blocks import GridBlocks, spread_windows
 from thermocald.photogrammetry.series.long_series import adjust_long_series
-from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.series.normals import ObservationGrid, spread_windows
 from thermocald.photogrammetry.series.result import SeriesSettings
 
 OWN = np.arange(8)
@@ -50,7 +50,7 @@ def case():
 def blocked(case, size, exterior="series", **other):
     field, _, grid = case
     return adjust_long_series(
-        scene.SENSOR, field, GridBlocks(grid, size), scene.INTERIOR, scene.EXTERIOR,
+        scene.SENSOR, field, InBlocks(grid, size), scene.INTERIOR, scene.EXTERIOR,
         SeriesSettings(exterior=exterior, **other), together=120,
     )  # fmt: skip
 
@@ -122,7 +122,7 @@ def test_processes_do_not_matter(case, exterior):
     field, _, grid = case
     one, two = (
         adjust_long_series(
-            scene.SENSOR, field, GridBlocks(grid, 60), scene.INTERIOR, scene.EXTERIOR,
+            scene.SENSOR, field, InBlocks(grid, 60), scene.INTERIOR, scene.EXTERIOR,
             SeriesSettings(exterior=exterior), together=120, jobs=jobs,
         )
         for jobs in (1, 2)

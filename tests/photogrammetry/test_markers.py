@@ -10,13 +10,17 @@ from tests.photogrammetry.exact_rendering import Scene, look_at, noisy
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw_marker
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.markers import (
     locate_markers,
     marker_rows,
-    measure_corners,
-    measure_markers,
     parse_marker,
 )
+
+
+def measure_markers(image, field, missed=None):
+    return measure_corners(image, locate_markers(image, field, missed), missed)
+
 
 APRILTAG, ARUCO = "DICT_APRILTAG_36h11", "DICT_5X5_50"
 

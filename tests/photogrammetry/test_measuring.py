@@ -14,7 +14,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.epoch.measuring import Line, Plane, on_line, on_plane, resect
+from thermocald.photogrammetry.epoch.measuring import Line, Plane, place_on, resect
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 SENSOR = Sensor(*SIZE, PITCH)
@@ -73,7 +73,7 @@ def test_errors_are_what_the_covariance_says(n):
         image = project(places, POSE, c, x0, y0) + rng.normal(0, SIGMA, (2, 2))
         level = rng.normal(0, WATER.sd_mm)
         lifted = replace(WATER, point=WATER.point + level * WATER.normal, sd_tilt=0.0)
-        X, C = on_plane(SENSOR, r.values, prior, image, SIGMA, lifted)
+        X, C = place_on(SENSOR, r.values, prior, image, SIGMA, lifted)
         errors.append((X - places)[:, :2].ravel() / np.sqrt(np.diag(C))[[0, 1, 3, 4]])
     assert np.mean(square) / 6 == pytest.approx(1.0, abs=0.1)
     assert np.std(np.array(errors), axis=0) == pytest.approx(np.ones(4), abs=0.13)
@@ -86,7 +86,7 @@ def test_places_on_a_plane_against_a_monte_carlo():
     _, field, seen = drawn(rng, points, Q, 10.0)
     r = resect(SENSOR, INTERIOR, Q, field, seen, snooping_alpha=0.0)
     uv = np.array([[1700.0, 1500.0], [900.0, 1900.0]])
-    X, C = on_plane(SENSOR, r.values, r.covariance, uv, SIGMA, WATER)
+    X, C = place_on(SENSOR, r.values, r.covariance, uv, SIGMA, WATER)
     N = 40_000
     draws = rng.multivariate_normal(r.values, r.covariance, N)
     found = np.empty((N, 2, 3))
@@ -185,9 +185,9 @@ def test_a_staff_is_read_along_its_line():
     staff = Line(np.array([800.0, 12_000.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     place = np.array([[800.0, 12_000.0, 730.0]])
     uv = project(place, POSE, INTERIOR.c, INTERIOR.x0, INTERIOR.y0)
-    X, C = on_line(SENSOR, values, Q, uv, SIGMA, staff)
+    X, C = place_on(SENSOR, values, Q, uv, SIGMA, staff)
     assert pytest.approx(place, abs=1e-4) == X
-    on_water, of_water = on_plane(SENSOR, values, Q, uv, SIGMA, WATER)
+    on_water, of_water = place_on(SENSOR, values, Q, uv, SIGMA, WATER)
     assert of_water[1, 1] > C[2, 2] > 0
     assert on_water[0, 2] == pytest.approx(0.0, abs=1e-9)
 
@@ -195,4 +195,4 @@ def test_a_staff_is_read_along_its_line():
 def test_above_the_horizon_there_is_no_water():
     values = np.concatenate([INTERIOR.as_array(), POSE])
     with pytest.raises(GeometryError, match="above the horizon"):
-        on_plane(SENSOR, values, np.zeros((16, 16)), [[1640.0, 20.0]], SIGMA, WATER)
+        place_on(SENSOR, values, np.zeros((16, 16)), [[1640.0, 20.0]], SIGMA, WATER)

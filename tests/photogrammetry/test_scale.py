@@ -68,6 +68,7 @@ def test_a_saturated_sheet_says_so(sheet):
     assert "expose" in status.reason
 
 
+@pytest.mark.slow
 def test_the_photographs_of_the_sheet_are_true(sheet):
     """The targets are where the camera model has them: what stands above can be relied upon."""
     field, sheets = sheet

@@ -137,7 +137,7 @@ def test_epochs_by_themselves_are_those_of_the_epoch_adjustment(hidden, correlat
     covariance = correlation * scene.SIGMA_PX**2
     observations = [replace(obs, covariances=np.full(len(obs), covariance)) for obs in observations]
     settings = SeriesSettings(exterior="per_epoch", target_offsets=False, target_noise=False,
-                              snooping_alpha=0.001)  # fmt: skip
+                              snooping_alpha=0.0005)  # fmt: skip
     grid = ObservationGrid.from_observations(field, observations)
     before = grid.weights.copy()
     r = adjust_series(scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR, settings)

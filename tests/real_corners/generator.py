@@ -26,6 +26,7 @@ import yaml
 from tests.blind.case import PROGRAMMES
 from tests.blind.hidden import Camera, fresh, hide, left_over, true_parameters
 from tests.blind.world import climate, image, smooth_unknown
+from tests.recordings import write_recording
 
 CAMERAS = ("aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6")
 NINE = (
@@ -189,26 +190,23 @@ def _size(left, e: dict, camera: Camera, strength: float) -> float:
 
 
 def write(series: RealSeries, source: str, folder: Path) -> None:
-    """The series as a recording (CONVENTIONS §3)."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write the series as a recording (CONVENTIONS §3)."""
     head = yaml.safe_load((SHARED / source / "recording.yaml").read_text())
     head |= {"name": f"{source}-{series.name}", "series": series.name, "interval": INTERVAL}
     head["temperatures"] = {name: {"unit": "degC"} for name in series.temperatures}
-    (folder / "recording.yaml").write_text(yaml.safe_dump(head, sort_keys=False))
-    (folder / "testfield.csv").write_text((SHARED / source / "testfield.csv").read_text())
+    epochs = []
+    for k, number in enumerate(series.numbers):
+        read = (f"{v[k]:.4f}" for v in series.temperatures.values())
+        epochs.append([number, *[f"{series.times[k]:.3f}"] * 2, *read, ""])
     names, _, _ = corners(source)
-    with (folder / "epochs.csv").open("w") as f:
-        print("epoch,frame_time,temperature_time", *series.temperatures, "frame", sep=",", file=f)
-        for k, number in enumerate(series.numbers):
-            values = [f"{v[k]:.4f}" for v in series.temperatures.values()]
-            t = f"{series.times[k]:.3f}"
-            print(number, t, t, *values, "", sep=",", file=f)
-    with (folder / "observations.csv").open("w") as f:
-        print("epoch,target,x,y,sx,sy", file=f)
-        for number, points in zip(series.numbers, series.points, strict=True):
-            for name, (x, y) in zip(names, points, strict=True):
-                if np.isfinite(x):
-                    print(f"{number},{name},{x:.4f},{y:.4f},0.1,0.1", file=f)
+    observations = [
+        [number, name, f"{x:.4f}", f"{y:.4f}", 0.1, 0.1]
+        for number, points in zip(series.numbers, series.points, strict=True)
+        for name, (x, y) in zip(names, points, strict=True)
+        if np.isfinite(x)
+    ]
+    write_recording(folder, head, epochs, observations)
+    (folder / "testfield.csv").write_text((SHARED / source / "testfield.csv").read_text())
 
 
 def main() -> None:

@@ -69,8 +69,8 @@ def input_of(series: RealSeries, source: str) -> SeriesInput:
     )  # fmt: skip
 
 
-def discovered(case: RealCase) -> tuple[Discovery, dict, float]:
-    """The discovery of one case, its truth, CPU s."""
+def discover_case(case: RealCase) -> tuple[Discovery, dict, float]:
+    """Return what discovery says of a case, the truth, and the seconds of processor."""
     series, truth = generate(case)
     inputs = [input_of(s, case.camera) for s in series]
     begin = time.process_time()
@@ -79,8 +79,14 @@ def discovered(case: RealCase) -> tuple[Discovery, dict, float]:
 
 
 def judge(case: RealCase) -> RealOutcome:
-    """One case, right or wrong."""
-    discovery, _, seconds = discovered(case)
+    """Run one case and judge it."""
+    return judge_discovery(case, *discover_case(case))
+
+
+def judge_discovery(
+    case: RealCase, discovery: Discovery, truth: dict, seconds: float
+) -> RealOutcome:
+    """Compare what was discovered with what is hidden."""
     found = tuple(sorted(e.effect for e in discovery.effects))
     listed = tuple(a for e in discovery.effects for a in e.alternative_names)
     hidden = tuple(sorted(case.effects))

@@ -68,16 +68,3 @@ def test_a_score_that_misses_its_goal_is_said():
     assert missed("nine", [good] * 19 + [bad]) == []
     assert "80% named" in missed("nine", [good] * 4 + [bad])[0]
     assert "100%" in missed("none", [good] * 99 + [bad])[0]
-
-
-@pytest.mark.slow
-def test_a_sample_of_the_scoring_seeds_reaches_its_goals():
-    """One seed of the quietest and of the most restless camera; the whole is the command's."""
-    from tests.real_corners.score import cases, judge, missed
-
-    cameras = ("aviary-cam2", "aviary-cam1")
-    nine = [judge(c) for c in list(cases("nine", [501], cameras))[::3]]
-    none = [judge(RealCase(camera, (), 12500 + k)) for camera in cameras for k in range(3)]
-
-    assert missed("nine", nine) == []
-    assert missed("none", none) == []

@@ -257,33 +257,6 @@ def test_sensitivity_is_the_derivative(name, coarse):
     exact = effect.sensitivity(h, **values).toarray()
     by_differences = Effect.sensitivity(effect, h, **values).toarray()
     np.testing.assert_allclose(exact, by_differences, atol=5e-6)
-    errors = rng.standard_normal((120, 3))
-    np.testing.assert_allclose(
-        effect.propagate(h, errors, **values), exact @ errors, rtol=0, atol=2e-5
-    )
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_cheap_enough_to_search(name):
-    """A course of 180 epochs in less than 1 ms, of a day in less than 20 ms."""
-    import time
-
-    effect = catalogue.get(name)
-    values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
-    values.pop("phase", None)
-    for epochs, limit in ((180, 1e-3), (8640, 20e-3)):
-        t = np.arange(epochs) * 10.0
-        T = T0 + np.sin(t / 500) + 0.05 * np.random.default_rng(1).standard_normal(epochs)
-        h = History(t, t + 0.3, {"temperature": T, "board": T}, "temperature", T0)
-        effect._course(h, **values)  # imports and the polygon, once per recording
-        best = min(_timed(time, effect, h, values) for _ in range(5))
-        assert best < limit
-
-
-def _timed(time, effect, h, values):
-    begin = time.perf_counter()
-    effect._course(h, **values)
-    return time.perf_counter() - begin
 
 
 def test_two_drives_follow_each_other():

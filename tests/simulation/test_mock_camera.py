@@ -8,7 +8,8 @@ import pytest
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, load_driver
 from thermocald.photogrammetry.camera.camera_model import project
-from thermocald.photogrammetry.targets.markers import measure_markers
+from thermocald.photogrammetry.targets.corner import measure_corners
+from thermocald.photogrammetry.targets.markers import locate_markers
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import write_model
 
@@ -32,7 +33,7 @@ def test_frame_shows_the_known_drift(camera):
     a, b = camera.truth(first.monotonic), camera.truth(hot.monotonic)
     moved = (b.iop[0] - a.iop[0]) / camera.model.sensor.pixel_pitch
     assert -12.0 < moved[1] < -9.0
-    seen = measure_markers(hot.image, camera.field)
+    seen = measure_corners(hot.image, locate_markers(hot.image, camera.field))
     assert len(seen) >= 100
     expected = project(camera.model.sensor, b.iop[0], b.eop[0], camera.field.points)
     assert np.sqrt(np.mean((seen.points - expected[seen.targets]) ** 2)) < 0.04

@@ -104,7 +104,7 @@ def test_written_and_read_again(tmp_path):
     recording = read_recording(tmp_path / "r")
     assert sum(done) == len(recording.epochs) == 12
     assert list(recording.channels) == ["temperature", "board_temperature"]
-    assert recording.extra["simulated"]["seed"] == 1
+    assert recording.head.extra["simulated"]["seed"] == 1
     for epoch, seen in zip(recording.epochs, s.observations(), strict=True):
         np.testing.assert_allclose(epoch.observations.points, seen.points, atol=1e-5)
         np.testing.assert_array_equal(epoch.observations.targets, seen.targets)
@@ -120,7 +120,8 @@ def test_seed_decides_everything(tmp_path):
 
 
 def test_frames_can_be_measured(tmp_path):
-    from thermocald.photogrammetry.targets.markers import measure_markers
+    from thermocald.photogrammetry.targets.corner import measure_corners
+    from thermocald.photogrammetry.targets.markers import locate_markers
 
     field = demonstration_field("markers")
     s = simulation(epochs=2, field=field)
@@ -130,7 +131,7 @@ def test_frames_can_be_measured(tmp_path):
     import cv2
 
     image = cv2.imread(str(recording.epochs[1].frame), cv2.IMREAD_GRAYSCALE)
-    seen = measure_markers(image, field)
+    seen = measure_corners(image, locate_markers(image, field))
     error = seen.points - s.image_points(slice(1, 2))[0, seen.targets]
     assert len(seen) > 150
     assert np.sqrt(np.mean(error**2)) < 0.05

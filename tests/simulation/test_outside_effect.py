@@ -43,7 +43,7 @@ import os
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 from dataclasses import replace
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.thermal.effect_options import parse_effect
+from thermocald.thermal.hypothesis import parse_effect
 from thermocald.discovery.result import discover_series
 from thermocald.thermal.reduce import reduce_together
 from thermocald.thermal.source import series_input

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ConfigurationError
-from thermocald.physics.presets import PRESETS, preset_names, preset_simulation
+from thermocald.physics.presets import PRESETS, preset_simulation
 
 # preset: principal point px, principal distance mm, where it goes (right, up), as the text has it
 REFERENCE = {
@@ -19,7 +19,7 @@ REFERENCE = {
 
 
 def test_all_five():
-    assert set(preset_names()) == set(REFERENCE)
+    assert set(PRESETS) == set(REFERENCE)
     with pytest.raises(ConfigurationError, match="known are: nexus5-cold"):
         preset_simulation("nexus6")
 

@@ -107,8 +107,8 @@ def test_parameters_are_found_again(tmp_path, name):
         assert abs(found.values[key] - value) <= limit, (key, found.values[key], value, sd)
     for key in ("c", "x0", "y0"):
         error = fitted.model.rates[key] - simulation.model.rates[key]
-        assert abs(error) < 3 * fitted.sd(f"rates.{key}"), key
-    assert abs(fitted.sigma0 - 1.0) < 0.03 or name == "defocus"
+        assert abs(error) < 3 * fitted.model.sd(f"rates.{key}"), key
+    assert abs(fitted.fitted["sigma0"] - 1.0) < 0.03 or name == "defocus"
 
 
 def test_a_lag_is_found_again(tmp_path):
@@ -123,7 +123,9 @@ def test_a_lag_is_found_again(tmp_path):
     assert abs(found.values["tau"] - 84.0) < 3 * found.sds["tau"] < 10.0
     # the thermometer's noise and steps together, from the image points alone: a lag of 8 epochs
     # lets some 180 / 8 independent values of it through, so 3 sd are 45 %
-    assert abs(fitted.series[0].thermometer_sd / np.hypot(0.04, 0.0625 / 12**0.5) - 1) < 0.45
+    assert (
+        abs(fitted.fitted["series"][0].thermometer_sd / np.hypot(0.04, 0.0625 / 12**0.5) - 1) < 0.45
+    )
     exact = replace(simulation.model, exterior=simulation.exterior)
     predicted = fitted.model.predict(simulation.true_history)
     truth = exact.predict(simulation.true_history)

@@ -15,7 +15,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.targets.markers import measure_markers
+from thermocald.photogrammetry.targets.corner import measure_corners
+from thermocald.photogrammetry.targets.markers import locate_markers
 from thermocald.physics import shapes as portable
 from thermocald.physics.scene import Look, Scene, coverage, windows_around
 from thermocald.physics.shapes import surface_normals
@@ -73,7 +74,7 @@ def test_corners_agree_with_the_projected_truth():
     iop = InteriorOrientation(c=3.04, x0=0.012, y0=-0.018).as_array()
     eop = corner_view(field, 1330.0).as_array()
     image = Scene(SENSOR, field, CLEAN).render(iop, eop)
-    seen = measure_markers(image, field)
+    seen = measure_corners(image, locate_markers(image, field))
     assert len(seen) >= 160
     error = seen.points - project(SENSOR, iop, eop, field.points)[seen.targets]
     assert np.sqrt(np.mean(error**2)) < 0.01

@@ -6,12 +6,11 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from thermocald.cli import application
+from tests.commands import answer
 from thermocald.errors import ThermocaldError
 from thermocald.files import dump_yaml
-from thermocald.physics.presets import preset_names, preset_simulation
+from thermocald.physics.presets import PRESETS, preset_simulation
 from thermocald.store.recording.reader import read_recording
 
 PROGRAMME = {
@@ -26,13 +25,13 @@ PROGRAMME = {
 
 
 def run(*arguments):
-    return CliRunner().invoke(application(), ["simulate", *(str(a) for a in arguments)])
+    return answer("simulate", *arguments)
 
 
 def test_list():
     result = run("--list")
     assert result.exit_code == 0
-    for name in (*preset_names(), "thermal_lag", "target_displacement"):
+    for name in (*PRESETS, "thermal_lag", "target_displacement"):
         assert name in result.output
     listed = json.loads(run("--list", "--json", "-").stdout)
     assert len(listed["effects"]) == 20

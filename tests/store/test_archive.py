@@ -49,7 +49,7 @@ def test_a_clock_that_was_set_back_is_mended(filled, tmp_path, make_epoch):
     recording = read_recording(tmp_path / "M1")
     assert np.diff(recording.columns.frame_time) == pytest.approx(10.0)
     assert recording.columns.frame_time[-1] == make_epoch(30).frame_time - 3600
-    (step,) = recording.extra["clock_set_back"]
+    (step,) = recording.head.extra["clock_set_back"]
     assert step == {"epoch": 21, "seconds": pytest.approx(-3600.0)}
     ahead = recording.columns.temperature_time - recording.columns.frame_time
     assert ahead == pytest.approx(0.75)

@@ -1,4 +1,4 @@
-"""Columns come whole from chunks, tail, and later calibrations, and chunks can be rebuilt."""
+"""Columns come whole from chunks, tail, and later calibrations."""
 
 from __future__ import annotations
 
@@ -117,22 +117,6 @@ def test_a_column_that_comes_and_goes(store, series):
     assert np.isnan(store.series_columns(series, ["never"])["never"]).all()
 
 
-def test_chunks_can_be_rebuilt(store, series):
-    for i in range(3 * CHUNK + 2):
-        store.append(series, epoch(i), result(i), extra={"blur": 0.5 * i})
-    store.amend(series, 1, result(1))
-    before = read(store, series)
-    for *row, data in store._db.execute(
-        "SELECT id, series_id, name, first_row, last_number, data FROM column_chunk"
-    ).fetchall():
-        id_, data = row.pop(0), bytes(len(data))
-        sealed = (data, columns._checksum(*row, data), id_)
-        store._db.execute("UPDATE column_chunk SET data = ?, checksum = ? WHERE id = ?", sealed)
-    assert read(store, series) != before
-    store.rebuild_columns(series)
-    assert read(store, series) == before
-
-
 @pytest.mark.parametrize("data", ["x'00'", "zeroblob(length(data))"])
 def test_of_a_broken_chunk_the_rows_are_read(store, series, data, caplog):
     for i in range(CHUNK):
@@ -156,8 +140,8 @@ def test_another_chunk_length_later_on(store_path, head, field, monkeypatch):
         assert read(store, series) == expected(range(4 * CHUNK))
 
 
-def late(store: Store) -> int:
-    return store._db.execute("SELECT count(*) FROM late_epoch").fetchone()[0]
+def late(store: Store, series) -> int:
+    return len(columns.SeriesColumns(store._db, series.id)._late_rows(0))
 
 
 def test_only_calibrations_after_their_chunk_are_looked_up(store, series):
@@ -169,7 +153,19 @@ def test_only_calibrations_after_their_chunk_are_looked_up(store, series):
     for i in range(3 * CHUNK - 3, 3 * CHUNK):
         store.amend(series, i, result(i))
     assert read(store, series) == expected(range(3 * CHUNK))
-    assert late(store) == 3 * 4  # of each chunk, the three waiting and the one in hand
-    store.rebuild_columns(series)
-    assert late(store) == 0
-    assert read(store, series) == expected(range(3 * CHUNK))
+    assert late(store, series) == 3 * 4  # of each chunk, the three waiting and the one in hand
+
+
+def test_a_merged_chunk_holds_what_came_late(store, series):
+    for i in range(MERGED * CHUNK):
+        store.append(series, epoch(i), None if i == 5 else result(i), extra={"blur": 0.5 * i})
+        if i == 2 * CHUNK:
+            store.amend(series, 5, result(3), extra={"contrast": 1.0})
+            store.amend(series, 5, result(5), extra={"contrast": 2.0})
+    assert chunks(store) == 1
+    assert late(store, series) == 0
+    assert read(store, series) == expected(range(MERGED * CHUNK))
+    assert store.series_columns(series, ["contrast"])["contrast"][[4, 5]].tolist()[1] == 2.0
+    store.amend(series, 6, result(6))
+    assert late(store, series) == 1
+    assert read(store, series) == expected(range(MERGED * CHUNK))

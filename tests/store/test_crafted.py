@@ -9,9 +9,8 @@ import sqlite3
 import pytest
 
 from thermocald.errors import RecordingError, StoreError
-from thermocald.store.database import columns
 from thermocald.store.database.archive import archive_readings, archive_series
-from thermocald.store.database.columns import row_checksum, sql_name
+from thermocald.store.database.columns import KEPT, row_checksum
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.series import LoggedReading
@@ -23,10 +22,9 @@ def change(path, statement: str, *values) -> None:
     for table in ("series", "epoch", "reading"):
         database.execute(f"DROP TRIGGER IF EXISTS {table}_update")
     database.execute(statement, values)
-    numbers, texts = [[*map(sql_name, names)] for names in (columns._NUMBERS, columns._TEXTS)]
     sealed = {
-        "epoch": (numbers, texts),
-        "reading": (["utc", "clock_trusted"], ["thermometer", "temperatures"]),
+        "epoch": KEPT["epoch"],
+        "reading": KEPT["reading"],
         "series": (
             ["created_utc"], ["camera", "name", "start", "head", "identity", "settings", "digest"],
         ),

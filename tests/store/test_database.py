@@ -12,9 +12,8 @@ import pytest
 
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError, StoreVersionError
-from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store.database.store import Store
-from thermocald.store.recording.reader import read_recording, temperature_at_frame, write_recording
+from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event
 
@@ -73,25 +72,11 @@ def test_fixed_parameters_have_no_sd(filled, make_result):
     assert columns["sd_C2"][-1] > 0
 
 
-def test_temperatures_at_the_frames(filled):
+def test_covariances_by_number(filled, make_result):
     store, series = filled
-    epochs = [stored.epoch for stored in store.epochs(series)]
-    found = store.temperatures_at_frame(series)
-    assert list(found) == ["temperature", "board_temperature"]
-    assert np.array_equal(found["temperature"], temperature_at_frame(epochs))
-
-
-def test_observations_and_covariances_by_number(filled, make_epoch, make_result):
-    store, series = filled
-    seen = list(store.observations(series, [3, 11]))
-    assert [s.points.tolist() for s in seen] == [
-        make_epoch(i).observations.points.tolist() for i in (3, 11)
-    ]
     covariances = store.covariances(series, [3, 11, 99])
     assert np.array_equal(covariances[1], make_result(11).covariance)
     assert np.isnan(covariances[2]).all()
-    with pytest.raises(StoreError, match="has no epoch 99"):
-        list(store.observations(series, [99]))
 
 
 def test_resume_where_it_stopped(filled, store_path, head, field):
@@ -247,13 +232,6 @@ def test_plain_sql_can_read_it(filled, store_path):
     assert all(isinstance(value, float) for value in row[1:])
 
 
-def test_parameters_in_the_schema_follow_the_model(filled):
-    store, series = filled
-    names = [*PARAMETER_NAMES, *(f"sd_{n}" for n in PARAMETER_NAMES)]
-    values = store.series_columns(series, names)
-    assert all(np.isfinite(values[name]).all() for name in names)
-
-
 def test_no_store(tmp_path):
     with pytest.raises(StoreError, match="there is no such store"):
         Store.open(tmp_path / "none.db")
@@ -297,31 +275,6 @@ def test_empty_file(tmp_path):
         Store.open(path)
     with Store.open(path, "append") as store:
         assert store.all_series() == []
-
-
-def test_damage_is_noticed(filled, store_path):
-    store, _ = filled
-    store.close()
-    data = bytearray(store_path.read_bytes())
-    for page in range(3, len(data) // 8192):
-        data[page * 8192 : page * 8192 + 64] = b"\xa5" * 64
-    store_path.write_bytes(data)
-
-    def read_all():
-        with Store.open(store_path) as broken:
-            broken.check()
-            list(broken.epochs(broken.find_series()))
-
-    with pytest.raises(StoreError):
-        read_all()
-
-
-def test_a_broken_blob_is_an_error(filled):
-    store, series = filled
-    store._db.execute("DROP TRIGGER detail_update")
-    store._db.execute("UPDATE detail SET data = x'0102'")
-    with pytest.raises(StoreError, match=r"small.db: epoch 1: .*damaged"):
-        list(store.epochs(series))
 
 
 def test_close_twice(filled):

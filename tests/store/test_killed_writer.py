@@ -63,7 +63,7 @@ def test_a_killed_writer_loses_at_most_the_epoch_in_hand(store_path, head, field
     for _ in range(6):
         said = kill_after(store_path, int(rng.integers(1, 30)), float(rng.uniform(0, 0.02)))
         with Store.open(store_path) as store:
-            store.check()
+            assert store.examine().damaged == ()
             series = store.find_series()
             last = store.last_epoch(series)
             assert last in (said, said + 1)  # committed, and perhaps not yet said
@@ -122,7 +122,7 @@ def test_space_again_after_a_full_disk(store_path, head, field, make_epoch, make
         store._db.execute("PRAGMA max_page_count = 100000")
         for number in range(last + 1, last + 30):
             store.append(series, make_epoch(number), make_result(number))
-        store.check()
+        assert store.examine().damaged == ()
         found = store.series_columns(series, ["c"])["c"]
         assert found.tolist() == [make_result(i).values[0] for i in range(1, last + 30)]
 
@@ -193,7 +193,7 @@ FULL = textwrap.dedent(
         for _ in range(20):
             append()
     with Store.open(disk / "store.db") as store:
-        store.check()
+        assert store.examine().damaged == ()
         kept = store.series_columns(store.find_series(), ["c"])["c"].tolist()
     print(full, kept == [float(i) for i in range(1, full + 21)])
     """

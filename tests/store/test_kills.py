@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import forker, make_recording  # noqa: F401
+from tests.daemon.conftest import make_recording
 from tests.daemon.forking import Forked, Forker
 from thermocald.errors import StoreError
 from thermocald.store.database.store import Store
@@ -67,7 +67,7 @@ def other_device(tmp_path_factory):
     pytest.skip("there is one device only")
 
 
-def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> list[Forked]:  # noqa: F811
+def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> list[Forked]:
     """What stands beside the writer, and processes that try to write too."""
 
     def writes(*arguments: object, script: str = "") -> Forked:
@@ -102,7 +102,7 @@ def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> l
 KINDS = ["alone", "hard link", "soft link", "copies", "second daemon", "replay", "run", "readers"]
 
 
-def kill_one(forker: Forker, store: Path, start, rng) -> int:  # noqa: F811
+def kill_one(forker: Forker, store: Path, start, rng) -> int:
     """Start the writer, and what `start` begins once it writes; the last epoch it reported."""
     folder = store.parent / f"writer-{len(list(store.parent.glob('writer-*')))}"
     folder.mkdir()
@@ -138,11 +138,11 @@ def kill_one(forker: Forker, store: Path, start, rng) -> int:  # noqa: F811
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_was_reported_is_kept(forker, store_path, head, field, recording, kind):  # noqa: F811
+def test_what_was_reported_is_kept(forker, store_path, head, field, recording, kind):
     _kill_often(forker, store_path, head, field, recording, kind)
 
 
-def test_links_over_devices(forker, other_device, tmp_path, head, field, recording):  # noqa: F811
+def test_links_over_devices(forker, other_device, tmp_path, head, field, recording):
     """The store on one device, its name on another, and the writer knows the name alone."""
     real = other_device / "real.db"
     name = tmp_path / "named.db"
@@ -154,7 +154,7 @@ def test_links_over_devices(forker, other_device, tmp_path, head, field, recordi
     assert name.is_symlink()
 
 
-def _kill_often(forker, store_path, head, field, recording, kind) -> None:  # noqa: F811
+def _kill_often(forker, store_path, head, field, recording, kind) -> None:
     times = -(-KILLS // (len(KINDS) + 1))
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)
@@ -168,7 +168,7 @@ def _kill_often(forker, store_path, head, field, recording, kind) -> None:  # no
             name.unlink()  # a daemon writes on beside a hard link; nothing else would
         reported += said - before
         with Store.open(store_path) as store:
-            store.check()
+            assert store.examine().damaged == ()
             series = next(s for s in store.all_series() if s.name == head.series)
             numbers = [s.epoch.number for s in store.epochs(series)]
             assert numbers == list(range(1, len(numbers) + 1))
@@ -183,7 +183,7 @@ def _kill_often(forker, store_path, head, field, recording, kind) -> None:  # no
     assert reported > times
 
 
-def test_a_name_that_lacks_the_wal_is_not_read_as_whole(forker, store_path, head, field):  # noqa: F811
+def test_a_name_that_lacks_the_wal_is_not_read_as_whole(forker, store_path, head, field):
     """While the writer is dead and its -wal waits: a hard link shows the store without it."""
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)

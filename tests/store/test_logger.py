@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 
 from thermocald.errors import DataError, UsageError
-from thermocald.store.logger.clock import DeviceClock, clock_error, time_zone
-from thermocald.store.logger.moments import MomentFormat, parse_moment
+from thermocald.store.logger.clock import (
+    DeviceClock,
+    clock_error,
+    parse_moment,
+    time_zone,
+)
+from thermocald.store.logger.dialect import stated_unit, without_unit
 from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
-from thermocald.store.logger.units import stated_unit
 
 BERLIN = DeviceClock(time_zone("Europe/Berlin"))
 JUNE = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()  # 12:00 in Berlin
@@ -291,7 +295,7 @@ def test_unknown_zones_are_refused(text):
     ],
 )
 def test_moments(text, expected):
-    found = parse_moment(text, MomentFormat("mdy"))
+    found = parse_moment(text, "mdy")
     assert found == expected
     assert (found.utcoffset() is None) == (expected.utcoffset() is None)
 
@@ -336,6 +340,15 @@ def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_
 )  # fmt: skip
 def test_one_pattern_reads_the_unit_of_a_head(head, unit):
     assert stated_unit(head) == unit
+
+
+@pytest.mark.parametrize(
+    ("head", "label"),
+    [("Temp (°F)", "Temp"), ("housing_f", "housing"), ("Celsius(C)", ""), ("T [K]", "T"),
+     ("TempF", "Temp"), ("温度(℃)", "温度"), ("Temp Fan", "Temp Fan")],
+)  # fmt: skip
+def test_what_is_converted_to_celsius_keeps_no_other_unit_in_its_name(head, label):
+    assert without_unit(head) == label
 
 
 TWO = """"Plot Title: x"

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from thermocald.cli import application
+from tests.commands import succeed
 from thermocald.errors import RecordingError
 from thermocald.store.recording.reader import open_recording, read_recording
 
@@ -15,8 +14,7 @@ parquet = pytest.importorskip("pyarrow.parquet")
 
 
 def convert(path, to):
-    result = CliRunner().invoke(application(), ["convert", str(path), "--to", to])
-    assert result.exit_code == 0, result.exception
+    succeed("convert", path, "--to", to)
 
 
 def same(a, b):

@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.epoch import Epoch
 from thermocald.store.recording.readings import (
     interpolate_readings,
-    temperature_at_frame,
-    temperatures_at_frame,
 )
 
 
@@ -51,12 +48,3 @@ def test_one_reading_holds_for_its_instant():
 
 def test_two_readings_at_one_instant_are_one():
     assert interpolate_readings([1.0], [0.0, 0.0, 2.0], [1.0, 1.0, 3.0]) == pytest.approx([2.0])
-
-
-def test_epochs_by_channel():
-    epochs = [
-        Epoch(i, 10.0 * i, 10.0 * i + 2, {"lens": 20 + 0.1 * (10 * i + 2), "board": 40.0})
-        for i in range(5)
-    ]
-    assert temperature_at_frame(epochs) == pytest.approx([20, 21, 22, 23, 24])
-    assert list(temperatures_at_frame(epochs)) == ["lens", "board"]

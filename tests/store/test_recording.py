@@ -20,7 +20,6 @@ from thermocald.store.recording.reader import (
     open_recording,
     read_recording,
     read_testfield,
-    temperature_at_frame,
     write_recording,
     write_testfield,
 )
@@ -36,7 +35,7 @@ def same(a: Observations, b: Observations) -> bool:
 
 def test_written_recording_is_read_as_it_was(recording_path, field, head, make_epoch):
     recording = read_recording(recording_path)
-    assert (recording.name, recording.series, recording.interval) == ("small", "M1", 10.0)
+    assert (recording.head.name, recording.series, recording.head.interval) == ("small", "M1", 10.0)
     assert (recording.camera, dict(recording.channels)) == (head.camera, dict(head.channels))
     assert recording.testfield.names == field.names
     assert np.array_equal(recording.testfield.points, field.points)
@@ -55,13 +54,13 @@ def test_head_keeps_interior_and_unknown_keys(tmp_path, field, head, make_epoch)
     with RecordingWriter(tmp_path / "r", replace(head, camera=camera, extra=extra), field) as w:
         w.append(make_epoch(1))
     recording = read_recording(tmp_path / "r")
-    assert (recording.camera, recording.extra) == (camera, extra)
+    assert (recording.camera, recording.head.extra) == (camera, extra)
 
 
 def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
     whole = read_recording(recording_path).epochs
     monkeypatch.setattr(module, "LONG_FROM_BYTES", 0)
-    monkeypatch.setattr(module.Table.chunks, "__defaults__", (7,))  # epochs span chunks
+    monkeypatch.setattr(module.Table.chunks, "__defaults__", (7, None, None))  # epochs span chunks
     streamed = list(open_recording(recording_path).iter_epochs())
     assert [e.number for e in streamed] == [e.number for e in whole]
     for a, b in zip(streamed, whole, strict=True):
@@ -192,7 +191,7 @@ def test_real_recordings_are_read_and_survive_a_round_trip(shared, tmp_path, cam
     recording = read_recording(shared / "data" / f"aviary-cam{camera}")
     assert len(recording.epochs) == 101
     assert sum(len(epoch.observations) for epoch in recording.epochs) == rows
-    assert np.isnan(temperature_at_frame(recording.epochs)).all()  # none was measured
+    assert np.isnan([[*e.temperatures.values()] for e in recording.epochs]).all()  # none measured
     copy = tmp_path / "copy"
     write_recording(copy, recording.head, recording.testfield, recording.epochs)
     for a, b in zip(read_recording(copy).epochs, recording.epochs, strict=True):
@@ -215,7 +214,7 @@ def test_unknown_keys_are_what_a_store_would_keep(recording_path):
     """A replay is resumed if the store's head equals the recording's."""
     path = recording_path / "recording.yaml"
     path.write_text(path.read_text() + "date: 2020-09-13\nwhere: {1: a, lamps: [60, null]}\n")
-    assert read_recording(recording_path).extra == {
+    assert read_recording(recording_path).head.extra == {
         "date": "2020-09-13",
         "where": {"1": "a", "lamps": [60, None]},
     }

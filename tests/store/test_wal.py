@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import threading
 
@@ -10,8 +11,8 @@ import pytest
 
 from thermocald.cli import application
 from thermocald.daemon.store_guard import StoreGuard
+from thermocald.store.database.file import WalTail, read_wal_tail
 from thermocald.store.database.store import Store
-from thermocald.store.database.wal import WalTail, read_wal_tail
 
 
 @pytest.fixture
@@ -73,13 +74,13 @@ def test_a_write_that_a_kill_cut_off_is_no_damage(crashed, capsys):
     assert read_wal_tail(wal) == WalTail(unfinished=True)
     with Store.open(crashed) as store:
         found = store.examine()
-        store.check()
+        assert store.examine().damaged == ()
     assert (found.damaged, found.unfinished) == ((), True)
     application()(["check", str(crashed)], standalone_mode=False)
     assert "the last write was cut off" in capsys.readouterr().out
     guard = StoreGuard(crashed)
     guard.flush()
-    assert guard.notice == ""
+    assert guard.status()["notice"] == ""
     assert [e.kind for e in guard.store.events()] == ["wal_unfinished"]
     guard.close()
     assert epochs(crashed) == list(range(1, 9))
@@ -104,15 +105,20 @@ def test_a_store_that_is_being_written_is_not_damaged(store_path, head, field, m
     wal = store_path.with_name(f"{store_path.name}-wal")
     with Store.open(store_path, "append", durable=False) as store:
         series = store.create_series(head, field)
-        writer = threading.Thread(
-            target=lambda: [store.append(series, make_epoch(i)) for i in range(1, 400)]
-        )
+        enough = threading.Event()
+
+        def write():
+            for i in itertools.takewhile(lambda _: not enough.is_set(), itertools.count(1)):
+                store.append(series, make_epoch(i))
+
+        writer = threading.Thread(target=write)
         writer.start()
-        tails = []
-        while writer.is_alive():
-            tails.append(read_wal_tail(wal))
-        writer.join()
-        assert len(tails) > 2
+        try:
+            tails = [read_wal_tail(wal) for _ in range(50)]
+        finally:
+            enough.set()
+            writer.join()
+        assert store.last_epoch(series) > 2
         assert not any(tail.lost for tail in tails)
 
 
@@ -155,3 +161,19 @@ def test_of_a_cut_file_the_index_knows_what_is_missing(store_path, head, field, 
         wal.write_bytes(data[: 24 + 2 * step])
         assert read_wal_tail(wal).lost == 1
         wal.write_bytes(data)
+
+
+@pytest.mark.parametrize("part", [0.1, 1 / 3, 0.5, 2 / 3, 0.8, 0.999])
+def test_what_a_copy_cut_off_is_said_with_how_many_epochs_are_left(crashed, capsys, part):
+    """Where the cut falls between two commits nothing tells of those that followed."""
+    wal = crashed.with_name(f"{crashed.name}-wal")
+    data, step = frames(wal)
+    size = int(part * len(data))
+    wal.write_bytes(data[: size + 1 if (size - 32) % step == 0 else size])
+    application()(["check", str(crashed)], standalone_mode=False)
+    said = capsys.readouterr().out
+    assert "the last write was cut off" in said
+    left = epochs(crashed)
+    assert left == list(range(1, len(left) + 1))
+    assert len(left) < 9
+    assert f"{len(left)} epochs" in said

@@ -16,7 +16,7 @@ import logging
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from thermocald.addresses import without_secrets
@@ -28,36 +28,16 @@ from thermocald.errors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
-    from thermocald.hal import Clock, Device, Kind
+    from thermocald.hal import Clock, Device, Kind, Output
 
     T = TypeVar("T")
+    OnEvent = Callable[[float, str, str], None]
 
+_QUEUE = 200  # results that wait for an output
 _LATEST_START = 0.1  # of a period: a tick that would begin later is skipped
 _REMEMBERED = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """One tick: its index, when it was due (monotonic s), how late it began, how many were missed
-    since the one before.
-    """
-
-    index: int
-    due: float
-    late_s: float
-    skipped: int
-
-
-@dataclass(frozen=True, slots=True)
-class ScheduleStats:
-    """What a schedule has to say about itself; lateness of the last ticks in s."""
-
-    ticks: int
-    skipped: int
-    late_p99_s: float
-    late_max_s: float
 
 
 class Schedule:
@@ -73,31 +53,35 @@ class Schedule:
         self._late: deque[float] = deque(maxlen=_REMEMBERED)
 
     def due(self, index: int) -> float:
-        """The deadline of a tick; computed, not summed up: no rounding accumulates."""
+        """Return the deadline of a tick; computed, not summed up: no rounding accumulates."""
         return self.begin + index * self.period_s
 
-    def wait(self, wake: threading.Event | None = None) -> Tick | None:
-        """Wait for the next tick that is not too late already; None if `wake` was set first."""
+    def wait(self, wake: threading.Event | None = None) -> int | None:
+        """Wait for the next tick that is not too late already; None if `wake` was set first.
+
+        Returns its number.
+        """
         behind = (self.clock.monotonic() - self.begin) / self.period_s - _LATEST_START
         index = max(self._next, math.ceil(behind))
         # before the first tick nothing was missed: a device may join a running schedule
         skipped = index - self._next if self._ticks else 0
         if not self.clock.sleep_until(self.due(index), wake):
             return None
-        late = self.clock.monotonic() - self.due(index)
         self._next = index + 1
         self._ticks += 1
         self._skipped += skipped
-        self._late.append(late)
-        return Tick(index, self.due(index), late, skipped)
+        self._late.append(self.clock.monotonic() - self.due(index))
+        return index
 
-    def stats(self) -> ScheduleStats:
-        """Counts so far, and the lateness of the last 1000 ticks."""
-        late = sorted(self._late.copy())
-        if not late:
-            return ScheduleStats(0, 0, 0.0, 0.0)
-        p99 = late[min(len(late) - 1, math.ceil(0.99 * len(late)) - 1)]
-        return ScheduleStats(self._ticks, self._skipped, p99, late[-1])
+    def stats(self) -> dict[str, float]:
+        """Return the counts so far, and the lateness of the last 1000 ticks, s."""
+        late = sorted(self._late.copy()) or [0.0]
+        return {
+            "ticks": self._ticks,
+            "skipped": self._skipped,
+            "late_p99_s": late[math.ceil(0.99 * len(late)) - 1],
+            "late_max_s": late[-1],
+        }
 
 
 log = logging.getLogger(__name__)
@@ -109,23 +93,13 @@ _LONGEST_PAUSE_S = 2.0  # or the device's period, so that no epoch is lost to wa
 _SEARCH_PAUSE_S = 10.0
 
 
-@dataclass(frozen=True, slots=True)
-class LinkEvent:
-    """A device went away (`device_out`), came back (`device_back`), or failed for good
-    (`device_failed`), or a recording ended (`device_finished`).
-    """
-
-    utc: float
-    kind: str
-    device: str
-    text: str
-
-
 class Link:
     """One device and its state; used by one thread, looked at by others.
 
     Attributes for the status: state; why: the last fault; out_since: monotonic s; since: UTC s,
     when it went away or ended, NaN while it has not; faults: calls that failed.
+    on_event: receives UTC s, a kind and a sentence when the device goes away (`device_out`), comes
+    back (`device_back`), fails for good (`device_failed`), or a recording ends (`device_finished`).
     """
 
     def __init__(
@@ -136,7 +110,7 @@ class Link:
         clock: Clock,
         *,
         period_s: float = 1.0,
-        on_event: Callable[[LinkEvent], None] | None = None,
+        on_event: OnEvent = lambda *_: None,
     ) -> None:
         self.kind = kind
         self.name = name
@@ -180,6 +154,15 @@ class Link:
             return result
         return None
 
+    def do(self, action: Callable[[], object]) -> bool:
+        """Do something with the open device; whether it was there."""
+
+        def done() -> bool:
+            action()
+            return True
+
+        return bool(self.call(done))
+
     def close(self) -> None:
         """Release the device."""
         self.device.close()
@@ -192,7 +175,7 @@ class Link:
             self.close()
 
     def identity(self) -> dict[str, Any]:
-        """What the device says it is; empty if it cannot say."""
+        """Return what the device says it is; empty if it cannot say."""
         try:
             return dict(self.device.identity())
         except Exception:
@@ -212,7 +195,7 @@ class Link:
             away_s = self._clock.monotonic() - self.out_since
             text = f"{self.kind} {self.name} is back after {away_s:.0f} s"
             log.info(text, extra={"device": self.name, "event": "device_back"})
-            self._tell("device_back", text)
+            self._on_event(self._clock.utc(), "device_back", text)
         self.state = "open"
         self.since = math.nan
         self.why = ""
@@ -229,7 +212,7 @@ class Link:
             self.since = self._clock.utc()
             text = f"{self.kind} {self.name} is out: {why}"
             log.warning(text, extra={"device": self.name, "event": "device_out"})
-            self._tell("device_out", text)
+            self._on_event(self.since, "device_out", text)
         # the first retry comes with the next tick, since most faults are of one frame alone
         now = self._clock.monotonic()
         self._retry_at = now + 0.9 * self._pause_s
@@ -249,11 +232,17 @@ class Link:
         level = logging.INFO if finished else logging.ERROR
         kind = f"device_{self.state}"
         log.log(level, "%s %s: %s", self.kind, self.name, self.why, extra={"event": kind})
-        self._tell(kind, f"{self.kind} {self.name}: {self.why}")
+        self._on_event(self.since, kind, f"{self.kind} {self.name}: {self.why}")
 
-    def _tell(self, kind: str, text: str) -> None:
-        if self._on_event is not None:
-            self._on_event(LinkEvent(self._clock.utc(), kind, self.name, text))
+    def status(self, busy_s: float, hang_after_s: float) -> dict[str, Any]:
+        """Return the device's part of the daemon's status."""
+        return {
+            "device": "hung" if busy_s > hang_after_s else self.state,
+            "why": self.why,
+            "since": self.since,
+            "warnings": self.warnings(),
+            "faults": self.faults,
+        }
 
 
 class DeviceLoop:
@@ -304,7 +293,7 @@ class DeviceLoop:
         return not self._thread.is_alive()
 
     def busy_s(self) -> float:
-        """For how long the device has not returned from a call; 0 between calls."""
+        """Return for how long the device has not returned from a call; 0 between calls."""
         since = self._busy_since
         return 0.0 if since is None else self._clock.monotonic() - since
 
@@ -321,7 +310,7 @@ class DeviceLoop:
                 self._busy_since = self._clock.monotonic()
                 if self._idle():
                     self.link.rest()
-                elif self.link.call(self._act):
+                elif self.link.do(self._action):
                     self.done += 1
                 else:
                     self.lost += 1
@@ -330,6 +319,59 @@ class DeviceLoop:
             self._busy_since = None
             self.link.close()
 
-    def _act(self) -> bool:
-        self._action()
-        return True
+
+class OutputLoop:
+    """Hands results to one output, in order; one that is slow or gone loses its oldest, no more."""
+
+    def __init__(self, name: str, output: Output, clock: Clock, on_event: OnEvent) -> None:
+        self.link = Link("output", name, output, clock, on_event=on_event)
+        self.emitted = 0
+        self.lost = 0
+        self._output = output
+        self._queue: deque[Mapping[str, Any]] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name=f"output {name}", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread; the output is opened in it."""
+        self._thread.start()
+
+    def put(self, result: Mapping[str, Any]) -> None:
+        """Hand over a result; returns at once."""
+        with self._changed:
+            if len(self._queue) >= _QUEUE:
+                self._queue.popleft()
+                self.lost += 1
+            self._queue.append(result)
+            self._changed.notify_all()
+
+    def stop(self, grace_s: float) -> bool:
+        """Emit what waits, within the grace, and close."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        self._thread.join(grace_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        self.link.do(lambda: None)
+        while True:
+            with self._changed:
+                while not self._queue and not self._stopping:
+                    self._changed.wait(1.0)
+                if not self._queue:
+                    break
+                result = self._queue[0]
+            if self.link.do(partial(self._output.emit, result)):
+                self.emitted += 1
+            elif self._stopping or self.link.ended:
+                self.lost += 1
+            else:
+                with self._changed:
+                    self._changed.wait(0.5)  # what waits is emitted once the output is back
+                continue
+            with self._changed:
+                if self._queue and self._queue[0] is result:
+                    self._queue.popleft()
+        self.link.close()

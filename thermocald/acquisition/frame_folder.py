@@ -13,7 +13,6 @@ import os
 import re
 import shutil
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,20 +34,6 @@ _OURS = re.compile(r"\d{7,}(-corrected)?\.(jpg|png)(\.partial)?")
 _FAST_PNG = 1  # of 9: what takes longer makes it hardly smaller
 
 
-@dataclass(frozen=True, slots=True)
-class Deleted:
-    """What a pass of retention deleted: how many frames, bytes, and why."""
-
-    frames: int
-    size: int
-    why: str
-
-    @property
-    def text(self) -> str:
-        """The pass in a sentence."""
-        return f"{self.frames} frames ({self.size / 1e6:.1f} MB) were deleted: {self.why}"
-
-
 class FrameFolder:
     """Writes frames of all cameras, and deletes the oldest; threads may share it."""
 
@@ -59,7 +44,7 @@ class FrameFolder:
         self._since = time.time()
 
     def wanted(self, number: int, eventful: bool) -> bool:
-        """Whether the configuration wants the frame of an epoch."""
+        """Return whether the configuration wants the frame of an epoch."""
         match self.config.keep:
             case "all":
                 return True
@@ -113,7 +98,7 @@ class FrameFolder:
                 (self.root / path).unlink()
 
     def free_bytes(self) -> int:
-        """Free space of the disk; nothing where it cannot be asked."""
+        """Return the free space of the disk; nothing where it cannot be asked."""
         folder = self.root
         while not folder.exists() and folder != folder.parent:
             folder = folder.parent
@@ -122,21 +107,20 @@ class FrameFolder:
         except OSError:
             return 0
 
-    def enforce(self, now_utc: float | None) -> list[Deleted]:
-        """Delete what is too old, then the oldest of what is too much.
+    def enforce(self, now_utc: float | None) -> list[str]:
+        """Delete what is too old, then the oldest of what is too much; return what was, in words.
 
         now_utc: None where the time is not known for sure: then nothing is deleted for its age.
         """
         config = self.config
         files = sorted(self._files())
-        deleted: list[Deleted] = []
+        deleted: list[str] = []
         if config.max_age_days is not None and now_utc is not None:
             limit = now_utc - config.max_age_days * _DAY_S
             # of before the program existed: taken while the clock was not set, of unknown age
             old = [f for f in files if _NOT_BEFORE <= f[0] < limit]
             files = [f for f in files if not _NOT_BEFORE <= f[0] < limit]
-            why = f"older than {config.max_age_days:g} days"
-            deleted += self._delete(old, why)
+            deleted += self._delete(old, f"older than {config.max_age_days:g} days")
         surplus, why = 0, ""
         if config.max_size_gb is not None:
             surplus = int(sum(size for _, size, _ in files) - config.max_size_gb * _GB)
@@ -150,10 +134,7 @@ class FrameFolder:
                 break
             victims.append(file)
             surplus -= file[1]
-        deleted += self._delete(victims, why)
-        for one in deleted:
-            log.info(one.text, extra={"event": "frames_deleted"})
-        return deleted
+        return [*deleted, *self._delete(victims, why)]
 
     def restamp(self, seconds: float) -> None:
         """Move the times of what this process wrote before the clock was set by so many seconds.
@@ -167,17 +148,21 @@ class FrameFolder:
                     os.utime(path, (modified + seconds,) * 2)
         self._since += seconds
 
-    def _delete(self, files: list[tuple[float, int, str]], why: str) -> list[Deleted]:
+    def _delete(self, files: list[tuple[float, int, str]], why: str) -> list[str]:
         count = size = 0
         for _, bytes_, path in files:
             with contextlib.suppress(OSError):
                 os.unlink(path)
                 count += 1
                 size += bytes_
-        return [Deleted(count, size, why)] if count else []
+        if not count:
+            return []
+        text = f"{count} frames ({size / 1e6:.1f} MB) were deleted: {why}"
+        log.info(text, extra={"event": "frames_deleted"})
+        return [text]
 
     def _files(self) -> Iterator[tuple[float, int, str]]:
-        """(time of change s, bytes, path) of all frames, and of pieces left by a crash."""
+        """Yield (time of change s, bytes, path) of all frames, and of pieces left by a crash."""
         for folder, _, names in os.walk(self.root):
             for name in names:
                 if not _OURS.fullmatch(name) or not _NUMBER.fullmatch(os.path.basename(folder)):
@@ -188,24 +173,19 @@ class FrameFolder:
                     yield found.st_mtime, found.st_size, path
 
     def _written(self, relative: Path, data: bytes) -> bool:
-        """Whether the disk has taken a file; `paused` says why not."""
+        """Write a file; whether the disk has taken it, `paused` says why not."""
+        path = self.root / relative
+        partial = path.with_name(path.name + ".partial")
         try:
-            self._write(self.root / relative, data)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial.write_bytes(data)
+            os.replace(partial, path)
         except OSError as error:
+            with contextlib.suppress(OSError):
+                partial.unlink()
             self._pause(f"{self.root}: {error.strerror or error}; no frames are kept")
             return False
         return True
-
-    def _write(self, path: Path, data: bytes) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        try:
-            partial.write_bytes(data)
-            os.replace(partial, path)
-        except OSError:
-            with contextlib.suppress(OSError):
-                partial.unlink()
-            raise
 
     def _pause(self, why: str) -> None:
         if not self.paused:

@@ -7,9 +7,6 @@ acquisition not.
 
 Two threads, one calibrates and one keeps, so that a slow disk or a slow adjustment never holds the
 camera up. `check_frame` looks at one frame before a series begins.
-
-Frame and readings keep their own times when they are paired; nothing is interpolated here. Who
-needs the temperature at the frame's time interpolates between neighbouring epochs' readings.
 """
 
 from __future__ import annotations
@@ -19,125 +16,20 @@ import math
 import threading
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError
-from thermocald.names import require_channels
 from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.photogrammetry.field.testfield import observations_from_lists
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
-    from thermocald.hal import Clock, Frame, Reading
-
-
-_REMEMBERED = 16
-_OLDEST_IN_PERIODS = 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class PairedReadings:
-    """What the thermometers said around a frame.
-
-    utc: s, of the reference thermometer, NaN if there is none; temperatures: {channel: °C};
-    skew_s: reading minus frame, NaN if there is none.
-    """
-
-    utc: float
-    temperatures: Mapping[str, float]
-    skew_s: float
-
-
-def pair_readings(readings: Mapping[str, Reading | None], frame_monotonic: float) -> PairedReadings:
-    """Join one reading per thermometer, the reference first, into the temperatures of an epoch.
-
-    Channels keep the thermometer's own names where there is one thermometer; with several they are
-    `<thermometer>` for its channel `temperature` and `<thermometer>_<channel>` for others. Without
-    the reference the next thermometer that answered gives the time.
-    """
-    temperatures: dict[str, float] = {}
-    reference: Reading | None = None
-    for name, reading in readings.items():
-        if reading is None:
-            continue
-        reference = reference or reading
-        for channel, value in reading.values.items():
-            temperatures[_column(name, channel, len(readings))] = value
-    if reference is None:
-        return PairedReadings(math.nan, {}, math.nan)
-    return PairedReadings(reference.utc, temperatures, reference.monotonic - frame_monotonic)
-
-
-def require_columns(thermometers: Mapping[str, Iterable[str]], error: type[Exception]) -> list[str]:
-    """The columns of an epoch for {thermometer: its channels}, the reference first.
-
-    Raises `error` where one has the name of another, or of a column of this program.
-    """
-    columns = [
-        _column(name, channel, len(thermometers))
-        for name, channels in thermometers.items()
-        for channel in channels
-    ]
-    where = f"thermometers {', '.join(thermometers)}"
-    require_channels(columns, where, error)
-    if "temperature" in columns[1:]:
-        raise error(
-            f"{where}: `temperature` is what the reference is called, the first of the channels "
-            f"({', '.join(columns)}); make it the first, or rename it"
-        )
-    return columns
-
-
-def _column(thermometer: str, channel: str, thermometers: int) -> str:
-    if thermometers == 1:
-        return channel
-    return thermometer if channel == "temperature" else f"{thermometer}_{channel}"
-
-
-class Readings:
-    """The last readings of all thermometers; threads add, pipelines ask."""
-
-    def __init__(self, periods_s: Mapping[str, float]) -> None:
-        self._periods_s = dict(periods_s)
-        self._kept: dict[str, deque[Reading]] = {
-            name: deque(maxlen=_REMEMBERED) for name in periods_s
-        }
-        self._changed = threading.Condition()
-
-    def add(self, name: str, reading: Reading) -> None:
-        """Keep a reading."""
-        with self._changed:
-            self._kept[name].append(reading)
-            self._changed.notify_all()
-
-    def nearest(self, name: str, monotonic: float) -> Reading | None:
-        """The reading nearest to a time; None if all are more than 1.5 periods away."""
-        with self._changed:
-            found = min(self._kept[name], key=lambda r: abs(r.monotonic - monotonic), default=None)
-        limit = _OLDEST_IN_PERIODS * self._periods_s[name]
-        if found is None or abs(found.monotonic - monotonic) > limit:
-            return None
-        return found
-
-    def around(self, names: Sequence[str], monotonic: float, patience_s: float) -> PairedReadings:
-        """The readings around a frame.
-
-        patience_s: of wall time to wait for a reading that is being taken just now; none is waited
-        for that cannot come nearer.
-        """
-        with self._changed:
-            self._changed.wait_for(
-                lambda: all(self._answered(name, monotonic) for name in names), patience_s
-            )
-        return pair_readings({name: self.nearest(name, monotonic) for name in names}, monotonic)
-
-    def _answered(self, name: str, monotonic: float) -> bool:
-        kept = self._kept[name]
-        return bool(kept) and kept[-1].monotonic >= monotonic - 0.5 * self._periods_s[name]
+    from thermocald.acquisition.thermometers import Thermometers
+    from thermocald.hal import Clock, Frame
 
 
 log = logging.getLogger(__name__)
@@ -149,16 +41,11 @@ _PATIENCE_S = 2.0
 _IDLE_S = 0.5
 
 
-def make_epoch(number: int, frame: Frame, paired: PairedReadings) -> Epoch:
-    """The epoch of a frame and its readings; the picture is not measured yet."""
-    return Epoch(number, frame.utc, paired.utc, paired.temperatures)
-
-
 def calibrate_frame(calibrator: EpochCalibrator, epoch: Epoch, frame: Frame) -> CalibratedEpoch:
     """Measure and adjust; a frame that is not an image gives the status `bad_frame`, no error."""
     try:
-        if (lists := frame.metadata.get("observations")) is not None:
-            seen = observations_from_lists(lists, calibrator.testfield)
+        if frame.observations is not None:
+            seen = observations_from_lists(frame.observations, calibrator.testfield)
             return calibrator.calibrate(replace(epoch, observations=seen))
         image = EncodedImage(frame.encoded or b"") if frame.image is None else frame.image
     except DataError as error:
@@ -192,24 +79,24 @@ class Keeper(Protocol):
         """Keep the calibration of an epoch that was kept without."""
 
     def backlog(self, below: int) -> Epoch | None:
-        """An epoch numbered below, kept without calibration, with the path of its frame."""
+        """Return an epoch numbered below, kept without calibration, with the path of its frame."""
 
 
 class Pipeline:
     """The queue, the calibrating and the keeping thread of one camera.
 
-    calibrator: None if epochs are only acquired. observe: (a calibrated epoch, whether it comes in
-    order) → the epoch as it is kept. depth: epochs that may wait. patience_s: to wait for a reading
-    that is being taken, at most half a period. columns: of an epoch's temperatures, the reference
-    first, as far as they are known. on_lost: told why an epoch that was taken is not kept.
+    names: of its thermometers, the reference first; calibrator: None if epochs are only acquired.
+    observe: (a calibrated epoch, whether it comes in order) → the epoch as it is kept. depth:
+    epochs that may wait. patience_s: to wait for a reading that is being taken, at most half a
+    period. on_lost: receives why an epoch that was taken is not kept.
     """
 
     def __init__(
         self,
         name: str,
         calibrator: EpochCalibrator | None,
-        readings: Readings,
-        thermometers: Sequence[str],
+        thermometers: Thermometers,
+        names: Sequence[str],
         keeper: Keeper,
         clock: Clock,
         *,
@@ -219,7 +106,6 @@ class Pipeline:
         patience_s: float | None = None,
         trusted: Callable[[], bool] = lambda: True,
         observe: Callable[[CalibratedEpoch, bool], CalibratedEpoch] = lambda epoch, _: epoch,
-        columns: Callable[[], Sequence[str]] = tuple,
         on_lost: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.name = name
@@ -228,15 +114,14 @@ class Pipeline:
         self.caught_up = 0
         self.lost = 0  # epochs that were taken and not handed over to be kept
         self.next_number = first
-        self._readings = readings
-        self._thermometers = list(thermometers)
+        self._thermometers = thermometers
+        self._names = list(names)
         self._keeper = keeper
         self._clock = clock
         self._patience_s = min(_PATIENCE_S, 0.5 * period_s) if patience_s is None else patience_s
         self._depth = depth
         self._trusted = trusted
         self._observe = observe
-        self._columns = columns
         self._on_lost = on_lost
         self._items: deque[AcquiredEpoch] = deque()
         self._amended: deque[CalibratedEpoch] = deque()
@@ -264,7 +149,7 @@ class Pipeline:
             self._changed.notify_all()
 
     def _is_full(self) -> bool:
-        """Whether no frame more may wait: a machine that stalls for seconds costs none."""
+        """Return whether no frame more may wait: a machine that stalls for seconds costs none."""
         frames = [i.frame for i in self._items]
         held = sum(
             len(f.encoded or b"") + (0 if f.image is None else f.image.nbytes) for f in frames
@@ -300,11 +185,11 @@ class Pipeline:
         return not any(thread.is_alive() for thread in self._threads)
 
     def waiting(self) -> int:
-        """How many epochs are on their way."""
+        """Return how many epochs are on their way."""
         return len(self._items)
 
     def busy_s(self) -> float:
-        """For how long a thread has not finished one thing; 0 if none is busy."""
+        """Return for how long a thread has not finished one thing; 0 if none is busy."""
         now = self._clock.monotonic()
         return max((now - since for since in list(self._busy_since.values())), default=0.0)
 
@@ -372,11 +257,9 @@ class Pipeline:
             return CalibratedEpoch(epoch, failed("program_error", str(error)), {})
 
     def _pair(self, item: AcquiredEpoch, patience_s: float) -> None:
-        paired = self._readings.around(self._thermometers, item.frame.monotonic, patience_s)
-        # a reference that was not read leaves its place empty: no other takes it
-        columns = dict.fromkeys(self._columns(), math.nan)
-        paired = replace(paired, temperatures={**columns, **paired.temperatures})
-        item.epoch = make_epoch(item.number, item.frame, paired)
+        frame = item.frame
+        paired = self._thermometers.around(self._names, frame.monotonic, patience_s)
+        item.epoch = Epoch(item.number, frame.utc, paired.utc, paired.temperatures)
         item.skew_s = paired.skew_s
 
     def _keep_all(self) -> None:
@@ -428,37 +311,26 @@ _RULES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class FrameCheck:
-    """What was found, sentence by sentence; failed: why no series can begin, empty if one can."""
+def check_frame(name: str, calibrator: EpochCalibrator, frame: Frame) -> tuple[list[str], str]:
+    """Measure and adjust a frame before a series begins.
 
-    found: tuple[str, ...]
-    failed: str = ""
-
-
-def check_frame(name: str, calibrator: EpochCalibrator, frame: Frame) -> FrameCheck:
-    """Measure and adjust a frame, and say what a person can mend."""
-    nothing = PairedReadings(float("nan"), {}, float("nan"))
-    calibrated = calibrate_frame(calibrator, make_epoch(1, frame, nothing), frame)
+    Returns what was found, sentence by sentence, with what a person can mend; and why no series
+    can begin, empty if one can.
+    """
+    calibrated = calibrate_frame(calibrator, Epoch(1, frame.utc, math.nan, {}), frame)
     result, seen = calibrated.adjustment, calibrated.epoch.observations
-    field = calibrator.testfield
-    found: list[str] = []
+    names, found = calibrator.testfield.names, []
     if seen is not None and len(seen):
         blur = calibrated.extra.get("blur_px")
         blurred = "" if blur is None else f", blur {blur:.2f} px"
-        found.append(f"{name}: {len(seen)} of {len(field)} targets{blurred}")
-        found += _remarks(field.names, seen.targets, seen.quality)
+        found.append(f"{name}: {len(seen)} of {len(names)} targets{blurred}")
+        for key, bad, words in _RULES:
+            values = zip(seen.targets, seen.quality.get(key, ()), strict=False)
+            if rows := [int(target) for target, value in values if bad(value)]:
+                shown = ", ".join(names[row] for row in rows[:_NAMED])
+                more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
+                found.append(f"  target {shown}{more}: {words}")
     if not result.ok:
-        return FrameCheck(tuple(found), f"{result.status}: {result.reason}")
+        return found, f"{result.status}: {result.reason}"
     c, sd = result.values[0], result.sd[0]
-    found.append(f"{name}: sigma0 {result.sigma0:.2f}, c {c:.5f} ± {sd:.5f} mm")
-    return FrameCheck(tuple(found))
-
-
-def _remarks(names: tuple[str, ...], targets: Any, quality: Mapping[str, Any]) -> Iterator[str]:
-    for key, bad, words in _RULES:
-        rows = [int(t) for t, v in zip(targets, quality.get(key, ()), strict=False) if bad(v)]
-        if rows:
-            shown = ", ".join(names[row] for row in rows[:_NAMED])
-            more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
-            yield f"  target {shown}{more}: {words}"
+    return [*found, f"{name}: sigma0 {result.sigma0:.2f}, c {c:.5f} ± {sd:.5f} mm"], ""

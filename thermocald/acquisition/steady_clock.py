@@ -120,7 +120,7 @@ class SteadyClock:
         return self._machine.utc() - self.utc()
 
     def trusted(self) -> bool:
-        """Whether a time stamp taken now is known to be right to a second."""
+        """Return whether a time stamp taken now is known to be right to a second."""
         return abs(self.error_s) < _WRONG_S and self._synchronised()
 
     def settled(self) -> bool:

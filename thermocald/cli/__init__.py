@@ -8,9 +8,10 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import signal
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 # Small matrices: threads of the linear algebra would only wait for one another (30 × slower on two
 # busy cores). It must be set before NumPy is imported.
@@ -25,6 +26,7 @@ from thermocald.errors import ThermocaldError
 from thermocald.files import cannot_write
 
 _INTERRUPTED = 130
+_USAGE_ERROR: Any = typer.BadParameter.__base__  # of click, which Typer brings along
 _VERBOSE = ("--verbose", "-v")
 
 
@@ -84,14 +86,23 @@ def main() -> None:
         signal.signal(signal.SIGTERM, _end)  # so that nothing half-written stays
     _settle_process()
     try:
-        application(_called(_words()))(prog_name="thermocald")
+        status = application(_called(_words()))(prog_name="thermocald", standalone_mode=False)
         sys.stdout.flush()
+        sys.exit(status or 0)
+    except _USAGE_ERROR as error:
+        sys.exit(_say_usage(error))
     except ThermocaldError as error:
         say(f"error: {error}")
         sys.exit(error.exit_status)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         say("interrupted")
         sys.exit(_INTERRUPTED)
+    except UnicodeEncodeError as error:
+        if error.encoding != "utf-8":
+            raise
+        # bytes of a file's name, which neither a server nor a library of C++ can be given
+        say(f"error: {error.object[:200]}: is no UTF-8 text; choose another name")
+        sys.exit(2)
     except BrokenPipeError:
         # The reader of our output has gone, as `head` does.
         sys.stderr.close()
@@ -106,6 +117,20 @@ def main() -> None:
         with contextlib.suppress(OSError):
             sys.stdout.close()  # else Python writes what is left in it again, and fails again
         sys.exit(failed.exit_status)
+
+
+def _say_usage(error: Any) -> int:
+    """Say in one line what of the command was not understood; a help where nothing was typed."""
+    status: int = error.exit_code
+    command = "thermocald" if error.ctx is None else error.ctx.command_path
+    said = error.format_message()
+    if not said or "Usage:" in said:  # the whole help, where nothing was typed
+        error.show()
+        return status
+    said = re.sub(r"^Invalid value for '([^']+)': (?:Input )?", r"\1: ", said)
+    said = said[0].lower() + said[1:]
+    say(f"error: {' '.join(said.split()).rstrip('.')}; see '{command} --help'")
+    return status
 
 
 def _settle_process() -> None:

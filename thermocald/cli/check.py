@@ -20,12 +20,12 @@ def devices(json: JsonOption = None) -> None:
 
     Example: thermocald devices >> config.yaml
     """
-    from thermocald.daemon.probe import attached, stanzas
+    from thermocald.daemon.soundness import attached, stanzas
 
     found, notes = attached()
     document = {
         "format": "thermocald-devices/1",
-        "devices": [one.as_dict() for one in found],
+        "devices": found,
         "notes": notes,
     }
     if write_result(document, json):
@@ -83,7 +83,7 @@ def check(
             "backup, or read what is sound"
         )
     probes = document.get("probes", [])
-    failed = [probe["name"] for probe in probes if probe["error"]]
+    failed = [probe.name for probe in probes if probe.error]
     if failed:
         raise DeviceError(
             f"{len(failed)} of {len(probes)} devices gave nothing: {', '.join(failed)}; why stands "

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from thermocald.files import check_output
+
+_OUTPUTS = {"camera_out", "effect_out", "json", "model_out", "out", "output", "report"}
 ADVANCED = "Advanced"
 """The section of options that only experts need."""
 
@@ -36,20 +40,20 @@ PANELS = {
         "status": Entry("run", "Say how the daemon is doing"),
         "top": Entry("run", "Say so again every second"),
         "dashboard": Entry("run", "Serve the daemon's web page"),
-        "import": Entry("import_", "Make a recording from photographs and a logger's file"),
+        "import": Entry("archive", "Make a recording from photographs and a logger's file"),
         "simulate": Entry("demo", "Make a recording of a simulated camera that warms up"),
     },
     "Analyse": {
         "replay": Entry("replay", "Calibrate every epoch of a recording, and say how it drifts"),
         "export": Entry("replay", "Write one row per epoch as CSV, JSON or Parquet"),
         "study": Entry("study", "Test how the camera changes with its temperature; report it"),
-        "discover": Entry("discover", "Find which effect a model misses, name it, prove it"),
-        "fit": Entry("fit", "Fit a thermal model to all series of a camera"),
+        "discover": Entry("study", "Find which effect a model misses, name it, prove it"),
+        "fit": Entry("study", "Fit a thermal model to all series of a camera"),
         "calibrate": Entry("camera", "Calibrate a camera from photographs of a test field"),
     },
     "Use": {
-        "predict": Entry("predict", "Predict the camera at a temperature, or along a log"),
-        "correct": Entry("predict", "Correct image points or images for the temperature"),
+        "predict": Entry("camera", "Predict the camera at a temperature, or along a log"),
+        "correct": Entry("camera", "Correct image points or images for the temperature"),
         "measure": Entry("measure", "Measure in metres on a water surface, a plane, a staff"),
         "camera": Entry("camera", "Convert and compare cameras; one at a temperature", True),
     },
@@ -59,7 +63,7 @@ PANELS = {
     "Many cameras": {
         "forward": Entry("server", "Send a store's rows to a server"),
         "fleet": Entry("server", "Show all cameras of a server, and which need a look"),
-        "reprocess": Entry("reprocess", "Calibrate or analyse whole archives again"),
+        "reprocess": Entry("server", "Calibrate or analyse whole archives again"),
         "server": Entry("server", "Make a server's tables, and let stations write to them", True),
     },
     "Look after": {
@@ -74,7 +78,18 @@ COMMANDS = {name: entry for panel in PANELS.values() for name, entry in panel.it
 
 
 class Command(TyperCommand):
-    """A command whose help has its expert's options in a section of their own."""
+    """A command whose help has its expert's options in a section of their own.
+
+    An output that cannot be written is refused before anything is computed.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Look where the outputs go, and run the command."""
+        for name in _OUTPUTS & ctx.params.keys():
+            given = ctx.params[name]  # `--report / --no-report` is no file
+            if isinstance(given, (str, Path)) and str(given) not in ("", "-"):
+                check_output(Path(given))
+        return super().invoke(ctx)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments, options, and last the advanced ones."""

@@ -17,6 +17,8 @@ from thermocald.result import jsonable
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
+    from thermocald import ThermalCamera
+
 CONFIG_PLACES = (Path("config.yaml"), Path("/etc/thermocald/config.yaml"))
 _NOTICES = ("thermocald.output.dashboard", "thermocald.store.database.file")
 _LINES = 10  # progress lines where there is no terminal
@@ -117,6 +119,13 @@ def write_result(document: Any, json: str | None) -> bool:
     if json is not None:
         write_json(document, json)
     return json != "-"
+
+
+def warned(camera: ThermalCamera) -> ThermalCamera:
+    """Return a thermal camera; what its user must know was said."""
+    if camera.warning:
+        say(f"warning: {camera.warning}")
+    return camera
 
 
 def write_text(text: str, destination: str | Path) -> None:

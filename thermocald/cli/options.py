@@ -28,6 +28,7 @@ PhotosArgument = Annotated[
 PixelPitchOption = Annotated[
     float | None, typer.Option("--pixel-pitch", help="Size of a pixel in mm.", min=1e-5, max=1.0)
 ]
+LogOption = Annotated[Path, typer.Option("--log", help="A logger's file, a recording, or a store.")]
 ModelOption = Annotated[Path, typer.Option("--model", help="The thermal model.")]
 ExtrapolateOption = Annotated[
     bool, expert("--extrapolate", help="Allow temperatures far outside the fit.")
@@ -79,7 +80,7 @@ LOG_OPTIONS: dict[str, tuple[Any, Any]] = {
         ],
         None,
     ),
-    "date_order": (Annotated[str | None, typer.Option(help="Of 06/07/2026: dmy or mdy.")], None),
+    "date_order": (Annotated[str | None, expert(help="Of 06/07/2026: dmy or mdy.")], None),
     "time_column": (
         Annotated[list[str] | None, expert(help="Of the log; twice for a date and a time.")],
         None,

@@ -37,6 +37,13 @@ def replay(
     times: Annotated[
         str, expert("--times", help="With --model, when each was taken: exif, name, or file.")
     ] = "exif",
+    recording_out: Annotated[
+        Path | None,
+        typer.Option(
+            "--recording-out",
+            help="With --model: a folder for what does not move, a recording for `discover`.",
+        ),
+    ] = None,
     timezone: TimezoneOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -53,8 +60,21 @@ def replay(
 
     if (model is None) != (log is None):
         raise UsageError("--model and --log go together")
+    if recording_out is not None and model is None:
+        raise UsageError(
+            "--recording-out goes with --model: it keeps what does not move in a scene"
+        )
     if model is not None and log is not None:
-        _follow_scene(recording, model, log, times, timezone, json)
+        from thermocald.store.logger.photographs import find_photographs
+
+        camera, pictures = tc.load_camera(model), find_photographs([recording])
+        with warnings_said(), progress(len(pictures), "following") as advance:
+            found = tc.follow_scene(
+                recording, camera, log=log, times=times, timezone=timezone, progress=advance,
+                recording=recording_out,
+            )  # fmt: skip
+        if write_result(found.as_dict(), json):
+            typer.echo(str(found))
         return
     series = tc.open(recording)
     with progress(len(series), "calibrating") as advance:
@@ -70,31 +90,6 @@ def replay(
     if not table.ok.any():
         why = next(iter(table.without_result), "there is no epoch")
         raise DataError(f"{recording}: no epoch has a result: {why}")
-
-
-def _follow_scene(
-    folder: Path, model: Path, log: Path, times: str, timezone: str | None, json: str | None
-) -> None:
-    import thermocald as tc
-    from thermocald.analysis.thermal.model_log import read_model_log
-    from thermocald.analysis.thermal.scene import follow_scene
-    from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.photographs import SOURCES, find_photographs, read_photograph
-    from thermocald.store.logger.temperatures import log_options
-
-    if times not in SOURCES:
-        raise UsageError(f"--times {times}: must be one of {', '.join(SOURCES)}")
-    thermal = tc.load_camera(model)
-    pictures = [read_photograph(path, times) for path in find_photographs([folder])]
-    paths = [picture.path for picture in pictures]
-    clock = device_clock(timezone)
-    taken = clock.utc([p.moment for p in pictures], lambda i: str(paths[i])).tolist()
-    read = read_model_log(thermal, log, log_options(timezone=timezone), (min(taken), max(taken)))
-    with warnings_said(), progress(len(paths), "following") as advance:
-        frames = list(zip(paths, taken, strict=True))
-        found = follow_scene(thermal, read, frames, advance=advance)
-    if write_result(found.as_dict(), json):
-        typer.echo(str(found))
 
 
 def export(
@@ -157,8 +152,9 @@ def export(
         table = opened.calibrate(exterior=exterior, free=free, jobs=jobs, progress=advance)
     known = None
     if extra or format_ == "parquet" or not style.is_plain:
-        known = series_export.besides(source, series, table.number, extra=extra)
-    parts = series_export.column_parts(table, style, known)
+        known = opened.besides(table.number, extra=extra)
+    pitch = opened.head.camera.sensor.pixel_pitch
+    parts = series_export.column_parts(table, style, pitch, known)
     if format_ == "parquet":
         series_export.write_parquet(parts, Path(output))
     elif format_ == "json":

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -20,9 +20,6 @@ from thermocald.cli.common import default_config, say, write_result
 from thermocald.cli.options import ConfigOption, JsonOption
 from thermocald.errors import DataError, StoreError, UsageError
 from thermocald.output.status_text import status_lines
-
-if TYPE_CHECKING:
-    pass
 
 
 def run(
@@ -49,10 +46,8 @@ def run(
 
     Example: thermocald run --config config.yaml
     """
-    import os
-
     from thermocald.config import load_config
-    from thermocald.daemon.given_config import mock_config, recording_config
+    from thermocald.daemon.plan import mock_config, recording_config
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
     from thermocald.hal import option_names
@@ -120,7 +115,6 @@ def dashboard(
 
     Example: thermocald dashboard --store thermocald.db
     """
-    from thermocald.cli.common import say
     from thermocald.config import load_config
     from thermocald.daemon.live_state import find_state
     from thermocald.output.dashboard import serve

@@ -16,7 +16,7 @@ from thermocald.files import make_folder
 
 if TYPE_CHECKING:
     from thermocald.config import Config
-    from thermocald.daemon.separating import Watch
+    from thermocald.daemon.desk import Watch
     from thermocald.daemon.session import Session
 
 CameraOption = Annotated[
@@ -82,11 +82,10 @@ def start(
     session = desk.session_of(read, camera, series, condition, epochs, programme, check)
     watch: Watch | None = None
     if until_separated is not None:
-        from thermocald.daemon.separating import Heating, separating
-
-        heating = Heating(max_temperature, max_rate, max_duty)
         known = None if evidence is None else tc.open(evidence).observed()
-        text, session, watch = separating(read, session, until_separated, known, heating, say)
+        text, session, watch = desk.plan_separation(
+            read, session, until_separated, known, say, max_temperature, max_rate, max_duty
+        )
         (typer.echo if dry_run else say)(text)
         if dry_run:
             return
@@ -147,7 +146,7 @@ def _configuration(config: Path | None, mock: bool) -> Config:
     from thermocald.hal import option_names
 
     if mock:
-        from thermocald.daemon.given_config import mock_config
+        from thermocald.daemon.plan import mock_config
 
         if config is not None:
             raise UsageError("give --config or --mock, not both")

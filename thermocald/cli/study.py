@@ -1,4 +1,8 @@
-"""`thermocald study`: statistics, significance, Monte-Carlo, and the report of measured series."""
+"""`thermocald study`, `discover` and `fit`: what measured series say of a camera.
+
+Statistics, significance and Monte-Carlo; where simulation and measurement disagree, why, and the
+proof; one thermal model from all series of a camera.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import progress, write_result
+from thermocald.cli.common import progress, say, write_result
 from thermocald.cli.options import (
     DEFAULT_FREE,
     ExteriorOption,
@@ -16,9 +20,11 @@ from thermocald.cli.options import (
     JobsOption,
     JsonOption,
     SeedOption,
+    TimezoneOption,
+    takes_log_options,
 )
 from thermocald.errors import UsageError
-from thermocald.files import make_folder
+from thermocald.files import make_folder, write_text
 from thermocald.store.server.connection import is_server
 from thermocald.store.sources import require_source
 
@@ -133,3 +139,179 @@ def _labelled(text: str) -> tuple[str | None, Path]:
     if not equals or Path(text).exists() or is_server(text):
         label, rest = "", text
     return label or None, require_source(Path(rest))
+
+
+def discover(
+    recording: Annotated[
+        Path | None,
+        typer.Argument(metavar="M1", help="What to explain: a recording, a store, postgresql://…"),
+    ] = None,
+    verify: Annotated[
+        list[Path] | None,
+        typer.Option(help="M2: another recording of this camera, to prove it on; repeatable."),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="The model so far (YAML) [base model].")
+    ] = None,
+    json: JsonOption = None,
+    model_out: Annotated[
+        Path | None, typer.Option(help="Write the model with what was found.")
+    ] = None,
+    effect_out: Annotated[
+        Path | None, expert(help="Write what was found as an effect file (YAML).")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a report, one HTML file.")] = None,
+    jobs: JobsOption = 1,
+    plan: Annotated[
+        bool,
+        typer.Option("--plan", help="Which effects a set-up would show, before heating anything."),
+    ] = False,
+    preset: Annotated[
+        str | None, typer.Option(help="With --plan: a camera of the reference study.")
+    ] = None,
+    testfield: Annotated[str | None, typer.Option(help="With --plan: a testfield.csv.")] = None,
+    programme: Annotated[
+        Path | None, typer.Option(help="With --plan: what is done to the camera.")
+    ] = None,
+    strength: Annotated[float, expert(min=0.001, help="With --plan: size of an effect, px.")] = 0.1,
+    seeds: Annotated[int, expert(min=1, max=50, help="With --plan: repetitions.")] = 2,
+) -> None:
+    """Find where simulation and measurement disagree, name the missing effect, prove it.
+
+    Example: thermocald discover M1 --verify M2 --model-out camera.yaml --report discovery.html
+    """
+    import thermocald as tc
+
+    if plan:
+        with progress(None, "planning") as advance:
+            planned = tc.plan(
+                None if recording is None else tc.open(recording), preset=preset, model=model,
+                testfield=testfield, programme=programme, strength_px=strength, seeds=seeds,
+                progress=advance,
+            )  # fmt: skip
+        if write_result(planned.as_dict(), json):
+            typer.echo(str(planned))
+        return
+    if recording is None:
+        raise UsageError("M1 is missing: the folder of the recording to explain")
+    others = [tc.open(path) for path in verify or ()]
+    found = tc.discover(tc.open(recording), verify=others, model=model, jobs=jobs, say=say)
+    document = found.as_dict()
+    if model_out is not None:
+        document["model"] = str(found.save(model_out))
+    if effect_out is not None and found.save_effects(effect_out) is None:
+        say(f"{effect_out} is not written: nothing was found that another recording would show too")
+    if report is not None:
+        found.report(report)
+    if write_result(document, json):
+        typer.echo(str(found))
+
+
+@takes_log_options
+def fit(
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RECORDING_OR_STORE…",
+            help="Recordings and stores; or JSON files of `calibrate`, each with its °C: "
+            "21.5=cold.json.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The model file to write.")],
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME[:PARAMETER=VALUE,…] to fit alongside the base model; repeatable."),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Fit the effects of this model, such as discovery wrote it.")
+    ] = None,
+    reference_temperature: Annotated[
+        float | None, expert("--t0", help="Reference temperature °C; default: the mean.")
+    ] = None,
+    type_name: Annotated[
+        str | None,
+        typer.Option(
+            "--type",
+            metavar="NAME|MODEL",
+            help="Several cameras: fit each, write the type NAME. One: its type's MODEL file helps "
+            "where it was measured at few temperatures.",
+        ),
+    ] = None,
+    code: Annotated[
+        Path | None, expert(help="Write the model as FILE.h (C, C++) and FILE.py too.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write the model's certificate, one HTML file.")
+    ] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(help="Temperatures of calibrations, at their photographs' times."),
+    ] = None,
+    temperature_sd: Annotated[
+        float, expert(min=0.0, help="Of the temperature of a calibration, K.")
+    ] = 0.1,
+    jobs: JobsOption = 1,
+    timezone: TimezoneOption = None,
+    ambiguous: str = "order",
+    log_options: Any = None,
+    json: JsonOption = None,
+) -> None:
+    """Fit a thermal model to all series of a camera, in one adjustment over all image points.
+
+    Of photographs that were calibrated at two temperatures or more it is fitted to the results.
+
+    Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
+    Example: thermocald fit 21.5=cold.json 48=warm.json -o camera.thermal.yaml
+    """
+    import thermocald as tc
+
+    calibrations = _temperatures(inputs)
+    if calibrations:
+        if effect or model or type_name:
+            raise UsageError("--effect, --model and --type are for series, not for calibrations")
+        camera = tc.fit_calibrations(
+            calibrations, log=log, log_options=log_options, timezone=timezone,
+            ambiguous=ambiguous, T0=reference_temperature, temperature_sd=temperature_sd, say=say,
+        )  # fmt: skip
+    elif log is not None:
+        raise UsageError("--log is for calibrations; a recording has its own temperatures")
+    else:
+        kind: str | Path | None = type_name
+        if type_name is not None and Path(type_name).is_file():
+            kind = Path(type_name)
+        elif type_name is not None and (Path(type_name).suffix == ".yaml" or "/" in type_name):
+            raise UsageError(f"--type {type_name}: there is no such file")
+        series = [one for source in inputs for one in tc.open_all(source)]
+        with progress(None, "reading and measuring") as advance:
+            camera = tc.fit(
+                *series, effects=effect or (), model=model, T0=reference_temperature, kind=kind,
+                jobs=jobs, progress=advance,
+            )  # fmt: skip
+    document = {**camera.as_dict(), "model": str(camera.save(output))}
+    if code is not None:
+        from thermocald.output.model_code import write_code
+
+        document["code"] = [str(file) for file in write_code(camera, code)]
+    if report is not None:
+        from thermocald.output.certificate import render_certificate
+
+        write_text(report, render_certificate(camera))
+    if write_result(document, json):
+        typer.echo(f"{output}: {camera}")
+
+
+def _temperatures(inputs: list[str]) -> dict[str, float | None]:
+    """{file: °C} of calibrations, where the inputs are some; UsageError for no temperature."""
+    found: dict[str, float | None] = {}
+    for text in inputs:
+        label, equals, rest = text.partition("=")
+        name = rest if equals and not Path(text).exists() else text
+        if Path(name).suffix != ".json":
+            if found:
+                raise UsageError(f"{text}: is no calibration; fit series and calibrations apart")
+            return {}
+        try:
+            found[name] = float(label) if name == rest else None
+        except ValueError:
+            raise UsageError(f"{text}: {label!r} is not a temperature in °C") from None
+    return found

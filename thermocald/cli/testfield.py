@@ -14,8 +14,8 @@ from thermocald.cli.options import JsonOption, PhotosArgument, PixelPitchOption
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
-    from thermocald.output.testfield.board import Board
     from thermocald.output.testfield.layout import Design
+    from thermocald.output.testfield.print import Board
 
 CameraFile = Annotated[
     Path | None,
@@ -284,7 +284,7 @@ def check(
     )  # fmt: skip
     if report is not None:
         from thermocald.files import write_text
-        from thermocald.output.field_check import render_field_check
+        from thermocald.output.calibration import render_field_check
 
         write_text(report, render_field_check(found))
     if write_result(found.as_dict(), json):
@@ -298,7 +298,7 @@ def _board(
     """The board that these options describe, None where none does; its sizes are 0 where they are
     not given. UsageError for two boards, or counts that are none.
     """
-    from thermocald.output.testfield.board import KINDS, Board, counts_of
+    from thermocald.output.testfield.print import KINDS, Board, counts_of
 
     given = [(k, n) for k, n in zip(KINDS, (charuco, chessboard, aprilgrid), strict=True) if n]
     if len(given) > 1:

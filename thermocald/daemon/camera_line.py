@@ -12,8 +12,8 @@ import logging
 import math
 import threading
 import time
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator
 from thermocald.acquisition.device_loop import DeviceLoop, Link
@@ -26,14 +26,14 @@ from thermocald.photogrammetry.camera.conversions import opencv_terms
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable
 
-    from thermocald.acquisition.device_loop import LinkEvent
+    from thermocald.acquisition.device_loop import OutputLoop
     from thermocald.acquisition.frame_folder import FrameFolder
-    from thermocald.acquisition.pipeline import AcquiredEpoch, FrameCheck, Readings
+    from thermocald.acquisition.pipeline import AcquiredEpoch
     from thermocald.acquisition.steady_clock import SteadyClock
+    from thermocald.acquisition.thermometers import Thermometers
     from thermocald.daemon.live_state import LiveState
-    from thermocald.daemon.output_loop import OutputLoop
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.hal import Frame
@@ -59,7 +59,7 @@ class SeriesDrift:
             self._learn(row)
 
     def columns(self, row: dict[str, Any]) -> dict[str, float]:
-        """The columns for one epoch; NaN without a result, and until the start is known."""
+        """Return the columns for one epoch; NaN without a result, and until the start is known."""
         self._learn(row)
         known = len(self._start) == START_EPOCHS and row.get("status") == "ok"
         result = {"pixel_pitch": self._pitch}
@@ -77,40 +77,23 @@ class SeriesDrift:
             self._start.append({k: float(row[k]) for n in _NAMES for k in (n, f"sd_{n}")})
 
 
-class Resources(Protocol):
-    """Clock, store, frames, readings and outputs, shared by the cameras of a station.
+@dataclass(frozen=True)
+class Ground:
+    """What outlives a configuration: the store, the clock, how a run was asked for.
 
-    fast, virtual, epochs, hang_after_s, start_condition: as of `Station`; preview: whether a page
-    may look.
+    fast: a recording is played as fast as it can be calibrated; virtual: so are the ticks of a
+    virtual clock; epochs: after how many new ones a camera stops, 0 for never; start_condition:
+    kept with a series that begins.
     """
 
     guard: StoreGuard
     clock: SteadyClock
     live: LiveState
-    frames: FrameFolder
-    readings: Readings
-    outputs: list[OutputLoop]
-    fast: bool
-    virtual: bool
-    epochs: int
-    hang_after_s: float
-    start_condition: str
-    preview: bool
-
-    def on_link_event(self, event: LinkEvent) -> None:
-        """A device went away or came back."""
-
-    def identity_of(self, line: Any) -> Callable[[], Mapping[str, Any]]:
-        """What a camera and its thermometers say they are, asked when a series begins."""
-
-    def columns_of(self, plan: CameraPlan) -> list[str]:
-        """The columns of a camera's temperatures, the reference first, as far as known."""
-
-    def make_observer(self, plan: CameraPlan, keeper: EpochKeeper) -> Any:
-        """The online estimate of a camera; None if it is only acquired."""
-
-    def read_now(self, names: Sequence[str]) -> None:
-        """Read thermometers in the caller's thread."""
+    fast: bool = False
+    virtual: bool = False
+    epochs: int = 0
+    hang_after_s: float = 60.0
+    start_condition: str = ""
 
 
 log = logging.getLogger(__name__)
@@ -129,33 +112,30 @@ class SeriesRun:
     """
 
     def __init__(self, line: CameraLine, series: str, start: str, limit: int) -> None:
-        station = line.station
-        plan = replace(line.plan, series=series)
+        ground, plan = line.ground, replace(line.plan, series=series)
         self.plan = plan
-        self.start_condition = start
         self.limit = limit
         self._line = line
         self.keeper = EpochKeeper(
-            plan, station.guard, station.frames, self._kept, station.identity_of(line), start=start
+            plan, ground.guard, line.frames, self._kept, line.identity, start=start
         )
-        self.observer = station.make_observer(plan, self.keeper)
+        self.observer = self._make_observer()
         self.running = running_series(plan)
         self._remembered = False
         self.first = self.keeper.first_number
         self.pipeline = Pipeline(
             plan.name,
             plan.calibrator,
-            station.readings,
+            line.thermometers,
             plan.config.thermometers,
             self.keeper,
-            station.clock,
+            ground.clock,
             first=self.first,
             period_s=plan.config.period_s,
-            patience_s=0.0 if station.fast else None,
-            trusted=station.clock.trusted,
+            patience_s=0.0 if ground.fast else None,
+            trusted=ground.clock.trusted,
             observe=self._observe,
-            columns=lambda: station.columns_of(plan),
-            on_lost=station.guard.lose,
+            on_lost=ground.guard.lose,
         )
         self.drift: SeriesDrift | None = None
         self.last: dict[str, Any] = {}
@@ -177,6 +157,26 @@ class SeriesRun:
         self.pipeline.drain(0.5 * grace_s)
         return self.pipeline.stop(max(0.1, deadline - time.monotonic()))
 
+    def _make_observer(self) -> Any:
+        """Return the online estimate of the camera; None if it is only acquired."""
+        plan = self.plan
+        if plan.sensor is None or plan.testfield is None or plan.calibrator is None:
+            return None
+        if isinstance(plan.calibrator, Calibrator):
+            from thermocald.analysis.online.observer import OnlineObserver
+
+            return OnlineObserver(plan.sensor, plan.testfield, self._tell)
+        from thermocald.analysis.thermal.gauge import GaugeObserver
+
+        plan.calibrator.remember(self.keeper.latest())
+        return GaugeObserver(plan.calibrator, self._tell)
+
+    def _tell(self, kind: str, text: str, utc: float, epoch: int) -> None:
+        log.warning("camera %s: %s", self.plan.name, text, extra={"event": kind})
+        series = self.keeper.series
+        known = None if series is None else series.id
+        self._line.ground.guard.event(Event(utc, kind, text, known, epoch))
+
     def _observe(self, calibrated: CalibratedEpoch, in_order: bool) -> CalibratedEpoch:
         """Adjust the epoch with what its series tells, then test it against those before."""
         seen = calibrated.epoch.observations
@@ -185,7 +185,7 @@ class SeriesRun:
         if self.running is not None and seen is not None:
             if in_order and self.first > 1 and not self.running.epochs:
                 self._remember()
-            hurried = self.pipeline.waiting() > 1 and not self._line.station.fast
+            hurried = self.pipeline.waiting() > 1 and not self._line.ground.fast
             try:
                 adjusted, columns = self.running.refine(
                     calibrated, self._weighed(seen), hurried=hurried
@@ -196,25 +196,18 @@ class SeriesRun:
                 self.running.reset()
                 adjusted, columns = calibrated.adjustment, {"series_restarted": 1.0}
             if "series_restarted" in columns:
-                self._tell_restart(calibrated)
+                self._tell(
+                    "series_restarted",
+                    "several epochs in a row contradict what the earlier ones of their series say "
+                    "of camera and targets; the common adjustment begins again",
+                    calibrated.epoch.frame_time,
+                    calibrated.epoch.number,
+                )
         if self.observer is not None and in_order:
             known = self.running
             told = () if known is None else (known.tremble, known.field_variance)
             columns |= self.observer.observe(calibrated, adjusted, *told)
         return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **columns})
-
-    def _tell_restart(self, calibrated: CalibratedEpoch) -> None:
-        epoch = calibrated.epoch
-        text = (
-            f"camera {self.plan.name}: several epochs in a row contradict what the earlier ones of "
-            "their series say of camera and targets; the common adjustment begins again"
-        )
-        log.warning("%s", text, extra={"event": "series_restarted"})
-        series = self.keeper.series
-        known = None if series is None else series.id
-        self._line.station.guard.event(
-            Event(epoch.frame_time, "series_restarted", text, known, epoch.number)
-        )
 
     def _weighed(self, seen: Observations) -> Observations:
         assert isinstance(self.plan.calibrator, Calibrator)
@@ -238,64 +231,68 @@ class SeriesRun:
 
     def _kept(self, acquired: AcquiredEpoch, row: dict[str, Any]) -> None:
         """Tell outputs and the live state; the epoch is in the store already."""
-        station, name = self._line.station, self.plan.name
+        line, name = self._line, self.plan.name
         report = {} if self.observer is None else self.observer.report()
         report |= {} if self.running is None else self.running.report()
         row["state"] = report.get("state", "unknown")
-        row |= self._drift(row)
-        if (camera := self._camera(acquired.calibrated)) is not None:
-            row["opencv"] = camera
+        if self.plan.sensor is not None:
+            if self.drift is None:
+                earlier = self.keeper.first_rows(START_EPOCHS)
+                self.drift = SeriesDrift(self.plan.sensor.pixel_pitch, earlier)
+            row |= self.drift.columns(row)
+            result = None if acquired.calibrated is None else acquired.calibrated.adjustment
+            if result is not None and result.interior is not None:
+                values, covariance = result.interior.as_array(), result.covariance[IOP, IOP]
+                row["opencv"] = opencv_terms(self.plan.sensor, values, covariance)
         self.last = {**row, "online": report}
-        for output in station.outputs:
+        for output in line.outputs:
             output.put(row)
         now = time.monotonic()
         if now - self._shown >= _SHOW_EVERY_S:
             self._shown = now
-            station.live.write_epoch(name, self.last, acquired.calibrated, self.plan.testfield)
-            if station.preview and now - self._previewed >= _PREVIEW_EVERY_S:
+            live = line.ground.live
+            live.write_epoch(name, self.last, acquired.calibrated, self.plan.testfield)
+            if line.preview and now - self._previewed >= _PREVIEW_EVERY_S:
                 self._previewed = now
-                station.live.write_frame(name, acquired.frame)
-
-    def _camera(self, calibrated: CalibratedEpoch | None) -> dict[str, float] | None:
-        """The camera of an epoch in OpenCV's terms."""
-        if calibrated is None or self.plan.sensor is None:
-            return None
-        result = calibrated.adjustment
-        if result.interior is None:
-            return None
-        values = result.interior.as_array()
-        return opencv_terms(self.plan.sensor, values, result.covariance[IOP, IOP])
-
-    def _drift(self, row: dict[str, Any]) -> dict[str, float]:
-        """Against the start of the series, where the size of the pixels is known."""
-        if self.plan.sensor is None:
-            return {}
-        if self.drift is None:
-            earlier = self.keeper.first_rows(START_EPOCHS)
-            self.drift = SeriesDrift(self.plan.sensor.pixel_pitch, earlier)
-        return self.drift.columns(row)
+                live.write_frame(name, acquired.frame)
 
 
 class CameraLine:
     """One camera; what it takes is changed by one thread, the service's."""
 
-    def __init__(self, plan: CameraPlan, station: Resources, begin: float) -> None:
-        self.plan = plan
-        self.station = station
-        self.checked: FrameCheck | None = None
+    def __init__(
+        self,
+        plan: CameraPlan,
+        ground: Ground,
+        thermometers: Thermometers,
+        frames: FrameFolder,
+        outputs: list[OutputLoop],
+        begin: float,
+        *,
+        preview: bool = False,
+    ) -> None:
+        self.plan, self.ground, self.preview = plan, ground, preview
+        self.thermometers, self.frames, self.outputs = thermometers, frames, outputs
+        self.checked: tuple[list[str], str] | None = None  # as of `check_frame`
+        self.run: SeriesRun | None = None
         self._checking = False
         self._started = False
         self._swap = threading.Lock()
         self.link = Link(
-            "camera", plan.name, plan.camera, station.clock,
-            period_s=plan.config.period_s, on_event=station.on_link_event,
+            "camera", plan.name, plan.camera, ground.clock,
+            period_s=plan.config.period_s,
+            on_event=self._event,
         )  # fmt: skip
         self.loop = DeviceLoop(
-            self.link, self._capture, station.clock, plan.config.period_s, begin,
-            free_running=station.fast and not station.virtual, idle=lambda: not self.taking,
+            self.link, self._capture, ground.clock, plan.config.period_s, begin,
+            free_running=ground.fast and not ground.virtual, idle=lambda: not self.taking,
         )  # fmt: skip
-        self.run: SeriesRun | None = None
-        self.take(plan.config.series, station.start_condition)
+        self.take(plan.config.series, ground.start_condition)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what the camera and its thermometers say they are."""
+        told = self.thermometers.identity(self.plan.config.thermometers)
+        return {**self.link.identity(), **({"thermometers": told} if told else {})}
 
     @property
     def taking(self) -> bool:
@@ -335,16 +332,16 @@ class CameraLine:
         self._checking = checking
 
     def _capture(self) -> None:
-        station, run = self.station, self.run
+        ground, run = self.ground, self.run
         # of a virtual clock each tick is an epoch, however long those before take
-        patience_s = _VIRTUAL_PATIENCE_S if station.virtual else 1.0
+        patience_s = _VIRTUAL_PATIENCE_S if ground.virtual else 1.0
         if run is not None and (
-            run.full or (station.fast and not run.pipeline.wait_for_room(patience_s))
+            run.full or (ground.fast and not run.pipeline.wait_for_room(patience_s))
         ):
             return
         frame = self.plan.camera.capture()
-        if station.fast:
-            station.read_now(self.plan.config.thermometers)
+        if ground.fast:
+            self.thermometers.read_now(self.plan.config.thermometers)
         if self._checking:
             self._look_at(frame)
             return
@@ -353,7 +350,7 @@ class CameraLine:
             if run is None or run.full:
                 return
             run.pipeline.submit(frame)
-        if station.epochs and run.taken - run.first + 1 >= station.epochs:
+        if ground.epochs and run.taken - run.first + 1 >= ground.epochs:
             self.loop.stop()
 
     def _look_at(self, frame: Frame) -> None:
@@ -363,51 +360,35 @@ class CameraLine:
             self._checking, self.checked = False, found
 
     def waiting(self) -> int:
-        """How many epochs are on their way."""
+        """Return how many epochs are on their way."""
         run = self.run
         return 0 if run is None else run.pipeline.waiting()
 
     def busy_s(self) -> float:
-        """For how long the pipeline has not finished one thing."""
+        """Return for how long the pipeline has not finished one thing."""
         run = self.run
         return 0.0 if run is None else run.pipeline.busy_s()
 
-    def event(self, utc: float, kind: str, text: str) -> Event:
-        """An event that belongs to the series being taken."""
-        run = self.run
-        series = None if run is None else run.keeper.series
-        return Event(utc, kind, text, None if series is None else series.id)
+    def _event(self, utc: float, kind: str, text: str) -> None:
+        """Keep an event of the device, which belongs to the series being taken."""
+        series = None if self.run is None else self.run.keeper.series
+        known = None if series is None else series.id
+        self.ground.guard.event(Event(utc, kind, text, known))
 
     def status(self) -> dict[str, Any]:
-        """For `thermocald status`."""
-        stats = self.loop.schedule.stats()
+        """Return the camera's part of what `thermocald status` shows."""
         run = self.run
         pipeline = None if run is None else run.pipeline
-        deferred = 0 if pipeline is None else pipeline.dropped
         return {
             "series": "" if run is None else run.plan.series,
             "period_s": self.plan.config.period_s,
-            **link_status(self.link, self.loop.busy_s(), self.station.hang_after_s),
-            "ticks": stats.ticks,
-            "skipped": stats.skipped,
-            "late_p99_s": stats.late_p99_s,
-            "late_max_s": stats.late_max_s,
+            **self.link.status(self.loop.busy_s(), self.ground.hang_after_s),
+            **self.loop.schedule.stats(),
             "lost": self.loop.lost + (0 if pipeline is None else pipeline.lost),
             "waiting": self.waiting(),
-            "deferred": deferred,
+            "deferred": 0 if pipeline is None else pipeline.dropped,
             "caught_up": 0 if pipeline is None else pipeline.caught_up,
             "stored": 0 if run is None else run.keeper.stored,
             "frames_kept": 0 if run is None else run.keeper.kept_frames,
             "last": {} if run is None else run.last,
         }
-
-
-def link_status(link: Link, busy_s: float, hang_after_s: float) -> dict[str, Any]:
-    """A device's part of the status."""
-    return {
-        "device": "hung" if busy_s > hang_after_s else link.state,
-        "why": link.why,
-        "since": link.since,
-        "warnings": link.warnings(),
-        "faults": link.faults,
-    }

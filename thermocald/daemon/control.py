@@ -17,14 +17,15 @@ import os
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from thermocald.config import Config, Name  # noqa: TC001 - pydantic reads it at run time
-from thermocald.daemon.live_state import find_state, plain
+from thermocald.daemon.live_state import find_state
 from thermocald.daemon.session import Session  # noqa: TC001
 from thermocald.errors import DataError, DeviceError, ThermocaldError, UsageError
+from thermocald.result import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -46,37 +47,26 @@ class DaemonBusy(DataError):
     """A daemon listens, but did not answer: it may when it is asked again."""
 
 
-class _Asked(BaseModel):
+class Request(BaseModel):
+    """What is asked: `session start` with a session, `session stop` with the camera whose ends.
+
+    `session status`: what is being taken; `retention`: delete frames that may go, now.
+    """
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     format: Literal["thermocald-control/1"]
+    do: Literal["session start", "session stop", "session status", "retention"]
+    session: Session | None = None
+    camera: Name | None = None
 
-
-class StartRequest(_Asked):
-    """Begin a session."""
-
-    do: Literal["session start"]
-    session: Session
-
-
-class StopRequest(_Asked):
-    """End a camera's session."""
-
-    do: Literal["session stop"]
-    camera: Name
-
-
-class PlainRequest(_Asked):
-    """`session status`: what is being taken; `retention`: delete frames that may go, now."""
-
-    do: Literal["session status", "retention"]
-
-
-Request = StartRequest | StopRequest | PlainRequest
-
-
-class _Envelope(BaseModel):
-    request: Annotated[Request, Field(discriminator="do")]
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        needed = {"session start": "session", "session stop": "camera"}.get(self.do)
+        for key in ("session", "camera"):
+            if (getattr(self, key) is None) == (key == needed):
+                raise ValueError(f"{key}: {'missing' if key == needed else 'not of ' + self.do}")
+        return self
 
 
 class ControlSocket:
@@ -145,7 +135,7 @@ class ControlSocket:
             with connection:
                 told = self._respond(connection)
                 connection.settimeout(_REQUEST_S)
-                connection.sendall(json.dumps(plain(told)).encode() + b"\n")
+                connection.sendall(json.dumps(jsonable(told)).encode() + b"\n")
         except OSError as error:  # who asked has gone, or says nothing
             log.debug("control: %s", error)
         finally:
@@ -195,11 +185,10 @@ def ask(folder: Path, do: str, **values: Any) -> dict[str, Any] | None:
 
 def _parse(line: bytes) -> Request:
     try:
-        document = json.loads(line)
-        return _Envelope.model_validate({"request": document}).request
+        return Request.model_validate(json.loads(line))
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"][1:])
+        where = ".".join(str(part) for part in first["loc"])
         raise UsageError(f"the request is refused: {where or 'it'}: {first['msg']}") from error
     except (ValueError, RecursionError) as error:
         raise UsageError("the request is refused: it is no JSON object in one line") from error
@@ -244,7 +233,7 @@ def enforce_retention(config: Config) -> list[str]:
     guard = StoreGuard(config.store.path)
     try:
         now = time.time() if machine_clock_trusted() else None
-        sentences = [deleted.text for deleted in FrameFolder(config.frames).enforce(now)]
+        sentences = FrameFolder(config.frames).enforce(now)
         for sentence in sentences:
             guard.event(Event(time.time(), "frames_deleted", sentence))
     finally:

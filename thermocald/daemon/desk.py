@@ -1,27 +1,45 @@
-"""A session as it is asked for and looked on at: taken here, or by a daemon that runs."""
+"""A session as it is asked for and looked on at: taken here, or by a daemon that runs.
+
+`--until-separated A,B`: the programme that separates two effects, and when it has.
+"""
 
 from __future__ import annotations
 
 import shutil
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import ConfigurationError, DataError, DeviceError, UsageError
+import numpy as np
+
+from thermocald.errors import (
+    ConfigurationError,
+    DataError,
+    DeviceError,
+    ThermocaldError,
+    UsageError,
+)
 from thermocald.numbers import with_sd
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from concurrent.futures import Future
 
     from thermocald.config import Config
-    from thermocald.daemon.separating import Watch
     from thermocald.daemon.session import Session
     from thermocald.daemon.station import Station
+    from thermocald.discovery.experiment import Experiment, Separation
+    from thermocald.thermal.series import SeriesInput
 
 _LOOK_EVERY_S = 0.5
 _WAIT_FOR_DAEMON_S = 300.0
 _LINE_EVERY_S = 10.0
+_EVERY = 15  # epochs between two looks
+_FEWEST = 45  # before anything can be seen
+_BELOW_LIMIT_K = 1.0  # the thermostat overshoots
 
 
 def take_on_the_desk(
@@ -70,8 +88,9 @@ def _turn(station: Station, progress: Progress, watch: Watch | None) -> bool:
 
 
 def _prepare(config: Config, session: Session, done: int) -> Config:
-    """The configuration with one camera, its thermometers, and the series' name."""
+    """Return the configuration with one camera, its thermometers, and the series' name."""
     from thermocald.config import parse_config
+    from thermocald.hal import load_driver
 
     document = config.model_dump(mode="python", by_alias=True)
     chosen = next(c for c in document["cameras"] if c["name"] == session.camera)
@@ -81,18 +100,12 @@ def _prepare(config: Config, session: Session, done: int) -> Config:
         t for t in document["thermometers"] if t["name"] in chosen["thermometers"]
     ]
     if session.programme:
-        _use_programme(document["outputs"], session.steps(done * chosen["period_s"]))
+        heaters = [o for o in document["outputs"] if load_driver("output", o["driver"]).heats]
+        if not heaters:
+            raise ConfigurationError("--programme: no output of the configuration heats")
+        for heater in heaters:
+            heater["programme"] = session.steps(done * chosen["period_s"])
     return parse_config(document, Path("config.yaml"))
-
-
-def _use_programme(outputs: list[dict[str, Any]], steps: list[dict[str, Any]]) -> None:
-    from thermocald.hal import load_driver
-
-    takers = [o for o in outputs if load_driver("output", o["driver"]).heats]
-    if not takers:
-        raise ConfigurationError("--programme: no output of the configuration heats")
-    for taker in takers:
-        taker["programme"] = steps
 
 
 def _stored(config: Config, session: Session) -> int:
@@ -101,14 +114,13 @@ def _stored(config: Config, session: Session) -> int:
     if not config.store.path.exists():
         return 0
     with Store.open(config.store.path) as store:
-        for found in store.all_series():
-            if (found.camera, found.name) == (session.camera, session.series):
-                return store.last_epoch(found) or 0
-    return 0
+        wanted = (session.camera, session.series)
+        found = next((s for s in store.all_series() if (s.camera, s.name) == wanted), None)
+        return 0 if found is None else store.last_epoch(found) or 0
 
 
 def _check(config: Config, say: Callable[[str], None]) -> None:
-    """One frame and one reading; DataError says what is to be mended first."""
+    """Take one frame and one reading; DataError says what is to be mended first."""
     from thermocald.acquisition.pipeline import check_frame
     from thermocald.daemon.plan import plan_cameras
     from thermocald.hal import SystemClock, open_device
@@ -123,11 +135,11 @@ def _check(config: Config, say: Callable[[str], None]) -> None:
         raise ConfigurationError(f"camera {plan.name!r}: a session needs its `testfield`")
     with plan.camera as camera:
         frame = camera.capture()
-    found = check_frame(plan.name, plan.calibrator, frame)
-    for sentence in found.found:
+    found, why = check_frame(plan.name, plan.calibrator, frame)
+    for sentence in found:
         say(sentence)
-    if found.failed:
-        raise DataError(f"the check failed: {found.failed}")
+    if why:
+        raise DataError(f"the check failed: {why}")
 
 
 def take_in_the_daemon(
@@ -174,12 +186,18 @@ def take_in_the_daemon(
             raise DataError(f"{one['taken']} of {one['epochs']} epochs: {one['why']}")
 
 
-def only_camera(config: Config) -> str:
-    """Return the one camera of a configuration; UsageError where there are others."""
+def only_camera(config: Config, camera: str | None = None) -> str:
+    """Return the camera that is asked for, or the only one of a configuration.
+
+    Raises UsageError where it is not known, or there are others.
+    """
     names = [c.name for c in config.cameras]
-    if len(names) != 1:
-        raise UsageError(f"which camera? give --camera, one of: {', '.join(names) or 'none'}")
-    return names[0]
+    there = ", ".join(names) or "none"
+    if camera is None and len(names) != 1:
+        raise UsageError(f"which camera? give --camera, one of: {there}")
+    if camera is not None and camera not in names:
+        raise UsageError(f"there is no camera {camera!r}; there are: {there}")
+    return camera or names[0]
 
 
 def session_of(
@@ -190,34 +208,21 @@ def session_of(
     from pydantic import ValidationError
 
     from thermocald.daemon.session import Session
+    from thermocald.files import read_yaml
 
-    names = [c.name for c in config.cameras]
-    if camera is None:
-        camera = only_camera(config)
-    if camera not in names:
-        raise UsageError(f"there is no camera {camera!r}; there are: {', '.join(names) or 'none'}")
-    steps = [] if programme is None else _steps(programme)
-    asked = {"camera": camera, "series": series, "start": condition, "epochs": epochs}
+    asked: dict[str, Any] = {"camera": only_camera(config, camera), "series": series}
+    asked |= {"start": condition, "epochs": epochs, "check": check}
+    if programme is not None:
+        steps = read_yaml(programme, ConfigurationError).get("programme")
+        if not isinstance(steps, list) or not steps:
+            raise ConfigurationError(f"{programme}: must hold `programme:`, a list of steps")
+        asked["programme"] = steps
     try:
-        return Session.model_validate({**asked, "programme": steps, "check": check})
+        return Session.model_validate(asked)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise UsageError(f"--{key}: {first['msg']}") from error
-
-
-def _steps(path: Path) -> list[Any]:
-    from thermocald.files import read_yaml
-
-    steps = read_yaml(path, ConfigurationError).get("programme")
-    if not isinstance(steps, list) or not steps:
-        raise ConfigurationError(f"{path}: must hold `programme:`, a list of steps")
-    return [
-        {key: float(v) if isinstance(v, int) else v for key, v in step.items()}
-        if isinstance(step, dict)
-        else step
-        for step in steps
-    ]
 
 
 def listening_daemon(config: Config) -> Path | None:
@@ -266,3 +271,119 @@ class Progress:
         elif now - self._told >= _LINE_EVERY_S or self._shown == self._total:
             self._told = now
             self._say(line)
+
+
+def plan_separation(
+    config: Config, session: Session, text: str, known: SeriesInput | None,
+    say: Callable[[str], None], max_c: float | None, max_rate: float, max_duty: float,
+) -> tuple[str, Session, Watch]:  # fmt: skip
+    """Return the programme that separates two effects, in words, and the session with it.
+
+    known: an earlier series of the camera, which tells how it warms, None without one; max_c: the
+    highest temperature °C that the user allows, None: the output's limit decides; max_rate: the
+    fastest rise K/min; max_duty: the largest share of time with heat.
+    """
+    from thermocald.discovery.experiment import (
+        Body,
+        Limits,
+        estimate_body,
+        rank_experiments,
+        read_alternatives,
+    )
+    from thermocald.hal import load_driver
+
+    if session.programme:
+        raise UsageError("--until-separated plans the programme: leave --programme out")
+    names = read_alternatives(text)
+    heaters = [o for o in config.outputs if load_driver("output", o.driver).heats]
+    if not heaters:
+        raise ConfigurationError("--until-separated: no output of the configuration heats")
+    highest = min(float(o.options["limit_c"]) - _BELOW_LIMIT_K for o in heaters)
+    limits = Limits(highest if max_c is None else min(highest, max_c), max_rate, max_duty)
+    body = Body()
+    if known is not None:
+        there = np.isfinite(readings := next(iter(known.readings.values())))
+        there &= np.isfinite(known.reading_times)
+        body = estimate_body(known.reading_times[there], readings[there])
+    camera = next(c for c in config.cameras if c.name == session.camera)
+    found = rank_experiments(*names, limits, body, session.epochs, camera.period_s)
+    document = {**session.model_dump(mode="python"), "programme": found[0].programme()}
+    watch = Watch(config.store.path, session, names, known, say)
+    return _describe(found, names), type(session).model_validate(document), watch
+
+
+def _describe(found: list[Experiment], names: tuple[str, str]) -> str:
+    """Return the programme as a file that `--programme` takes, with what is expected of it."""
+    best = found[0]
+    others = ", ".join(f"{e.name} {e.sigmas:.0f}" for e in found[1:])
+    hottest = best.temperature.max()
+    lines = [
+        f"# to separate {names[0]} and {names[1]}: {best.name}",
+        f"# expected: up to {hottest:.1f} °C, heat in {best.duty:.0%} of the time",
+        f"# effects of 0.1 px differ by {best.sigmas:.0f} sd at the end",
+        f"# sd of the other programmes: {others}",
+        "programme:",
+    ]
+    for seconds, hold in best.steps:
+        held = "null" if hold is None else f"{hold:.1f}"
+        lines.append(f"  - {{seconds: {seconds:.0f}, hold_c: {held}}}")
+    return "\n".join(lines)
+
+
+class Watch:
+    """Looks at the epochs taken so far, in a thread of its own, until two effects are separated."""
+
+    def __init__(
+        self, store: Path, session: Session, names: tuple[str, str],
+        evidence: SeriesInput | None, say: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        self._store, self._session, self._names = store, session, names
+        self._evidence = evidence
+        self._say = say
+        self._pool = ThreadPoolExecutor(1, "separation")
+        self._pending: Future[Separation] | None = None
+        self._seen = 0
+        self.found: Separation | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether they are separated."""
+        return self.found is not None and self.found.separated
+
+    def look(self, taken: int) -> bool:
+        """Return whether it is enough; taken: epochs so far. Never waits."""
+        if self._pending is not None and self._pending.done():
+            self._conclude(self._pending)
+            self._pending = None
+        if self._pending is None and taken >= max(_FEWEST, self._seen + _EVERY) and not self.ended:
+            self._seen = taken
+            self._pending = self._pool.submit(self._compare)
+        return self.ended
+
+    def close(self) -> None:
+        """Let the thread end, and say what was reached."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        if not self.ended:
+            reached = self.found.sentence if self.found else "too few epochs"
+            self._say(f"not separated: {reached}")
+
+    def _conclude(self, done: Future[Separation]) -> None:
+        try:
+            self.found = done.result()
+        except ThermocaldError as error:
+            self._say(f"after {self._seen} epochs: {error}")
+            return
+        self._say(f"after {self._seen} epochs: {self.found.sentence}")
+
+    def _compare(self) -> Separation:
+        from thermocald.discovery.experiment import compare_effects
+        from thermocald.store.sources import open_source
+        from thermocald.thermal.reduce import reduce_together
+        from thermocald.thermal.source import epochs_input
+
+        with open_source(self._store) as store:
+            found = store.find_series(self._session.camera, self._session.series)
+            epochs = [s.epoch for s in store.epochs(found)]
+            now = epochs_input(found.head, found.testfield, epochs, self._session.series)
+        before = [] if self._evidence is None else [replace(self._evidence, camera=now.camera)]
+        return compare_effects(reduce_together([*before, now]), *self._names)

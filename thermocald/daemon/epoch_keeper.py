@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from thermocald.daemon.plan import check_series, series_head
@@ -60,21 +61,14 @@ class EpochKeeper:
         self._on_kept = on_kept
         self._identity = identity
         self._start = start
-        self._series: StoredSeries | None = self._existing()
+        name = (plan.name, plan.series)
+        found = (s for s in guard.all_series() if (s.camera, s.name) == name)
+        self._series: StoredSeries | None = next(found, None)
+        if self._series is not None:
+            check_series(plan, self._series.testfield)
         self._backlog: list[Epoch] = []
         self._searched_to = 0
         self._uncorrected = ""
-
-    def _existing(self) -> StoredSeries | None:
-        found = [
-            s
-            for s in self._guard.all_series()
-            if (s.camera, s.name) == (self.plan.name, self.plan.series)
-        ]
-        if not found:
-            return None
-        check_series(self.plan, found[0].testfield)
-        return found[0]
 
     @property
     def series(self) -> StoredSeries | None:
@@ -92,47 +86,36 @@ class EpochKeeper:
         series = self.series
         return 1 if series is None else self._guard.last_epoch(series) + 1
 
-    def recent(self, count: int) -> Iterator[tuple[Epoch, Array, bool]]:
-        """The last epochs with a result: observations and values (16,), and whether the running
-        series began again after it.
-        """
+    def _read(self, first: int, last: int | None = None, **how: bool) -> list[StoredEpoch]:
+        """Return some epochs of the series; none where they cannot be read, which is logged."""
         series = self.series
         if series is None:
-            return
-        first = max(1, self.first_number - count)
+            return []
         try:
-            for stored in self._guard.epochs(series, first):
-                if stored.epoch.observations is not None and stored.result.status == "ok":
-                    begun = "series_restarted" in stored.extra
-                    yield stored.epoch, stored.result.values, begun
+            return self._guard.epochs(series, first, last, **how)
         except StoreError as error:
             log.warning("earlier epochs cannot be read: %s", error)
+            return []
+
+    def recent(self, count: int) -> Iterator[tuple[Epoch, Array, bool]]:
+        """Yield the last epochs with a result: observations and values (16,), and whether the
+        running series began again after it.
+        """
+        for stored in self._read(max(1, self.first_number - count)):
+            if stored.epoch.observations is not None and stored.result.status == "ok":
+                yield stored.epoch, stored.result.values, "series_restarted" in stored.extra
 
     def latest(self) -> Iterator[StoredEpoch]:
-        """The last epochs as they are stored, the very last with all details."""
-        series = self.series
-        if series is None:
-            return
+        """Yield the last epochs as they are stored, the very last with all details."""
         last = self.first_number - 1
-        try:
-            detailed = max(0, last - _DETAILED)
-            yield from self._guard.epochs(series, last - _LATEST, detailed, details=False)
-            yield from self._guard.epochs(series, detailed + 1)
-        except StoreError as error:
-            log.warning("earlier epochs cannot be read: %s", error)
+        detailed = max(0, last - _DETAILED)
+        yield from self._read(last - _LATEST, detailed, details=False)
+        yield from self._read(detailed + 1)
 
     def first_rows(self, count: int) -> list[dict[str, Any]]:
-        """The first epochs with a result that are stored, as rows for the outputs."""
-        series = self.series
-        rows: list[dict[str, Any]] = []
-        if series is not None and self.first_number > 1:
-            try:
-                for stored in self._guard.epochs(series, 1, 20 * count):
-                    if stored.result.status == "ok" and len(rows) < count:
-                        rows.append(result_row(self.plan, stored.epoch, stored.result, {}))
-            except StoreError as error:
-                log.warning("the first epochs cannot be read: %s", error)
-        return rows
+        """Return the first epochs with a result that are stored, as rows for the outputs."""
+        found = (s for s in self._read(1, 20 * count) if s.result.status == "ok")
+        return [result_row(self.plan, s.epoch, s.result, {}) for s in islice(found, count)]
 
     def keep(self, acquired: AcquiredEpoch) -> None:
         """Keep an epoch; a deferred calibration is made up for later from its frame."""
@@ -162,12 +145,9 @@ class EpochKeeper:
             result = EpochResult("frame_not_kept", "calibration deferred, the frame not kept")
         epoch = replace(epoch, frame=path)
         values = result_row(self.plan, epoch, result, extra)
-
-        def told(stored: bool) -> None:
-            self.stored += stored
-            self._on_kept(acquired, {**values, "stored": stored, "lost": self._guard.lost})
-
-        self._guard.append(Row(series, epoch, result, extra, acquired.clock_trusted, told))
+        stored = self._guard.append(Row(series, epoch, result, extra, acquired.clock_trusted))
+        self.stored += stored
+        self._on_kept(acquired, {**values, "stored": stored, "lost": self._guard.lost})
 
     def amend(self, calibrated: CalibratedEpoch) -> None:
         """Keep a calibration made later; a frame that was kept only for it is deleted."""
@@ -186,13 +166,12 @@ class EpochKeeper:
             self._searched_to = min(self._searched_to, epoch.number - 1)
             return
         failed = calibrated.adjustment.status not in WITH_VALUES
-        wanted = self._frames.wanted(epoch.number, failed)
-        stored = self._stored(epoch.number)
-        if not wanted and stored is not None and stored.epoch.frame is not None:
-            self._frames.delete(stored.epoch.frame)
+        frame = next((s.epoch.frame for s in self._read(epoch.number, epoch.number)), None)
+        if frame is not None and not self._frames.wanted(epoch.number, failed):
+            self._frames.delete(frame)
             self.kept_frames -= 1
-        elif stored is not None:
-            self._correct(stored.epoch.frame, calibrated)
+        else:
+            self._correct(frame, calibrated)
 
     def _correct(self, frame: Path | None, calibrated: CalibratedEpoch) -> None:
         """Keep a frame a second time, as the steady camera had seen it; said once where not."""
@@ -209,18 +188,8 @@ class EpochKeeper:
         self._uncorrected = ""
         self._frames.keep_corrected(frame, jpeg)
 
-    def _stored(self, number: int) -> StoredEpoch | None:
-        series = self.series
-        if series is None:
-            return None
-        try:
-            return next(iter(self._guard.epochs(series, number, number)), None)
-        except StoreError as error:
-            log.warning("epoch %d cannot be read: %s", number, error)
-            return None
-
     def backlog(self, below: int) -> Epoch | None:
-        """The oldest epoch that was kept uncalibrated and whose frame is still there."""
+        """Return the oldest epoch that was kept uncalibrated and whose frame is still there."""
         if self._series is None:
             return None
         try:
@@ -251,7 +220,7 @@ class EpochKeeper:
         return True
 
     def _begin_series(self, acquired: AcquiredEpoch) -> StoredSeries:
-        """The series; a new one is made with its first row, as soon as the store can be written."""
+        """Return the series; make it with its first row, as soon as the store can be written."""
         if self._series is None:
             assert acquired.epoch is not None
             channels = acquired.epoch.temperatures

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import math
 import os
 import time
 from pathlib import Path
@@ -18,7 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.addresses import without_secrets
 from thermocald.errors import DataError
+from thermocald.files import overwrite_json, read_json
+from thermocald.result import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,7 +37,6 @@ _RUN = Path("/run")
 _PREVIEW_PX = 1280
 _PREVIEW_QUALITY = 80
 _PAGE_BYTES = 4096
-_LOOKS, _PAUSE_S = 3, 0.01
 
 
 class LiveState:
@@ -47,13 +48,14 @@ class LiveState:
 
     @classmethod
     def beside(cls, store: Path) -> LiveState:
-        """The folder of the daemon that writes this store."""
+        """Return the folder of the daemon that writes this store."""
         runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
         return cls(Path(runtime) if runtime else _beside(store))
 
     def write_status(self, status: Mapping[str, Any]) -> None:
         """Replace status.json."""
-        self._write("status.json", json.dumps(plain({"format": FORMAT, **status})).encode())
+        document = _without_secrets(jsonable({"format": FORMAT, **status}))
+        self._write("status.json", json.dumps(document).encode())
 
     def write_epoch(
         self, camera: str, row: Mapping[str, Any], calibrated: CalibratedEpoch | None,
@@ -63,7 +65,7 @@ class LiveState:
         document: dict[str, Any] = {"row": row}
         if calibrated is not None and field is not None:
             document["targets"] = _targets(calibrated, field)
-        self._write(f"{camera}.json", json.dumps(plain(document)).encode())
+        self._write(f"{camera}.json", json.dumps(jsonable(document)).encode())
 
     def write_frame(self, camera: str, frame: Frame) -> None:
         """Replace a camera's last frame, at most 1280 px wide."""
@@ -92,22 +94,11 @@ class LiveState:
         except OSError as error:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
-            if name.endswith(".json") and _overwrite(self.folder / name, data):
+            if name.endswith(".json") and overwrite_json(self.folder / name, data):
                 return  # a status from before the disk was full would say that all is well
             if not self._failed:
                 log.warning("%s: the status cannot be written: %s", self.folder, error)
             self._failed = True
-
-
-def _overwrite(path: Path, data: bytes) -> bool:
-    """Write a document over the one at the path, which takes no room; whether it fits."""
-    try:
-        with path.open("r+b", buffering=0) as file:
-            room = os.fstat(file.fileno()).st_size
-            document = data.rstrip()
-            return len(document) <= room and file.write(document.ljust(room)) == room
-    except OSError:
-        return False
 
 
 def _beside(store: Path) -> Path:
@@ -133,7 +124,7 @@ def _preview(frame: Frame) -> bytes | None:
 
 
 def _targets(calibrated: CalibratedEpoch, field: TestField) -> dict[str, Any]:
-    """Lists over the measured targets: name, x, y px, residuals px, whether it was rejected."""
+    """Return lists over the measured targets: name, x, y px, residuals px, rejected or not."""
     seen, result = calibrated.epoch.observations, calibrated.adjustment
     if seen is None or len(seen) != len(result.targets):
         return {}
@@ -148,23 +139,16 @@ def _targets(calibrated: CalibratedEpoch, field: TestField) -> dict[str, Any]:
     }
 
 
-def plain(value: Any) -> Any:
-    """As JSON has it: what is not a number becomes null."""
+def _without_secrets(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value
+        return {key: _without_secrets(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_without_secrets(inner) for inner in value]
+    return without_secrets(value) if isinstance(value, str) else value
 
 
 def find_state(store: Path) -> Path:
-    """The folder of the daemon that writes a store, running or not."""
+    """Return the folder of the daemon that writes a store, running or not."""
     beside = _beside(store)
     if (beside / "status.json").exists():
         return beside
@@ -177,16 +161,7 @@ def find_state(store: Path) -> Path:
 
 def read_state(folder: Path) -> dict[str, Any]:
     """status.json of a folder; empty if nobody runs there."""
-    for _ in range(_LOOKS):
-        try:
-            document = json.loads((folder / "status.json").read_bytes())
-        except OSError:
-            return {}
-        except ValueError:
-            time.sleep(_PAUSE_S)  # on a full disk it is written in place
-        else:
-            return document if isinstance(document, dict) else {}
-    return {}
+    return read_json(folder / "status.json")
 
 
 def running_status(path: Path) -> dict[str, Any]:
@@ -198,12 +173,8 @@ def running_status(path: Path) -> dict[str, Any]:
     # the daemon's own clock may be stepped; how old the file is tells the machine's alone
     age_s = time.time() - (folder / "status.json").stat().st_mtime
     document["age_s"] = max(0.0, age_s)
-    if not _alive(int(document.get("pid", 0))):
+    if not Path(f"/proc/{document.get('pid', 0)}").exists():
         raise DataError(
             f"the daemon that wrote {path} was killed {age_s:.0f} s ago; start it again"
         )
     return document
-
-
-def _alive(pid: int) -> bool:
-    return pid > 0 and Path(f"/proc/{pid}").exists()

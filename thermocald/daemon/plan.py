@@ -1,25 +1,30 @@
-"""A configuration made into objects: devices, calibrators, the head of a series."""
+"""A configuration made into objects: devices, calibrators, the head of a series.
+
+And configurations that nobody writes: a rendered camera, a recording as devices.
+"""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
-from thermocald.acquisition.pipeline import require_columns
+from thermocald.config import parse_config
 from thermocald.errors import ConfigurationError
 from thermocald.hal import open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.reader import read_testfield
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping
 
     from thermocald.analysis.online.running_series import RunningSeries
     from thermocald.analysis.thermal.corrected_frame import FrameCorrector
@@ -59,14 +64,6 @@ def plan_cameras(config: Config, clock: Clock) -> list[CameraPlan]:
     return [_plan(config, camera, clock) for camera in config.cameras]
 
 
-def require_thermometer_columns(
-    config: Config, channels: Mapping[str, Sequence[str]], error: type[Exception]
-) -> None:
-    """Raise `error` where channels {thermometer: …} cannot all be columns of a camera's epochs."""
-    for camera in config.cameras:
-        require_columns({name: channels.get(name, ()) for name in camera.thermometers}, error)
-
-
 def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
     camera: Camera = open_device("camera", one.driver, one.options, clock)
     calibration = config.calibration_of(one)
@@ -81,7 +78,7 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
                 "pixel_pitch_mm: …}}` too"
             )
     elif (scene := camera.known_scene()) is not None:
-        targets, sensor = scene.testfield, sensor or scene.sensor
+        targets, sensor = scene[1], sensor or scene[0]
     _check_size(one, camera, sensor)
     calibrator = None
     if targets is not None and sensor is not None:
@@ -99,7 +96,7 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
 def _plan_gauge(
     one: CameraConfig, calibration: CalibrationConfig, camera: Camera, *, corrected: bool
 ) -> CameraPlan:
-    """A camera that is predicted by its thermal model, and posed by control points."""
+    """Plan a camera that is predicted by its thermal model, and posed by control points."""
     from thermocald.analysis.thermal.corrected_frame import FrameCorrector
     from thermocald.analysis.thermal.gauge import plan_gauge
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -139,7 +136,7 @@ def _sensor(one: CameraConfig) -> Sensor | None:
 
 
 def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
-    """The settings of an epoch's adjustment."""
+    """Return the settings of an epoch's adjustment."""
     return AdjustmentSettings(
         free=tuple(calibration.free),
         priors={name: (prior.value, prior.sd) for name, prior in calibration.priors.items()},
@@ -149,7 +146,7 @@ def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
 
 
 def running_series(plan: CameraPlan) -> RunningSeries | None:
-    """The series of this camera as it is adjusted while it is taken; None if nothing is shared."""
+    """Return the camera's series as it is adjusted while it is taken; None if nothing is shared."""
     if not isinstance(plan.calibrator, Calibrator):
         return None
     assert plan.sensor is not None
@@ -183,7 +180,7 @@ def _held(one: CameraConfig, calibration: CalibrationConfig) -> InteriorOrientat
 def series_head(
     plan: CameraPlan, frame: Frame, channels: Iterable[str]
 ) -> tuple[Head, TestField, dict[str, Any]]:
-    """(head, test field, settings) of the series that begins with a frame."""
+    """Return (head, test field, settings) of the series that begins with a frame."""
     extra: dict[str, Any] = dict(plan.extra)
     sensor = plan.sensor
     if sensor is None:
@@ -201,23 +198,86 @@ def series_head(
         extra=extra,
     )
     targets = plan.testfield or TestField.build([], np.empty((0, 3)))
-    return head, targets, _settings(plan.calibration)
-
-
-def _settings(calibration: CalibrationConfig) -> dict[str, Any]:
-    settings: Mapping[str, Any] = calibration.model_dump(mode="json")
-    return dict(settings)
-
-
-def _same_field(a: TestField, b: TestField) -> bool:
-    """Whether two test fields have the same targets at the same places."""
-    return a.names == b.names and np.array_equal(a.points, b.points)
+    return head, targets, dict(plan.calibration.model_dump(mode="json"))
 
 
 def check_series(plan: CameraPlan, field: TestField) -> None:
     """Raise ConfigurationError if a series that goes on would change its test field."""
-    if plan.testfield is not None and not _same_field(plan.testfield, field):
+    mine = plan.testfield
+    if mine is not None and not (
+        mine.names == field.names and np.array_equal(mine.points, field.points)
+    ):
         raise ConfigurationError(
             f"camera {plan.name!r}: series {plan.series!r} was begun with another test "
             "field; give the series another name"
         )
+
+
+def mock_config() -> Config:
+    """Return a camera and a thermometer without hardware."""
+    return parse_config(
+        {
+            "store": {"path": "thermocald-mock.db"},
+            "frames": {"keep": "none", "folder": "thermocald-mock-frames", "min_free_gb": 0.1},
+            "cameras": [
+                {
+                    "name": "mock",
+                    "driver": "mock",
+                    "principal_distance_mm": 3.04,
+                    "thermometers": ["housing"],
+                    "options": {"seed": 1},
+                }
+            ],
+            "thermometers": [{"name": "housing", "driver": "mock", "seed": 2}],
+        },
+        Path("config.yaml"),
+    )
+
+
+def demo_config(folder: Path, seed: int) -> Config:
+    """Return a rendered camera and a thermometer, kept in `demo.db` of a folder."""
+    config = mock_config().model_dump(mode="json", by_alias=True)
+    config["store"] |= {"path": str(folder.absolute() / "demo.db"), "durable": False}
+    config["frames"] |= {"folder": str(folder.absolute() / "frames")}
+    config["cameras"][0] |= {
+        "name": "demo", "thermometers": ["temperature"], "options": {"seed": seed}
+    }  # fmt: skip
+    config["thermometers"][0] |= {"name": "temperature", "options": {"seed": seed + 1}}
+    return parse_config(config, Path("config.yaml"))
+
+
+def recording_config(path: Path, *, loop: bool = False) -> Config:
+    """Return a recording as camera and thermometer."""
+    head = read_head(path)
+    sensor = head.camera.sensor
+    replay = {"driver": "replay", "recording": str(path.absolute()), "loop": loop}
+    period = max(0.05, head.interval)
+    return parse_config(
+        {
+            "store": {"path": f"{path.absolute().name}.db", "durable": False},
+            "frames": {"keep": "none", "folder": f"{path.absolute().name}-frames"},
+            "cameras": [
+                {
+                    "name": _name(head.camera.name),
+                    "series": _name(head.series),
+                    "period_s": period,
+                    "sensor": {
+                        "width_px": sensor.width,
+                        "height_px": sensor.height,
+                        "pixel_pitch_mm": sensor.pixel_pitch,
+                    },
+                    "principal_distance_mm": head.camera.principal_distance,
+                    "testfield": str((path / "testfield.csv").absolute()),
+                    "thermometers": ["recorded"] if head.channels else [],
+                    **replay,
+                }
+            ],
+            "thermometers": [{"name": "recorded", "period_s": period, **replay}],
+        },
+        Path("config.yaml"),
+    )
+
+
+def _name(text: str) -> str:
+    """Text as a configuration takes it for a name."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", text).lstrip("_.-")[:64] or "camera"

@@ -2,6 +2,10 @@
 
 SIGTERM and SIGINT finish the current epoch; SIGHUP reads the configuration again, or says why not
 and goes on with the old one.
+
+The web page of a daemon that was started by hand is its child, and never ends it; under systemd it
+is a unit of its own, with its own bound on memory: in the daemon's control group it could take what
+the daemon needs.
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ import logging
 import os
 import queue
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -20,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 from thermocald import __version__
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
-from thermocald.daemon.control import ControlSocket, StartRequest, StopRequest
-from thermocald.daemon.dashboard_process import DashboardProcess
+from thermocald.daemon.camera_line import Ground
+from thermocald.daemon.control import ControlSocket
 from thermocald.daemon.live_state import LiveState
 from thermocald.daemon.session import Sessions
 from thermocald.daemon.station import Station
@@ -29,7 +34,6 @@ from thermocald.daemon.store_guard import StoreGuard
 from thermocald.daemon.systemd import (
     notify,
     notify_ready,
-    notify_reloading,
     watchdog_interval_s,
 )
 from thermocald.errors import DataError, ThermocaldError
@@ -41,9 +45,68 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from thermocald.config import Config
+    from thermocald.config import Config, DashboardConfig
     from thermocald.daemon.control import Request
     from thermocald.hal import Clock
+
+
+_NOT_SOONER_S = 10.0
+_PAGE_GRACE_S = 3.0
+_WRONG_CONFIGURATION = 2  # the exit status of a port in use, or of a token that cannot be used
+_REFUSED = "there is no page: its configuration or its port cannot be used (see the line above)"
+_PRIVATE = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
+
+
+class DashboardProcess:
+    """`thermocald dashboard` for a store and a live folder."""
+
+    def __init__(self, store: Path, live: Path) -> None:
+        self._store = store.absolute()
+        self._live = live.absolute()
+        self._child: subprocess.Popen[bytes] | None = None
+        self._next_at = 0.0
+        self.why = ""  # why there is no page, empty while there is one or none is wanted
+
+    def keep(self, config: DashboardConfig) -> None:
+        """See that it runs; it is started at most every 10 s."""
+        if self.why == _REFUSED or os.environ.get("INVOCATION_ID"):
+            return
+        child = self._child
+        if (child is not None and child.poll() is None) or time.monotonic() < self._next_at:
+            return
+        if child is not None and child.returncode == _WRONG_CONFIGURATION:
+            self.why = _REFUSED
+            log.error("%s; acquisition goes on without it", self.why)
+            return
+        if child is not None:
+            self.why = f"the page ended ({child.returncode}); it is started again"
+            log.warning(self.why)
+        self._next_at = time.monotonic() + _NOT_SOONER_S
+        command = [sys.executable, "-m", "thermocald", "dashboard"]
+        command += ["--store", str(self._store), "--live", str(self._live)]
+        command += ["--host", config.host, "--port", str(config.port)]
+        for name in config.names:
+            command += ["--name", name]
+        if config.token_file is not None:
+            command += ["--token-file", str(config.token_file)]
+        environment = {k: v for k, v in os.environ.items() if k not in _PRIVATE}
+        try:
+            # a group of its own: Ctrl-C ends the daemon, which then ends the page
+            self._child = subprocess.Popen(command, env=environment, process_group=0)
+        except OSError as error:
+            log.error("the dashboard cannot be started: %s", error)
+
+    def stop(self) -> None:
+        """End it."""
+        child = self._child
+        if child is None or child.poll() is not None:
+            return
+        child.terminate()
+        try:
+            child.wait(_PAGE_GRACE_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
 
 
 log = logging.getLogger(__name__)
@@ -106,11 +169,12 @@ class Service:
         """
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         self._guard = StoreGuard(self.config.store.path, durable=self.config.store.durable)
+        self._ground = Ground(self._guard, self.clock, self.live, **self._options)
         done = False
         control = ControlSocket(self.live.folder, self._ask)
         try:
             self._sessions = Sessions(self._guard, self.clock)
-            self._station = self._build(self.config)
+            self._station = Station(self.config, self._ground)
             if not self._until_finished:
                 self._sessions.resume(self._station)
             with self._signals():
@@ -141,9 +205,6 @@ class Service:
         store = self._guard.status()
         return f"{store['lost']} epochs were lost: {store['lost_why']}" if store["lost"] else ""
 
-    def _build(self, config: Config) -> Station:
-        return Station(config, self._guard, self.clock, self.live, **self._options)
-
     def _loop(self) -> None:
         interval = watchdog_interval_s()
         turn_s = _TURN_S if interval is None else min(_TURN_S, interval)
@@ -161,8 +222,8 @@ class Service:
                 data = {"seconds": step.seconds, "adopted": step.adopted}
                 self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
                 if step.adopted:
-                    self._station.clock_stepped(step.seconds)
-            if self._station.preview:
+                    self._station.frames.restamp(step.seconds)  # they follow, too
+            if self.config.dashboard.enabled:
                 self._dashboard.keep(self.config.dashboard)
             stalled = self._station.stalled()
             self._complain(stalled)
@@ -180,7 +241,7 @@ class Service:
                 break
 
     def status(self) -> dict[str, Any]:
-        """What `thermocald status` shows."""
+        """Return what `thermocald status` shows."""
         return {
             "version": __version__,
             "pid": os.getpid(),
@@ -188,7 +249,7 @@ class Service:
             "utc": self.clock.utc(),
             "configuration": None if self._path is None else str(self._path.absolute()),
             "clock": {"trusted": self.clock.trusted(), "error_s": self.clock.error_s},
-            "store": {**self._guard.status(), "path": str(self.config.store.path.absolute())},
+            "store": {**self._guard.status(), "path": self.config.store.path.absolute()},
             "stalled": self._station.stalled(),
             "sessions": self._sessions.status(self._station),
             "dashboard": {"enabled": self.config.dashboard.enabled, "why": self._dashboard.why},
@@ -218,74 +279,74 @@ class Service:
                 future.set_exception(DataError(f"the daemon could not: {error}"))
 
     def _answer(self, request: Request) -> dict[str, Any]:
-        if isinstance(request, StartRequest):
+        if request.session is not None:
             return {"session": self._sessions.start(self._station, request.session)}
-        if isinstance(request, StopRequest):
+        if request.camera is not None:
             return {"session": self._sessions.stop(self._station, request.camera)}
         if request.do == "retention":
             return {"deleted": self._station.retain()}
         return {"sessions": self._sessions.status(self._station)}
 
     def _line(self) -> str:
-        """The status line of `systemctl status`."""
+        """Return the status line of `systemctl status`."""
         parts = []
         for camera in self._station.cameras:
             last = {} if camera.run is None else camera.run.last
             if not camera.taking:
-                parts.append(f"{camera.plan.name}: idle")
-                continue
-            if camera.link.state != "open" or not last:
-                parts.append(f"{camera.plan.name}: {camera.link.why or camera.link.state}")
-                continue
-            text = f"{camera.plan.name}: epoch {last['epoch']}, {last['temperature']:.1f} °C"
-            if last["status"] in WITH_VALUES:
-                text += f", c {last['c']:.4f} mm, {last['state']}"
+                text = "idle"
+            elif camera.link.state != "open" or not last:
+                text = camera.link.why or camera.link.state
             else:
-                text += f", {last['status']}"
-            parts.append(text)
+                found = last["status"]
+                if found in WITH_VALUES:
+                    found = f"c {last['c']:.4f} mm, {last['state']}"
+                text = f"epoch {last['epoch']}, {last['temperature']:.1f} °C, {found}"
+            parts.append(f"{camera.plan.name}: {text}")
         if not parts:
-            for name, values in self._station.last_readings.items():
-                parts.append(f"{name}: " + ", ".join(f"{v:.1f} °C" for v in values.values()))
+            thermometers = self._station.thermometers
+            read = {name: thermometers.last(name) for name in thermometers.links}
+            parts = [
+                f"{name}: " + ", ".join(f"{celsius:.1f} °C" for celsius in values.values())
+                for name, values in read.items()
+                if values
+            ]
         if self._guard.away:
             parts.append(f"store: {self._guard.away}")
         return "; ".join(parts)[:500]
 
     def _reload_configuration(self) -> None:
-        notify_reloading()
+        now_us = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+        notify(f"RELOADING=1\nMONOTONIC_USEC={now_us}")  # `notify_ready` ends it
         try:
-            self._change_to(self._read_again())
+            text = self._change()
         except ThermocaldError as error:
-            log.error(
-                "the configuration was not read again, the old one stays: %s", error,
-                extra={"event": "reload_failed"},
-            )  # fmt: skip
+            text = f"the configuration was not read again, the old one stays: {error}"
+            log.error("%s", text, extra={"event": "reload_failed"})
             self._tell("reload_failed", str(error))
+        else:
+            log.info(text, extra={"event": "reloaded"})
         notify_ready(self._line())
 
-    def _read_again(self) -> Config:
-        if self._path is None:
-            return self.config
-        config = load_config(self._path, option_names)
+    def _change(self) -> str:
+        """Read the configuration again and go over to it; return what was done."""
+        config = self.config if self._path is None else load_config(self._path, option_names)
         if config.store != self.config.store:
             log.warning("another store needs a restart; the old one is still used")
             config = config.model_copy(update={"store": self.config.store})
-        return config
-
-    def _change_to(self, config: Config) -> None:
         if config == self.config:
-            log.info("the configuration has not changed", extra={"event": "reloaded"})
-            return
-        new = self._build(config)  # what is wrong with it shows before the old one ends
+            return "the configuration has not changed"
+        Station(config, self._ground)  # what is wrong with it shows before the old one ends
         if not self._station.stop(_GRACE_S):
             log.error("a device does not let go; it may not be there for a while")
         # numbers go on after what the old station kept to its end
-        new = self._build(config)
+        new = Station(config, self._ground)
         self._sessions.resume(new)
         logging.getLogger().setLevel(config.logging.level.upper())
         self.config, self._station = config, new
         new.start()
-        log.info("the configuration was read again", extra={"event": "reloaded"})
-        self._tell("reloaded", "the configuration was read again")
+        text = "the configuration was read again"
+        self._tell("reloaded", text)
+        return text
 
     def _complain(self, stalled: list[str]) -> None:
         for text in stalled:

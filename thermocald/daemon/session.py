@@ -10,13 +10,14 @@ its sessions when it starts again.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from thermocald.config import Name  # noqa: TC001 - pydantic reads it at run time
 from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
+from thermocald.hal import HeatingStep  # noqa: TC001
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
@@ -31,15 +32,6 @@ log = logging.getLogger(__name__)
 State = Literal["checking", "running", "done", "stopped", "refused"]
 
 _NO_HEAT = ({"seconds": 1.0, "hold_c": None},)
-
-
-class HeatingStep(BaseModel):
-    """Hold a temperature (°C; None: do not heat) for a time (s)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-    seconds: Annotated[float, Field(ge=1.0, le=1e6)]
-    hold_c: Annotated[float, Field(ge=-40.0, le=150.0)] | None
 
 
 class Session(BaseModel):
@@ -58,7 +50,7 @@ class Session(BaseModel):
     check: bool = True
 
     def steps(self, elapsed_s: float) -> list[dict[str, Any]]:
-        """What is left of the programme after so many seconds of it."""
+        """Return what is left of the programme after so many seconds of it."""
         left: list[dict[str, Any]] = []
         for step in self.programme:
             seconds = step.seconds - max(0.0, elapsed_s)
@@ -75,14 +67,13 @@ class _Progress:
     session: Session
     state: State
     why: str = ""
-    found: tuple[str, ...] = ()
+    found: list[str] = field(default_factory=list)
     taken: int = 0
 
     def told(self) -> dict[str, Any]:
         asked = self.session.model_dump(mode="json", exclude={"programme", "check"})
         return {
-            **asked, "state": self.state, "why": self.why, "found": list(self.found),
-            "taken": self.taken,
+            **asked, "state": self.state, "why": self.why, "found": self.found, "taken": self.taken,
         }  # fmt: skip
 
 
@@ -107,7 +98,7 @@ class Sessions:
             elif self._active.pop(session.camera, None) is not None:
                 data = event.data
                 self._ended[session.camera] = _Progress(
-                    session, data["state"], data["why"], (), int(data["taken"])
+                    session, data["state"], data["why"], taken=int(data["taken"])
                 )
         except (ValidationError, KeyError, TypeError) as error:
             log.warning("an event of a session cannot be read: %s", error)
@@ -178,7 +169,7 @@ class Sessions:
                 self._end(station, active, "stopped", line.link.why)
 
     def status(self, station: Station) -> dict[str, dict[str, Any]]:
-        """By camera: the session under way, or the last one that ended."""
+        """Return by camera the session under way, or the last one that ended."""
         told = {name: one.told() for name, one in self._ended.items()}
         for name, active in self._active.items():
             line, document = station.line(name), active.told()
@@ -193,8 +184,7 @@ class Sessions:
         found, name = line.checked, line.plan.name
         why = ""
         if found is not None:
-            active.found = found.found
-            why = found.failed
+            active.found, why = found
         elif line.link.ended:
             why = line.link.why
         else:

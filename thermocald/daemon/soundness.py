@@ -1,21 +1,139 @@
-"""Whether a recording, a configuration or a store is sound, and what it is."""
+"""Whether a recording, a configuration or a store is sound, and what it is.
+
+And what is attached to a machine, as configuration; what configured devices give now. A device that
+is not certain (a serial port, an I2C bus: nobody knows what is on it) is shown as a comment.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import time
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import ConfigurationError, DataError
+from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
+from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from thermocald.config import DeviceConfig
-    from thermocald.hal import Kind
+    from thermocald.config import Config, DeviceConfig
+    from thermocald.hal import Frame, Kind
     from thermocald.store.recording.reader import Recording
+
+
+KINDS: tuple[Kind, ...] = ("camera", "thermometer", "output")
+
+
+@dataclass(frozen=True)
+class Attached:
+    """A device that a driver found; certain: whether it is known to be one for this driver."""
+
+    kind: Kind
+    driver: str
+    options: Mapping[str, Any]
+    about: str
+    certain: bool
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What one frame or reading of a configured device gave; error: why there is none."""
+
+    kind: Kind
+    name: str
+    driver: str
+    took_s: float
+    values: Mapping[str, Any]
+    error: str | None = None
+
+    @property
+    def text(self) -> str:
+        """The probe for people, in one line."""
+        shown = ", ".join(f"{key} {v}" for key, v in self.values.items() if v is not None)
+        what = f"FAILED: {self.error}" if self.error else shown
+        return f"{self.kind} {self.name} ({self.driver}), {self.took_s * 1e3:.0f} ms: {what}"
+
+
+def attached() -> tuple[list[Attached], list[str]]:
+    """Return the devices that are found, and notes on drivers that could not look."""
+    found: list[Attached] = []
+    notes: list[str] = []
+    for kind in KINDS:
+        for name in driver_names(kind):
+            try:
+                found += [
+                    Attached(kind, name, one.options, one.about, one.certain)
+                    for one in load_driver(kind, name).attached()
+                ]
+            except DeviceError as error:
+                notes.append(f"{kind} driver {name}: {error}")
+    return found, notes
+
+
+def probe_devices(config: Config) -> list[Probe]:
+    """Take one frame of each camera and one reading of each thermometer; nothing is stored."""
+    return [
+        *(_probe("camera", device) for device in config.cameras),
+        *(_probe("thermometer", device) for device in config.thermometers),
+    ]
+
+
+def _probe(kind: Kind, device: DeviceConfig) -> Probe:
+    begin = time.monotonic()
+    try:
+        with open_device(kind, device.driver, device.options, SystemClock()) as driver:
+            begin = time.monotonic()
+            result = driver.capture() if kind == "camera" else driver.read()
+            took_s = time.monotonic() - begin
+    except Exception as error:  # noqa: BLE001
+        # a driver's own mistake is told like a fault, so that the other devices are tried too
+        took_s = time.monotonic() - begin
+        known = isinstance(error, ThermocaldError)
+        why = str(error) if known else f"its driver failed: {type(error).__name__}: {error}"
+        return Probe(kind, device.name, device.driver, took_s, {}, why)
+    if kind == "camera":
+        values = _frame_values(result)
+    else:
+        values = {f"{channel}_c": round(celsius, 4) for channel, celsius in result.values.items()}
+        values |= {f"{channel}_missing": why for channel, why in result.missing.items()}
+    return Probe(kind, device.name, device.driver, took_s, values)
+
+
+def _frame_values(frame: Frame) -> dict[str, Any]:
+    values: dict[str, Any] = {"age_s": round(time.time() - frame.utc, 3)}
+    if frame.image is not None:
+        height, width = frame.image.shape
+        values |= {
+            "width_px": width,
+            "height_px": height,
+            "grey_mean": round(float(frame.image.mean()), 1),
+            "grey_max": int(frame.image.max()),
+        }
+    values |= {"exposure_s": frame.exposure, "sequence": frame.sequence}
+    return values
+
+
+def stanzas(found: Sequence[Attached]) -> Iterator[str]:
+    """Yield lines of YAML; what is uncertain as comments."""
+    import yaml
+
+    if not found:
+        yield "# nothing found"
+    for kind in KINDS:
+        mine = [one for one in found if one.kind == kind]
+        certain = [one for one in mine if one.certain]
+        if mine:
+            yield f"{kind}s:" if certain else f"# {kind}s:"
+        for number, one in enumerate(sorted(mine, key=lambda one: not one.certain), 1):
+            mark = "" if one.certain else "# "
+            yield f"  # {one.about}"
+            stanza = {"name": f"{one.driver}-{number}", "driver": one.driver, **one.options}
+            text = yaml.safe_dump(stanza, default_flow_style=True, sort_keys=False, width=10_000)
+            yield f"  {mark}- {text.strip()}"
+
 
 _SHOWN = 20  # lines of a kind
 _TRIED = 3  # epochs of a recording that are calibrated
@@ -33,18 +151,20 @@ def examine(source: Path, probe: bool, say: Callable[[str], None]) -> dict[str, 
     if _is_system(source):
         raise DataError(f"{source}: is the system's; give a recording, a config.yaml, or a store")
     if source.is_dir():
-        return _recording(source)
-    if source.suffix in (".yaml", ".yml"):
-        return _config(source, probe)
-    return _store(source, say)
+        kind, found = "recording", _examine_recording(source)
+    elif source.suffix in (".yaml", ".yml"):
+        kind, found = "configuration", _examine_config(source, probe)
+    else:
+        kind, found = "store", _examine_store(source, say)
+    return {"format": "thermocald-check/1", "kind": kind, "path": source, **found}
 
 
 def _is_system(path: Path) -> bool:
-    """Whether a path leads into a file system of the kernel, which keeps nothing."""
+    """Return whether a path leads into a file system of the kernel, which keeps nothing."""
     return path.resolve().parts[:2] in (("/", "proc"), ("/", "sys"), ("/", "dev"))
 
 
-def _recording(path: Path) -> dict[str, Any]:
+def _examine_recording(path: Path) -> dict[str, Any]:
     from thermocald.store.logger.photographs import strange_photographs
     from thermocald.store.recording.reader import read_recording
     from thermocald.store.recording.sense import doubt_lines
@@ -77,9 +197,6 @@ def _recording(path: Path) -> dict[str, Any]:
         lines.append(f"  {np.median(seen):.0f} targets an epoch (median), {min(seen)} at least")
     lines += [f"  {line}" for line in doubt_lines(doubts)]
     return {
-        "format": "thermocald-check/1",
-        "kind": "recording",
-        "path": path,
         "camera": recording.camera.name,
         "series": recording.series,
         "epochs": len(columns),
@@ -108,11 +225,10 @@ def _calibration_doubts(recording: Recording) -> list[str]:
     return interior_doubts(recording.camera, *np.median(found, axis=0).tolist())
 
 
-def _config(path: Path, probe: bool) -> dict[str, Any]:
+def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
+    from thermocald.acquisition.thermometers import Thermometers
     from thermocald.config import load_config
-    from thermocald.daemon.plan import plan_cameras, require_thermometer_columns
-    from thermocald.daemon.probe import probe as probe_devices
-    from thermocald.daemon.probe import probe_document, probe_lines
+    from thermocald.daemon.plan import plan_cameras
     from thermocald.hal import SystemClock, open_device, option_names
 
     config = load_config(path, option_names)
@@ -121,46 +237,31 @@ def _config(path: Path, probe: bool) -> dict[str, Any]:
         if _is_system(place):
             raise ConfigurationError(f"{path}: {key}: {place}: nothing can be kept there")
     devices: list[dict[str, Any]] = []
-    channels: dict[str, Sequence[str]] = {}
     clock = SystemClock()
-    groups: tuple[tuple[Kind, tuple[DeviceConfig, ...]], ...] = (
-        ("camera", config.cameras),
-        ("thermometer", config.thermometers),
-        ("output", config.outputs),
-    )
-    for kind, entries in groups:
-        for entry in entries:
+    for kind in KINDS:
+        for entry in getattr(config, f"{kind}s"):
             try:
                 device = open_device(kind, entry.driver, entry.options, clock)  # not opened
             except ConfigurationError as error:
                 raise ConfigurationError(f"{path}: {kind} {entry.name}: {error}") from error
-            if kind == "thermometer":
-                channels[entry.name] = device.named_channels()
             devices.append({"kind": kind, "name": entry.name, "driver": entry.driver})
             if not probe or kind == "output":
                 lines.append(f"  {kind} {entry.name}: driver {entry.driver}")
             lines += [f"  {kind} {entry.name}: warning: {text}" for text in device.warnings()]
-    require_thermometer_columns(config, channels, ConfigurationError)
+    Thermometers(config, clock)  # whose channels must fit together
     lines += [
         f"  test field of {plan.name}: {len(plan.testfield)} targets"
         for plan in plan_cameras(config, clock)
         if plan.testfield is not None
     ]
-    document: dict[str, Any] = {
-        "format": "thermocald-check/1",
-        "kind": "configuration",
-        "path": path,
-        "devices": devices,
-        "lines": lines,
-    }
+    document: dict[str, Any] = {"devices": devices, "lines": lines}
     if probe:
-        answers = probe_devices(config)
-        document["probes"] = probe_document(answers)["devices"]
-        lines += [f"  {line}" for line in probe_lines(answers)]
+        document["probes"] = answers = probe_devices(config)
+        lines += [f"  {answer.text}" for answer in answers]
     return document
 
 
-def _store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
+def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
     from thermocald.store.database.store import Store
 
     with Store.open(path) as store:
@@ -183,9 +284,6 @@ def _store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
             "-wal file was cut off in copying, and more may be missing; the store is used without"
         )
     return {
-        "format": "thermocald-check/1",
-        "kind": "store",
-        "path": path,
         "series": series,
         "epochs": found.epochs,
         "damaged": list(found.damaged),

@@ -16,17 +16,19 @@ import shutil
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from thermocald.addresses import without_secrets
 from thermocald.errors import OutputError, StoreError, StoreFullError
-from thermocald.store.database.file import StoreFile
+from thermocald.store.database.file import HELPERS, StoreFile, helper, read_wal_tail
 from thermocald.store.database.store import Store
-from thermocald.store.database.wal import read_wal_tail
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     from thermocald.epoch import Epoch
@@ -39,19 +41,19 @@ log = logging.getLogger(__name__)
 class FollowedStore:
     """An open store and its file; used under one lock. Raises StoreError.
 
-    notice: what happened to the file, empty if nothing; events: what is to be stored about that.
+    events: gets what is to be stored about the file; notice: what happened to it, empty if nothing.
     """
 
-    def __init__(self, path: Path, *, durable: bool = True) -> None:
+    def __init__(self, path: Path, events: deque[Event], *, durable: bool = True) -> None:
         self.path = path
         self.notice = ""
-        self.events: list[Event] = []
+        self._events = events
         self._durable = durable
         self._open()
 
     def _open(self) -> None:
         self._file = StoreFile(self.path)
-        tail = read_wal_tail(self._file.wal_path)
+        tail = read_wal_tail(helper(self.path, "wal"))
         kept = self._keep_damaged_wal() if tail.lost else ""
         try:
             self.store = Store.open(self.path, "append", durable=self._durable, claimed=True)
@@ -70,19 +72,18 @@ class FollowedStore:
         elif tail.unfinished:
             text = "the last write was cut off when its writer ended; it had not been committed"
             log.info("%s: %s", self.path, text, extra={"event": "wal_unfinished"})
-            self.events.append(Event(time.time(), "wal_unfinished", text))
+            self._events.append(Event(time.time(), "wal_unfinished", text))
 
     def _note(self, kind: str, text: str) -> None:
         self.notice = text
         log.error("%s: %s", self.path, text, extra={"event": kind})
-        self.events.append(Event(time.time(), kind, f"{self.path.name}: {text}"))
+        self._events.append(Event(time.time(), kind, f"{self.path.name}: {text}"))
 
     def _keep_damaged_wal(self) -> str:
-        """A copy of the -wal file for who wants to look into it."""
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{stamp}")
+        """Copy the -wal file for who wants to look into it; return where."""
+        copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{_stamp()}")
         try:
-            shutil.copyfile(self._file.wal_path, copy)
+            shutil.copyfile(helper(self.path, "wal"), copy)
         except OSError as error:
             return f"nowhere: {error.strerror}"
         return str(copy)
@@ -90,7 +91,7 @@ class FollowedStore:
     @property
     def in_place(self) -> bool:
         """Whether what was committed is in the files that are at their paths."""
-        return self._file.there and self._file.helpers_there
+        return self._file.there and all(map(self._file.helper_there, HELPERS))
 
     def watch(self) -> bool:
         """Look whether the files are where they were, and go on with what is there.
@@ -133,7 +134,7 @@ class FollowedStore:
         return carried
 
     def _emptied_wal(self) -> bool:
-        """Whether all of the -wal file could be moved into the file."""
+        """Return whether all of the -wal file could be moved into the file."""
         try:
             return self.store.checkpoint()
         except StoreError as error:
@@ -141,10 +142,9 @@ class FollowedStore:
             return False
 
     def _rescued(self) -> Path:
-        """A copy of all that the open store holds, beside where it was."""
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        """Copy all that the open store holds beside where it was; return where."""
         target = self.path.resolve()
-        copy = target.with_name(f"{target.stem}-rescued-{stamp}.db")
+        copy = target.with_name(f"{target.stem}-rescued-{_stamp()}.db")
         target.parent.mkdir(parents=True, exist_ok=True)
         self.store.copy_to(copy)
         return copy
@@ -157,17 +157,21 @@ class FollowedStore:
         """
         if self.store.closed:
             return
-        foreign = not self._file.there and self.path.exists() and not self._file.wal_there
+        foreign = not self._file.there and self.path.exists() and not self._file.helper_there("wal")
         stale = not self.in_place and not foreign
         try:
             self.store.close()
         except StoreError as error:
             log.error("%s", error)
         if stale:
-            for name in (self._file.wal_path, self._file.shm_path):
+            for kind in HELPERS:
                 with contextlib.suppress(OSError):
-                    name.unlink(missing_ok=True)
+                    helper(self.path, kind).unlink(missing_ok=True)
         self._file.release()
+
+
+def _stamp() -> str:
+    return time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
 
 
 # Results alone take about 1.2 kB an epoch: this is more than a day at one every 10 s.
@@ -179,30 +183,21 @@ _MOST_WAITING = 20_000
 
 @dataclass(eq=False)
 class Row:
-    """What is kept of one epoch, and who is told: `told(stored)` after the first attempt."""
+    """What is kept of one epoch."""
 
     series: StoredSeries
     epoch: Epoch
     result: EpochResult | None
     extra: Mapping[str, float]
     clock_trusted: bool
-    told: Callable[[bool], None] = field(default=lambda _: None)
     stored: bool = False  # committed, and in the file that is at the store's path
 
     def thin(self) -> Row:
-        """The same without observations and covariance."""
-        epoch = replace(self.epoch, observations=None)
-        result = None if self.result is None else _without_covariance(self.result)
-        return replace(self, epoch=epoch, result=result)
-
-
-def _without_covariance(result: EpochResult) -> EpochResult:
-    """Standard deviations are what is left of a covariance: its diagonal, 16 numbers."""
-    if result.covariance is None:
-        return result
-    import numpy as np
-
-    return replace(result, covariance=np.diag(np.diag(result.covariance)))
+        """Return the same without observations, and of the covariance the standard deviations."""
+        result = self.result
+        if result is not None and result.covariance is not None:
+            result = replace(result, covariance=np.diag(np.diag(result.covariance)))
+        return replace(self, epoch=replace(self.epoch, observations=None), result=result)
 
 
 class StoreGuard:
@@ -224,22 +219,12 @@ class StoreGuard:
         self._lock = threading.RLock()
         self._series: dict[tuple[str, str], StoredSeries] = {}
         self._known: Store | None = None  # whose series are in `_series`
-        self._file = FollowedStore(path, durable=durable)
-        self._note_events()
+        self._file = FollowedStore(path, self._events, durable=durable)
 
     @property
     def store(self) -> Store:
         """The open store; another one after its file was followed, so read through the guard."""
         return self._file.store
-
-    @property
-    def notice(self) -> str:
-        """What happened to the file while it was open, empty if nothing."""
-        return self._file.notice
-
-    def _note_events(self) -> None:
-        self._events.extend(self._file.events)
-        self._file.events.clear()
 
     @property
     def waiting(self) -> int:
@@ -281,26 +266,26 @@ class StoreGuard:
             return list(self.store.epochs(series, first, last, details=details))
 
     def last_epoch(self, series: StoredSeries) -> int:
-        """The number of the last epoch kept, 0 if there is none."""
+        """Return the number of the last epoch kept, 0 if there is none."""
         with self._lock:
             return self.store.last_epoch(series) or 0
 
     def all_series(self) -> list[StoredSeries]:
-        """All series, in the order in which they were begun."""
+        """Return all series, in the order in which they were begun."""
         with self._lock:
             return self.store.all_series()
 
     def stored_events(self) -> list[Event]:
-        """All events in the store, oldest first."""
+        """Return all events in the store, oldest first."""
         with self._lock:
             return self.store.events()
 
-    def append(self, row: Row) -> None:
-        """Keep an epoch, now or when the store can be written again."""
+    def append(self, row: Row) -> bool:
+        """Keep an epoch, now or when the store can be written again; whether it is stored."""
         with self._lock:
             self._waiting.append(row)
             self.flush()
-            row.told(row.stored)
+            return row.stored
 
     def amend(
         self,
@@ -369,8 +354,6 @@ class StoreGuard:
         except StoreError as error:
             self._out(error, time.time())
             return False
-        finally:
-            self._note_events()
 
     def _write(self, row: Row) -> StoreError | None:
         self._look_at_the_disk(row)
@@ -397,18 +380,18 @@ class StoreGuard:
         except OSError:
             return
         if not self.thin and free < _RESERVE_BYTES:
-            self.thin = True
-            text = f"{free / 1e6:.0f} MB are free: results are kept, observations no more"
-            log.warning(text, extra={"event": "observations_paused"})
-            self._events.append(Event(row.epoch.frame_time, "observations_paused", text))
+            kind, what = "observations_paused", "results are kept, observations no more"
         elif self.thin and free > _ENOUGH_BYTES:
-            self.thin = False
-            text = f"{free / 1e6:.0f} MB are free: observations are kept again"
-            log.info(text, extra={"event": "observations_resumed"})
-            self._events.append(Event(row.epoch.frame_time, "observations_resumed", text))
+            kind, what = "observations_resumed", "observations are kept again"
+        else:
+            return
+        self.thin = not self.thin
+        text = f"{free / 1e6:.0f} MB are free: {what}"
+        log.log(logging.WARNING if self.thin else logging.INFO, text, extra={"event": kind})
+        self._events.append(Event(row.epoch.frame_time, kind, text))
 
     def _holds(self, row: Row) -> bool:
-        """Whether a row was committed before its file could be followed."""
+        """Return whether a row was committed before its file could be followed."""
         number = row.epoch.number
         try:
             found = self.epochs(self.series(row.series), number, number, details=False)
@@ -417,7 +400,7 @@ class StoreGuard:
         return any(stored.epoch.frame_time == row.epoch.frame_time for stored in found)
 
     def _takes_all_but(self, error: StoreError) -> bool:
-        """Whether the store is well and it is this row that it does not take.
+        """Return whether the store is well and it is this row that it does not take.
 
         On a full disk a row may find no room where an event still does: that row waits.
         """
@@ -437,10 +420,9 @@ class StoreGuard:
 
     def _refused(self, error: StoreError) -> None:
         self._out(error, self._waiting[0].epoch.frame_time)
-        if len(self._waiting) > _MOST_WITH_OBSERVATIONS:
-            self._waiting[-1 - _MOST_WITH_OBSERVATIONS] = self._waiting[
-                -1 - _MOST_WITH_OBSERVATIONS
-            ].thin()
+        last = -1 - _MOST_WITH_OBSERVATIONS
+        if len(self._waiting) >= -last:
+            self._waiting[last] = self._waiting[last].thin()
         if len(self._waiting) > _MOST_WAITING:
             self.lose(f"epoch {self._waiting.popleft().epoch.number}: too many wait: {error}")
 
@@ -452,7 +434,8 @@ class StoreGuard:
     def _flush_events(self) -> bool:
         while self._events:
             try:
-                self.store.add_event(self._events[0])
+                event = self._events[0]
+                self.store.add_event(replace(event, text=without_secrets(event.text)))
             except StoreError as error:
                 log.debug("an event waits: %s", error)
                 return False
@@ -473,7 +456,7 @@ class StoreGuard:
         self._back()
 
     def status(self) -> dict[str, Any]:
-        """For `thermocald status`."""
+        """Return the store's part of what `thermocald status` shows."""
         return {
             "path": str(self.path),
             "state": "out" if self.away else "results_only" if self.thin else "ok",
@@ -482,5 +465,5 @@ class StoreGuard:
             "lost": self.lost,
             "lost_why": self._lost_why,
             "lost_s_ago": time.monotonic() - self._lost_at if self.lost else None,
-            "notice": self.notice,
+            "notice": self._file.notice,
         }

@@ -12,7 +12,6 @@ import os
 import socket
 import struct
 import sys
-import time
 
 from thermocald.addresses import CleanFormatter
 
@@ -99,11 +98,6 @@ def notify(message: str) -> bool:
 def notify_ready(status: str) -> None:
     """Started, or reloaded."""
     notify(f"READY=1\nSTATUS={status}")
-
-
-def notify_reloading() -> None:
-    """A reload begins; `notify_ready` ends it."""
-    notify(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
 
 def watchdog_interval_s() -> float | None:

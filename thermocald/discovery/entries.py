@@ -17,8 +17,8 @@ constant and no more, while their sum is as well determined as one lag alone wou
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -27,14 +27,10 @@ from thermocald.photogrammetry.linalg import explained, inverse_of_determined, u
 from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
 from thermocald.physics.model import ModelEffect, ThermalModel
-from thermocald.thermal.scan import normals_beside
-from thermocald.thermal.series import COLUMNS, FIELD_SCALES, unit_directions
+from thermocald.thermal.scan import normals_of_term
+from thermocald.thermal.series import COLUMNS, FIELD_SCALES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from thermocald.arrays import Array, Index
-    from thermocald.discovery.evidence import Displaced
     from thermocald.discovery.examination import Examination
     from thermocald.discovery.gap import Gap
     from thermocald.thermal.fit import HypothesisFitter
@@ -151,36 +147,6 @@ def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
     }
 
 
-def model_values(
-    estimates: dict[str, Estimate], parameters: tuple[str, ...]
-) -> tuple[dict[str, Any], dict[str, float]]:
-    """Return values and standard deviations by the names that the simulation's effect uses."""
-    values: dict[str, Any] = {}
-    sds: dict[str, float] = {}
-    known = {p.removeprefix("scale_") for p in parameters}
-    for key, e in estimates.items():
-        name = key[2:] if key.startswith("a_") and key[2:] in known else key
-        values[name] = e["value"]
-        if e["sd"] is not None and np.isfinite(e["sd"]):
-            sds[name] = e["sd"]
-    return values, sds
-
-
-def estimate_displacement(group: Displaced, names: tuple[str, ...]) -> dict[str, Estimate]:
-    """Return targets, time, and displacement across the rays: the mean of the lengths."""
-    lengths = np.linalg.norm(group.vectors, axis=1)
-    sd = np.sqrt(np.mean(group.sd_vectors**2)) / np.sqrt(len(lengths))
-    mean = group.vectors.mean(axis=0)
-    out: dict[str, Estimate] = {
-        "targets": {"value": [names[r] for r in group.rows], "sd": None, "unit": "names"},
-        "time": _make_estimate(group.time, group.sd_time, "s"),
-        "displacement": _make_estimate(float(lengths.mean()), float(sd), "mm"),
-    }
-    for axis, value in zip(("dX", "dY", "dZ"), mean, strict=True):
-        out[axis] = _make_estimate(float(value), float(sd), "mm")
-    return out
-
-
 def acts_on(parameters: tuple[str, ...]) -> list[str]:
     """Name parameters in the words of the document."""
     return [p if p not in FIELD_SCALES else f"object {p[-1]}" for p in parameters]
@@ -190,6 +156,8 @@ def acts_on(parameters: tuple[str, ...]) -> list[str]:
 class EffectFound:
     """One entry of `effects` in CONVENTIONS §4."""
 
+    JSON: ClassVar = {"term": ""}
+
     effect: str
     statement: str
     where: dict[str, Any]
@@ -198,7 +166,7 @@ class EffectFound:
     alternatives: list[dict[str, Any]]
     gap_before: Gap
     gap_after: Gap
-    term: Term | None = field(default=None, metadata={"json": ""})
+    term: Term | None = None
 
     @property
     def alternative_names(self) -> list[str]:
@@ -211,18 +179,16 @@ def effects_of(found: EffectFound) -> list[ModelEffect]:
     """Return what was found as effects of a model; none where it has no name and no formula."""
     if found.term is None and found.effect not in catalogue.names():
         return []
-    name = found.effect if found.effect in catalogue.names() or not found.term else (
-        found.term.effect
-    )  # fmt: skip
-    numbers, sds = model_values(found.estimates, found.term.parameters if found.term else ())
+    term = found.term
+    name = term.effect if term and found.effect not in catalogue.names() else found.effect
+    # an estimate of a coefficient is called a_c or a_X, the coefficient itself c or X
+    short = [p.removeprefix("scale_") for p in (term.parameters if term else ())]
+    own = {f"a_{p}": p for p in short}
     known = catalogue.get(name).units()
-    return [
-        ModelEffect(
-            name,
-            {k: v for k, v in numbers.items() if k in known},
-            {k: v for k, v in sds.items() if k in known},
-        )
-    ]
+    numbers = {own.get(key, key): e for key, e in found.estimates.items()}
+    numbers = {key: e for key, e in numbers.items() if key in known}
+    sds = {k: e["sd"] for k, e in numbers.items() if e["sd"] is not None and np.isfinite(e["sd"])}
+    return [ModelEffect(name, {k: e["value"] for k, e in numbers.items()}, sds)]
 
 
 def terms_of(model: ThermalModel) -> list[tuple[str, dict[str, Any]]]:
@@ -258,12 +224,12 @@ def compare_shift_and_tilt(
     own = -1 if term.is_drive else number
     # of the estimates, c and kappa estimated too; an effect that is T itself has its shift in the
     # base's rates
-    A, _ = _sum_normal_equations(fitter, fit, number, names, frozenset({own, -1}))
+    A, _ = normals_of_term(fitter, fit, term, names, leave=frozenset({own, -1}))
     Q = np.linalg.inv(unit_diagonal(A, 1e-12)[0])
     low_s, low_t = (np.linalg.cholesky(Q[np.ix_(i, i)]) for i in (shift, tilt))
     whitened = np.linalg.solve(low_s, np.linalg.solve(low_t, Q[np.ix_(tilt, shift)]).T)
     correlation = float(min(np.linalg.svd(whitened, compute_uv=False)[0], 1.0))
-    A, c = _sum_normal_equations(fitter, fit, number, names, frozenset({own}))
+    A, c = normals_of_term(fitter, fit, term, names, leave=frozenset({own}))
     some = [np.concatenate([i, both]) for i in (shift, tilt)]
     gains = [float(explained(A[np.ix_(i, i)], c[i], 1e-12)) for i in some]
     difference = gains[0] - gains[1]
@@ -279,55 +245,20 @@ def compare_shift_and_tilt(
     return document, "" if separable else sentence
 
 
-def _sum_normal_equations(
-    fitter: HypothesisFitter, fit: Fit, number: int, names: Sequence[str], own: frozenset[int]
-) -> tuple[Array, Array]:
-    """Return A (k, k), c (k,) of a term's trajectory in some columns.
-
-    The other coefficients are eliminated; own: the terms whose coefficients are left out.
-    """
-    term, k = fit.terms[number], len(names)
-    further: list[tuple[Array, Array, Index] | None] = []
-    for s in range(len(fit.weightings)):
-        if term.values(s) is None:
-            further.append(None)
-            continue
-        if term.is_drive:
-            trajectory = fitter.drive(fit.terms, s)[0]
-        else:
-            trajectory = fitter.trajectories(term, s, fit.terms, operators=False)[0][:, 0]
-        centred = (trajectory - trajectory.mean())[:, None]
-        further.append((np.tile(centred, k), unit_directions(names), np.arange(k)))
-    return normals_beside(fit, further, k, leave=own)
-
-
-@dataclass(frozen=True)
-class TradeOff:
-    """names: of two time constants; value, sd s: of their sum."""
-
-    names: tuple[str, str] = field(metadata={"json": "parameters"})
-    value: float = field(metadata={"json": "sum"})
-    sd: float
-    unit: str = "s"
-
-    @property
-    def sentence(self) -> str:
-        """What is added to a statement."""
-        total = say_estimate({"value": self.value, "sd": self.sd, "unit": self.unit})
-        return f"; the time constants are not separable, their sum is {total}"
-
-
-def find_trade_off(fitter: HypothesisFitter, fit: Fit, number: int) -> TradeOff | None:
+def find_trade_off(
+    fitter: HypothesisFitter, fit: Fit, number: int
+) -> tuple[dict[str, Any], str] | None:
     """Find two time constants of a term that M1 does not separate; None where it does.
 
-    The standard deviation is that of the one where the other is held, which is that of their sum.
+    Returns the document, and what is added to the statement. The standard deviation is that of the
+    one where the other is held, which is that of their sum.
     """
     term, K = fit.terms[number], len(fit.coefficients)
     loose = []
     for place, (owner, name) in enumerate(fit.searched, K):
         value = float(dict(fit.terms[owner].nonlinear)[name])
         sd = float(np.sqrt(fit.covariance[place, place]))
-        is_time = term.kind.nonlinear[name].unit == "s" if owner == number else False
+        is_time = owner == number and term.kind.nonlinear[name].unit == "s"
         if is_time and not sd <= criteria.LOOSE * abs(value):
             loose.append((place, name, value))
     if len(loose) != 2:
@@ -336,66 +267,53 @@ def find_trade_off(fitter: HypothesisFitter, fit: Fit, number: int) -> TradeOff 
     A, _, _ = fitter.normal_equations(fit, only=[0])
     kept = np.delete(np.arange(len(A)), two)
     Q = inverse_of_determined(A[np.ix_(kept, kept)])
-    sd = float(np.sqrt(Q[kept.tolist().index(one), kept.tolist().index(one)]))
-    return TradeOff((first, second), a + b, sd)
+    row = kept.tolist().index(one)
+    total = _make_estimate(a + b, np.sqrt(Q[row, row]), "s")
+    document = {
+        "parameters": [first, second], "sum": total["value"], "sd": total["sd"], "unit": "s"
+    }  # fmt: skip
+    return document, (f"; the time constants are not separable, their sum is {say_estimate(total)}")
 
 
-@dataclass(frozen=True)
-class Ridge:
-    """names: of constants of which M1 knows only what they make of its temperatures together."""
-
-    names: tuple[str, ...] = field(metadata={"json": "parameters"})
-
-    @property
-    def sentence(self) -> str:
-        """What is added to a statement."""
-        return (
-            f"; of {', '.join(self.names)} and the size only their product over the recorded range "
-            "is known: others explain the same"
-        )
-
-
-def find_ridge(fitter: HypothesisFitter, fit: Fit, number: int) -> Ridge | None:
+def find_ridge(
+    fitter: HypothesisFitter, fit: Fit, number: int
+) -> tuple[dict[str, Any], str] | None:
     """Find the constants of a term that M1 exchanges for its size or each other; None without any.
 
-    tanh far below its middle is an exponential: middle and size are one number, and its slopes are
-    nothing but rounding, which looks like knowledge. So a temperature outside the recorded ones by
-    more than their range counts, whatever the normal equations say.
+    Of these M1 knows only what they make of its temperatures together. Returns the document, and
+    what is added to the statement. tanh far below its middle is an exponential: middle and size are
+    one number, and its slopes are nothing but rounding, which looks like knowledge. So a
+    temperature outside the recorded ones by more than their range counts, whatever the normal
+    equations say.
     """
     history = fitter.series[0].history
     recorded = np.concatenate([history.temperature(name) for name in history.readings])
     low, high = float(np.nanmin(recorded)), float(np.nanmax(recorded))
-    kind = fit.terms[number].kind
+    term = fit.terms[number]
     A, _, searched = fitter.normal_equations(fit, only=[0])
     shares, axes = np.linalg.eigh(unit_diagonal(A)[0])
     loose = axes[:, shares < _EXCHANGED]
-    names = [
-        name
-        for place, (owner, name) in enumerate(searched, len(fit.coefficients))
-        if owner == number
-        and (
-            float(np.abs(loose[place]).max(initial=0.0)) > _TAKES_PART
-            or (
-                kind.nonlinear[name].unit == "degC"
-                and not 2 * low - high
-                <= float(dict(fit.terms[number].nonlinear)[name])
-                <= 2 * high - low
-            )
-        )
-    ]
-    return Ridge(tuple(names)) if names else None
-
-
-def list_image_places(x: Examination) -> list[str]:
-    """List where such effects were seen ("targets", "noise"), in the document's order."""
-    places = ["targets"] if x.displaced[0] else []
-    return [*places, "noise"] if x.noise_growth else places
+    names = []
+    for place, (owner, name) in enumerate(searched, len(fit.coefficients)):
+        if owner != number:
+            continue
+        exchanged = float(np.abs(loose[place]).max(initial=0.0)) > _TAKES_PART
+        is_temperature = term.kind.nonlinear[name].unit == "degC"
+        value = float(dict(term.nonlinear)[name])
+        if exchanged or (is_temperature and not 2 * low - high <= value <= 2 * high - low):
+            names.append(name)
+    if not names:
+        return None
+    return {"parameters": names}, (
+        f"; of {', '.join(names)} and the size only their product over the recorded range "
+        "is known: others explain the same"
+    )
 
 
 def list_image_effects(x: Examination, gap: Gap) -> list[EffectFound]:
     """Make the entries of the document; gap: of the base model, which the caller replaces."""
     out = []
-    if x.displaced[0]:
+    if "targets" in x.image_places:
         out.append(_describe_moved_targets(x, gap))
     if x.noise_growth:
         out.append(_describe_noise_growth(x.fitter.series[0], x.noise_growth, gap))
@@ -407,7 +325,16 @@ def _describe_moved_targets(x: Examination, gap: Gap) -> EffectFound:
     names = e.source.field.names
     group = max(x.displaced[0], key=lambda g: g.gain)
     effect = catalogue.seen_in("targets")
-    estimates = estimate_displacement(group, names)
+    lengths = np.linalg.norm(group.vectors, axis=1)
+    sd = np.sqrt(np.mean(group.sd_vectors**2)) / np.sqrt(len(lengths))
+    estimates: dict[str, Estimate] = {
+        "targets": {"value": [names[r] for r in group.rows], "sd": None, "unit": "names"},
+        "time": _make_estimate(group.time, group.sd_time, "s"),
+        # across the rays: the mean of the lengths
+        "displacement": _make_estimate(lengths.mean(), sd, "mm"),
+    }
+    for axis, value in zip(("dX", "dY", "dZ"), group.vectors.mean(axis=0), strict=True):
+        estimates[axis] = _make_estimate(value, sd, "mm")
     points = e.at.predicted[group.rows]
     first = int(np.searchsorted(e.times, group.time))
     where = {

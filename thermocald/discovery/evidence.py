@@ -22,7 +22,10 @@ import numpy as np
 from thermocald.discovery import criteria
 from thermocald.errors import DataError
 from thermocald.photogrammetry.field.planes import field_sheets
+from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.field_motion import (
+    FEW_TARGETS,
+    MOST_TARGETS,
     FieldMovement,
     FieldSeries,
     board_movements,
@@ -34,7 +37,7 @@ from thermocald.thermal.reduce import with_points, without_targets
 from thermocald.thermal.scan import cosines
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -44,8 +47,20 @@ if TYPE_CHECKING:
 
 def require_other_series(series: Sequence[SeriesInput]) -> None:
     """Refuse series to prove it on that are of another camera or thermometer, or copies."""
-    for other in series[1:]:
-        _same_camera(series[0], other)
+    a = series[0]
+    reference = next(iter(a.readings), None)
+    for b in series[1:]:
+        if a.camera != b.camera or a.sensor != b.sensor:
+            raise DataError(
+                f"{b.name} is of another camera ({b.camera}, {b.sensor.width}×{b.sensor.height} px)"
+                f" than {a.name} ({a.camera}, {a.sensor.width}×{a.sensor.height} px); constants of "
+                "one camera cannot be verified on another"
+            )
+        if reference is not None and reference != next(iter(b.readings), None):
+            raise DataError(
+                f"{b.name}: the reference temperature is {next(iter(b.readings), 'missing')!r}, in "
+                f"{a.name} it is {reference!r}; both series need the same thermometer"
+            )
     for k, other in enumerate(series):
         for before in series[:k]:
             if np.array_equal(before.grid.points, other.grid.points, equal_nan=True):
@@ -53,21 +68,6 @@ def require_other_series(series: Sequence[SeriesInput]) -> None:
                     f"{other.name} holds the same observations as {before.name}; "
                     "--verify needs measurements of their own (simulated ones another --seed)"
                 )
-
-
-def _same_camera(a: SeriesInput, b: SeriesInput) -> None:
-    if a.camera != b.camera or a.sensor != b.sensor:
-        raise DataError(
-            f"{b.name} is of another camera ({b.camera}, {b.sensor.width}×{b.sensor.height} px) "
-            f"than {a.name} ({a.camera}, {a.sensor.width}×{a.sensor.height} px); constants of one "
-            "camera cannot be verified on another"
-        )
-    reference = next(iter(a.readings), None)
-    if reference is not None and reference != next(iter(b.readings), None):
-        raise DataError(
-            f"{b.name}: the reference temperature is {next(iter(b.readings), 'missing')!r}, in "
-            f"{a.name} it is {reference!r}; both series need the same thermometer"
-        )
 
 
 _PASSES = 2
@@ -95,12 +95,21 @@ def _put_boards_back(evidence: ReducedSeries, found: list[FieldMovement]) -> Red
 
 
 def drop_wandering_targets(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:
-    """Find the targets that wander, and reduce the series without them."""
-    found = wandering_targets(_field_series(evidence))
-    if not found:
-        return [], evidence
-    rows = np.concatenate([m.rows for m in found])
-    return found, without_targets(evidence, np.union1d(evidence.excluded, rows))
+    """Find the targets that wander, and reduce the series without them.
+
+    Among few targets, those that wander make the noise: without them others may stand out.
+    """
+    found: list[FieldMovement] = []
+    still, every = evidence, int(evidence.weights[..., 0].any(axis=0).sum())
+    while more := wandering_targets(_field_series(still)):
+        if len(found) + len(more) > MOST_TARGETS * every:
+            break
+        found += more
+        rows = np.concatenate([m.rows for m in found])
+        still = without_targets(evidence, np.union1d(evidence.excluded, rows))
+        if every > FEW_TARGETS:
+            break
+    return found, still
 
 
 def _field_series(e: ReducedSeries) -> FieldSeries:
@@ -132,8 +141,8 @@ def _find_steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Arra
     w = np.sqrt(evidence.weights[..., :2])
     r = evidence.residuals * w
     # noise may grow with heat: each epoch in units of its own spread
-    own = np.array([np.nanmedian(np.abs(x)) if np.isfinite(x).any() else 1.0 for x in r])
-    r = np.nan_to_num(r / np.maximum(1.4826 * own, 0.3)[:, None, None])
+    own = np.array([mad_sd(x) if np.isfinite(x).any() else 1.0 for x in r])
+    r = np.nan_to_num(r / np.maximum(own, 0.3)[:, None, None])
     there = np.isfinite(evidence.residuals[..., 0]).astype(float)
     count = np.cumsum(there, axis=0)
     total = count[-1]
@@ -201,16 +210,13 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
             found[int(row)] = (int(first[row]), float(gain[row]))
         if len(found) > 0.2 * evidence.source.grid.observed.any(axis=0).sum():
             return [], evidence  # so many do not jump by themselves: it is the camera
-        cleaned = without_targets(evidence, _add_markers(evidence, found))
+        groups = evidence.source.field.groups  # a marker goes as a whole
+        whole = np.flatnonzero(np.isin(groups, groups[sorted(found)]))
+        cleaned = without_targets(evidence, whole)
     if not found:
         return [], evidence
-    whole = _keep_whole_markers(evidence, found)
-    return _group_steps(cleaned, whole) if whole else [], cleaned
-
-
-def _add_markers(evidence: ReducedSeries, found: Iterable[int]) -> NDArray[np.int64]:
-    groups = evidence.source.field.groups
-    return np.flatnonzero(np.isin(groups, groups[sorted(found)]))
+    jumped = _keep_whole_markers(evidence, found)
+    return _group_steps(cleaned, jumped) if jumped else [], cleaned
 
 
 def _keep_whole_markers(

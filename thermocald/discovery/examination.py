@@ -14,7 +14,7 @@ from thermocald.discovery.evidence import (
     find_displaced_targets,
     replace_moved_boards,
 )
-from thermocald.discovery.mounted import is_convincing, search_beside_mount, treat_slips_as_knocks
+from thermocald.discovery.mounted import is_convincing, search_beside_mount, split_knocks
 from thermocald.discovery.search import Search, Solution
 from thermocald.discovery.validation import (
     SurrogateTest,
@@ -22,8 +22,8 @@ from thermocald.discovery.validation import (
     is_confirmed,
     measure_block_gains,
 )
-from thermocald.thermal.basis import choose_distortion
-from thermocald.thermal.fit import HypothesisFitter
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.thermal.fit import HypothesisFitter, choose_distortion
 from thermocald.thermal.movement import (
     WAVES,
     add_jumps_to_noise,
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 
 _EFFECTS = 3
 _COMBINATIONS = 8  # of a level that are fitted in full
+_WIDTH = 4  # solutions of a level that grow further
 # effects of which one says how far the image moves
 _GUIDES = 3
 
@@ -66,7 +67,8 @@ class Examination:
     ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per
     series; cross_validation: gains (blocks,) of its effects on blocks of time left out; surrogates:
     each of its effects against surrogates; mount: its movement, where it moves; knocks: of the
-    mount, terms of the base; field_movements: boards and targets that moved, per series.
+    mount, terms of the base; as_slips: whether a slip inside the camera explains each as well;
+    field_movements: boards and targets that moved, per series.
     """
 
     fitter: HypothesisFitter
@@ -83,8 +85,15 @@ class Examination:
     surrogates: tuple[SurrogateTest, ...] = ()
     mount: Mount | None = None
     knocks: tuple[Term, ...] = ()
+    as_slips: tuple[bool, ...] = ()
     original: tuple[ReducedSeries, ...] = ()
     field_movements: tuple[tuple[FieldMovement, ...], ...] = ()
+
+    @property
+    def image_places(self) -> list[str]:
+        """Where effects were seen that move no trajectory, in the document's order."""
+        places = ["targets"] if self.displaced[0] else []
+        return [*places, "noise"] if self.noise_growth else places
 
 
 def examine_series(
@@ -143,23 +152,23 @@ def _examine_standing(
     shaking: the series where all targets jump together. What a thermometer's errors take up of that
     depends on the effect; unless an effect explains it, each is fitted with the tremble it leaves.
     """
+
+    def search_in(series: list[ReducedSeries]) -> Examination:
+        search = Search(HypothesisFitter(series), say)
+        return _search_standing(search, search.base(given), say, jobs)
+
     say("base model")
-    fitter = HypothesisFitter(ready)
-    search = Search(fitter, say)
+    search = Search(HypothesisFitter(ready), say)
     base = search.base(given)
     # one effect moves the image by most of what it moves at all
     guide = min([base, *search.expand(base, _GUIDES)], key=lambda s: s.score).fit
-    bent = remove_curvature(fitter, guide)
-    if bent:
-        search = Search(HypothesisFitter(bent), say)
-        base = search.base(given)
-    found = _search_standing(search, base, say, jobs)
+    bent = remove_curvature(search.fitter, guide)
+    found = search_in(bent) if bent else _search_standing(search, base, say, jobs)
     if not found.adequate:
         again = remove_curvature(found.fitter, found.best.fit)
         if again is not None and _is_explained(again, found):
             say("curvature of the projection: once more")
-            search = Search(HypothesisFitter(again), say)
-            found = _search_standing(search, search.base(given), say, jobs)
+            found = search_in(again)
     noisy = add_jumps_to_noise(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
         alongside = _examine_beside_mount(shaking, say, given, jobs)
@@ -167,8 +176,7 @@ def _examine_standing(
             return alongside
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
         say("noise that targets share: once more")
-        search = Search(HypothesisFitter(noisy), say)
-        found = _search_standing(search, search.base(given), say, jobs)
+        found = search_in(noisy)
     return found
 
 
@@ -176,8 +184,7 @@ def _is_explained(series: list[ReducedSeries], found: Examination) -> bool:
     """Test whether the effects found leave nothing over in other states of the series."""
     fitter = HypothesisFitter(series)
     refined = fitter.refine(fitter.fit(found.best.terms, found.best.fit.coefficients))
-    now = examine_all(fitter, refined)
-    return adequate(now, found.base_adequacy)
+    return _is_adequate(examine_all(fitter, refined), found.base_adequacy)
 
 
 def _search_standing(
@@ -194,12 +201,11 @@ def _search_standing(
         say(f"effect {level}: alongside {' or '.join(', '.join(s.names) for s in frontier)}"
             if level > 1 else "effect 1: alongside the base")  # fmt: skip
         if level == 1:
-            grown = search.expand(base)
-            ranking = grown
+            grown = ranking = search.expand(base)
         else:
             # once nothing is left over, other effects have to promise more than the best explains
             below = best.score if complete else np.inf
-            more = search.expand_all(frontier, 4, _COMBINATIONS, below)
+            more = search.expand_all(frontier, _WIDTH, _COMBINATIONS, below)
             grown = [search.shrink(s, kept) for s in more]
         seen += grown
         if complete:
@@ -212,7 +218,7 @@ def _search_standing(
             break
         best = search.with_events_moved(champion)
         seen.append(best)
-        complete = adequate(examine_all(fitter, best.fit), base_adequacy)
+        complete = _is_adequate(examine_all(fitter, best.fit), base_adequacy)
         # what is adequate may still lack something too fast for the absolute test, and one effect
         # with many coefficients may stand for two others that have not been tried together yet
         frontier = _choose_frontier(grown) if complete or level == 1 else [best]
@@ -229,10 +235,10 @@ def _search_standing(
             best = other if other.fit.chi2 < best.fit.chi2 - 0.5 * criteria.DRIVES_BAND else best
     blocks: list[Array] = []
     tests: tuple[SurrogateTest, ...] = ()
-    if adequate(examine_all(fitter, best.fit), base_adequacy):
+    if _is_adequate(examine_all(fitter, best.fit), base_adequacy):
         best, blocks, tests = _keep_named(search, base, best, jobs)
     adequacy = examine_all(fitter, best.fit)
-    complete = adequate(adequacy, base_adequacy)
+    complete = _is_adequate(adequacy, base_adequacy)
     if len(best.terms) > kept and len(fitter.series) < 2:
         # where single targets wander much, one series alone carries no name
         complete = complete and fitter.series[0].correlation <= criteria.WANDERING
@@ -271,7 +277,7 @@ def _compare_ties(
     fitter = search.fitter
     again: list[Solution] = []
     for s in sorted(close.values(), key=lambda s: s.score)[:6]:
-        _, objective = fitter.thermometer_scale(s.fit)
+        objective = fitter.suit_thermometers(s.fit)
         again.append(replace(s, fit=replace(s.fit, logdet=objective - s.fit.chi2)))
     again.sort(key=lambda s: s.score)
     others = [s for s in seen if s.terms not in close]
@@ -310,16 +316,16 @@ def _measure_px(fitter: HypothesisFitter, without: Solution, with_it: Solution) 
     return float(np.sqrt(gain / coordinates / np.mean(weights[weights > 0])))
 
 
-def _choose_frontier(grown: list[Solution], width: int = 4) -> list[Solution]:
+def _choose_frontier(grown: list[Solution]) -> list[Solution]:
     """Choose the best solutions of a level, one per set of names."""
     out: list[Solution] = []
     for s in sorted(grown, key=lambda s: s.score):
         if all(sorted(s.names) != sorted(o.names) for o in out):
             out.append(s)
-    return out[:width]
+    return out[:_WIDTH]
 
 
-def adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
+def _is_adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
     """Test whether a solution leaves nothing, or next to nothing of what the base left."""
     return all(
         a.adequate or a.misfit_px < criteria.LEFT_SHARE * b.misfit_px
@@ -342,24 +348,25 @@ def _examine_beside_mount(
         weight_leaps_down(fitter, fitter.fit(()), find_combinations(fitter.series))
     )
     shaken = add_tremble(fitter, fitter.fit(()), WAVES)
-    found = search_beside_mount(HypothesisFitter(shaken), say, given)
-    if found.mount.smoothness(found.fitter, found.best.fit) > criteria.SMOOTH:
+    beside, ranking, seen, like = search_beside_mount(HypothesisFitter(shaken), say, given)
+    fitter = beside.fitter
+    base, whole, knocks = split_knocks(fitter, beside.solution, len(given))
+    if beside.mount.smoothness(fitter, whole.fit) > criteria.SMOOTH:
         return None
-    search = Search(found.fitter, say, found.like)
-    best, blocks, tests = _keep_named(search, found.base, found.best, jobs)
-    if any(t.kind.is_event and t not in best.terms for t in found.best.terms):
-        found = treat_slips_as_knocks(
-            found, len(given)
-        )  # steps that cannot be named are still there
-        best, blocks, tests = _keep_named(search, found.base, found.best, jobs)
-    base = found.base
-    if not is_convincing(found.fitter, base, best):
+    search = Search(fitter, say, like)
+    best, blocks, tests = _keep_named(search, base, whole, jobs)
+    if any(t.kind.is_event and t not in best.terms for t in whole.terms):
+        # steps that cannot be named are still there
+        base, whole, knocks = split_knocks(fitter, whole, len(given), slips=True)
+        best, blocks, tests = _keep_named(search, base, whole, jobs)
+    if not is_convincing(fitter, base, best):
         best, blocks, tests = base, [], ()
-    adequacy = examine_all(found.fitter, best.fit)
+    tried = iter(beside.as_slips)
+    as_slips = tuple(t.parameters != EOP_NAMES or next(tried) for t in knocks)
     rivals: list[Solution] = []
-    for s in sorted(found.seen, key=lambda s: s.score):
-        names = [t.effect for t in s.terms if t not in found.knocks]
-        own = [t.effect for t in best.terms if t not in found.knocks]
+    for s in sorted(seen, key=lambda s: s.score):
+        names = [t.effect for t in s.terms if t not in knocks]
+        own = [t.effect for t in best.terms if t not in knocks]
         # between two readings the temperature is unknown: a delay and its rate look alike
         differ = [t for t in (*s.terms, *best.terms) if (t in s.terms) != (t in best.terms)]
         band = criteria.DRIVES_BAND if any(t.kind.delay for t in differ) else criteria.BAND
@@ -367,8 +374,9 @@ def _examine_beside_mount(
         if close and sorted(names) != sorted(own) and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(
-        found.fitter, base, best, found.ranking, tuple(rivals), examine_all(found.fitter, base.fit),
-        adequacy, True, tuple(blocks), surrogates=tests, mount=found.mount, knocks=found.knocks,
+        fitter, base, best, tuple(ranking), tuple(rivals), examine_all(fitter, base.fit),
+        examine_all(fitter, best.fit), True, tuple(blocks), surrogates=tests, mount=beside.mount,
+        knocks=knocks, as_slips=as_slips,
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.discovery.search import Solution
-    from thermocald.physics.effect import Effect, Parameter
+    from thermocald.physics.effect import Parameter
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -216,9 +216,8 @@ def rank_experiments(
     times = interval * np.arange(epochs, dtype=np.float64)
     runs = {name: _limit_programme(name, limits, body, times, highest) for name in _KINDS}
     usual = runs["two equal cycles"]
-    sizes = {
-        n: _measure_size(n, _history(times, usual[1], body)) / strength_px for n in (first, second)
-    }  # fmt: skip
+    history = _history(times, usual[1], body)
+    sizes = {n: _measure_left(n, None, history) / strength_px for n in (first, second)}
     out = []
     for name, (steps, temperature, duty) in runs.items():
         history = _history(times, temperature, body)
@@ -311,15 +310,12 @@ def _trajectories(name: str, history: History) -> list[Array]:
             trials = [{**t, key: "other"} for t in trials]
         elif parameter.role != "phase":
             trials = [{**t, key: float(v)} for t in trials for v in _values(parameter, history)]
-    return [_trajectory(effect, history, t) for t in trials]
-
-
-def _trajectory(effect: Effect, history: History, values: dict[str, Any]) -> Array:
     if effect.is_drive:
-        return (effect.drive(history, **values) - history.temperature())[:, None]
+        T = history.temperature()
+        return [(effect.drive(history, **t) - T)[:, None] for t in trials]
     if effect.kind == "signal":
-        return effect.signal(history, **values)
-    return (history.temperature() - history.T0)[:, None]
+        return [effect.signal(history, **t) for t in trials]
+    return [(history.temperature() - history.T0)[:, None] for _ in trials]
 
 
 def _values(parameter: Parameter, history: History) -> Array:
@@ -341,29 +337,18 @@ def _values(parameter: Parameter, history: History) -> Array:
     return np.linspace(parameter.low, parameter.high, 20)
 
 
-def _remove_columns(columns: Array, y: Array) -> Array:
-    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
-    out: Array = y - columns @ np.linalg.lstsq(columns, y, rcond=1e-9)[0]
-    return out
-
-
-def _base(history: History) -> Array:
-    return np.column_stack([np.ones(len(history.times)), history.temperature()])
-
-
-def _choose_typical(name: str, history: History) -> Array:
-    """Return one trajectory (E,) in the middle of an effect's trial constants."""
+def _measure_left(name: str, other: str | None, history: History) -> float:
+    """Return the RMS that the base model leaves of an effect in the middle of its trial constants;
+    with another effect beside it, that one's constants are the best.
+    """
     every = _trajectories(name, history)
-    return every[len(every) // 3][:, 0]
-
-
-def _measure_size(name: str, history: History) -> float:
-    """Return the RMS that the base model leaves of an effect."""
-    return float(np.std(_remove_columns(_base(history), _choose_typical(name, history))))
-
-
-def _measure_left(name: str, other: str, history: History) -> float:
-    """Return the RMS that the base model and another effect leave of one, at its best constants."""
-    y, base = _choose_typical(name, history), _base(history)
-    left = [_remove_columns(np.hstack([base, t]), y) for t in _trajectories(other, history)]
-    return min(float(np.std(r)) for r in left)
+    y = every[len(every) // 3][:, 0]
+    base = np.column_stack([np.ones(len(history.times)), history.temperature()])
+    beside = [np.zeros((len(y), 0))] if other is None else _trajectories(other, history)
+    left = []
+    for trajectory in beside:
+        columns = np.hstack([base, trajectory])
+        columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+        rest = y - columns @ np.linalg.lstsq(columns, y, rcond=1e-9)[0]
+        left.append(float(np.std(rest)))
+    return min(left)

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.likelihood import Weighting
-    from thermocald.thermal.series import ReducedSeries
 
 _ROWS = 90  # of one series
 
@@ -69,14 +68,7 @@ class Condensed:
 
     def gains(self, trajectories: Array) -> Array:
         """Return χ² (G,) that trajectories (rows, G) explain, each in all parameters together."""
-        Z = self.regressors(trajectories)
-        out: Array = np.sum((Z @ self.data) ** 2, axis=1)
-        return out
-
-    def gains_of(self, regressors: Array, data: Array) -> Array:
-        """Return the same (G, S) for other data (r, S), from `regressors` (G, k, r)."""
-        G, k, r = regressors.shape
-        out: Array = ((regressors.reshape(G * k, r) @ data) ** 2).reshape(G, k, -1).sum(axis=1)
+        out: Array = np.sum((self.regressors(trajectories) @ self.data) ** 2, axis=1)
         return out
 
     def whitened(self, trajectories: Array) -> Array:
@@ -133,7 +125,18 @@ def condensed(
     weightings: covariances of another hypothesis, whose reading errors are nearer to the truth.
     """
     k, directions = len(parameters), unit_directions(parameters)
-    pools = [_pool(e) for e in fitter.series]
+    pools, histories = [], []
+    for e in fitter.series:
+        # rows of neighbouring epochs (E, m), and the history at their mean times on some knots
+        group = np.arange(len(e.times)) // int(np.ceil(len(e.times) / _ROWS))
+        pool = (group[:, None] == np.arange(group[-1] + 1)).astype(float)
+        h = e.history
+        knots = h.polygon().times
+        knots = knots[:: int(np.ceil(len(knots) / _KNOTS))]
+        readings = {name: h.polygon(name).at(knots) for name in h.readings}
+        times = (e.times @ pool) / pool.sum(axis=0)
+        pools.append(pool)
+        histories.append(History(times, knots, readings, h.reference, h.T0, h.columns))
     counts = [p.shape[1] for p in pools]
     edges = np.concatenate([[0], np.cumsum(counts)])
     rows = int(edges[-1])
@@ -149,35 +152,13 @@ def condensed(
     held = 0.1 * float(np.median(size))
     amplitude = U @ (U.T @ y / (size + held))
     return Condensed(
-        tuple(_history(e, p) for e, p in zip(fitter.series, pools, strict=True)),
+        tuple(histories),
         tuple(int(i) for i in edges),
         (U * np.sqrt(size)).reshape(k, rows, -1),
         U.T @ y / np.sqrt(size),
         amplitude.reshape(k, rows),
         sum(int((e.n > 0).sum()) for e in fitter.series),
     )
-
-
-def _pool(e: ReducedSeries) -> Array:
-    """Return which of the rows each epoch belongs to, (E, m)."""
-    E = len(e.times)
-    size = int(np.ceil(E / _ROWS))
-    group = np.arange(E) // size
-    out: Array = (group[:, None] == np.arange(group[-1] + 1)).astype(float)
-    return out
-
-
-def _history(e: ReducedSeries, pool: Array) -> History:
-    """Return the history at the rows' mean times, on some hundred knots."""
-    h = e.history
-    knots = h.polygon().times
-    knots = knots[:: int(np.ceil(len(knots) / _KNOTS))]
-    readings = {name: h.polygon(name).at(knots) for name in h.readings}
-    times = (e.times @ pool) / pool.sum(axis=0)
-    return History(times, knots, readings, h.reference, h.T0, h.columns)
-
-
-_MEMORIES = ("lag", "play", "peak", "maximum", "minimum")
 
 
 class Library:
@@ -359,10 +340,6 @@ class Found:
     gain: float
     penalty: float
 
-    @property
-    def net(self) -> float:
-        return self.gain - self.penalty
-
 
 class FormulaSearch:
     """One search over what some series recorded."""
@@ -404,27 +381,25 @@ class FormulaSearch:
             for one in found[:_FURTHER]:
                 more += self.library.further(one.node)
             before = found[0]
-            found = sorted([*found, *self._tried(more)], key=self._rank, reverse=True)
+            self.tried += len(more)
+            kept, stack = self._finite(more)
+            tried = self._exact(kept, self.evidence.gains(stack), _WIDTH // 2)
+            found = sorted([*found, *tried], key=self._rank, reverse=True)
             if self._rank(found[0]) <= self._rank(before):
                 break
         return found
 
-    def _tried(self, nodes: Sequence[Node]) -> list[Found]:
-        """Try formulas one operator further; the most promising become exact."""
-        self.tried += len(nodes)
-        kept, stack = self._finite(nodes)
-        return self._exact(kept, self.evidence.gains(stack), _WIDTH // 2)
-
     def _rank(self, found: Found) -> float:
         """Rank by what is left; a further operator has to leave a quarter less."""
-        return self._ranked(found.node, found.gain)
+        return self._rank_gain(found.node, found.gain)
 
-    def _ranked(self, node: Node, gain: float) -> float:
-        return -float(np.log(self._left(gain))) - _SIMPLER * _count_operators(node)
+    def _rank_gain(self, node: Node, gain: float) -> float:
+        return -float(np.log(self._left(gain))) - _SIMPLER * node.size
 
     def _exact(self, nodes: Sequence[Node], gains: Array, width: int) -> list[Found]:
         """Fit the constants of the best structures."""
-        order = np.argsort([-self._ranked(n, float(g)) for n, g in zip(nodes, gains, strict=True)])
+        ranks = [-self._rank_gain(n, float(g)) for n, g in zip(nodes, gains, strict=True)]
+        order = np.argsort(ranks)
         seen: dict[Node, Node] = {}
         for i in order:
             structure = nodes[i].named()[0]
@@ -432,10 +407,10 @@ class FormulaSearch:
                 seen[structure] = nodes[i]
             if len(seen) == width:
                 break
-        out = [self._refined(node) for node in seen.values()]
+        out = [self._refine(node) for node in seen.values()]
         return sorted(out, key=self._rank, reverse=True)
 
-    def _refined(self, node: Node) -> Found:
+    def _refine(self, node: Node) -> Found:
         """Find the constants that explain most: Gauss-Newton, the coefficients eliminated."""
         structure, values = node.named()
         constants = list(structure.free())
@@ -525,10 +500,7 @@ class FormulaSearch:
         """
         data = self.evidence.surrogates(count, rng)
         power = np.maximum(np.sum(data**2, axis=0), 1e-300)
-        gains = self.evidence.gains_of(self.regressors, np.column_stack([data, self.evidence.data]))
-        top = gains.max(axis=0)
+        G, k, r = self.regressors.shape
+        every = self.regressors.reshape(G * k, r) @ np.column_stack([data, self.evidence.data])
+        top = (every**2).reshape(G, k, -1).sum(axis=1).max(axis=0)
         return float(top[-1] / self.evidence.power), top[:-1] / power
-
-
-def _count_operators(node: Node) -> int:
-    return sum(not n.is_leaf for n in node.walk())

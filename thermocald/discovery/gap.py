@@ -7,19 +7,19 @@ on a plane at 10 m.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from thermocald.photogrammetry.linalg import scaled_solve
+from thermocald.photogrammetry.linalg import mad_sd, scaled_solve
 from thermocald.thermal.scan import examine
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.arrays import Array
     from thermocald.discovery.evidence import Displaced
+    from thermocald.discovery.examination import Examination
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.series import ReducedSeries
@@ -30,31 +30,30 @@ _DISTANCE_MM = 10_000.0
 
 @dataclass(frozen=True)
 class Gap:
-    """One G of CONVENTIONS §4."""
+    """One G of CONVENTIONS §4.
+
+    floor: of chi2_reduced, what the measurement leaves about its own cameras.
+    """
+
+    JSON: ClassVar = {"floor": ""}
 
     rms_px: float
     chi2_reduced: float
     object_mm_at_10m: float
-    # of chi2_reduced: what the measurement leaves about its own cameras
-    floor: float = field(default=1.0, metadata={"json": ""})
+    floor: float = 1.0
 
 
 def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
-    """Fit a hypothesis to the first series alone and carry its constants to the others."""
-    fit = fitter.refine(fitter.fit(terms, only=[0]), only=[0])
-    return carry_over(fit)
+    """Fit a hypothesis to the first series alone and carry its constants to the others.
 
-
-def carry_over(fit: Fit) -> Fit:
-    """Keep constants as the first series gave them; estimate again what a series has of its own.
-
-    Of an oscillation that is the phase, of a slip its time and height.
+    What a series has of its own is estimated again: of an oscillation the phase, of a slip time and
+    height.
     """
+    fit = fitter.refine(fitter.fit(terms, only=[0]), only=[0])
     x = fit.coefficients.copy()
     for block in fit.blocks:
-        if block.series in (None, 0):
+        if not block.series:
             continue
-        assert block.series is not None
         _, _, index = fit.designs[block.series]
         reduced = fit.reduced[block.series]
         inside = (index >= block.start) & (index < block.stop)
@@ -82,23 +81,37 @@ def image_chi2(evidence: ReducedSeries, fit: Fit, series: int) -> float:
     return float(evidence.squares(evidence.values - fit.parameters(series)).sum())
 
 
-def measure_gap(
-    fitter: HypothesisFitter,
-    fit: Fit,
-    series: int,
-    displaced: Sequence[Displaced] = (),
-    displacement_known: bool = True,
-    noise: Array | None = None,
-    noise_known: bool = True,
-    explained: float = 0.0,
-) -> Gap:
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One step: what was added, and the gap then on each recording, M1 first."""
+
+    added: str
+    gaps: tuple[Gap, ...]
+
+    @property
+    def fit(self) -> Gap:
+        """The gap on M1."""
+        return self.gaps[0]
+
+    @property
+    def verify(self) -> Gap | None:
+        """The gap on M2; None where there is none."""
+        return self.gaps[1] if len(self.gaps) > 1 else None
+
+
+def measure_stage(x: Examination, added: str, fit: Fit, known: int) -> Stage:
+    """Measure the gaps at a fit when the first `known` effects of image space are in the model."""
+    every = range(len(x.fitter.series))
+    return Stage(added, tuple(measure_gap(x, fit, s, known) for s in every))
+
+
+def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: float = 0.0) -> Gap:
     """Measure the gap of one series at a fit.
 
-    displaced: targets taken out, and whether the model knows of their steps; noise: the epochs'
-    noise factor the evidence is weighted by, and whether the model knows it; explained: χ² that
-    a bridge takes up alongside the model.
+    known: how many effects of image space the model knows; explained: χ² that a bridge takes up
+    alongside the model.
     """
-    e = fitter.series[series]
+    e, in_model = x.fitter.series[series], x.image_places[:known]
     residuals = np.nan_to_num(e.residuals)
     within = float(np.sum(e.weights[..., :2] * residuals**2))
     coordinates = 2.0 * float(e.n.sum())
@@ -111,18 +124,17 @@ def measure_gap(
     k = e.correlation
     total = within + k * max(fit.chi2_of(series) - explained, 0.0)
     image = within + k * max(image_chi2(e, fit, series) - explained, 0.0)
-    moved, count = _measure_moved(e, displaced, displacement_known)
+    moved, count = _measure_moved(e, x.displaced[series], "targets" in in_model)
     total, image, free = total + moved, image + moved, free + count
     chi2 = total / free
-    if noise is not None:
-        power = float(np.mean(noise**2))
-        if not noise_known:
-            chi2 *= power / float(np.min(noise) ** 2)
+    if x.noise_growth and "noise" not in in_model:
+        noise = x.noise_growth.noise[series]
+        chi2 *= float(np.mean(noise**2)) / float(np.min(noise) ** 2)
     rms = e.sigma_px * float(np.sqrt(image / free))
     floor = 1.0
     if e.movement is not None:
         # the camera's own noise, on this recording: what no smooth trajectory takes up
-        floor = chi2 - k * examine(fitter, fit, series).excess / free
+        floor = chi2 - k * examine(x.fitter, fit, series).excess / free
     mm = rms * e.source.sensor.pixel_pitch / float(e.at.iop[0]) * _DISTANCE_MM
     return Gap(rms, chi2, mm, floor)
 
@@ -145,7 +157,7 @@ def _measure_moved(
             v = np.where(after[:, None, None], v - group.steps, v)
         middle = np.nanmedian(v, axis=0)
         v = v - middle
-        spread = 1.4826 * np.nanmedian(np.abs(v), axis=0)
+        spread = mad_sd(v, axis=0)
         inside = np.abs(v) < np.maximum(8.0 * spread, 1e-9)
         inside &= (evidence.n > 0)[:, None, None]
         total += weight * float(np.sum(np.where(inside, v, 0.0) ** 2))

@@ -42,11 +42,15 @@ _SETTLED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """A solution and the movement of the mount with it, in a fitter that has it."""
+    """A solution and the movement of the mount with it, in a fitter that has it.
+
+    as_slips: whether a slip inside the camera explains each knock of the mount as well, in order.
+    """
 
     solution: Solution
     fitter: HypothesisFitter
     mount: Mount
+    as_slips: tuple[bool, ...] = ()
 
     @property
     def score(self) -> float:
@@ -57,30 +61,16 @@ class Beside:
         return self.solution.terms
 
 
-@dataclass(frozen=True, eq=False)
-class Mounted:
-    """What the search found: base (knocks in it) and best in one fitter; knocks of the mount.
-
-    ranking: single effects by score; seen: every solution that was looked at, with its movement;
-    like: the search, for its trajectories.
-    """
-
-    fitter: HypothesisFitter
-    mount: Mount
-    base: Solution
-    best: Solution
-    knocks: tuple[Term, ...]
-    ranking: tuple[Solution, ...]
-    seen: tuple[Solution, ...]
-    like: Search
-
-
 def search_beside_mount(
     fitter: HypothesisFitter,
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]] = (),
-) -> Mounted:
-    """Add effects and knocks, one by one, while the penalised likelihood improves."""
+) -> tuple[Beside, list[Solution], list[Solution], Search]:
+    """Add effects and knocks, one by one, while the penalised likelihood improves.
+
+    Returns the best, single effects by score, every solution that was looked at, each with its
+    movement, and a search whose trajectories serve in the fitter of the best.
+    """
     first = Search(fitter)
     start = first.base(given)
     W = find_combinations(fitter.series)
@@ -98,8 +88,7 @@ def search_beside_mount(
         least = _PROMISE * _least_further(plain, best) if further else 0.0
         for solution in _add_delays(search, search.expand(best.solution, 6, least)[:_WIDTH]):
             trial = _profile(best, solution)
-            knock = _try_knock(best, trial)
-            grown.append(knock or trial)
+            grown.append(_try_knock(best, trial) or trial)
         if not grown:
             break
         if level == 0:
@@ -107,11 +96,11 @@ def search_beside_mount(
             # a movement estimated to its end takes up drifts too: a scan would find nothing in it
             plain = best = _settle(plain, ranking[0].score)
         seen += [g.solution for g in grown]
-        allowed = [g for g in grown if _allowed(g, best, plain, len(start.terms))]
+        allowed = [g for g in grown if _is_allowed(g, best, plain, len(start.terms))]
         if not allowed:
             break
         best = min(allowed, key=lambda g: g.score)
-    return _conclude(best, len(start.terms), ranking, seen, first, False)
+    return best, ranking, seen, first
 
 
 def _add_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
@@ -156,11 +145,7 @@ def _profile(best: Beside, solution: Solution) -> Beside:
     mount = replace(best.mount, covariance=guess + _REST * best.mount.covariance)
     found = _fit_beside(best.fitter, solution, mount, 5)
     fit = found.fitter.refine(found.solution.fit, max_iterations=3)
-    return replace(found, solution=Solution(fit, solution.penalties))
-
-
-def _is_knock(term: Term) -> bool:
-    return term.kind.is_event and term.parameters == EOP_NAMES
+    return replace(found, solution=Solution(fit, solution.penalties), as_slips=best.as_slips)
 
 
 def _try_knock(best: Beside, trial: Beside) -> Beside | None:
@@ -173,12 +158,14 @@ def _try_knock(best: Beside, trial: Beside) -> Beside | None:
     penalties = (*trial.solution.penalties[:-1], trial.solution.penalties[-1] * more)
     fit = best.fitter.fit(terms)
     knock = _profile(best, Solution(fit, penalties))
-    if knock.solution.fit.objective < trial.solution.fit.objective + criteria.SLIP_NOT_KNOCK:
-        return knock
+    worse = knock.solution.fit.objective - trial.solution.fit.objective
+    if worse < criteria.SLIP_NOT_KNOCK:
+        alike = worse > -criteria.SLIP_NOT_KNOCK
+        return replace(knock, as_slips=(*best.as_slips, alike))
     return None
 
 
-def _allowed(grown: Beside, best: Beside, plain: Beside, given: int) -> bool:
+def _is_allowed(grown: Beside, best: Beside, plain: Beside, given: int) -> bool:
     """Decide whether a solution improves enough on the one before."""
     gain = best.score - grown.score
     own = [t for t in grown.terms[given:] if not t.kind.is_event]
@@ -195,35 +182,26 @@ def _least_further(plain: Beside, best: Beside) -> float:
     return max(criteria.MOUNT_FURTHER, criteria.MOUNT_SHARE * (plain.score - best.score))
 
 
-def treat_slips_as_knocks(found: Mounted, given: int) -> Mounted:
-    """Take steps inside the camera for nuisances as knocks are."""
-    best = Beside(found.best, found.fitter, found.mount)
-    return _conclude(best, given, found.ranking, found.seen, found.like, True)
+def split_knocks(
+    fitter: HypothesisFitter, solution: Solution, given: int, slips: bool = False
+) -> tuple[Solution, Solution, tuple[Term, ...]]:
+    """Fit the base model with the knocks, and all of it, in one fitter; also return the knocks.
 
-
-def _conclude(
-    best: Beside,
-    given: int,
-    ranking: Sequence[Solution],
-    seen: Sequence[Solution],
-    like: Search,
-    all_steps: bool,
-) -> Mounted:
-    """Put base and best in the fitter of the best, knocks with the base; all_steps: slips too."""
-    terms, penalties = best.terms, best.solution.penalties
-    first = list(zip(terms[:given], penalties[:given], strict=True))
-    rest = list(zip(terms[given:], penalties[given:], strict=True))
-    knocks = [x for x in rest if _is_knock(x[0]) or (all_steps and x[0].kind.is_event)]
+    given: how many terms the model has already; slips: take steps inside the camera for nuisances
+    as knocks are.
+    """
+    every = list(zip(solution.terms, solution.penalties, strict=True))
+    first, rest = every[:given], every[given:]
+    knocks = [x for x in rest if x[0].kind.is_event and (slips or x[0].parameters == EOP_NAMES)]
     effects = [x for x in rest if x not in knocks]
 
-    def solution(parts: list[tuple[Term, float]]) -> Solution:
-        fit: Fit = best.fitter.refine(best.fitter.fit([t for t, _ in parts]), max_iterations=3)
+    def fitted(parts: list[tuple[Term, float]]) -> Solution:
+        fit: Fit = fitter.refine(fitter.fit([t for t, _ in parts]), max_iterations=3)
         return Solution(fit, tuple(p for _, p in parts))
 
-    base = solution(first + knocks)
-    whole = solution(first + knocks + effects) if effects else base
-    own = tuple(t for t, _ in knocks)
-    return Mounted(best.fitter, best.mount, base, whole, own, tuple(ranking), tuple(seen), like)
+    base = fitted(first + knocks)
+    whole = fitted(first + knocks + effects) if effects else base
+    return base, whole, tuple(t for t, _ in knocks)
 
 
 def is_convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> bool:

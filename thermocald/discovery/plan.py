@@ -21,16 +21,15 @@ from thermocald.errors import UsageError
 from thermocald.physics import catalogue
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal.fit import HypothesisFitter
-from thermocald.thermal.hypothesis import Term
+from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.reduce import reduce_series
-from thermocald.thermal.series import COLUMNS, ReducedSeries, SeriesInput
+from thermocald.thermal.series import ReducedSeries, SeriesInput, unit_directions
 from thermocald.thermal.source import series_input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from thermocald.arrays import Array
-    from thermocald.physics.history import History
     from thermocald.physics.simulation import Simulation
     from thermocald.thermal.hypothesis import Candidate
 
@@ -127,9 +126,17 @@ def set_ups(
         raise UsageError(
             "--plan needs a recording of the set-up, or --preset, or --model and --programme"
         )
+    from thermocald.physics.presets import given_simulation
+    from thermocald.physics.testfields import load_field
+
+    model = None if preset is not None else model
+    field = load_field(testfield) if testfield is not None else None
     out = []
     for seed in range(seeds):
-        simulation = _set_up_simulation(model, preset, testfield, programme, seed)
+        simulation = given_simulation(preset, model, None, field, programme, seed, "plan")
+        if preset is not None:  # its camera counts, not how it drifts
+            bare = simulation.model.without(*(e.name for e in simulation.model.effects))
+            simulation = replace(simulation, model=bare)
         out.append(SetUp(_record(simulation), simulation))
     return out
 
@@ -141,30 +148,6 @@ def _record(simulation: Simulation) -> SeriesInput:
         path = Path(folder) / "plan"
         simulation.write(path)
         return series_input(read_recording(path))
-
-
-def _set_up_simulation(
-    model: Path | None, preset: str | None, testfield: str | None, programme: Path | None, seed: int
-) -> Simulation:
-    from thermocald.physics.device import CameraDevice, default_heat, read_programme
-    from thermocald.physics.model_file import read_model
-    from thermocald.physics.presets import preset_simulation
-    from thermocald.physics.simulation import Simulation
-    from thermocald.physics.testfields import load_field
-
-    field = load_field(testfield) if testfield is not None else None
-    if preset is not None:
-        simulation = preset_simulation(preset, seed, "plan", field)
-        bare = simulation.model.without(*(e.name for e in simulation.model.effects))
-        simulation = replace(simulation, model=bare)
-        return replace(simulation, programme=read_programme(programme)) if programme else simulation
-    assert model is not None
-    assert programme is not None
-    thermal = read_model(model)
-    network, thermometers = default_heat()
-    device = CameraDevice(thermal.camera, thermal.sensor, network, thermometers)
-    chosen = field if field is not None else load_field("circles")
-    return Simulation(thermal, device, chosen, read_programme(programme), seed)
 
 
 def plan_power(inputs: Sequence[SetUp], strength_px: float, advance: Callable[[], None]) -> Plan:
@@ -204,31 +187,19 @@ def _put_effect(
     fitter: HypothesisFitter, candidate: Candidate, strength_px: float, rng: np.random.Generator
 ) -> ReducedSeries:
     """Put one effect into the normal equations, scaled to what the base leaves over."""
-    e = fitter.series[0]
-    seen = HypothesisFitter([replace(e, history=_restore_readings(e))])
+    e, h = fitter.series[0], fitter.series[0].history
+    # the readings themselves, which the evidence has smoothed: a camera feels every kink
+    readings = {n: h.readings[n] + c.deviation for n, c in e.thermometers.items()}
+    seen = HypothesisFitter([replace(e, history=replace(h, readings=readings))])
     value = _choose_place(candidate, e, rng)
     term = candidate.term(value, 1)
     if candidate.kind.is_event:
         term = Term(term.effect, term.parameters, (), (((candidate.name, value or 0.0),),))
     trajectory = seen.trajectories(term, 0, operators=False)[0][:, 0]
-    direction = np.zeros(len(COLUMNS))
-    direction[[COLUMNS.index(p) for p in term.parameters]] = rng.normal(size=len(term.parameters))
+    direction = unit_directions(term.parameters) @ rng.normal(size=len(term.parameters))
     moved = trajectory[:, None] * direction[None]
-    return _move(e, moved * (strength_px / max(_measure_left(fitter, moved), 1e-12)))
-
-
-def _move(e: ReducedSeries, moved: Array) -> ReducedSeries:
-    """Move the parameters of the series (E, P), px-scaled."""
-    return e.with_values(e.values + moved)
-
-
-def _restore_readings(evidence: ReducedSeries) -> History:
-    """Return the readings themselves, where the evidence has them smoothed: a camera feels every
-    kink.
-    """
-    h = evidence.history
-    readings = {n: h.readings[n] + c.deviation for n, c in evidence.thermometers.items()}
-    return replace(h, readings=readings)
+    size = strength_px / max(_measure_left(fitter, moved), 1e-12)
+    return e.with_values(e.values + moved * size)
 
 
 def _put_drive(
@@ -249,8 +220,8 @@ def _put_drive(
         off = abs(float(np.log(max(_measure_left(fitter, moved), 1e-9) / strength_px)))
         trials.append((off, term, moved))
     _, term, moved = min(trials, key=lambda t: t[0])
-    source = set_up.following(term)
-    return _move(fitter.series[0], moved) if source is None else reduce_series(source)
+    source, e = set_up.following(term), fitter.series[0]
+    return e.with_values(e.values + moved) if source is None else reduce_series(source)
 
 
 def _choose_place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> float | None:
@@ -271,11 +242,9 @@ def _measure_left(fitter: HypothesisFitter, moved: Array) -> float:
     T = T - T.mean()
     r = moved - moved.mean(axis=0)
     N = e.N.mean(axis=0)
-    columns = [COLUMNS.index(p) for p in ("c", "x0", "y0")]
+    columns = unit_directions(BASE)
     slope = (T @ r) / (T @ T)
-    take = np.linalg.solve(N[np.ix_(columns, columns)], N[columns] @ slope)
-    full = np.zeros(len(COLUMNS))
-    full[columns] = take
-    r = r - np.outer(T, full)
+    rates = np.linalg.solve(columns.T @ N @ columns, columns.T @ N @ slope)
+    r = r - np.outer(T, columns @ rates)
     image = np.einsum("tij,ej->eti", e.columns[e.weights[..., 0].any(axis=0)], r)
     return float(np.sqrt(np.mean(image**2)))

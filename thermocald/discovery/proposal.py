@@ -23,13 +23,11 @@ from thermocald.physics.formula import parse
 from thermocald.thermal import criteria as noise_criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Term
-from thermocald.thermal.scan import examine_all, normals_beside, relinearise
-from thermocald.thermal.series import unit_directions
+from thermocald.thermal.scan import examine_all, normals_of_term, relinearise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from thermocald.arrays import Array
     from thermocald.discovery.examination import Examination
     from thermocald.discovery.formulas import Found
     from thermocald.thermal.hypothesis import Fit
@@ -109,10 +107,10 @@ def propose(
         else by_m1 > criteria.CLOSED and by_m2 > criteria.CLOSED_BACK
     ):
         return None
-    size = _count_operators(best.terms[-1])
+    size = parse(best.terms[-1].effect).size
     rivals = sorted(
         ((s.terms[-1], float(s.score - best.score)) for s in tried.values()
-         if s.terms[-1].effect != best.terms[-1].effect and _count_operators(s.terms[-1]) <= size),
+         if s.terms[-1].effect != best.terms[-1].effect and parse(s.terms[-1].effect).size <= size),
         key=lambda r: r[1],
     )  # fmt: skip
     return Proposal(fitter, base, best, closed, test, tuple(rivals))
@@ -142,7 +140,7 @@ def _try(
     for found in formulas[:_FITTED]:
         structure, values = found.node.named()
         term = Term(structure.text(), tuple(parameters), tuple(values.items()))
-        penalty = found.penalty + criteria.MARGIN * _count_operators(term)
+        penalty = found.penalty + criteria.MARGIN * structure.size
         fit = _fit(fitter, (*base.terms, term))
         if fit is not None:
             here[term.effect] = Solution(fit, (*base.penalties, penalty))
@@ -152,10 +150,6 @@ def _try(
     for text, solution in here.items():
         if text not in tried or solution.score < tried[text].score:
             tried[text] = solution
-
-
-def _count_operators(term: Term) -> int:
-    return sum(not n.is_leaf for n in parse(term.effect).walk())
 
 
 def _fit(
@@ -203,7 +197,7 @@ def _simplify(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solut
 def _choose_parameters(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solution:
     """Choose the parameters in which the formula is needed, one after the other."""
     term = best.terms[-1]
-    A, c = _sum_all_parameters(fitter, base, best, term)
+    A, c = normals_of_term(fitter, base.fit, term, PARAMETER_NAMES, best.fit.weightings)
     n = float(np.log(sum(int((e.n > 0).sum()) for e in fitter.series)))
     chosen = [PARAMETER_NAMES.index(p) for p in term.parameters]
 
@@ -232,21 +226,6 @@ def _choose_parameters(fitter: HypothesisFitter, base: Solution, best: Solution)
         return best
     change = n * (len(names) - len(term.parameters))
     return Solution(fit, (*best.penalties[:-1], best.penalties[-1] + change))
-
-
-def _sum_all_parameters(
-    fitter: HypothesisFitter, base: Solution, best: Solution, term: Term
-) -> tuple[Array, Array]:
-    """Return normal equations A (16, 16), c (16,) of a trajectory in each parameter of the camera,
-    beside the base model.
-    """
-    count = len(PARAMETER_NAMES)
-    every = [fitter.trajectories(term, s, operators=False)[0] for s in range(len(fitter.series))]
-    further = [
-        (np.tile(t - t.mean(), count), unit_directions(PARAMETER_NAMES), np.arange(count))
-        for t in every
-    ]
-    return normals_beside(base.fit, further, count, best.fit.weightings)
 
 
 def _cross_check(

@@ -3,6 +3,11 @@
 What the test field did while the camera was watched: boards that moved, targets that wander.
 
 What the mount did while the camera was watched: its movement, and when it was knocked.
+
+What was found is also the next version of a thermal model that `simulate` runs. Its level, camera
+and orientation at T₀ with all effects at zero: the readings' errors move it as they move the
+drifts, and so do the drifts' own. Level and drifts are one system of normal equations, from which
+the thermometers' errors are eliminated; what the field's coordinates do to the level is added.
 """
 
 from __future__ import annotations
@@ -17,41 +22,44 @@ from thermocald.discovery.entries import (
     EffectFound,
     acts_on,
     compare_shift_and_tilt,
+    effects_of,
     estimate_term,
     lagging_thermometer,
     list_image_effects,
-    list_image_places,
 )
 from thermocald.discovery.examination import Examination, examine_series
-from thermocald.discovery.gap import Gap, fit_first, measure_gap
+from thermocald.discovery.gap import Gap, Stage, fit_first, measure_gap, measure_stage
+from thermocald.discovery.proposal import propose
 from thermocald.discovery.search import enrich_term
-from thermocald.discovery.unnamed import NO_PROPOSAL, describe_unnamed, propose_entry, resolve
+from thermocald.discovery.unnamed import (
+    NO_PROPOSAL,
+    describe_misfit,
+    describe_proposal,
+    describe_unnamed,
+)
 from thermocald.discovery.validation import cross_validation
+from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    IOP_NAMES,
+    PARAMETER_NAMES,
+    ExteriorOrientation,
+    InteriorOrientation,
+)
+from thermocald.photogrammetry.linalg import inverse_of_determined, scaled_inverse
 from thermocald.physics import catalogue
+from thermocald.physics.model import ThermalModel
 from thermocald.result import jsonable
+from thermocald.thermal.hypothesis import BASE
+from thermocald.thermal.scan import examine_all
+from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from thermocald.discovery.search import Solution
+    from thermocald.arrays import Array
+    from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.series import ReducedSeries
-
-
-def field_of(x: Examination) -> dict[str, Any] | None:
-    """Describe the movements for the document; None where the field stood still."""
-    movements = [
-        {"recording": e.source.name, **m.as_dict()}
-        for e, found in zip(x.original, x.field_movements, strict=True)
-        for m in found
-    ]
-    if not movements:
-        return None
-    return {
-        "movements": movements,
-        "note": "boards are put back where they were, wandering targets are left out; neither is "
-        "the camera's",
-    }
 
 
 def field_lines(x: Examination) -> list[str]:
@@ -63,29 +71,44 @@ def field_lines(x: Examination) -> list[str]:
     ]
 
 
-def mount_of(x: Examination) -> dict[str, Any] | None:
-    """Describe movement and knocks for the document; None where the mount stands still.
-
-    movement_px: RMS over image points and time; knocks: recording, time s from its start, size_px.
-    """
+def mount_lines(x: Examination) -> list[str]:
+    """Describe the movement of the mount for people."""
     if x.mount is None:
-        return None
-    knocks = [k for number, term in enumerate(x.base.terms) if term in x.knocks
-              for k in _list_steps(x, number, term)]  # fmt: skip
-    return {
-        "movement_px": [x.mount.size_px(e) for e in x.fitter.series],
-        "knocks": knocks,
-        "note": "movement of the mount is estimated with the effects and is none of the camera's",
-    }
+        return []
+    sizes = " and ".join(f"{x.mount.size_px(e):.3f}" for e in x.fitter.series)
+    return [
+        f"the camera moves on its mount by {sizes} px RMS; this is not counted as an effect",
+        *(
+            f"    a knock of {k['size_px']:.3f} px at {k['time_s']:.0f} s (epoch {k['epoch']}) in "
+            f"{k['recording']}" + ("; or a slip inside the camera" if k["not_excluded"] else "")
+            for k in _list_knocks(x)
+        ),
+    ]
 
 
-def _list_steps(x: Examination, number: int, term: Term) -> list[dict[str, Any]]:
-    """Describe the steps of one event, one for each series in which it came."""
+def say_adequate(x: Examination) -> str:
+    """Say what reproduces the recording where no effect was found, and what would not show."""
+    if any(x.as_slips):
+        return (
+            "the model reproduces the recording but for steps that are a knock of the mount or a "
+            "slip inside the camera: a second camera on the same mount tells them apart"
+        )
+    if x.mount is not None:
+        return (
+            "the model and a mount that moves reproduce the recording; an effect that moves the "
+            "image as the mount does would not show"
+        )
+    return "the model reproduces the recording; nothing is missing that it could show"
+
+
+def _list_knocks(x: Examination) -> list[dict[str, Any]]:
+    """Describe the knocks of the mount, one for each series in which one came."""
     out = []
     fit = x.base.fit
     for block in fit.blocks:
-        if block.term != number or block.series is None:
+        if block.term < 0 or block.series is None or fit.terms[block.term] not in x.knocks:
             continue
+        term = fit.terms[block.term]
         e = x.fitter.series[block.series]
         values = term.values(block.series) or {}
         first, time, sd = e.locate(float(next(iter(values.values()))))
@@ -98,56 +121,10 @@ def _list_steps(x: Examination, number: int, term: Term) -> list[dict[str, Any]]
                 "sd_time_s": sd,
                 "epoch": int(e.numbers[first]),
                 "size_px": float(np.sqrt(np.mean(moved**2))),
+                "not_excluded": [term.kind.name] if x.as_slips[x.knocks.index(term)] else [],
             }
         )
     return out
-
-
-def mount_lines(x: Examination) -> list[str]:
-    """Describe the movement of the mount for people."""
-    found = mount_of(x)
-    if found is None:
-        return []
-    sizes = " and ".join(f"{v:.3f}" for v in found["movement_px"])
-    lines = [f"the camera moves on its mount by {sizes} px RMS; this is not counted as an effect"]
-    lines += [
-        f"    a knock of {k['size_px']:.3f} px at {k['time_s']:.0f} s (epoch {k['epoch']}) in "
-        f"{k['recording']}"
-        for k in found["knocks"]
-    ]
-    return lines
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """One step: what was added, the gap then on M1 (fit), on each further recording (others)."""
-
-    added: str
-    fit: Gap
-    others: tuple[Gap, ...] = ()
-
-    @property
-    def verify(self) -> Gap | None:
-        """The gap on M2, the first of the others; None where there is none."""
-        return self.others[0] if self.others else None
-
-
-def measure_stage(x: Examination, added: str, fit: Fit, known: int) -> Stage:
-    """Measure the gaps at a fit when the first `known` effects of image space are in the model."""
-    first, *others = (measure_gap_of(x, fit, s, known) for s in range(len(x.fitter.series)))
-    return Stage(added, first, tuple(others))
-
-
-def measure_gap_of(
-    x: Examination, fit: Fit, series: int, known: int, explained: float = 0.0
-) -> Gap:
-    """Measure the gap of one series; explained: χ² that a bridge takes up alongside the model."""
-    order = list_image_places(x)[:known]
-    noise = x.noise_growth.noise[series] if x.noise_growth else None
-    return measure_gap(
-        x.fitter, fit, series,
-        x.displaced[series], "targets" in order, noise, "noise" in order, explained,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,40 +155,52 @@ class Discovery:
 
         What the mount and the test field did stands under `mount` and `field`.
         """
-        mount, field = mount_of(self.examination), field_of(self.examination)
-        first, last = self.stages[0], self.stages[-1]
-        others = [
-            {"recording": e.source.name, "before": b, "after": a}
-            for e, b, a in zip(
-                self.examination.fitter.series[1:], first.others, last.others, strict=True
-            )
-        ]
-        verify = {k: others[0][k] for k in ("before", "after")} if others else None
+        x = self.examination
+        gaps = zip(self.stages[0].gaps, self.stages[-1].gaps, strict=True)
+        fit, *others = ({"before": before, "after": after} for before, after in gaps)
         effects = [jsonable(e) for e in self.effects]
         if effects:  # where the base model is wrong stands with the first of its causes
-            misfit = resolve(self.examination)
-            effects[0]["evidence"] = {**effects[0]["evidence"], "base_misfit": misfit}
-        document = {
+            effects[0]["evidence"]["base_misfit"] = describe_misfit(x)
+        document: dict[str, Any] = {
             "format": "thermocald-discovery/1",
             "verdict": self.verdict,
             "effects": effects,
-            "gap": {
-                "fit": {"before": first.fit, "after": last.fit},
-                "verify": verify,
-                **({"verify_each": others} if len(others) > 1 else {}),
-            },
+            "gap": {"fit": fit, "verify": others[0] if others else None},
             "model": None,
             "doubts": list(self.doubts),
-            **({"mount": mount} if mount is not None else {}),
-            **({"field": field} if field is not None else {}),
         }
+        if len(others) > 1:
+            names = [e.source.name for e in x.fitter.series[1:]]
+            document["gap"]["verify_each"] = [
+                {"recording": name, **gap} for name, gap in zip(names, others, strict=True)
+            ]
+        if x.mount is not None:  # RMS over image points and time
+            document["mount"] = {
+                "movement_px": [x.mount.size_px(e) for e in x.fitter.series],
+                "knocks": _list_knocks(x),
+                "note": "movement of the mount is estimated with the effects and is none of the "
+                "camera's",
+            }
+        movements = [
+            {"recording": e.source.name, **m.as_dict()}
+            for e, found in zip(x.original, x.field_movements, strict=True)
+            for m in found
+        ]
+        if movements:
+            document["field"] = {
+                "movements": movements,
+                "note": "boards are put back where they were, wandering targets are left out; "
+                "neither is the camera's",
+            }
         written: dict[str, Any] = jsonable(document)
         return written
 
     @property
     def headline(self) -> str:
-        """Verdict and names in one line: A or B where B cannot be excluded."""
+        """Verdict and names in one line: A or B where B cannot be excluded, a knock too."""
         names = [" or ".join([e.effect, *e.alternative_names]) for e in self.effects]
+        if any(self.examination.as_slips):
+            names.append("slip or a knock of the mount")
         return f"{self.verdict}: {', and '.join(names)}" if names else self.verdict
 
 
@@ -226,62 +215,55 @@ def discover_series(
     jobs: candidates that surrogates try at a time, with the same bits for any number.
     """
     x = examine_series(series, progress, given, jobs)
-    return conclude(x, progress)
-
-
-def conclude(x: Examination, progress: Callable[[str], None] | None = None) -> Discovery:
-    """Put an examination into words and numbers."""
     terms = x.best.terms if x.adequate else x.base.terms
     known = len(x.base.terms)
     fits = [fit_first(x.fitter, terms[:k]) for k in range(known, len(terms) + 1)]
     stages = [measure_stage(x, "", fits[0], 0)]
     found = list_image_effects(x, stages[0].fit)
+    n = len(found)
     for k, entry in enumerate(found):
         stages.append(measure_stage(x, entry.effect, fits[0], k + 1))
-        entry = replace(entry, gap_before=stages[-2].fit, gap_after=stages[-1].fit)
-        found[k] = entry
-    n = len(found)
+        found[k] = replace(entry, gap_before=stages[-2].fit, gap_after=stages[-1].fit)
     if not x.adequate:
         return _conclude_unexplained(x, fits[0], stages, n, progress)
     for k in range(known, len(terms)):
-        fit = fits[k + 1 - known]
-        stages.append(measure_stage(x, terms[k].effect, fit, n))
-        found.append(_make_entry(x, fits[-1], k, stages[-2].fit, stages[-1].fit, len(found) == n))
+        stages.append(measure_stage(x, terms[k].effect, fits[k + 1 - known], n))
+        found.append(_describe_effect(x, fits[-1], k, stages[-2].fit, stages[-1].fit))
     blocks = cross_validation(x.fitter, fits[-1]) if found else (float("nan"), float("nan"))
     verdict = "effects_found" if found else "adequate"
     return Discovery(verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks)
 
 
-def _make_entry(
-    x: Examination, fit: Fit, k: int, before: Gap, after: Gap, first: bool
-) -> EffectFound:
+def _describe_effect(x: Examination, fit: Fit, k: int, before: Gap, after: Gap) -> EffectFound:
+    """Describe one term beyond the base model; fit: constants of M1 alone."""
     term = fit.terms[k]
     e = x.fitter.series[0]
-    effect = catalogue.get(term.effect)
+    number = k - len(x.base.terms)
     estimates = _widen_estimates(x, fit, k, estimate_term(fit, k, e))
-    without = _measure_score_without(x, k)
-    blocks = [float(g) for g in x.cross_validation[k - len(x.base.terms)]]
+    others = x.fitter.refine(x.fitter.fit([t for i, t in enumerate(x.best.terms) if i != k]))
+    without = others.objective + sum(p for i, p in enumerate(x.best.penalties) if i != k)
+    blocks = [float(g) for g in x.cross_validation[number]]
     evidence: dict[str, Any] = {
-        "score_gain": without,
+        "score_gain": float(without - x.best.score),
         "penalty": x.best.penalties[k],
         "absolute_test": jsonable(x.adequacy),
         "cross_validation": blocks,
         "inflation_for_correlated_noise": e.correlation,
     }
     if x.surrogates:
-        test = x.surrogates[k - len(x.base.terms)]
+        test = x.surrogates[number]
         evidence["false_alarm_probability"] = test.p
         evidence["surrogates"] = {
             "count": len(test.surrogates),
             "gain": float(test.gain),
             "gains_of_surrogates": [float(g) for g in np.sort(test.surrogates)],
         }
-    statement = effect.sentence(estimates)
+    statement = term.kind.sentence(estimates)
     part = compare_shift_and_tilt(x.fitter, x.best.fit, k)
     if part is not None:
         evidence["shift_and_tilt"], said = part
         statement += said
-    alternatives = _list_alternatives(x, term, first)
+    alternatives = _list_alternatives(x, term, first=number == 0)
     if alternatives:
         statement += f". Not excluded instead: {', '.join(a['effect'] for a in alternatives)}"
     if (lags := lagging_thermometer(fit, k)) is not None:
@@ -320,14 +302,6 @@ def _widen_estimates(
     }
 
 
-def _measure_score_without(x: Examination, k: int) -> float:
-    """Return by how much the score worsens without one effect, the others fitted again."""
-    terms = tuple(t for i, t in enumerate(x.best.terms) if i != k)
-    fit = x.fitter.refine(x.fitter.fit(terms))
-    score = fit.objective + sum(p for i, p in enumerate(x.best.penalties) if i != k)
-    return float(score - x.best.score)
-
-
 def _find_epochs(x: Examination, fit: Fit, k: int) -> list[int]:
     """Return first and last epoch in which the effect moves the image by a quarter of its most."""
     e = x.fitter.series[0]
@@ -346,21 +320,17 @@ def _list_alternatives(x: Examination, term: Term, first: bool) -> list[dict[str
         instead = [n for n in theirs if n not in mine]
         if not instead or (term.effect not in replaced and not (first and not replaced)):
             continue
-        out.append(_describe_alternative(term.effect, rival, instead, rival.score - x.best.score))
+        out.append(
+            {
+                "effect": "+".join(instead),
+                "score_difference": float(rival.score - x.best.score),
+                "values": {
+                    k: v for t in rival.terms if t.effect in instead for k, v in t.nonlinear
+                },
+                "experiment": term.kind.experiment_against(catalogue.get(instead[0])),
+            }
+        )
     return out
-
-
-def _describe_alternative(
-    name: str, rival: Solution, instead: list[str], difference: float
-) -> dict[str, Any]:
-    effect = catalogue.get(name)
-    searched = {k: v for t in rival.terms if t.effect in instead for k, v in t.nonlinear}
-    return {
-        "effect": "+".join(instead),
-        "score_difference": float(difference),
-        "values": searched,
-        "experiment": effect.experiment_against(catalogue.get(instead[0])),
-    }
 
 
 def _conclude_unexplained(
@@ -373,8 +343,8 @@ def _conclude_unexplained(
     """Describe what the catalogue does not explain: a formula where the data allow one, else
     described and bridged, not named.
     """
-    description = describe_unnamed(x)
-    resembling = [
+    described = describe_unnamed(x, stages[-1].fit)
+    resembling: list[dict[str, Any]] = [
         {
             "effect": s.names[0],
             "resembles": True,
@@ -383,26 +353,25 @@ def _conclude_unexplained(
         }
         for s in x.ranking[:4]
     ]
-    nan = float("nan")
-    found = propose_entry(x, description, stages[-1].fit, progress)
-    if found is not None:
-        y = found.examination
-        fits = (found.base_fit, found.final_fit)
-        added = (stages[-1].added, "unnamed")
-        stages[-1:] = [measure_stage(y, a, f, known) for a, f in zip(added, fits, strict=True)]
-        entry = replace(
-            found.entry, alternatives=[*found.entry.alternatives, *resembling],
-            gap_before=stages[-2].fit, gap_after=stages[-1].fit,
+    fits = base, base
+    proposal = propose(x, described.where["parameters"], progress)
+    if proposal is not None:
+        fitter, best = proposal.fitter, proposal.best
+        x = replace(
+            x, fitter=fitter, base=proposal.base, best=best,
+            adequacy=examine_all(fitter, best.fit),
         )  # fmt: skip
-        return Discovery("unexplained", (entry,), tuple(stages), y, *fits, (nan, nan))
-    bridge = sum(a.excess for a in x.base_adequacy[:1])
-    before = measure_stage(x, "unnamed", base, known)
-    stages.append(replace(before, fit=measure_gap_of(x, base, 0, known, bridge)))
-    entry = EffectFound(
-        "unnamed", f"{description.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}",
-        description.where, description.estimates,
-        {
-            **description.evidence,
+        fits = fit_first(fitter, x.base.terms), fit_first(fitter, best.terms)
+        added = (stages[-1].added, "unnamed")
+        stages[-1:] = [measure_stage(x, a, f, known) for a, f in zip(added, fits, strict=True)]
+        entry = describe_proposal(described, proposal, x, fits[1])
+    else:
+        bridge = sum(a.excess for a in x.base_adequacy[:1])
+        before = measure_stage(x, "unnamed", base, known)
+        gaps = (measure_gap(x, base, 0, known, bridge), *before.gaps[1:])
+        stages.append(replace(before, gaps=gaps))
+        evidence = {
+            **described.evidence,
             "proposal": None,
             "absolute_test_of_best_combination": {
                 "effects": list(x.best.names),
@@ -410,7 +379,113 @@ def _conclude_unexplained(
                 "misfit_px": [float(a.misfit_px) for a in x.adequacy],
             },
             "image_space": [e.effect for e in list_image_effects(x, before.fit)],
-        },
-        resembling, before.fit, stages[-1].fit,
+        }
+        statement = f"{described.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}"
+        entry = replace(described, statement=statement, evidence=evidence)
+    entry = replace(
+        entry, alternatives=[*entry.alternatives, *resembling],
+        gap_before=stages[-2].fit, gap_after=stages[-1].fit,
     )  # fmt: skip
-    return Discovery("unexplained", (entry,), tuple(stages), x, base, base, (nan, nan))
+    nan = float("nan")
+    return Discovery("unexplained", (entry,), tuple(stages), x, *fits, (nan, nan))
+
+
+_P = len(PARAMETER_NAMES)
+
+
+def estimate_level(fitter: HypothesisFitter, fit: Fit) -> tuple[Array, Array]:
+    """Estimate the level (16,) of the first series about its linearisation, px-scaled, and its sds
+    (16,).
+
+    The scales of the test field are held. The sds hold the noise of image and thermometers, the
+    drifts' own errors, and the stated errors of the test field's coordinates.
+    """
+    C, V = fitter.design(fit.terms, fit.blocks, 0, centred=False)[:2]
+    index, weighting = fit.designs[0][2], fit.weightings[0]
+    searched = list(fit.searched)
+    dC, dV, mapping = fitter.derivatives(fit, searched, 0, centred=False)
+    A, _, coupling = weighting.joint(np.hstack([C, dC]), np.hstack([V, dV]))
+    drifts = coupling[:, : C.shape[1]] @ fit.coefficients[index]
+    own = weighting.level_normal[:_P, :_P]
+    level = inverse_of_determined(own) @ (weighting.level_b - drifts)[:_P]
+
+    K = len(fit.coefficients)
+    T = np.zeros((len(A) + _P, _P + K + len(searched)))
+    T[np.arange(C.shape[1]), _P + index] = 1.0
+    T[C.shape[1] : len(A), _P + K :] = mapping
+    T[len(A) :, :_P] = np.eye(_P)
+    normal = T.T @ np.block([[A, coupling[:_P].T], [coupling[:_P], own]]) @ T
+    empty = np.diag(normal) <= 0
+    normal[empty, empty] = 1e12  # a coefficient of another series
+    along = fitter.series[0].along[:_P, :_P]
+    Q = scaled_inverse(normal)[:_P, :_P] + _field_errors(fitter.series[0])
+    return along @ level, np.sqrt(np.einsum("ij,jk,ik->i", along, Q, along))
+
+
+def _field_errors(series: ReducedSeries) -> Array:
+    """Return the covariance (16, 16) that the errors of the targets' coordinates give the level."""
+    weights = series.weights[..., :2].sum(axis=0)
+    A = series.columns[..., :_P]
+    WA = A * weights[..., None]
+    lever = np.einsum("tci,tcx->itx", WA, series.at.B).reshape(_P, -1)
+    moved = inverse_of_determined(np.einsum("tci,tcj->ij", WA, A)) @ (
+        lever * series.source.field.sigmas.ravel()
+    )
+    return np.asarray(moved @ moved.T)
+
+
+def build_model(discovery: Discovery, old: ThermalModel | None = None) -> ThermalModel:
+    """Build the model with what was found; constants as M1 alone gave them.
+
+    An effect keeps what is its own in each series (a time, a phase) as M1 had it.
+    """
+    x, fit = discovery.examination, discovery.final_fit
+    e = x.fitter.series[0]
+    level, sd = estimate_level(x.fitter, fit)
+    scale = e.scale[: len(PARAMETER_NAMES)]
+    start = np.concatenate([e.at.iop, e.at.eop])
+    values, sds = start + level / scale, sd / scale
+    block = fit.blocks[0]
+    rates, rate_sds = {}, {}
+    for j, name in enumerate(BASE):
+        unit = e.scale[COLUMNS.index(name)]
+        rates[name] = float(fit.coefficients[block.start + j] / unit)
+        rate_sds[f"rates.{name}"] = float(np.sqrt(fit.covariance[j, j]) / unit)
+    T = e.history.temperature()
+    weights = e.weights[..., :2] / e.source.per_row[:, None, None]
+    return ThermalModel(
+        camera=e.source.camera,
+        sensor=e.source.sensor,
+        T0=e.T0,
+        interior=InteriorOrientation.from_array(values[:10]),
+        rates=rates,
+        effects=tuple(one for found in discovery.effects for one in effects_of(found)),
+        distortion=e.distortion,
+        exterior=ExteriorOrientation.from_array(values[10:]),
+        image_sigma=float(1.0 / np.sqrt(np.mean(weights[weights > 0]))),
+        sds={
+            **{f"interior.{n}": float(s) for n, s in zip(IOP_NAMES, sds[:10], strict=True)},
+            **{f"exterior.{n}": float(s) for n, s in zip(EOP_NAMES, sds[10:], strict=True)},
+            **rate_sds,
+        },
+        validity={e.history.reference: (float(T.min()), float(T.max()))},
+        fitted_on=[{"recording": s.source.name, "epochs": int((s.n > 0).sum())}
+                   for s in x.fitter.series[:1]],
+        evidence=_evidence(discovery),
+        name=old.name if old else e.source.camera,
+        version=old.version + 1 if old else 1,
+    )  # fmt: skip
+
+
+def _evidence(discovery: Discovery) -> dict[str, Any]:
+    document = discovery.as_dict()
+    out: dict[str, Any] = {"verdict": discovery.verdict, "gap": document["gap"]}
+    for entry in document["effects"]:
+        out[entry["effect"]] = {
+            "statement": entry["statement"],
+            "evidence": entry["evidence"],
+            "alternatives": entry["alternatives"],
+        }
+        if "bridge" in entry["evidence"]:
+            out["unnamed"]["note"] = "bridged by a smooth term in M1 alone; not transferable"
+    return out

@@ -150,9 +150,9 @@ class Search:
 
     def scan(self, candidate: Candidate, solution: Solution) -> Scanned:
         """Find the best place of one candidate added to a solution."""
-        return self.judged(candidate, self.scanner.scan(candidate, solution.fit))
+        return self.promise(candidate, self.scanner.scan(candidate, solution.fit))
 
-    def judged(self, candidate: Candidate, found: Scan) -> Scanned:
+    def promise(self, candidate: Candidate, found: Scan) -> Scanned:
         """Return what a scan of a candidate promises."""
         if candidate.kind.is_event:
             return self._event(candidate, found)
@@ -235,21 +235,18 @@ class Search:
         return self.refine((*solution.terms, promise.term), penalties)
 
     def _promises(self, solution: Solution, width: int, least: float = 0.0) -> list[Scanned]:
-        promises = []
-        for found in self._scans(solution):
-            enough = found.net > (0.0 if found.candidate.kind.is_event else least)
-            if np.isfinite(found.gain) and enough:
-                promises.append(found)
-        return _worth_fitting(promises, width)
-
-    def _scans(self, solution: Solution) -> list[Scanned]:
-        """Scan every candidate that a solution does not have."""
+        """Scan every candidate that a solution does not have; the most promising come first."""
         if solution.fit not in self._scanned:
             self._scanned[solution.fit] = [
                 self.scan(c, solution) for c in self.candidates if c.effect not in solution.names
             ]
             solution.fit.forget()
-        return self._scanned[solution.fit]
+        promises = []
+        for found in self._scanned[solution.fit]:
+            enough = found.net > (0.0 if found.candidate.kind.is_event else least)
+            if np.isfinite(found.gain) and enough:
+                promises.append(found)
+        return _worth_fitting(promises, width)
 
     def with_other_delay(self, solution: Solution) -> Solution | None:
         """Put another kind of delay of the temperature in place of a solution's own."""

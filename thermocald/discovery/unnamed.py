@@ -2,61 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.discovery.entries import (
-    EffectFound,
-    Ridge,
-    TradeOff,
-    estimate_term,
-    find_ridge,
-    find_trade_off,
-)
-from thermocald.discovery.gap import Gap, fit_first
-from thermocald.discovery.proposal import propose
+from thermocald.discovery.entries import EffectFound, estimate_term, find_ridge, find_trade_off
+from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined
 from thermocald.physics import catalogue
 from thermocald.result import jsonable
-from thermocald.thermal.scan import examine_all
 from thermocald.thermal.series import COLUMNS, unit_directions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from thermocald.arrays import Array
     from thermocald.discovery.examination import Examination
+    from thermocald.discovery.gap import Gap
     from thermocald.discovery.proposal import Proposal
-    from thermocald.thermal.hypothesis import Fit, Term
-    from thermocald.thermal.scan import Adequacy
+    from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
 # a shift of the image is attributed to the principal point before a tilt
 _IN_ORDER = (range(3), range(3, 10), range(10, 16), range(16, len(COLUMNS)))
 
 
-@dataclass(frozen=True, eq=False)
-class Description:
-    """Statement, where, estimates and evidence of an unnamed influence; trajectory (E,) px RMS, its
-    direction (P,) in px-scaled columns.
-    """
-
-    statement: str
-    where: dict[str, Any]
-    estimates: dict[str, dict[str, Any]]
-    evidence: dict[str, Any]
-    trajectory: Array
-    direction: Array
-
-
-def describe_unnamed(x: Examination) -> Description:
+def describe_unnamed(x: Examination, gap: Gap) -> EffectFound:
     """Describe in time, space and correlations what the base model leaves in M1.
 
     Its size is what it moves the image points by, in px, and its parameters are the fewest whose
-    movement of the image is nearly all of it.
+    movement of the image is nearly all of it. gap: for now, before and after; the caller knows
+    better.
     """
     a, e = x.base_adequacy[0], x.fitter.series[0]
     rest = a.trajectories.T @ a.amplitudes  # (E, P), px-scaled
@@ -69,7 +45,6 @@ def describe_unnamed(x: Examination) -> Description:
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     u, s, _ = np.linalg.svd(rest @ root, full_matrices=False)
     course_px = u[:, 0] * s[0]
-    direction = rest.T @ u[:, 0] / s[0]
     T = e.history.temperature()  # on all epochs; the rows may be blocks of them
     recorded: dict[str, Array] = {
         "temperature": e.averaged(T),
@@ -91,13 +66,16 @@ def describe_unnamed(x: Examination) -> Description:
     most = np.abs(course_px - course_px.mean())
     large = np.flatnonzero(most > 0.5 * most.max())
     parameters = _choose_movers(metric, moved)
+    amplitudes = a.amplitudes / e.scale
     strongest = max(correlation, key=lambda k: abs(correlation[k]))
+    moving = ", ".join(map(parameter_label, parameters))
     statement = (
         f"something that no effect of the catalogue explains moves the image by {size:.3f} px RMS, "
-        f"in {', '.join(parameters)}; strongest correlation {correlation[strongest]:+.2f} with "
+        f"in {moving}; strongest correlation {correlation[strongest]:+.2f} with "
         f"{strongest}. A smooth term bridges it in this series alone"
     )
-    return Description(
+    return EffectFound(
+        "unnamed",
         statement,
         {
             "parameters": parameters,
@@ -112,10 +90,22 @@ def describe_unnamed(x: Examination) -> Description:
             "correlation": correlation,
             "share_of_first_pattern": float(s[0] ** 2 / np.sum(s**2)),
             "significance_sigmas": float(a.significance),
-            "bridge": _describe_bridge(a, e),
+            # what takes the rest up in this series alone: amplitudes of cos(k π t / duration),
+            # k = 1, 2, …, t from the first frame, in each parameter's own unit
+            "bridge": {
+                "transferable": False,
+                "recording": e.source.name,
+                "duration_s": duration,
+                "cosines": {
+                    name: amplitudes[:, i].tolist()
+                    for i, name in enumerate(COLUMNS)
+                    if amplitudes[:, i].any()
+                },
+            },
         },
-        course_px,
-        direction,
+        [],
+        gap,
+        gap,
     )
 
 
@@ -144,20 +134,6 @@ def _choose_movers(metric: Array, moved: Array) -> list[str]:
     return [COLUMNS[i] for i in chosen]
 
 
-def _describe_bridge(a: Adequacy, e: ReducedSeries) -> dict[str, Any]:
-    """Return what takes the rest up in this series alone: amplitudes of cos(k π t / duration), k =
-    1, 2, … with t from the first frame, in each parameter's own unit.
-    """
-    amplitudes = a.amplitudes / e.scale
-    moving = [(i, name) for i, name in enumerate(COLUMNS) if amplitudes[:, i].any()]
-    return {
-        "transferable": False,
-        "recording": e.source.name,
-        "duration_s": float(e.times[-1] - e.times[0]),
-        "cosines": {name: [float(v) for v in amplitudes[:, i]] for i, name in moving},
-    }
-
-
 NO_PROPOSAL = {
     True: "no formula over what was recorded explains it on both recordings: its cause was not "
     "recorded, or it is none that the operators describe",
@@ -168,86 +144,30 @@ _EXPERIMENT = "record over a wider range of temperatures, and at other rates"
 _RIVALS = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Proposed:
-    """A formula as an entry of a discovery.
+def describe_proposal(
+    described: EffectFound, found: Proposal, x: Examination, fit: Fit
+) -> EffectFound:
+    """Describe a formula that takes the place of a name.
 
-    examination: with the series it was found on; fits: base and whole, constants of M1 alone.
+    described: what it explains; x: the examination with the series that the formula was found on;
+    fit: constants of M1 alone.
     """
-
-    examination: Examination
-    base_fit: Fit
-    final_fit: Fit
-    entry: EffectFound
-
-
-def propose_entry(
-    x: Examination,
-    description: Description,
-    gap: Gap,
-    progress: Callable[[str], None] | None = None,
-) -> Proposed | None:
-    """Propose a formula for what an examination leaves unexplained; None where the data allow none.
-
-    gap: for now, before and after; the caller knows better.
-    """
-    found = propose(x, description.where["parameters"], progress)
-    if found is None:
-        return None
-    base_fit = fit_first(found.fitter, found.base.terms)
-    final_fit = fit_first(found.fitter, found.best.terms)
-    adequacy = examine_all(found.fitter, found.best.fit)
-    examination = replace(
-        x, fitter=found.fitter, base=found.base, best=found.best, adequacy=adequacy
-    )
-    term = found.terms[-1]
-    e = found.fitter.series[0]
-    estimates = estimate_term(final_fit, len(found.best.terms) - 1, e)
-    together: Ridge | TradeOff | None = find_ridge(
-        found.fitter, final_fit, len(found.best.terms) - 1
-    )
+    number = len(found.best.terms) - 1
+    term = found.best.terms[number]
+    estimates = estimate_term(fit, number, found.fitter.series[0])
+    together = find_ridge(found.fitter, fit, number)
     if together is not None:  # what the inverse says of them is of the others held
+        known_together = together[0]["parameters"]
         estimates = {
-            k: {**v, "sd": None} if k in together.names or k.startswith("a_") else v
+            k: {**v, "sd": None} if k in known_together or k.startswith("a_") else v
             for k, v in estimates.items()
         }
     else:
-        together = find_trade_off(found.fitter, final_fit, len(found.best.terms) - 1)
+        together = find_trade_off(found.fitter, fit, number)
     sentence = catalogue.get(term.effect).sentence(estimates)
-    if together is not None:
-        sentence += together.sentence
-    alternatives = [
-        {
-            "effect": t.effect,
-            "score_difference": d,
-            "values": dict(t.nonlinear),
-            "experiment": _EXPERIMENT,
-            "formula": True,
-        }
-        for t, d in found.rivals[:_RIVALS]
-        if d < criteria.FORMULA_BAND
-    ]
-    entry = EffectFound(
-        "unnamed",
-        f"{sentence}; no effect of the catalogue, proposed from what was recorded",
-        {**description.where, "parameters": list(term.parameters)},
-        {**description.estimates, **estimates},
-        {
-            **{k: v for k, v in description.evidence.items() if k != "bridge"},
-            "proposal": _describe_proposal(found, term, examination),
-            **({"not_separable": jsonable(together)} if together is not None else {}),
-        },
-        alternatives,
-        gap,
-        gap,
-        term,
-    )
-    return Proposed(examination, base_fit, final_fit, entry)
-
-
-def _describe_proposal(found: Proposal, term: Term, x: Examination) -> dict[str, Any]:
+    evidence = {k: v for k, v in described.evidence.items() if k != "bridge"}
     by_m1, by_m2 = found.closed
-    return {
+    evidence["proposal"] = {
         "formula": term.effect,
         "transferable": True,
         "closed_on_verify_by_fit": by_m1,
@@ -262,54 +182,51 @@ def _describe_proposal(found: Proposal, term: Term, x: Examination) -> dict[str,
         },
         "absolute_test": jsonable(x.adequacy),
     }
+    if together is not None:
+        evidence["not_separable"], said = together
+        sentence += said
+    return replace(
+        described,
+        statement=f"{sentence}; no effect of the catalogue, proposed from what was recorded",
+        where={**described.where, "parameters": list(term.parameters)},
+        estimates={**described.estimates, **estimates},
+        evidence=evidence,
+        alternatives=[
+            {
+                "effect": t.effect,
+                "score_difference": d,
+                "values": dict(t.nonlinear),
+                "experiment": _EXPERIMENT,
+                "formula": True,
+            }
+            for t, d in found.rivals[:_RIVALS]
+            if d < criteria.FORMULA_BAND
+        ],
+        term=term,
+    )
 
 
-@dataclass(frozen=True)
-class Misfit:
-    """A misfit resolved.
+def describe_misfit(x: Examination) -> dict[str, Any]:
+    """Describe where the base model fails in M1, as an effect's evidence has it.
 
-    rows: (against what, size in px RMS, significance in sigma); targets: those that jumped;
-    regions {(row, column) of a 3 × 3 grid over the image: what a free camera leaves, in units of
-    the noise}.
+    against: size in px RMS and significance of the misfit against what was recorded, and in each
+    parameter; targets: those that jumped; image_regions: what a free camera leaves on a grid of
+    3 × 3 over the image, in units of the noise.
     """
-
-    rows: tuple[tuple[str, float, float], ...]
-    targets: tuple[str, ...]
-    regions: dict[tuple[int, int], float]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the misfit as an effect's evidence has it."""
-        return {
-            "against": [
-                {"what": what, "rms_px": size, "significance_sigmas": sigmas}
-                for what, size, sigmas in self.rows
-            ],
-            "targets": list(self.targets),
-            "image_regions": [
-                {"row": i, "column": j, "noise_ratio": ratio}
-                for (i, j), ratio in self.regions.items()
-            ],
-        }
-
-
-def resolve(x: Examination, series: int = 0) -> Misfit:
-    """Resolve the base model's misfit in one series."""
-    e = x.fitter.series[series]
-    fit = x.base.fit
-    weighting = fit.weightings[series]
-    C, V, index = fit.designs[series]
-    coefficients = fit.coefficients[index]
-    sigma = e.sigma_px
+    e, fit = x.fitter.series[0], x.base.fit
+    C, V, index = fit.designs[0]
     coordinates = 2.0 * float(e.n.sum())
+    rows: list[tuple[str, float, float]] = []
 
-    def against(trajectories: Array, directions: Array) -> tuple[float, float]:
-        A, c, B = weighting.scan(trajectories[None], directions, (C, V))
-        rest = c[0] - B[0] @ coefficients
+    def add(what: str, trajectories: Array, directions: Array) -> None:
+        A, c, B = fit.weightings[0].scan(trajectories[None], directions, (C, V))
+        rest = c[0] - B[0] @ fit.coefficients[index]
         gain, free = float(explained(A[0], rest, 1e-9)), len(rest)
-        excess = max(gain - free, 0.0)
-        return sigma * float(np.sqrt(excess / coordinates)), (gain - free) / np.sqrt(2.0 * free)
+        size = e.sigma_px * float(np.sqrt(max(gain - free, 0.0) / coordinates))
+        rows.append((what, size, (gain - free) / np.sqrt(2.0 * free)))
 
-    every = x.base_adequacy[series].directions
+    total = x.base_adequacy[0]
+    rows.append(("all slow trajectories in all parameters", total.misfit_px, total.significance))
     T = e.history.temperature()  # on all epochs; the rows may be blocks of them
     trajectories: dict[str, Array] = {
         "time": e.times - e.times.mean(),
@@ -319,18 +236,20 @@ def resolve(x: Examination, series: int = 0) -> Misfit:
     for name in e.history.readings:
         if name != e.history.reference:
             trajectories[f"channel {name}"] = e.averaged(e.history.temperature(name))
-    rows: list[tuple[str, float, float]] = []
     for name, trajectory in trajectories.items():
-        rows.append((name, *against((trajectory - trajectory.mean())[:, None], every)))
-    smooth = x.base_adequacy[series].trajectories.T
+        add(name, (trajectory - trajectory.mean())[:, None], total.directions)
     for column in COLUMNS:
-        one = unit_directions((column,))
-        rows.append((f"{column}, slow trajectories", *against(smooth, one)))
-    total = x.base_adequacy[series]
-    rows.insert(0, ("all slow trajectories in all parameters", total.misfit_px, total.significance))
+        add(f"{column}, slow trajectories", total.trajectories.T, unit_directions((column,)))
     rows.append(("noise level (sigma0)", *_test_noise(e.sigma0, e.n.astype(float), e.N.shape[1])))
-    rows = [(what, float(size), float(sigmas)) for what, size, sigmas in rows]
-    return Misfit(tuple(rows), tuple(_targets(x, series)), _measure_regions(e, sigma))
+    names = e.source.field.names
+    return {
+        "against": [
+            {"what": what, "rms_px": float(size), "significance_sigmas": float(sigmas)}
+            for what, size, sigmas in rows
+        ],
+        "targets": [names[r] for g in x.displaced[0] for r in g.rows],
+        "image_regions": _measure_regions(e),
+    }
 
 
 def _test_noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
@@ -342,22 +261,18 @@ def _test_noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
     return float(np.std(sigma0[ok])), (z - count) / np.sqrt(2 * count)
 
 
-def _targets(x: Examination, series: int) -> list[str]:
-    names = x.fitter.series[series].source.field.names
-    return [names[r] for g in x.displaced[series] for r in g.rows]
-
-
-def _measure_regions(e: ReducedSeries, sigma: float) -> dict[tuple[int, int], float]:
+def _measure_regions(e: ReducedSeries) -> list[dict[str, Any]]:
     """Return the RMS of what a free camera leaves, on a grid of 3 × 3, in units of the noise."""
     place = e.at.predicted
     row = np.clip((3 * place[:, 1] / e.source.sensor.height).astype(float), 0, 2.99)
     column = np.clip((3 * place[:, 0] / e.source.sensor.width).astype(float), 0, 2.99)
-    out = {}
+    out = []
     for i in range(3):
         for j in range(3):
             inside = (np.floor(row) == i) & (np.floor(column) == j)
             v = e.residuals[:, inside]
             v = v[np.isfinite(v)]
             if len(v):
-                out[(i, j)] = float(np.sqrt(np.mean(v**2)) / sigma)
+                ratio = float(np.sqrt(np.mean(v**2)) / e.sigma_px)
+                out.append({"row": i, "column": j, "noise_ratio": ratio})
     return out

@@ -26,13 +26,15 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.photogrammetry.linalg import best_level, orthonormal_combinations
+from thermocald.photogrammetry.linalg import orthonormal_combinations, subtract_level
 from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.movement import solve_combinations
 from thermocald.thermal.scan import gains_beside
 
 if TYPE_CHECKING:
@@ -44,14 +46,13 @@ if TYPE_CHECKING:
     from thermocald.discovery.search import Search, Solution
     from thermocald.thermal.hypothesis import Candidate, Fit
     from thermocald.thermal.scan import Scan
-    from thermocald.thermal.series import ReducedSeries
 
 BLOCKS = 6
 _PRIOR = 1e-6  # of a coefficient's whole information, where the other blocks hold none
 
 
-def predict_blocks(
-    fitter: HypothesisFitter, fit: Fit, series: Sequence[int], blocks: int = BLOCKS
+def _predict_blocks(
+    fitter: HypothesisFitter, fit: Fit, series: Sequence[int]
 ) -> tuple[Array, Array]:
     """Return χ² and -2 log likelihood (blocks,) of the blocks as predicted without them.
 
@@ -59,9 +60,13 @@ def predict_blocks(
     uncertainty is in the prediction: a step that happened in the block itself is not foreseen, and
     not held against its cause.
     """
-    chi2, objective = np.zeros(blocks), np.zeros(blocks)
-    for k in range(blocks):
-        masks = [_mark_block(e, k, blocks) for e in fitter.series]
+    chi2, objective = np.zeros(BLOCKS), np.zeros(BLOCKS)
+    for k in range(BLOCKS):
+        masks = []
+        for e in fitter.series:
+            edges = np.linspace(0, len(e.times), BLOCKS + 1).astype(int)
+            place = np.arange(len(e.times))
+            masks.append((place >= edges[k]) & (place < edges[k + 1]))
         trained = _keep_epochs(fitter, [~m for m in masks]).fit(
             fit.terms, fit.coefficients, 1, series
         )
@@ -87,11 +92,11 @@ def measure_block_gains(fitter: HypothesisFitter, fit: Fit, kept: int = 0) -> li
     The others are fitted again without it; in -2 log likelihood, all series together.
     """
     every = range(len(fitter.series))
-    whole = predict_blocks(fitter, fit, every)[1]
+    whole = _predict_blocks(fitter, fit, every)[1]
     out = []
     for i in range(kept, len(fit.terms)):
         fewer = fitter.fit([t for j, t in enumerate(fit.terms) if j != i])
-        out.append(predict_blocks(fitter, fitter.refine(fewer), every)[1] - whole)
+        out.append(_predict_blocks(fitter, fitter.refine(fewer), every)[1] - whole)
     return out
 
 
@@ -106,16 +111,9 @@ def is_confirmed(gain: Array) -> bool:
 def cross_validation(fitter: HypothesisFitter, fit: Fit) -> tuple[float, float]:
     """Return χ² per degree of freedom on blocks of M1 that the fit did not see, and on M1."""
     e = fitter.series[0]
-    outside = float(predict_blocks(fitter, fit, [0])[0].sum())
+    outside = float(_predict_blocks(fitter, fit, [0])[0].sum())
     free = e.rank * float((e.n > 0).sum())
     return outside / max(free - BLOCKS * e.rank, 1.0), fit.chi2_of(0) / max(free - e.rank, 1.0)
-
-
-def _mark_block(evidence: ReducedSeries, number: int, blocks: int) -> NDArray[np.bool_]:
-    edges = np.linspace(0, len(evidence.times), blocks + 1).astype(int)
-    inside = np.zeros(len(evidence.times), dtype=bool)
-    inside[edges[number] : edges[number + 1]] = True
-    return inside
 
 
 def _keep_epochs(fitter: HypothesisFitter, masks: Sequence[NDArray[np.bool_]]) -> HypothesisFitter:
@@ -163,13 +161,22 @@ def compare_with_surrogates(
     the same bits for any number.
     """
     rng = np.random.default_rng(_SEED)
-    scans = _prepare_scans(search, without)
+    scans: list[tuple[Candidate, Scan, float]] = []
+    for candidate in search.candidates:
+        if candidate.effect not in without.names:
+            scan = search.scanner.scan(candidate, without.fit)
+            scans.append((candidate, scan, search.promise(candidate, scan).penalty))
+    without.fit.forget()
     tops = np.zeros(0)
     for few in (min(_FIRST, count), count - min(_FIRST, count)):
         if few and not np.any(tops >= gain):
             every = range(len(best.weightings))
             data = [_draw_data(search, best, without.fit, s, rng, few) for s in every]
-            tops = np.append(tops, _find_largest_gains(scans, without, data, jobs))
+            gains = partial(_measure_gains, without.fit, data)
+            # threads: nearly all of it is linear algebra, and the stacks would have to be copied
+            with ThreadPoolExecutor(jobs) as pool:
+                found = list(pool.map(gains, scans) if jobs > 1 else map(gains, scans))
+            tops = np.append(tops, np.max(found, axis=0))
     return SurrogateTest(gain, tops)
 
 
@@ -182,10 +189,8 @@ def _draw_data(
     w = best.weightings[series]
     W, good = orthonormal_combinations(search.fitter.series[series].N.mean(axis=0))
     W = W[:, good]
-    rest = w.left(best.parameters(series))
-    z = (rest - w.N @ best_level(w.N, rest)) @ W
-    normal = np.einsum("pi,epq,qj->eij", W, w.N, W) + 0.1 * np.eye(W.shape[1])
-    y = 1.1 * np.linalg.solve(normal, z[..., None])[..., 0]
+    rest = subtract_level(w.N, w.left(best.parameters(series)))
+    y = 1.1 * solve_combinations(w.N, rest, W)[1]
     moved = np.stack([_move_in_time(y, rng) for _ in range(count)])
     parameters = without.parameters(series) + moved @ W.T
     return without.weightings[series].weighted(np.moveaxis(parameters, 0, 2))
@@ -206,63 +211,25 @@ def _move_in_time(y: Array, rng: np.random.Generator) -> Array:
     return y if rng.random() < 0.5 else -y
 
 
-@dataclass(frozen=True, eq=False)
-class _Scan:
-    """A scan of one candidate, of which all but the right-hand sides serves any data; penalty."""
+def _measure_gains(fit: Fit, data: list[Array], tried: tuple[Candidate, Scan, float]) -> Array:
+    """Return the largest penalised gain (count,) of one candidate over its grid.
 
-    candidate: Candidate
-    scan: Scan
-    penalty: float
-
-
-def _prepare_scans(search: Search, without: Solution) -> list[_Scan]:
-    """Scan all candidates but those that the solution has."""
-    out = []
-    for candidate in search.candidates:
-        if candidate.effect not in without.names:
-            scan = search.scanner.scan(candidate, without.fit)
-            out.append(_Scan(candidate, scan, search.judged(candidate, scan).penalty))
-    without.fit.forget()
-    return out
-
-
-def _find_largest_gains(
-    scans: list[_Scan], without: Solution, data: list[Array], jobs: int
-) -> Array:
-    """Return the largest penalised gain (count,) of any candidate."""
-
-    def gain(scan: _Scan) -> Array:
-        return _measure_gains(scan, without.fit, data) - scan.penalty
-
-    top = np.full(data[0].shape[2], -np.inf)
-    # threads: nearly all of it is linear algebra, and the stacks would have to be copied
-    with ThreadPoolExecutor(jobs) as pool:
-        for found in pool.map(gain, scans) if jobs > 1 else map(gain, scans):
-            top = np.maximum(top, found)
-    return top
-
-
-def _measure_gains(scan: _Scan, fit: Fit, data: list[Array]) -> Array:
-    """Return the largest gain (count,) of one candidate over its grid."""
-    candidate = scan.candidate
+    Of its scan all but the right-hand sides serves any data.
+    """
+    candidate, scan, penalty = tried
     base_c = np.zeros((len(fit.coefficients), data[0].shape[2]))
     parts = []
     for s, weighted in enumerate(data):
         C, V, index = fit.designs[s]
-        A, _, B = scan.scan.parts[s]
-        parts.append(
-            (A, _sum_right_hand_sides(scan.scan.stacks[s], candidate.directions, weighted), B)
-        )
+        A, _, B = scan.parts[s]
+        stack = scan.stacks[s]
+        # right-hand sides (G, mk, count) of trajectories (G, E, m) along the directions (P, k)
+        G, E, m = stack.shape
+        along = candidate.directions.T @ weighted  # (E, k, count)
+        _, k, count = along.shape
+        by_time = np.moveaxis(stack, 0, 1).reshape(E, G * m)
+        right = (by_time.T @ along.reshape(E, -1)).reshape(G, m * k, count)
+        parts.append((A, right, B))
         base_c[index] += np.einsum("er,pr,eps->rs", C, V, weighted, optimize=True)
     gains = gains_beside(candidate, parts, fit.normals()[0], base_c)
-    return np.asarray(sum(g.max(axis=0) for g in gains))
-
-
-def _sum_right_hand_sides(stack: Array, directions: Array, weighted: Array) -> Array:
-    """Return right-hand sides (G, mk, count) of trajectories (G, E, m) along directions (P, k)."""
-    G, E, m = stack.shape
-    along = directions.T @ weighted  # (E, k, count)
-    _, k, count = along.shape
-    s = np.moveaxis(stack, 0, 1).reshape(E, G * m)
-    out: Array = (s.T @ along.reshape(E, -1)).reshape(G, m * k, count)
-    return out
+    return np.asarray(sum(g.max(axis=0) for g in gains)) - penalty

@@ -17,14 +17,15 @@ from __future__ import annotations
 import json
 import logging
 import time
-from dataclasses import asdict, dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from thermocald.errors import ServerError, ServerGone, StoreError, StoreVersionError
+from pydantic import BaseModel, ConfigDict, Field
+
+from thermocald.errors import ServerError, ServerGone, StoreError
 from thermocald.files import write_text
 from thermocald.names import FileFolder
-from thermocald.store.database.examination import KEPT
+from thermocald.store.database.columns import KEPT
 from thermocald.store.database.store import Store
 from thermocald.store.server.writer import ServerWriter
 
@@ -39,8 +40,7 @@ if TYPE_CHECKING:
 _COUNTED = (*KEPT, "frame")
 
 
-@dataclass(slots=True)
-class Cursor:
+class Cursor(BaseModel):
     """The last ids sent of each growing table, to one server and from one store.
 
     server: its whole address but a password; identity, inode: of the store and its file, since
@@ -50,12 +50,14 @@ class Cursor:
     (UTC, days since 1970).
     """
 
+    model_config = ConfigDict(strict=True, extra="forbid")
+
     server: str
     station: str
     identity: str
     inode: int
-    sent: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_COUNTED, 0))
-    refused: dict[str, list[int]] = field(default_factory=dict)
+    sent: dict[str, int] = Field(default_factory=lambda: dict.fromkeys(_COUNTED, 0))
+    refused: dict[str, list[int]] = Field(default_factory=dict)
     day: int = 0
     frame_bytes: int = 0
 
@@ -69,20 +71,15 @@ class Cursor:
             inode = store.path.stat().st_ino
         except OSError as error:
             raise StoreError(f"{store.path}: cannot be read: {error.strerror}") from error
-        fresh = cls(server, station, store.identity, inode)
+        fresh = cls(server=server, station=station, identity=store.identity, inode=inode)
         try:
-            found = cls(**json.loads(path.read_text(encoding="utf-8")))
-            same = (found.server, found.station, found.identity, found.inode) == (
-                server, station, fresh.identity, inode,
-            )  # fmt: skip
-            found.sent = {**fresh.sent, **found.sent}
-            sound = {*found.sent} == {*_COUNTED} and all(
-                type(n) is int for n in (*found.sent.values(), found.day, found.frame_bytes)
-            )
-            sound = sound and all(type(ids) is list for ids in found.refused.values())
-        except (OSError, ValueError, TypeError, AttributeError):
+            found = cls.model_validate_json(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
             return fresh
-        return found if same and sound else fresh
+        found.sent = {**fresh.sent, **found.sent}
+        names = ("server", "station", "identity", "inode")
+        same = all(getattr(found, name) == getattr(fresh, name) for name in names)
+        return found if same and {*found.sent} == {*_COUNTED} else fresh
 
     @property
     def rows_refused(self) -> int:
@@ -90,12 +87,12 @@ class Cursor:
 
     def write(self, path: Path) -> None:
         """Replace the file as a whole. Raises OutputError where it cannot be written."""
-        write_text(path, json.dumps(asdict(self)))
+        write_text(path, json.dumps(self.model_dump()))
 
 
 log = logging.getLogger(__name__)
 
-_ROWS = 1000
+_FRAMES = 1000  # looked at together
 _DAY_S = 86400
 _LARGEST = 64_000_000
 """Bytes of a frame: a raw of 48 megapixels is below, and a row of PostgreSQL may be far larger."""
@@ -120,96 +117,6 @@ class FrameRule:
         if frame.path is None or self.choose == "all":
             return frame.path is not None
         return frame.eventful if self.choose == "events" else frame.number % self.every_n == 0
-
-
-class FrameSender:
-    """Sends the chosen frames of a store, from where its cursor stands."""
-
-    def __init__(self, rule: FrameRule, clock: Callable[[], float] = time.time) -> None:
-        self.rule = rule
-        self._clock = clock
-        self._files = FileFolder(rule.folder)
-        self._full_on = -1  # the day whose limit was reported
-
-    def send(
-        self,
-        store: Store,
-        writer: ServerWriter,
-        series: Mapping[int, StoredSeries],
-        cursor: Cursor,
-        keep: Callable[[], None],
-    ) -> int:
-        """Send what waits; how many were sent. `keep` writes the cursor.
-
-        A frame that retention has deleted is passed over. Raises ServerGone, ServerError.
-        """
-        count = 0
-        while frames := store.frames_after(cursor.sent["frame"], _ROWS):
-            for frame in frames:
-                if frame.series not in series:
-                    keep()
-                    return count
-                data = self._read(frame) if self.rule.wants(frame) else None
-                if data is not None:
-                    if not self._room(cursor, len(data)):
-                        keep()
-                        return count
-                    count += self._send(writer, series[frame.series], frame, data, cursor)
-                    cursor.sent["frame"] = frame.id
-                    keep()
-                cursor.sent["frame"] = frame.id
-            keep()
-        return count
-
-    def _read(self, frame: KeptFrame) -> bytes | None:
-        assert frame.path is not None
-        path = self._files.find(frame.path)
-        try:
-            if path is None:
-                return None
-            if path.stat().st_size > _LARGEST:
-                log.warning("%s: has more than %d MB and is not sent", path, _LARGEST // 10**6)
-                return None
-            return path.read_bytes()
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            log.warning("%s: cannot be read and is not sent: %s", path, error.strerror)
-            return None
-
-    def _room(self, cursor: Cursor, size: int) -> bool:
-        day = int(self._clock() // _DAY_S)
-        if day != cursor.day:
-            cursor.day, cursor.frame_bytes = day, 0
-        # one frame a day goes through whatever its size, else nothing ever would
-        if cursor.frame_bytes and cursor.frame_bytes + size > self.rule.daily_bytes:
-            if self._full_on != day:
-                log.warning(
-                    "%d MB of frames were sent today; the others wait for tomorrow",
-                    cursor.frame_bytes // 10**6,
-                )
-                self._full_on = day
-            return False
-        cursor.frame_bytes += size
-        return True
-
-    @staticmethod
-    def _send(
-        writer: ServerWriter, series: StoredSeries, frame: KeptFrame, data: bytes, cursor: Cursor
-    ) -> bool:
-        try:
-            writer.write_frame(series, frame, data)
-        except ServerGone:
-            cursor.frame_bytes -= len(data)
-            raise
-        except ServerError as error:
-            if not error.about_values:
-                cursor.frame_bytes -= len(data)
-                raise
-            log.error("frame %s is refused and passed over: %s", frame.path, error)
-            cursor.refused.setdefault("frame", []).append(frame.id)
-            return False
-        return True
 
 
 BATCH = 200
@@ -252,10 +159,12 @@ class Forwarder:
         self.address = address
         self.station = station
         self.batch = batch
+        self.frames = frames
         self._path = cursor or store.with_name(f"{store.name}.forwarded")
-        self._frames = FrameSender(frames) if frames is not None else None
+        self._clock = time.time
         self._reported = -_REPORT_S
         self._waiting = 0  # as last reported
+        self._full_on = -1  # the day whose limit of frames was reported
 
     def send_waiting(self) -> Progress:
         """Send all that waits, batch by batch, until nothing waits.
@@ -266,62 +175,115 @@ class Forwarder:
         with Store.open(self.store) as store:
             cursor = Cursor.read(self._path, store, self.address.place, self.station)
             before = cursor.rows_refused
-            count = {**dict.fromkeys(KEPT, 0), "frame": 0}
-            if self._waits(store, cursor):
+            count = dict.fromkeys(_COUNTED, 0)
+            frames = self.frames is not None and store.frames_after(cursor.sent["frame"], 1)
+            report = self._report_is_due or self._waiting
+            if report or frames or store.rows_waiting(cursor.sent):
                 with ServerWriter(self.address, self.station, store.identity) as writer:
-                    self._send_all(store, writer, cursor, count)
+                    for table in KEPT:
+                        count[table] = self._send_rows(store, writer, cursor, table)
+                    if self.frames is not None:
+                        count["frame"] = self._send_frames(store, writer, cursor, self.frames)
+                    if self._waiting:
+                        self._report(store, writer, cursor)
             return Progress(count, cursor.rows_refused - before)
 
-    def _waits(self, store: Store, cursor: Cursor) -> bool:
-        """Whether there is a reason to connect."""
-        frames = self._frames is not None and store.frames_after(cursor.sent["frame"], 1)
-        reported = not self._report_is_due and not self._waiting
-        return not reported or bool(frames) or store.rows_waiting(cursor.sent) > 0
+    def _send_rows(self, store: Store, writer: ServerWriter, cursor: Cursor, table: str) -> int:
+        """Send the rows of a table that wait; how many the server took."""
+        count, series = 0, {one.id: one for one in store.all_series()}
+        while True:
+            if self._report_is_due:  # also while much waits
+                self._report(store, writer, cursor)
+            rows = store.rows_after(table, cursor.sent[table], self.batch)
+            if not rows:
+                return count
+            if any(row.get("series_id") not in {None, *series} for row in rows):
+                series = {one.id: one for one in store.all_series()}
+            bad = []
+            for row in rows:
+                if why := row.pop("damage"):
+                    log.error("%s; it is not sent", why)
+                    bad.append(int(row["id"]))
+            last = rows[-1]["id"]
+            rows = [row for row in rows if row["id"] not in bad]
+            refused = self._send_batch(writer, table, rows, series) if rows else []
+            cursor.sent[table] = last
+            if bad or refused:
+                cursor.refused.setdefault(table, []).extend([*bad, *refused])
+            cursor.write(self._path)
+            count += len(rows) - len(refused)
 
-    def _send_all(
-        self,
-        store: Store,
-        writer: ServerWriter,
-        cursor: Cursor,
-        count: dict[str, int],
-    ) -> None:
-        series = {one.id: one for one in store.all_series()}
-        for table in KEPT:
-            while True:
-                if self._report_is_due:  # also while much waits
-                    self._report(store, writer, cursor)
-                rows = store.rows_after(table, cursor.sent[table], self.batch)
-                if not rows:
-                    break
-                if any(r.get("series_id") not in {None, *series} for r in rows):
-                    series = {one.id: one for one in store.all_series()}
-                bad = self._send_sound(writer, table, rows, series)
-                cursor.sent[table] = rows[-1]["id"]
-                if bad:
-                    cursor.refused.setdefault(table, []).extend(bad)
-                cursor.write(self._path)
-                count[table] += len(rows) - len(bad)
-        if self._frames is not None:
-            keep = partial(cursor.write, self._path)
-            count["frame"] = self._frames.send(store, writer, series, cursor, keep)
-        if self._waiting:
-            self._report(store, writer, cursor)
-
-    def _send_sound(
+    def _send_batch(
         self,
         writer: ServerWriter,
         table: str,
         rows: list[dict[str, Any]],
         series: Mapping[int, StoredSeries],
     ) -> list[int]:
-        """Send what is as it was written; the ids of rows that are damaged or refused."""
-        damaged = []
-        for row in rows:
-            if why := row.pop("damage"):
-                log.error("%s; it is not sent", why)
-                damaged.append(int(row["id"]))
-        sound = [row for row in rows if row["id"] not in damaged]
-        return [*damaged, *(self._send(writer, table, sound, series) if sound else [])]
+        """Send rows; the ids of those that the server refuses for what they hold."""
+        try:
+            writer.write(table, rows, series)
+        except ServerError as error:
+            if not error.about_values:
+                raise
+            if len(rows) == 1:
+                log.error("%s %s is refused and passed over: %s", table, rows[0]["id"], error)
+                return [int(rows[0]["id"])]
+            half = len(rows) // 2
+            return [
+                *self._send_batch(writer, table, rows[:half], series),
+                *self._send_batch(writer, table, rows[half:], series),
+            ]
+        return []
+
+    def _send_frames(
+        self, store: Store, writer: ServerWriter, cursor: Cursor, rule: FrameRule
+    ) -> int:
+        """Send the chosen frames that wait, up to the day's limit; how many the server took.
+
+        A frame that retention has deleted is passed over.
+        """
+        count = 0
+        files = FileFolder(rule.folder)
+        series = {one.id: one for one in store.all_series()}
+        while frames := store.frames_after(cursor.sent["frame"], _FRAMES):
+            for frame in frames:
+                data = _read_frame(files, frame) if rule.wants(frame) else None
+                if frame.series not in series or (
+                    data is not None and not self._has_room(cursor, rule, len(data))
+                ):
+                    cursor.write(self._path)
+                    return count
+                if data is not None:
+                    try:
+                        writer.write_frame(series[frame.series], frame, data)
+                        count += 1
+                    except ServerError as error:
+                        if not error.about_values:
+                            raise
+                        log.error("frame %s is refused and passed over: %s", frame.path, error)
+                        cursor.refused.setdefault("frame", []).append(frame.id)
+                    cursor.frame_bytes += len(data)
+                cursor.sent["frame"] = frame.id
+                if data is not None:
+                    cursor.write(self._path)
+            cursor.write(self._path)
+        return count
+
+    def _has_room(self, cursor: Cursor, rule: FrameRule, size: int) -> bool:
+        day = int(self._clock() // _DAY_S)
+        if day != cursor.day:
+            cursor.day, cursor.frame_bytes = day, 0
+        # one frame a day goes through whatever its size, else nothing ever would
+        if not cursor.frame_bytes or cursor.frame_bytes + size <= rule.daily_bytes:
+            return True
+        if self._full_on != day:
+            log.warning(
+                "%d MB of frames were sent today; the others wait for tomorrow",
+                cursor.frame_bytes // 10**6,
+            )
+            self._full_on = day
+        return False
 
     @property
     def _report_is_due(self) -> bool:
@@ -336,30 +298,22 @@ class Forwarder:
         self._waiting = waiting
         self._reported = time.monotonic()
 
-    def _send(
-        self,
-        writer: ServerWriter,
-        table: str,
-        rows: list[dict[str, Any]],
-        series: Mapping[int, StoredSeries],
-    ) -> list[int]:
-        """Send a batch; the ids of rows that the server refuses for what they hold."""
-        try:
-            writer.write(table, rows, series)
-        except (ServerGone, StoreVersionError):
-            raise
-        except ServerError as error:
-            if not error.about_values:
-                raise
-            if len(rows) == 1:
-                log.error("%s %s is refused and passed over: %s", table, rows[0]["id"], error)
-                return [int(rows[0]["id"])]
-            half = len(rows) // 2
-            return [
-                *self._send(writer, table, rows[:half], series),
-                *self._send(writer, table, rows[half:], series),
-            ]
-        return []
+
+def _read_frame(files: FileFolder, frame: KeptFrame) -> bytes | None:
+    assert frame.path is not None
+    path = files.find(frame.path)
+    try:
+        if path is None:
+            return None
+        if path.stat().st_size > _LARGEST:
+            log.warning("%s: has more than %d MB and is not sent", path, _LARGEST // 10**6)
+            return None
+        return path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        log.warning("%s: cannot be read and is not sent: %s", path, error.strerror)
+        return None
 
 
 def forward_forever(

@@ -16,28 +16,29 @@ stations of one name, or with copies of one store.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+import textwrap
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from thermocald.analysis.statistics.dependence import dependence
 from thermocald.analysis.statistics.random_effects import odd_specimens, population
 from thermocald.names import WITH_VALUES
-from thermocald.numbers import short_duration
-from thermocald.photogrammetry.linalg import MAD_TO_SD
-from thermocald.store.server.fleet_reader import FleetReader
+from thermocald.numbers import percent, short_duration, shortened
+from thermocald.photogrammetry.linalg import mad_sd
+from thermocald.result import document_of
+from thermocald.store.server.connection import ServerAddress
+from thermocald.store.server.fleet_reader import Finding, FleetCamera, FleetReader, Rate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from thermocald.arrays import Array
-    from thermocald.store.server.connection import ServerAddress
-    from thermocald.store.server.fleet_reader import CameraRecord, StationState
+    from thermocald.store.server.fleet_reader import StationState
+
 
 RATED = ("c", "x0", "y0")
 ODD = 0.01
@@ -49,64 +50,24 @@ _LEAST_RANGE_K = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Rate:
-    """A change with temperature, mm/K, and its standard deviation."""
+class TypeRate(Rate):
+    """The mean of a type's specimens; sd_between: their standard deviation about it, mm/K."""
 
-    value: float
-    sd: float
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Something that a person should look at: one word of `findings`, and a sentence."""
-
-    kind: str
-    text: str
-
-
-@dataclass(slots=True)
-class CameraOverview:
-    """One camera of the fleet.
-
-    lag_s: since its last epoch, by the server's clock; on_the_way_s: the median time that its last
-    epochs took to the server, NaN if not known; ok: fraction of its last epochs with a result;
-    temperature: °C, the last of the reference, NaN without; range: °C, of its epochs with a result;
-    shift_px: how far c, x0 or y0 has left its own line lately, and in standard deviations; odd:
-    the probability that a camera of this type is as unlike the others, NaN where that is not known.
-    """
-
-    record: CameraRecord
-    type: str
-    state: StationState | None
-    lag_s: float
-    on_the_way_s: float
-    ok: float
-    last_ok: float
-    temperature: float
-    range: tuple[float, float]
-    rates: dict[str, Rate]
-    shift_px: float
-    shift_sds: float
-    odd: float = math.nan
-    findings: list[Finding] = field(default_factory=list)
-
-    @property
-    def name(self) -> str:
-        return f"{self.record.station}/{self.record.camera}"
+    sd_between: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class TypeOverview:
-    """A type: its cameras, and mean, sd between specimens and sd of the mean of each rate, mm/K."""
+    """A type, its cameras, and their rates by parameter."""
+
+    JSON: ClassVar = {"name": "type"}
 
     name: str
     cameras: tuple[str, ...]
-    mean: dict[str, float]
-    between: dict[str, float]
-    sd_mean: dict[str, float]
+    rates: dict[str, TypeRate]
 
 
-def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[CameraOverview]]:
+def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[FleetCamera]]:
     """The server's time (s UTC) and all cameras that an address selects; path: for messages.
 
     Raises ServerGone, ServerError, StoreVersionError.
@@ -114,13 +75,15 @@ def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[Camer
     with FleetReader(address) as reader:
         now = reader.now()
         stations = reader.stations()
-        records = reader.cameras(now, path)
-    return now, [_camera(record, stations.get(record.station), now) for record in records]
+        cameras = reader.cameras(now, path)
+    for camera in cameras:
+        _complete(camera, stations.get(camera.station), now)
+    return now, cameras
 
 
-def camera_types(cameras: Sequence[CameraOverview]) -> list[TypeOverview]:
+def camera_types(cameras: Sequence[FleetCamera]) -> list[TypeOverview]:
     """The types of which enough specimens are known; sets `odd` of their cameras."""
-    groups: dict[str, list[CameraOverview]] = defaultdict(list)
+    groups: dict[str, list[FleetCamera]] = defaultdict(list)
     for camera in cameras:
         if len(camera.rates) == len(RATED):
             groups[camera.type].append(camera)
@@ -144,75 +107,64 @@ def camera_types(cameras: Sequence[CameraOverview]) -> list[TypeOverview]:
             TypeOverview(
                 name,
                 tuple(c.name for c in group),
-                dict(zip(RATED, people.mean.tolist(), strict=True)),
-                dict(zip(RATED, between.tolist(), strict=True)),
-                dict(zip(RATED, sd_mean.tolist(), strict=True)),
+                {
+                    rated: TypeRate(float(mean), float(sd), sd_between=float(scatter))
+                    for rated, mean, sd, scatter in zip(
+                        RATED, people.mean, sd_mean, between, strict=True
+                    )
+                },
             )
         )
     return found
 
 
-def _camera(record: CameraRecord, state: StationState | None, now: float) -> CameraOverview:
-    recent = record.recent
-    reference = next(iter(record.head.channels), "")
-    read = [e.temperatures.get(reference, math.nan) for e in recent]
-    known = [t for t in read if math.isfinite(t)]
+def _complete(camera: FleetCamera, state: StationState | None, now: float) -> None:
+    """Fill what follows from a camera's last epochs and its samples; now: s UTC."""
+    recent = camera.recent
+    reference = next(iter(camera.head.channels), "")
+    known = [t for e in recent if math.isfinite(t := e.temperatures.get(reference, math.nan))]
     on_the_way = [e.received - e.frame_time for e in recent if math.isfinite(e.received)]
-    rates, shift_px, shift_sds = _rates(record)
-    return CameraOverview(
-        record,
-        _type(record),
-        state,
-        now - record.last_time,
-        float(np.median(on_the_way)) if on_the_way else math.nan,
-        sum(e.status in WITH_VALUES for e in recent) / len(recent) if recent else math.nan,
-        record.last_ok,
-        known[0] if known else math.nan,
-        record.range,
-        rates,
-        shift_px,
-        shift_sds,
-    )
+    camera.state = state
+    sensor = camera.head.camera.sensor
+    # what the camera says that it is, else what its images are like
+    model = str(camera.identity.get("model") or camera.identity.get("card") or "").strip()
+    size = f"{sensor.width}×{sensor.height}"
+    camera.type = f"{model} {size}" if model else f"{size}, {sensor.pixel_pitch * 1000:g} µm"
+    camera.lag_s = now - camera.last_time
+    if on_the_way:
+        camera.on_the_way_s = float(np.median(on_the_way))
+    if recent:
+        camera.ok = sum(e.status in WITH_VALUES for e in recent) / len(recent)
+    if known:
+        camera.temperature = known[0]
+    _find_rates(camera)
 
 
-def _type(record: CameraRecord) -> str:
-    """What the camera says that it is, else what its images are like."""
-    identity, camera = record.identity, record.head.camera
-    model = str(identity.get("model") or identity.get("card") or "").strip()
-    size = f"{camera.sensor.width}×{camera.sensor.height}"
-    return f"{model} {size}" if model else f"{size}, {camera.sensor.pixel_pitch * 1000:g} µm"
-
-
-def _rates(record: CameraRecord) -> tuple[dict[str, Rate], float, float]:
-    """Rates by parameter; the largest recent departure from their lines, px and in sds."""
-    samples = [
-        s
-        for s in record.samples
-        if math.isfinite(s.temperature) and all(map(math.isfinite, (*s.values, *s.sds)))
-    ]
-    pitch = record.head.camera.sensor.pixel_pitch
+def _find_rates(camera: FleetCamera) -> None:
+    """Fill the rates by parameter, and the largest recent departure from their lines."""
+    samples = camera.samples[np.isfinite(camera.samples).all(axis=1)]
     if len(samples) < _FEWEST_SAMPLES:
-        return {}, math.nan, math.nan
-    temperature = np.array([s.temperature for s in samples])
-    of = np.array([s.series for s in samples])
-    centred = _about_series_means(temperature, of)
+        return
+    of = samples[:, 0]
+    centred = _about_series_means(samples[:, 2], of)
     if np.ptp(centred) < _LEAST_RANGE_K:
-        return {}, math.nan, math.nan
-    resolution = next(iter(record.head.channels.values())).resolution or _RESOLUTION
+        return
+    resolution = next(iter(camera.head.channels.values())).resolution or _RESOLUTION
     rates: dict[str, Rate] = {}
     shift = (0.0, 0.0)
-    for j, name in enumerate(RATED):
-        values = _about_series_means(np.array([s.values[j] for s in samples]), of)
-        sds = np.array([s.sds[j] for s in samples])
+    for name, measured, sds in zip(RATED, samples.T[3::2], samples.T[4::2], strict=True):
+        values = _about_series_means(measured, of)
         if not np.ptp(values) > 0:
-            return {}, math.nan, math.nan
+            return
         line = dependence(values, sds, centred, resolution / math.sqrt(12))
         rates[name] = Rate(line.slope, line.sd_slope)
         shift = max(shift, _shift(values - line.slope * centred), key=lambda s: s[1])
-    return rates, shift[0] / pitch, shift[1]
+    camera.rates = rates
+    camera.shift_px = shift[0] / camera.head.camera.sensor.pixel_pitch
+    camera.shift_sds = shift[1]
 
 
-def _about_series_means(values: Array, of: NDArray[np.int64]) -> Array:
+def _about_series_means(values: Array, of: Array) -> Array:
     """Values (n,) minus the mean of their series: another set-up has another level."""
     centred = values.copy()
     for one in np.unique(of):
@@ -228,7 +180,7 @@ def _shift(residual: Array) -> tuple[float, float]:
     last = max(3, len(residual) // 10)
     before, after = residual[:-last], residual[-last:]
     size = abs(float(np.median(after) - np.median(before)))
-    scatter = MAD_TO_SD * float(np.median(np.abs(before - np.median(before))))
+    scatter = float(mad_sd(before - np.median(before)))
     sd = 1.2533 * scatter * math.sqrt(1 / len(before) + 1 / last)
     return size, size / sd if sd > 0 else math.inf if size > 0 else 0.0
 
@@ -247,9 +199,7 @@ _OUTSIDE_K = 2.0
 _SHIFT_PX, _SHIFT_SDS = 0.3, 6.0
 
 
-def add_findings(
-    cameras: Sequence[CameraOverview], types: Sequence[TypeOverview], now: float
-) -> None:
+def add_findings(cameras: Sequence[FleetCamera], types: Sequence[TypeOverview], now: float) -> None:
     """Fill `findings` of all cameras; now: s UTC, by the server's clock."""
     of_name = {name: kind for kind in types for name in kind.cameras}
     for camera in cameras:
@@ -262,8 +212,8 @@ def add_findings(
         ]
 
 
-def _late(camera: CameraOverview, now: float) -> Iterator[Finding]:
-    limit = max(_LATE_INTERVALS * camera.record.head.interval, _LATE_S)
+def _late(camera: FleetCamera, now: float) -> Iterator[Finding]:
+    limit = max(_LATE_INTERVALS * camera.head.interval, _LATE_S)
     if camera.lag_s > limit:
         since = f"no epoch for {short_duration(camera.lag_s)}"
         state = camera.state
@@ -289,7 +239,7 @@ def _late(camera: CameraOverview, now: float) -> Iterator[Finding]:
             f"{camera.state.stores} stores report under its station's name: the card of one is a "
             "copy; give each station its own name (forward.station)",
         )
-    if camera.record.copied:
+    if camera.copied:
         yield Finding(
             "twins",
             "epochs of one number were taken at two times: its store runs at two stations, or a "
@@ -302,14 +252,14 @@ def _late(camera: CameraOverview, now: float) -> Iterator[Finding]:
         )
 
 
-def _sensors(camera: CameraOverview) -> Iterator[Finding]:
-    for i, channel in enumerate(camera.record.head.channels):
-        read = [e.temperatures.get(channel, math.nan) for e in camera.record.recent]
+def _sensors(camera: FleetCamera) -> Iterator[Finding]:
+    for i, channel in enumerate(camera.head.channels):
+        read = [e.temperatures.get(channel, math.nan) for e in camera.recent]
         if len(read) >= _FEWEST and (trouble := _trouble(camera, read, reference=i == 0)):
             yield Finding("sensor", f"{channel}: {trouble}")
 
 
-def _trouble(camera: CameraOverview, read: Sequence[float], *, reference: bool) -> str:
+def _trouble(camera: FleetCamera, read: Sequence[float], *, reference: bool) -> str:
     """What is wrong with a thermometer's last readings (newest first); empty: nothing."""
     known = [t for t in read if math.isfinite(t)]
     if not known:
@@ -325,20 +275,20 @@ def _trouble(camera: CameraOverview, read: Sequence[float], *, reference: bool) 
     return ""
 
 
-def _stuck_for(camera: CameraOverview, known: Sequence[float]) -> float:
+def _stuck_for(camera: FleetCamera, known: Sequence[float]) -> float:
     """For how long the reference has not changed by a bit, s."""
     if len(known) < _FEWEST or len({*known}) > 1:
         return 0.0
-    since = camera.record.recent[-1].frame_time
-    for sample in reversed(camera.record.samples):
-        if sample.temperature != known[0]:
+    since = camera.recent[-1].frame_time
+    for _, frame_time, temperature, *_ in camera.samples[::-1].tolist():
+        if temperature != known[0]:
             break
-        since = min(since, sample.frame_time)
-    return camera.record.last_time - since
+        since = min(since, frame_time)
+    return camera.last_time - since
 
 
-def _calibration(camera: CameraOverview, now: float) -> Iterator[Finding]:
-    recent = camera.record.recent
+def _calibration(camera: FleetCamera, now: float) -> Iterator[Finding]:
+    recent = camera.recent
     if len(recent) >= _FEWEST and camera.ok < _LEAST_OK:
         failed = [e.status for e in recent if e.status not in WITH_VALUES]
         often = max(sorted({*failed}), key=failed.count)
@@ -370,23 +320,25 @@ def _calibration(camera: CameraOverview, now: float) -> Iterator[Finding]:
         )
 
 
-def _odd(camera: CameraOverview, kind: TypeOverview | None) -> Iterator[Finding]:
+def _odd(camera: FleetCamera, kind: TypeOverview | None) -> Iterator[Finding]:
     if kind is None or not camera.odd < ODD:
         return
 
     def distance(name: str) -> float:
         rate = camera.rates[name]
-        return abs(rate.value - kind.mean[name]) / math.hypot(rate.sd, kind.between[name], 1e-12)
+        usual = kind.rates[name]
+        return abs(rate.value - usual.value) / math.hypot(rate.sd, usual.sd_between, 1e-12)
 
     name = max(RATED, key=distance)
+    usual = kind.rates[name]
     yield Finding(
         "odd",
         f"{name} moves by {camera.rates[name].value * 1e3:+.3f} µm/K, the others "
-        f"by {kind.mean[name] * 1e3:+.3f} ± {kind.between[name] * 1e3:.3f} (p = {camera.odd:.1g})",
+        f"by {usual.value * 1e3:+.3f} ± {usual.sd_between * 1e3:.3f} (p = {camera.odd:.1g})",
     )
 
 
-def _clock(camera: CameraOverview) -> Iterator[Finding]:
+def _clock(camera: FleetCamera) -> Iterator[Finding]:
     state = camera.state
     if state is not None and abs(state.clock) > _CLOCK_S:
         way = "ahead of" if state.clock > 0 else "behind"
@@ -397,3 +349,99 @@ def _clock(camera: CameraOverview) -> Iterator[Finding]:
         )
     elif camera.lag_s < -_FUTURE_S:
         yield Finding("clock", f"its last epoch is {short_duration(-camera.lag_s)} in the future")
+
+
+_WIDTH = 80
+_MOST_SOUND = 40
+_LONGEST_NAME = 34
+_KINDS = ("late", "sensor", "calibrate", "odd", "clock", "refused", "twins")
+
+
+def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
+    """Everything about the cameras that some addresses select; several servers are one fleet.
+
+    Raises UsageError, ServerGone, ServerError, StoreVersionError.
+    """
+    cameras: list[FleetCamera] = []
+    now = 0.0
+    addresses = [ServerAddress.parse(source) for source in sources]
+    for address, source in zip(addresses, sources, strict=True):
+        now, found = read_overview(address, source)
+        cameras += found
+    types = camera_types(cameras)
+    add_findings(cameras, types, now)
+    counts = Counter(kind for c in cameras for kind in {f.kind for f in c.findings})
+    document: dict[str, Any] = {
+        "format": "thermocald-fleet/1",
+        "servers": [str(address) for address in addresses],
+        "time": now,
+        "cameras": [document_of(camera) for camera in cameras],
+        "types": [document_of(kind) for kind in types],
+        "summary": {
+            "cameras": len(cameras),
+            "stations": len({c.station for c in cameras}),
+            "epochs": sum(c.epochs for c in cameras),
+            "sound": sum(not c.findings for c in cameras),
+            **{kind: counts[kind] for kind in _KINDS},
+        },
+    }
+    return document
+
+
+def fleet_lines(document: dict[str, Any]) -> list[str]:
+    """Return the lines that `fleet` prints of a document."""
+    cameras = document["cameras"]
+    if not cameras:
+        return ["no epochs there yet; stations send theirs with `thermocald forward`"]
+    summary = document["summary"]
+    words = {
+        "late": "late", "sensor": "with a dead sensor", "calibrate": "need calibration",
+        "odd": "unlike their type", "clock": "with a wrong clock", "refused": "with refused rows",
+    }  # fmt: skip
+    parts = [f"{summary[kind]} {text}" for kind, text in words.items() if summary[kind]]
+    head = (
+        f"{summary['cameras']} cameras at {summary['stations']} stations: {summary['sound']} sound"
+    )
+    lines = textwrap.wrap(", ".join([head, *parts]), _WIDTH)
+    shown = [c for c in cameras if c["findings"]]
+    shown += [c for c in cameras if not c["findings"]][:_MOST_SOUND]
+    name = min(_LONGEST_NAME, max(14, *(len(_name(c)) for c in shown)))
+    heads = f"{'last':>7} {'waiting':>7} {'ok':>6} {'°C':>6} {'c µm/K':>16}"
+    lines += ["", f"{'station/camera':<{name}} {heads}"]
+    for camera in shown:
+        lines.append(_row(camera, name))
+        for finding in camera["findings"]:
+            lines += textwrap.wrap(
+                finding["text"],
+                _WIDTH,
+                initial_indent=f"  {finding['kind']}: ",
+                subsequent_indent="      ",
+            )
+    if hidden := len(cameras) - len(shown):
+        lines.append(f"and {hidden} more without a finding (--json has them all)")
+    for kind in document["types"]:
+        rate = kind["rates"]["c"]
+        lines += textwrap.wrap(
+            f"type {kind['type']}: {len(kind['cameras'])} cameras, c {rate['value'] * 1e3:+.3f} ± "
+            f"{rate['sd'] * 1e3:.3f} µm/K, between cameras ± {rate['sd_between'] * 1e3:.3f}",
+            _WIDTH,
+            subsequent_indent="  ",
+        )
+    return lines
+
+
+def _row(camera: dict[str, Any], width: int) -> str:
+    rate = camera["rates"].get("c")
+    text = "–" if rate is None else f"{rate['value'] * 1e3:+.3f} ± {rate['sd'] * 1e3:.3f}"
+    waiting = "–" if camera["waiting"] is None else str(camera["waiting"])
+    ok = "–" if camera["ok"] is None else percent(camera["ok"])
+    degrees = camera["temperature"]
+    return (
+        f"{shortened(_name(camera), width):<{width}} {short_duration(camera['lag_s']):>7} "
+        f"{waiting:>7} {ok:>6} {'–' if degrees is None else f'{degrees:.1f}':>6} "
+        f"{text:>16}"
+    )
+
+
+def _name(camera: dict[str, Any]) -> str:
+    return f"{camera['station']}/{camera['camera']}"

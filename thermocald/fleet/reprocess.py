@@ -10,14 +10,14 @@ itself; one whose process dies is tried again before it is given up.
 
 from __future__ import annotations
 
-import logging
 import os
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from itertools import islice
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,64 +32,83 @@ from thermocald.store.series import EpochResult
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-
-    Item = TypeVar("Item")
-    Result = TypeVar("Result")
     from pathlib import Path
 
 _ROUNDS = 3
-"""How often an item is handed to a cluster whose workers died of it, or of something else."""
+"""How often a task is handed to a cluster whose workers died of it, or of something else."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a task; `error` is empty where it is done.
+
+    epochs, calibrated: of a block, how many there are and how many have a result; not_written: the
+    exit status where it is the file of results that could not be written, else 0.
+    """
+
+    task: Any
+    epochs: int = 0
+    calibrated: int = 0
+    error: str = ""
+    not_written: int = 0
 
 
 def run_tasks(
-    work: Callable[[Item], Result],
-    items: Sequence[Item],
-    lost: Callable[[Item, str], Result],
+    work: Callable[[Any], Outcome],
+    tasks: Sequence[Any],
     engine: str = "local",
     jobs: int = 1,
-) -> Iterator[Result]:
-    """The results of `work` for all items, in the order in which they are done.
+    report: Callable[[Outcome], None] = lambda _: None,
+) -> list[Outcome]:
+    """Do all tasks and return what became of each, in the order in which they are done.
 
-    work: a function of a module, which raises nothing; lost: the result of an item whose process
-    died every time, and why; engine: `local`, with `jobs` processes, or the address of a Dask
-    scheduler, `tcp://host:8786`, whose workers see the same files. Raises UsageError, ServerGone.
+    work: a function of a module; engine: `local`, with `jobs` processes, or the address of a Dask
+    scheduler, `tcp://host:8786`, whose workers see the same files; report: is told of each task as
+    it is done. Raises UsageError, ServerGone.
     """
+    do = partial(_attempt, work)
     if engine == "local":
-        return map(work, items) if jobs == 1 else _processes(work, items, lost, jobs)
-    if "://" in engine:
-        return _cluster(work, items, lost, engine)
-    raise UsageError(f"--engine {engine}: there is `local`, or a scheduler's tcp://HOST:PORT")
+        done = map(do, tasks) if jobs == 1 else _processes(do, tasks, jobs)
+    elif "://" in engine:
+        done = _cluster(do, tasks, engine)
+    else:
+        raise UsageError(f"--engine {engine}: there is `local`, or a scheduler's tcp://HOST:PORT")
+    outcomes = []
+    for outcome in done:
+        outcomes.append(outcome)
+        report(outcome)
+    return outcomes
 
 
-def _processes(
-    work: Callable[[Item], Result],
-    items: Sequence[Item],
-    lost: Callable[[Item, str], Result],
-    jobs: int,
-) -> Iterator[Result]:
-    """On processes of this machine; where one dies, its items are tried again one by one."""
-    again: list[Item] = []
+def _attempt(work: Callable[[Any], Outcome], task: Any) -> Outcome:
+    """Do a task; what its data or its output do not allow is an outcome."""
+    try:
+        return work(task)
+    except OutputError as error:
+        return Outcome(task, error=str(error), not_written=error.exit_status)
+    except (ThermocaldError, OSError) as error:
+        return Outcome(task, error=str(error))
+
+
+def _processes(do: Callable[[Any], Outcome], tasks: Sequence[Any], jobs: int) -> Iterator[Outcome]:
+    """On processes of this machine; where one dies, its tasks are tried again one by one."""
+    again = []
     with processes(jobs) as pool:
-        futures = {pool.submit(work, item): item for item in items}
+        futures = {pool.submit(do, task): task for task in tasks}
         for future in as_completed(futures):
             try:
                 yield future.result()
             except BrokenProcessPool:
                 again.append(futures[future])
-    for item in again:
+    for task in again:
         with processes(1) as pool:
             try:
-                yield pool.submit(work, item).result()
+                yield pool.submit(do, task).result()
             except BrokenProcessPool:
-                yield lost(item, "its process died twice")
+                yield Outcome(task, error="its process died twice")
 
 
-def _cluster(
-    work: Callable[[Item], Result],
-    items: Sequence[Item],
-    lost: Callable[[Item, str], Result],
-    address: str,
-) -> Iterator[Result]:
+def _cluster(do: Callable[[Any], Outcome], tasks: Sequence[Any], address: str) -> Iterator[Outcome]:
     try:
         distributed: Any = import_module("distributed")
     except ImportError as error:
@@ -101,31 +120,26 @@ def _cluster(
     except (OSError, TimeoutError) as error:
         raise ServerGone(f"{address}: the scheduler cannot be reached ({error})") from error
     with client:
-        waiting = list(items)
+        waiting = list(tasks)
         for left in reversed(range(_ROUNDS)):
-            again: list[Item] = []
-            futures = client.map(work, waiting, pure=False, retries=1)
-            which = {future.key: item for future, item in zip(futures, waiting, strict=True)}
+            again = []
+            futures = client.map(do, waiting, pure=False, retries=1)
+            which = {future.key: task for future, task in zip(futures, waiting, strict=True)}
             for future in distributed.as_completed(futures, loop=client.loop):
-                item = which[future.key]
+                task, cause = which[future.key], future.exception()
                 if future.status == "finished":
                     yield future.result()
-                elif left and isinstance(future.exception(), distributed.KilledWorker):
+                elif left and isinstance(cause, distributed.KilledWorker):
                     # its workers died: of it, or because somebody ends workers now and then
-                    again.append(item)
+                    again.append(task)
                 else:
-                    yield lost(item, _first_line(future.exception()))
+                    why = (str(cause).splitlines() or [type(cause).__name__])[0]
+                    yield Outcome(task, error=why)
                 future.release()
             waiting = again
             if not waiting:
                 return
 
-
-def _first_line(error: BaseException | None) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-log = logging.getLogger(__name__)
 
 BLOCK = 360
 """Epochs of a block: an hour at 10 s. The search that it begins with is a hundredth of its work."""
@@ -140,20 +154,6 @@ class Block:
     stop: int
     target: Path
     free: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of a block: epochs, how many have a result; `error` is empty where it is done.
-
-    not_written: the exit status where it is the file of results that could not be written, else 0.
-    """
-
-    block: Block
-    epochs: int
-    calibrated: int
-    error: str = ""
-    not_written: int = 0
 
 
 def find_blocks(
@@ -186,15 +186,9 @@ def find_blocks(
 
 
 def calibrate_block(block: Block) -> Outcome:
-    """Calibrate one block and write its file, whole or not at all; never raises for its data."""
-    try:
-        columns, calibrated = _columns(block)
-    except (ThermocaldError, OSError) as error:
-        return Outcome(block, 0, 0, str(error))
-    try:
-        write_parquet(block.target, columns)
-    except OutputError as error:
-        return Outcome(block, 0, 0, str(error), error.exit_status)
+    """Calibrate one block and write its file, whole or not at all."""
+    columns, calibrated = _columns(block)
+    write_parquet(block.target, columns)
     return Outcome(block, block.stop - block.first, calibrated)
 
 
@@ -204,20 +198,8 @@ def run_blocks(
     jobs: int = 1,
     report: Callable[[Outcome], None] = lambda _: None,
 ) -> list[Outcome]:
-    """Calibrate blocks, on `jobs` processes of this machine or on a Dask scheduler's workers.
-
-    engine: `local`, or the address of a scheduler, `tcp://host:8786`, whose workers see the same
-    folders. report: told of each block as it is done. Raises UsageError, ServerGone.
-    """
-    outcomes = []
-    for outcome in run_tasks(calibrate_block, blocks, _lost, engine, jobs):
-        outcomes.append(outcome)
-        report(outcome)
-    return outcomes
-
-
-def _lost(block: Block, why: str) -> Outcome:
-    return Outcome(block, 0, 0, why)
+    """Calibrate blocks; arguments as those of `run_tasks`."""
+    return run_tasks(calibrate_block, blocks, engine, jobs, report)
 
 
 def _columns(block: Block) -> tuple[dict[str, Any], int]:

@@ -1,16 +1,19 @@
 """The report of a calibration from photographs: what was found, and what its residuals show.
 
 Residuals and coverage show what a standard deviation does not: distortion that the model leaves,
-and parts of the image in which no target was seen.
+and parts of the image in which no target was seen. The report of a test field's check: what a
+camera would get out of it, and what to add.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.field.check import CELLS, FieldCheck
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel
 from thermocald.numbers import (
     UNITS,
@@ -20,56 +23,44 @@ from thermocald.numbers import (
     plain,
     with_sd,
 )
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
-from thermocald.report import (
-    Answer,
-    Chapter,
-    Section,
-    Table,
-    of_figure,
-    render_report,
-)
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, Sensor, project
+from thermocald.report import Answer, Chapter, Section, Table, as_sentence, render_report
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from datetime import datetime
 
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
+    from thermocald.analysis.field.advice import FieldAssessment
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.field.testfield import TestField
+
 
 _CELLS = (12, 9)
 _MOST_ARROWS = 3000
 _RINGS = 10
 _LITTLE_COVERED = 0.6
+_FIELD_DOMINATES = 2.0  # times what the image alone would give
+_FEW_NAMES = 3  # that a legend has room for
 
 
-def render_calibration(
-    result: Photographs, sensor: Sensor, name: str, made: datetime | None = None
-) -> str:
-    """Return the report as HTML text; made: the time that it bears, by default now."""
+def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
+    """Return the report as HTML text."""
     posed = [p for p in result.photographs if len(p.points)]
-    interior = Section(
-        "Interior orientation",
-        tables=tuple(t for t in (_interior(result, sensor), _correlations(result)) if t.rows),
-    )
-    figures = tuple(
-        of_figure(Figure(f"f{i}", panel.title, caption, (panel,)))
-        for i, (panel, caption) in enumerate(_panels(posed, sensor))
-    )
-    sections = [
-        Section("Residuals and coverage", figures=figures[1:]),
-        interior,
+    proof = residual_figure(result, sensor) if posed else None
+    figures = _figures(result, sensor) if posed else ()
+    tables = (_interior(result, sensor), _correlations(result))
+    sections = (
+        Section("Residuals and coverage", figures=figures),
+        Section("Interior orientation", tables=tuple(t for t in tables if t.rows)),
         Section("Photographs", tables=(_photographs(result),)),
-    ]
-    answer = _answer(result, posed, sensor)
+    )
     chapter = Chapter(
         f"Calibration of {name}",
-        Answer(answer.sentence, figures[0] if figures else None, answer.more, answer.next_steps,
-               answer.not_covered),
+        replace(_answer(result, posed, sensor), proof=proof),
         tuple(s for s in sections if s.figures or s.tables),
         (f"{name}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm.",),
-    )  # fmt: skip
-    return render_report(chapter.title, [chapter], made=made)
+    )
+    return render_report(chapter.title, [chapter])
 
 
 def coverage(points: Array, sensor: Sensor) -> float:
@@ -87,8 +78,7 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     ]
     if not posed or result.interior is None:
         return Answer(f"Not calibrated: {result.reason}.", next_steps=tuple(steps))
-    points = np.concatenate([p.points[p.used] for p in posed])
-    residuals = np.concatenate([p.residuals[p.used] for p in posed])
+    points, residuals = _used(result)
     left_out = sum(int(np.count_nonzero(~p.used)) for p in posed)
     rms = float(np.sqrt(np.mean(residuals**2)))
     covered = coverage(points, sensor)
@@ -135,72 +125,78 @@ def _found(result: Photographs, sensor: Sensor) -> str:
     return f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "".join(parts)
 
 
-def _panels(posed: Sequence[PhotographResult], sensor: Sensor) -> list[tuple[Panel, str]]:
-    if not posed:
-        return []
-    used = [p.points[p.used] for p in posed]
-    points = np.concatenate(used)
-    residuals = np.concatenate([p.residuals[p.used] for p in posed])
-    return [
-        _arrows(points, residuals, sensor),
-        _coverage_map([p.path for p in posed], used, sensor),
-        _by_radius(points, residuals, sensor),
-        _scatter(residuals),
-    ]
-
-
-def _frame(sensor: Sensor) -> Curve:
-    w, h = float(sensor.width), float(sensor.height)
-    corners = np.array([[0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=float)
-    return Curve("", corners[:, 0], corners[:, 1], "line", "#888888")
-
-
-def _arrows(points: Array, residuals: Array, sensor: Sensor) -> tuple[Panel, str]:
-    length = float(np.percentile(np.linalg.norm(residuals, axis=1), 95))
+def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
+    """Measured minus adjusted image points of all photographs, as arrows; there may be none."""
+    points, residuals = _used(result)
+    lengths = np.linalg.norm(residuals, axis=1)
     rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MOST_ARROWS)).astype(int))
     arrows = Arrows(
         points[rows], residuals[rows], (sensor.width, sensor.height), PALETTE[0],
-        max(1.5 * length, 1e-9),
+        max(1.5 * float(np.percentile(lengths, 95)), 1e-9) if len(rows) else 1.0,
     )  # fmt: skip
-    panel = Panel("Residuals", "x in px", "y in px, down", (), arrows=arrows)
-    return panel, (
+    return Figure(
+        "residuals", "Residuals",
         "Measured minus adjusted image points of all photographs. Without pattern they are noise; "
         "neighbours that point the same way are distortion that the model leaves, or targets that "
-        "are not where the test field says."
+        "are not where the test field says.",
+        (Panel("Residuals", "x in px", "y in px, down", (), arrows=arrows),),
+    )  # fmt: skip
+
+
+def _used(result: Photographs) -> tuple[Array, Array]:
+    """Image points (n, 2) that the adjustment used, and their residuals, px."""
+    posed = [p for p in result.photographs if len(p.points)]
+    nothing = np.empty((0, 2))
+    return (
+        np.concatenate([nothing, *(p.points[p.used] for p in posed)]),
+        np.concatenate([nothing, *(p.residuals[p.used] for p in posed)]),
     )
 
 
-def _coverage_map(
-    names: Sequence[Path | str], used: Sequence[Array], sensor: Sensor
-) -> tuple[Panel, str]:
-    curves = [_frame(sensor)]
-    few = len(names) <= len(PALETTE)
-    for i, (name, points) in enumerate(zip(names, used, strict=True)):
-        curves.append(
-            Curve(
-                Path(name).name if few else "",
-                points[:, 0],
-                sensor.height - points[:, 1],
-                "points",
-                PALETTE[i % len(PALETTE)],
-            )
-        )
-    panel = Panel("Coverage", "x in px", "y in px, up", tuple(curves), equal=True)
-    return panel, "Where targets were seen, a colour per photograph, and the image's frame."
+def _figures(result: Photographs, sensor: Sensor) -> tuple[Figure, ...]:
+    """Where targets were seen, and what the residuals show."""
+    posed = [p for p in result.photographs if len(p.points)]
+    points, residuals = _used(result)
+    w, h = float(sensor.width), float(sensor.height)
+    seen = [Curve("", np.array([0, w, w, 0, 0]), np.array([0, 0, h, h, 0]), "line", "#888888")]
+    for i, photograph in enumerate(posed):
+        name = Path(photograph.path).name if len(posed) <= _FEW_NAMES else ""
+        x, y = photograph.points[photograph.used].T
+        seen.append(Curve(name, x, y, "points", PALETTE[i % len(PALETTE)]))
+    cloud = Curve("", residuals[:, 0], residuals[:, 1], "points", PALETTE[0])
+    return (
+        Figure(
+            "coverage", "Coverage",
+            "Where targets were seen, a colour per photograph, and the image's frame.",
+            (
+                Panel("Coverage", "x in px", "y in px, down", tuple(seen), equal=True,
+                      y_down=True),
+            ),
+        ),
+        _by_radius(points, residuals, sensor),
+        Figure(
+            "scatter", "Residuals in x and y",
+            "The same residuals against each other: a round cloud without outliers.",
+            (
+                Panel("Residuals in x and y", "x in px", "y in px, down", (cloud,), equal=True,
+                      y_down=True),
+            ),
+        ),
+    )  # fmt: skip
 
 
-def _by_radius(points: Array, residuals: Array, sensor: Sensor) -> tuple[Panel, str]:
+def _by_radius(points: Array, residuals: Array, sensor: Sensor) -> Figure:
     from_centre = points - sensor.centre
     radius = np.linalg.norm(from_centre, axis=1)
     outwards = np.einsum("ni,ni->n", residuals, from_centre) / np.maximum(radius, 1e-9)
-    order = np.argsort(radius)
-    middles, means, sds = [], [], []
-    for rows in np.array_split(order, min(_RINGS, len(order))):
-        if len(rows) > 1:
-            middles.append(float(radius[rows].mean()))
-            means.append(float(outwards[rows].mean()))
-            sds.append(float(outwards[rows].std(ddof=1)) / np.sqrt(len(rows)))
-    x, y, sd = np.array(middles), np.array(means), np.array(sds)
+    rings = np.array_split(np.argsort(radius), min(_RINGS, len(radius)))
+    x, y, sd = np.array(
+        [
+            (radius[r].mean(), outwards[r].mean(), outwards[r].std(ddof=1) / np.sqrt(len(r)))
+            for r in rings
+            if len(r) > 1
+        ]
+    ).reshape(-1, 3).T  # fmt: skip
     curves = (
         Curve("points", radius, outwards, "points", "#9fc4dc"),
         Curve("mean, 95 %", x, y, "band", PALETTE[1], y - BAND * sd, y + BAND * sd),
@@ -209,37 +205,37 @@ def _by_radius(points: Array, residuals: Array, sensor: Sensor) -> tuple[Panel, 
         "Residuals outwards", "distance from the image centre in px", "outwards in px", curves,
         horizontal=((0.0, ""),),
     )  # fmt: skip
-    return panel, (
+    return Figure(
+        "outwards", panel.title,
         "The residuals' component away from the image centre, and its mean in rings of as many "
-        "points. A band that leaves zero is radial distortion that the model leaves."
-    )
-
-
-def _scatter(residuals: Array) -> tuple[Panel, str]:
-    panel = Panel(
-        "Residuals in x and y", "x in px", "y in px, down",
-        (Curve("", residuals[:, 0], residuals[:, 1], "points", PALETTE[0]),), equal=True,
+        "points. A band that leaves zero is radial distortion that the model leaves.",
+        (panel,),
     )  # fmt: skip
-    return panel, "The same residuals against each other: a round cloud without outliers."
 
 
 def _interior(result: Photographs, sensor: Sensor) -> Table:
     """Values with their standard deviations, the same in px for what has one."""
-    rows = []
-    values = np.empty(0) if result.interior is None else result.interior.as_array()
-    variance = np.diag(result.covariance)[:10]
-    for name, value, v in zip(IOP_NAMES, values, variance, strict=False):
-        if not v > 0:
-            rows.append((parameter_label(name), f"{plain(value, UNITS[name], 6)} (held)", ""))
-            continue
-        sd = float(np.sqrt(v))
+    values = () if result.interior is None else result.interior.as_array()
+    sds = np.sqrt(np.diag(result.covariance)[:10])
+
+    def value(name: str, value: float, sd: float) -> str:
+        if not sd > 0:
+            return f"{plain(value, UNITS[name], 6)} (held)"
+        return with_sd(value, sd, UNITS[name])
+
+    def in_px(name: str, value: float, sd: float) -> str:
         pitch = sensor.pixel_pitch
-        in_px = with_sd(value / pitch, sd / pitch, "px") if name in ("c", "x0", "y0") else ""
-        rows.append((parameter_label(name), with_sd(value, sd, UNITS[name]), in_px))
-    return Table(
+        shown = sd > 0 and name in ("c", "x0", "y0")
+        return with_sd(value / pitch, sd / pitch, "px") if shown else ""
+
+    return Table.of(
         "Values",
-        ("parameter", "value ± sd", "in px"),
-        tuple(rows),
+        list(zip(IOP_NAMES, values, sds, strict=False)),
+        {
+            "parameter": lambda r: parameter_label(r[0]),
+            "value ± sd": lambda r: value(*r),
+            "in px": lambda r: in_px(*r),
+        },
         "The standard deviations hold the noise of the image points and the errors of the test "
         "field's coordinates; errors of the camera model they do not hold.",
     )
@@ -263,22 +259,114 @@ def _correlations(result: Photographs) -> Table:
 
 
 def _photographs(result: Photographs) -> Table:
-    headings = ("photograph", "result", "targets", "left out", "RMS px", "X0, Y0, Z0 mm ± sd")
-    return Table("Each photograph", headings, tuple(_photograph(p) for p in result.photographs))
+    def outcome(p: PhotographResult) -> str:
+        return p.status.replace("_", " ") + (f": {p.reason}" if p.reason else "")
 
+    def place(p: PhotographResult) -> str:
+        if p.exterior is None:
+            return "–"
+        centre = zip(p.exterior.as_array()[3:], p.exterior_sd[3:], strict=True)
+        return ", ".join(with_sd(float(v), float(sd)) for v, sd in centre)
 
-def _photograph(p: PhotographResult) -> tuple[str, ...]:
-    where = "–"
-    if p.exterior is not None:
-        values = p.exterior.as_array()[3:]
-        where = ", ".join(
-            with_sd(float(v), float(s)) for v, s in zip(values, p.exterior_sd[3:], strict=True)
-        )
-    return (
-        Path(p.path).name,
-        p.status.replace("_", " ") + (f": {p.reason}" if p.reason else ""),
-        str(p.n_targets),
-        str(len(p.rejected)),
-        f"{p.rms_px:.3f}" if np.isfinite(p.rms_px) else "–",
-        where,
+    return Table.of(
+        "Each photograph",
+        result.photographs,
+        {
+            "photograph": lambda p: Path(p.path).name,
+            "result": outcome,
+            "targets": lambda p: str(p.n_targets),
+            "left out": lambda p: str(len(p.rejected)),
+            "RMS px": lambda p: f"{p.rms_px:.3f}" if np.isfinite(p.rms_px) else "–",
+            "X0, Y0, Z0 mm ± sd": place,
+        },
     )
+
+
+def render_field_check(assessed: FieldAssessment) -> str:
+    """Return the report as HTML text."""
+    result, field, model = assessed.check, assessed.check.field, assessed.check.camera
+    pitch = model.sensor.pixel_pitch
+    sds = result.precision.pixels(pitch)
+    said = ", ".join(f"{parameter_label(n)} to ± {_sd(one)}" for n, (one, *_) in sds.items())
+    if result.weak:
+        sentence = f"Not enough for a result from there: {'; '.join(result.weak)}."
+    else:
+        sentence = f"One image gives {said}, for image points of ± {result.sigma_px:g} px."
+    X, Y, Z = result.station.centre
+    more = (
+        f"{len(result.visible)} of {len(field)} targets are visible from ({X:.0f}, {Y:.0f}, "
+        f"{Z:.0f}) mm, {result.distance:.0f} mm away; they cover {percent(result.coverage)} of the "
+        f"image, and their depth spans {percent(result.depth_relief)} of the distance."
+    )
+    worse = max(field / one for one, _, field in sds.values())
+    if worse > _FIELD_DOMINATES and not result.weak:
+        stated = ", ".join(
+            f"{parameter_label(n)} to ± {_sd(field)}" for n, (*_, field) in sds.items()
+        )
+        more += f" With the errors of the targets' places as they are stated it gives {stated}."
+    rows = tuple((parameter_label(n), *(_sd(value) for value in row)) for n, row in sds.items())
+    reasons = list(result.hidden.values())
+    chapter = Chapter(
+        "Check of a test field",
+        Answer(
+            sentence,
+            _seen(result, field, model),
+            (more,),
+            tuple(map(as_sentence, assessed.advice))
+            or ("Nothing would help by a seventh: put it up.",),
+            (
+                "Blur, shadow, glare and paper that is not flat: look at the first frames.",
+                "Errors of the camera model, which no field shows beforehand.",
+            ),
+        ),
+        (
+            Section(
+                "How precise",
+                tables=(
+                    Table(
+                        "Standard deviations",
+                        ("parameter", "one image", "in a series", "with the field's own errors"),
+                        rows,
+                        "In a series: one epoch relative to the others, of a camera that stands "
+                        "still.",
+                    ),
+                ),
+            ),
+            Section(
+                "Which targets are not seen, and why",
+                items=tuple((f"{reasons.count(r)} targets", r) for r in sorted(set(reasons))),
+                text=() if reasons else ("All are seen.",),
+            ),
+        ),
+        (f"{model.sensor.width} × {model.sensor.height} px of {pitch * 1000:g} µm.",),
+    )
+    return render_report(chapter.title, [chapter])
+
+
+def _sd(value: float) -> str:
+    return f"{plain(value, 'px', 2)}" if value < 1e300 else "nothing"
+
+
+def _seen(result: FieldCheck, field: TestField, model: CameraModel) -> Figure:
+    """The visible targets in the image, with the parts that ought to be filled."""
+    w, h = float(model.sensor.width), float(model.sensor.height)
+    lines = [Curve("", np.array([x, x]), np.array([0.0, h]), colour="#bbbbbb")
+             for x in np.linspace(0, w, CELLS[0] + 1)]  # fmt: skip
+    lines += [Curve("", np.array([0.0, w]), np.array([y, y]), colour="#bbbbbb")
+              for y in np.linspace(0, h, CELLS[1] + 1)]  # fmt: skip
+    points = project(
+        model.sensor, model.interior.as_array(), result.station.as_array(),
+        field.points[result.visible],
+    )  # fmt: skip
+    targets = Curve("", points[:, 0], points[:, 1], "points", PALETTE[0])
+    empty = int(np.count_nonzero(result.cells == 0))
+    panel = Panel(
+        "Targets in the image", "x in px", "y in px, down", (*lines, targets), equal=True,
+        y_down=True,
+    )  # fmt: skip
+    return Figure(
+        "seen", "What the camera sees",
+        f"The visible targets in the image, in {CELLS[0]} × {CELLS[1]} parts, {empty} of them "
+        "empty. Distortion is only known where there are targets.",
+        (panel,),
+    )  # fmt: skip

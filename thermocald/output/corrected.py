@@ -18,7 +18,9 @@ from thermocald.analysis.thermal.correction import (
 from thermocald.analysis.thermal.timed_rows import STANDARD_INPUT, RowBlock, row_blocks
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import make_folder, new_file, write_parts
-from thermocald.photogrammetry.targets.image_metadata import with_metadata
+from thermocald.photogrammetry.targets.image_file import EncodedImage, with_metadata
+from thermocald.result import document_of
+from thermocald.store.logger.series import iso
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -78,9 +80,10 @@ class Correction:
         if self.images:
             worst = max(d["rms_left_over_px"] for d in self.images)
             most = max(d["largest_correction_px"] for d in self.images)
+            images = "1 image" if len(self.images) == 1 else f"{len(self.images)} images"
             return (
-                f"{len(self.images)} images corrected by up to {most:.3f} px; left over ± "
-                f"{worst:.3f} px at most (RMS)"
+                f"{images} corrected by up to {most:.3f} px; left over ± {worst:.3f} px at most "
+                "(RMS)"
             )
         return (
             f"{self.points} points corrected by {self._rms(self._moved):.3f} px (RMS); left over ± "
@@ -135,7 +138,8 @@ class Correction:
                 except ImageError as cause:
                     self._refuse(line, str(cause))
                 else:
-                    self.images.append(_told(source, written, c))
+                    where = {"image": str(source), "corrected": str(written)}
+                    self.images.append(where | document_of(c))
                 advance(1)
         self._require_any(len(self.images))
 
@@ -145,8 +149,8 @@ class Correction:
             count = len(self.refused) + self.points + len(self.images)
             lines = ", ".join(str(r["line"]) for r in self.refused[:_SAID])
             raise DataError(
-                f"{self.path}: {len(self.refused)} of {count} rows were not corrected: lines "
-                + lines
+                f"{self.path}: {len(self.refused)} of {count} rows were not corrected: line"
+                f"{'s' if len(self.refused) > 1 else ''} {lines}"
                 + (", …" if len(self.refused) > _SAID else "")
             )
 
@@ -157,7 +161,7 @@ class Correction:
         within = (block.times >= log[0] - step) & (block.times <= log[-1] + step)
         possible = block.kept(
             within,
-            f"was measured outside the temperature log ({log[0]:.0f} to {log[-1]:.0f} s)",
+            f"was measured outside the temperature log ({iso(log[0])} to {iso(log[-1])})",
         )
         if possible.values.shape[1]:
             sensor = self.thermal.model.sensor
@@ -223,32 +227,18 @@ class Correction:
 def _write_corrected(source: Path, written: Path, c: ImageCorrection) -> None:
     import cv2
 
-    image = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise ImageError(f"{source}: is not a readable image")
+    image = EncodedImage(source).as_it_is()
     if written.exists() and written.samefile(source):
         raise UsageError(f"{written}: would be overwritten; give another --out")
-    height, width = c.map_x.shape
+    width, height = c.maps.sensor.width, c.maps.sensor.height
     if image.shape[:2] != (height, width):
         raise ImageError(
             f"{source}: has {image.shape[1]}×{image.shape[0]} px, the model's camera "
             f"{width}×{height}; say --size where it is binned"
         )
-    corrected = cv2.remap(image, c.map_x, c.map_y, cv2.INTER_CUBIC)
+    corrected = c.maps.resample(image, c.values)
     encoded, data = cv2.imencode(written.suffix, corrected)
     if not encoded:
         raise ImageError(f"{written}: its format cannot be written")
     with new_file(written) as partial:
         partial.write_bytes(with_metadata(data.tobytes(), source.read_bytes()))
-
-
-def _told(source: Path, written: Path, c: ImageCorrection) -> dict[str, Any]:
-    return {
-        "image": str(source),
-        "corrected": str(written),
-        "temperature": c.temperature,
-        "rms_correction_px": c.rms_px,
-        "largest_correction_px": c.largest_px,
-        "rms_left_over_px": c.left_over_px,
-        "extrapolated_K": c.extrapolated,
-    }

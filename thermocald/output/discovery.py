@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery.gap import Gap, image_chi2
-from thermocald.discovery.result import Discovery, field_lines, mount_lines
+from thermocald.discovery.gap import image_chi2
+from thermocald.discovery.result import Discovery, field_lines, mount_lines, say_adequate
 from thermocald.discovery.search import MOUNT, Solution
-from thermocald.discovery.unnamed import resolve
+from thermocald.discovery.unnamed import describe_misfit
 from thermocald.figures import (
     BAND,
     GREY,
     PALE,
     PALETTE,
     Arrows,
-    draw_arrows,
+    Curve,
+    Figure,
+    Panel,
     drawing_style,
     label_axes,
     legend_above,
@@ -25,21 +28,10 @@ from thermocald.figures import (
     tick_text,
 )
 from thermocald.numbers import parameter_label, plain, shortened, with_sd
-from thermocald.report import (
-    Answer,
-    Chapter,
-    Drawing,
-    Section,
-    Table,
-    day,
-    of_drawing,
-    render_report,
-)
+from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day, render_report
 from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
-    from datetime import datetime
-
     from thermocald.arrays import Array
     from thermocald.discovery.entries import EffectFound
     from thermocald.discovery.validation import SurrogateTest
@@ -50,15 +42,15 @@ _BASE, _FOUND = PALETTE[1], PALETTE[0]
 _AT_NOISE = 1.1  # times the noise: what an effect leaves counts as noise
 
 
-def report_html(discovery: Discovery, title: str, made: datetime | None = None) -> str:
-    """Return the whole page; made: the time that it bears, by default now."""
+def report_html(discovery: Discovery, title: str) -> str:
+    """Return the whole page."""
     chapter = Chapter(
         f"Discovery: {title}",
         _answer(discovery),
         tuple(_sections(discovery)),
         tuple(_origin(discovery)),
         tuple(
-            f"{line[0].upper()}{line[1:].strip()}."
+            as_sentence(line)
             for line in (
                 *doubt_lines(discovery.doubts),
                 *mount_lines(discovery.examination),
@@ -66,7 +58,7 @@ def report_html(discovery: Discovery, title: str, made: datetime | None = None) 
             )
         ),
     )
-    return render_report(chapter.title, [chapter], made=made)
+    return render_report(chapter.title, [chapter])
 
 
 def _answer(d: Discovery) -> Answer:
@@ -74,7 +66,9 @@ def _answer(d: Discovery) -> Answer:
     temperatures = _temperatures(d)
     closing = sorted(d.effects, key=lambda e: e.gap_after.rms_px - e.gap_before.rms_px)
     if closing:
-        sentence = f"{_sentence(closing[0].statement)}."
+        sentence = as_sentence(_statement(closing[0]))
+    elif d.examination.mount is not None:
+        sentence = as_sentence(say_adequate(d.examination))
     else:
         sentence = (
             f"The model reproduces the recording within its noise of {_noise_px(d, 0):.3f} px"
@@ -82,21 +76,20 @@ def _answer(d: Discovery) -> Answer:
         )
     more = []
     if d.effects:
-        gaps = zip(_names(d), (before.fit, *before.others), (after.fit, *after.others), strict=True)
+        gaps = zip(_names(d), before.gaps, after.gaps, strict=True)
         said = [f"{a.rms_px:.3f} to {b.rms_px:.3f} px RMS on {name}" for name, a, b in gaps]
-        more += [f"Also found: {e.statement.rstrip('.')}." for e in closing[1:]]
+        more += [f"Also found: {_statement(e)}." for e in closing[1:]]
         it = "it" if len(closing) == 1 else "all of it"
         more.append(
             f"With {it} the gap between model and measurement goes from {' and from '.join(said)}"
             f"{temperatures}; the noise of an image coordinate is {_noise_px(d, 0):.3f} px."
         )
-    if d.verdict == "unexplained":
-        more.append("No effect of the catalogue explains it.")
     return Answer(sentence, _trajectory(d), tuple(more), _next_steps(d), _not_covered(d))
 
 
-def _sentence(statement: str) -> str:
-    return (statement[:1].upper() + statement[1:]).rstrip(".")
+def _statement(effect: EffectFound) -> str:
+    """What an effect states, without its stop; amplitudes are called as what they are of."""
+    return re.sub(r"\ba_(?=[A-Zcxy])", "", effect.statement).rstrip(".")
 
 
 def _temperatures(d: Discovery) -> str:
@@ -117,7 +110,7 @@ def _next_steps(d: Discovery) -> tuple[str, ...]:
     if d.verdict == "effects_found":
         steps.append("Write the model with --model-out and correct measurements with it.")
     if d.verdict == "adequate":
-        steps.append("See with `thermocald discover --plan` which effects this set-up would show.")
+        steps.append("See with thermocald discover --plan which effects this set-up would show.")
     if d.verdict == "unexplained":
         steps.append("Record what may be the cause (light, current, a second temperature) too.")
     return tuple(steps)
@@ -154,7 +147,7 @@ def _origin(d: Discovery) -> list[str]:
 def _sections(d: Discovery) -> list[Section]:
     tested = d.verdict == "effects_found" and bool(d.examination.surrogates)
     return [
-        Section("Before and after", figures=(_movement(d), _gaps(d)), tables=(_gap_table(d),)),
+        Section("Before and after", figures=(_movement(d), gap_figure(d)), tables=(_gap_table(d),)),
         *(_effect(e) for e in d.effects),
         *([_noise_test(d)] if tested else []),
         _candidates(d),
@@ -188,7 +181,7 @@ def _noise_px(d: Discovery, series: int) -> float:
     return float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
 
 
-def _trajectory(d: Discovery) -> Drawing:
+def _trajectory(d: Discovery) -> Figure:
     """Measured image movement against both models over time and temperature, residuals below."""
     e = d.examination.fitter.series[0]
     base, final = (_model(fit, 0) for fit in (d.base_fit, d.final_fit))
@@ -199,42 +192,43 @@ def _trajectory(d: Discovery) -> Drawing:
     model = _without_level(e, final - base) if found else rests[0]
     _, _, v = np.linalg.svd(model @ root, full_matrices=False)
     # root-mean-square over the image coordinates
-    along = root @ v[0] * _noise_px(d, 0) / np.sqrt(max(float(2 * e.n.mean()), 1.0))
-    measured = _without_level(e, e.values) @ along
     noise = _noise_px(d, 0) / np.sqrt(max(float(2 * e.n.mean()), 1.0))
-    minutes, T = e.times / 60.0, e.averaged(e.history.temperature())
+    along = root @ v[0] * noise
+    measured, (before, after) = _without_level(e, e.values) @ along, (r @ along for r in rests)
     name = " + ".join(effect.effect for effect in d.effects) if found else ""
-    with drawing_style():
-        drawing = new_drawing(9.0, 4.6)
-        axes = drawing.subplots(
-            2, 2, sharex="col", sharey="row", gridspec_kw={"height_ratios": (2, 1)}
-        )
-        for column, x in enumerate((minutes, T)):
-            top, below = axes[:, column]
-            top.plot(x, measured, ".", color=PALE, ms=4, label="measured")
-            top.plot(x, measured - rests[0] @ along, "--", color=_BASE, lw=1.2, label="base model")
-            below.plot(x, rests[0] @ along, ".", color=_BASE, ms=2.5)
-            if found:
-                shown = measured - rests[1] @ along
-                label = f"with {name}" if len(d.effects) == 1 else "with all effects"
-                top.plot(x, shown, "-", color=_FOUND, lw=1.2, label=label)
-                below.plot(x, rests[1] @ along, ".", color=_FOUND, ms=2.5)
-            below.axhspan(-BAND * noise, BAND * noise, color=GREY, alpha=0.25, lw=0)
-            below.axhline(0.0, color=GREY, lw=0.6)
-        label_axes(axes[0, 0], y="image movement in px")
-        label_axes(axes[1, 0], "time in min", "left over in px")
-        label_axes(axes[1, 1], "temperature in °C")
-        legend_above(axes[0, 0])
-    text = (
+    label = f"with {name}" if len(d.effects) == 1 else "with all effects"
+    above, below = [], []
+    for x, of in (
+        (e.times / 60.0, "time in min"),
+        (e.averaged(e.history.temperature()), "temperature in °C"),
+    ):
+        curves = [
+            Curve("measured", x, measured, "points", PALE),
+            Curve("base model", x, measured - before, "line", _BASE, dashed=True),
+        ]
+        ends, band = np.array([np.nanmin(x), np.nanmax(x)]), np.full(2, BAND * noise)
+        left = [
+            Curve("", ends, np.zeros(2), "band", GREY, -band, band),
+            Curve("", x, before, "points", _BASE),
+        ]
+        if found:
+            curves.append(Curve(label, x, measured - after, "line", _FOUND))
+            left.append(Curve("", x, after, "points", _FOUND))
+        above.append(Panel("Movement", of, "image movement in px", tuple(curves)))
+        below.append(Panel("Left over", of, "left over in px", tuple(left)))
+    return Figure(
+        "trajectory",
+        "Measured and modelled",
         "Movement of the image in the pattern in which "
         + (f"{name} shows" if found else "the model leaves most")
         + ", root-mean-square over the targets of M1: measured, and as the models have it. Below: "
-        "what each leaves; grey: 95 % of the noise of an epoch."
+        "what each leaves; grey: 95 % of the noise of an epoch.",
+        (*above, *below),
+        columns=2,
     )
-    return of_drawing(drawing, "trajectory", "Measured and modelled", text)
 
 
-def _movement(d: Discovery) -> Drawing:
+def _movement(d: Discovery) -> Figure:
     """What each model leaves of the targets' movement, as vectors of one scale."""
     e = d.examination.fitter.series[0]
     seen = e.weights[..., 0].any(axis=0)
@@ -253,68 +247,87 @@ def _movement(d: Discovery) -> Drawing:
     # what is less than the noise shall not look large
     longest = max(float(np.linalg.norm(drawn[0][1], axis=1).max()), _noise_px(d, 0))
     frame = (e.source.sensor.width, e.source.sensor.height)
-    with drawing_style():
-        drawing = new_drawing(9.0, 3.8)
-        axes = drawing.subplots(1, 2, sharey=True)
-        for axis in axes[len(drawn) :]:
-            axis.set_axis_off()
-        for axis, (misfit, vectors), title, colour in zip(
-            axes, drawn, ("Before", "After"), (_BASE, _FOUND), strict=False
-        ):
-            axis.plot(*places.T, ".", color=GREY, ms=2)
-            draw_arrows(axis, Arrows(places, vectors, frame, colour, longest))
-            axis.set_title(f"{title}: {misfit:.3f} px RMS", loc="left")
-            label_axes(axis, "x in px")
-        label_axes(axes[0], y="y in px, down")
-    return of_drawing(
-        drawing, "movement", "Image movement that the model leaves",
-        "Each target of M1 with the strongest pattern of what is measured less what the model "
-        + ("says, before and after what was found; both drawn to the same scale."
-           if len(drawn) > 1
-           else "says; nothing was found that another recording would show too."),
+    targets = Curve("", places[:, 0], places[:, 1], "points", PALE)
+    panels = tuple(
+        Panel(
+            f"{title}: {misfit:.3f} px", "x in px", "y in px, down", (targets,),
+            arrows=Arrows(places, vectors, frame, colour, longest),
+        )
+        for (misfit, vectors), title, colour in zip(
+            drawn, ("Before", "After"), (_BASE, _FOUND), strict=False
+        )
     )  # fmt: skip
+    return Figure(
+        "movement",
+        "Image movement that the model leaves",
+        "Each target of M1 with the strongest pattern of what is measured less what the model says"
+        + (
+            ", before and after what was found, with its root-mean-square; one scale for both."
+            if len(drawn) > 1
+            else "; nothing was found that another recording would show too."
+        ),
+        panels,
+        columns=2,
+    )
 
 
-def _gaps(d: Discovery) -> Drawing:
-    """The gap of every stage on every recording as bars against the noise."""
-    labels = ["base model", *(f"+ {stage.added}" for stage in d.stages[1:])]
-    names = _names(d)
+def _bars(groups: list[tuple[float, list[tuple[str, float, str]]]], label: str) -> Any:
+    """Draw bars (name, px, colour) in groups, each against its noise, px."""
+    bars = [bar for _, group in groups for bar in group]
     with drawing_style():
-        drawing = new_drawing(9.0, 0.9 + 0.32 * len(labels) * len(names))
+        drawing = new_drawing(9.0, 0.9 + 0.3 * len(bars) + 0.1 * len(groups))
         axis = drawing.subplots()
         ticks, place = [], 0.0
-        top = max(gap.rms_px for stage in d.stages for gap in (stage.fit, *stage.others))
-        for k, name in enumerate(names):
-            noise = _noise_px(d, k)
+        for k, (noise, group) in enumerate(groups):
             first = place
-            for stage, label in zip(d.stages, labels, strict=True):
-                gap = (stage.fit, *stage.others)[k]
-                axis.barh(place, gap.rms_px, 0.7, color=_BASE if not stage.added else _FOUND)
-                axis.annotate(f"{gap.rms_px:.3f}", (gap.rms_px, place), (4, 0), fontsize=8,
+            for _, length, colour in group:
+                axis.barh(place, length, 0.7, color=colour)
+                axis.annotate(f"{length:.3f}", (length, place), (4, 0), fontsize=8,
                               textcoords="offset points", va="center")  # fmt: skip
-                ticks.append((place, f"{name}, {label}"))
+                ticks.append(place)
                 place -= 1.0
             axis.plot([noise, noise], [first + 0.5, place + 0.5], "--", color=GREY, lw=1.2,
                       label="" if k else "noise")  # fmt: skip
             place -= 0.4
-        axis.set_yticks([at for at, _ in ticks], [shortened(label, 40) for _, label in ticks])
-        axis.set_xlim(0.0, 1.12 * top)
+        axis.set_yticks(ticks, [shortened(name, 40) for name, *_ in bars])
+        axis.set_xlim(0.0, 1.12 * max(length for _, length, _ in bars))
         axis.grid(visible=False, axis="y")
-        label_axes(axis, "gap between model and measurement in px RMS")
+        label_axes(axis, label)
         legend_above(axis)
-    return of_drawing(
-        drawing, "gaps", "The gap",
+    return drawing
+
+
+def gap_figure(d: Discovery) -> Figure:
+    """The gap of every stage on every recording as bars against the noise."""
+    groups = [
+        (
+            _noise_px(d, k),
+            [
+                (
+                    f"{name}, {f'+ {stage.added}' if stage.added else 'base model'}",
+                    stage.gaps[k].rms_px,
+                    _FOUND if stage.added else _BASE,
+                )
+                for stage in d.stages
+            ],
+        )
+        for k, name in enumerate(_names(d))
+    ]
+    return Figure(
+        "gaps",
+        "The gap",
         "Image points measured less simulated, with and without what was found, against the noise "
         "of an image coordinate (dashed). The constants are those of M1 throughout.",
-    )  # fmt: skip
+        drawing=_bars(groups, "gap between model and measurement in px RMS"),
+    )
 
 
 def _gap_table(d: Discovery) -> Table:
-    rows = []
-    for stage in d.stages:
-        label = f"with {stage.added}" if stage.added else "base model"
-        gaps = (stage.fit, *stage.others)
-        rows += [_gap_row(f"{n}, {label}", gap) for n, gap in zip(_names(d), gaps, strict=True)]
+    gaps = [
+        (f"{name}, {f'with {stage.added}' if stage.added else 'base model'}", gap)
+        for stage in d.stages
+        for name, gap in zip(_names(d), stage.gaps, strict=True)
+    ]
     outside, inside = d.cross_validation
     note = "1 is the floor of reduced χ²."
     if math.isfinite(outside):
@@ -324,13 +337,17 @@ def _gap_table(d: Discovery) -> Table:
         )
     if d.stages[0].verify is None:
         note += " No M2 was given: the constants are not verified."
-    return Table(
-        "The gap in numbers", ("", "px RMS", "reduced χ²", "mm at 10 m"), tuple(rows), note
+    return Table.of(
+        "The gap in numbers",
+        gaps,
+        {
+            "": lambda r: r[0],
+            "px RMS": lambda r: f"{r[1].rms_px:.4f}",
+            "reduced χ²": lambda r: f"{r[1].chi2_reduced:.3f}",
+            "mm at 10 m": lambda r: f"{r[1].object_mm_at_10m:.2f}",
+        },
+        note,
     )
-
-
-def _gap_row(name: str, gap: Gap) -> tuple[str, ...]:
-    return (name, f"{gap.rms_px:.4f}", f"{gap.chi2_reduced:.3f}", f"{gap.object_mm_at_10m:.2f}")
 
 
 # what was found
@@ -398,12 +415,14 @@ def _noise_test(d: Discovery) -> Section:
         for axis, (name, test) in zip(axes, tests, strict=True):
             _draw_surrogates(axis, name, test)
     text = "; ".join(f"{name}: p {_p(t.p, len(t.surrogates))}" for name, t in tests)
-    figure = of_drawing(
-        drawing, "surrogates", "Surrogates",
+    figure = Figure(
+        "surrogates",
+        "Surrogates",
         f"{text}. Grey: what the same search gains on surrogates, which are the recording's own "
         "noise moved in time against the temperatures. A name needs a gain that none of them "
         "reaches.",
-    )  # fmt: skip
+        drawing=drawing,
+    )
     return Section("Could noise do this?", (), (figure,))
 
 
@@ -434,32 +453,19 @@ def _candidates(d: Discovery) -> Section:
         singles.setdefault(_candidate_name(s), s)
     noise = _noise_px(d, 0)
     rows = [(name, s, _left_px(d, s.fit)) for name, s in singles.items()]
-    best = x.best.names[len(x.base.terms) :]
-    combined = len(best) > 1 and x.adequate
-    named = x.adequate and bool(best)
-    bars = [(name, left, named and name.split(" ")[0] in best) for name, _, left in rows]
-    if combined:
-        bars.insert(0, (" + ".join(best), _left_px(d, x.best.fit), True))
+    best = x.best.names[len(x.base.terms) :] if x.adequate else ()
+    bars = [(name, left, _FOUND if name.split(" ")[0] in best else PALE) for name, _, left in rows]
+    if len(best) > 1:
+        bars.insert(0, (" + ".join(best), _left_px(d, x.best.fit), _FOUND))
     if not bars:
         return Section("The candidates", ("No effect of the catalogue promised anything.",))
-    with drawing_style():
-        drawing = new_drawing(9.0, 0.8 + 0.3 * len(bars))
-        axis = drawing.subplots()
-        for place, (_, left, found) in enumerate(bars):
-            axis.barh(-place, left, 0.7, color=_FOUND if found else PALE)
-            axis.annotate(f"{left:.3f}", (left, -place), (4, 0), fontsize=8, va="center",
-                          textcoords="offset points")  # fmt: skip
-        axis.axvline(noise, ls="--", color=GREY, lw=1.2, label="noise")
-        axis.set_yticks([-k for k in range(len(bars))], [shortened(b[0], 40) for b in bars])
-        axis.set_xlim(0.0, 1.12 * max(left for _, left, _ in bars))
-        axis.grid(visible=False, axis="y")
-        label_axes(axis, "left on M1 in px RMS")
-        legend_above(axis)
-    figure = of_drawing(
-        drawing, "candidates", "The candidates, each alone",
-        f"What the base model with one effect more leaves of M1. {'Blue: named. ' if named else ''}"
+    figure = Figure(
+        "candidates",
+        "The candidates, each alone",
+        f"What the base model with one effect more leaves of M1. {'Blue: named. ' if best else ''}"
         "The dashed line is the noise, below which nothing can be explained.",
-    )  # fmt: skip
+        drawing=_bars([(noise, bars)], "left on M1 in px RMS"),
+    )
     items = tuple((name, _why(d, name, s, left, noise)) for name, s, left in rows)
     return Section("The candidates, and why each lost", (), (figure,), (), items)
 
@@ -500,22 +506,23 @@ def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str
 
 
 def _misfit_table(d: Discovery) -> Table:
-    rows = tuple(
-        (parameter_label(name), _number(value, 4), _number(sigmas, 1))
-        for name, value, sigmas in resolve(d.examination).rows
+    def number(value: Any, decimals: int) -> str:
+        if not isinstance(value, float):
+            return str(value)
+        return f"{value:.{decimals}f}".replace("-", "−") if math.isfinite(value) else "–"
+
+    return Table.of(
+        "Misfit of the base model",
+        describe_misfit(d.examination)["against"],
+        {
+            "against": lambda r: ", ".join(map(parameter_label, r["what"].split(", "))),
+            "size in px RMS": lambda r: number(r["rms_px"], 4),
+            "significance in σ": lambda r: number(r["significance_sigmas"], 1),
+        },
     )
-    return Table(
-        "Misfit of the base model", ("against", "size in px RMS", "significance in σ"), rows
-    )
 
 
-def _number(value: Any, decimals: int) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    return f"{value:.{decimals}f}".replace("-", "−") if math.isfinite(value) else "–"
-
-
-def _misfit_matrix(d: Discovery) -> Drawing:
+def _misfit_matrix(d: Discovery) -> Figure:
     """Where the base model fails: slow trajectories by parameter combination, in sigma."""
     a = d.examination.base_adequacy[0]
     scores = np.maximum(np.abs(a.scores[:, ::-1]), 1e-3)
@@ -529,8 +536,10 @@ def _misfit_matrix(d: Discovery) -> Drawing:
         bar = drawing.colorbar(image, ax=axis)
         bar.set_label("|misfit| in σ")
         bar.ax.yaxis.set_major_formatter(lambda value, _: tick_text(value))
-    text = (
+    return Figure(
+        "misfit-matrix",
+        "Misfit of the base model",
         f"Slow trajectories that the base model leaves: {plain(float(scores.max()), digits=3)} σ "
-        "at most."
+        "at most.",
+        drawing=drawing,
     )
-    return of_drawing(drawing, "misfit-matrix", "Misfit of the base model", text)

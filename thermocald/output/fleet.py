@@ -8,21 +8,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from thermocald.figures import BAND, PALETTE, drawing_style, label_axes, new_drawing
-from thermocald.numbers import parameter_label, short_duration, shortened
-from thermocald.report import (
-    Answer,
-    Chapter,
-    Drawing,
-    Section,
-    Table,
-    of_drawing,
-    render_report,
-)
+from thermocald.figures import BAND, PALETTE, Figure, drawing_style, label_axes, new_drawing
+from thermocald.numbers import parameter_label, percent, short_duration, shortened
+from thermocald.report import Answer, Chapter, Section, Table, render_report
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from datetime import datetime
 
 _WORDS = {
     "late": "late",
@@ -50,8 +41,8 @@ _ADVICE = {
 _MOST_LABELLED = 40
 
 
-def render_fleet(document: Mapping[str, Any], made: datetime | None = None) -> str:
-    """Return the page as HTML text; document: of `fleet_document`; made: the time it bears."""
+def render_fleet(document: Mapping[str, Any]) -> str:
+    """Return the page as HTML text; document: of `fleet_document`."""
     summary, cameras = document["summary"], document["cameras"]
     found = tuple(
         (f"{_name(c)}, {_WORDS[f['kind']]}", f["text"]) for c in cameras for f in c["findings"]
@@ -84,7 +75,7 @@ def render_fleet(document: Mapping[str, Any], made: datetime | None = None) -> s
         ),
     ]
     about = (f"From {', '.join(document['servers'])}.",)
-    return render_report(title, [Chapter(title, answer, tuple(sections), about)], made=made)
+    return render_report(title, [Chapter(title, answer, tuple(sections), about)])
 
 
 def _name(camera: Mapping[str, Any]) -> str:
@@ -92,40 +83,41 @@ def _name(camera: Mapping[str, Any]) -> str:
 
 
 def _table(cameras: Sequence[Mapping[str, Any]]) -> Table:
-    rates = tuple(f"{parameter_label(name)} µm/K" for name in ("c", "x0", "y0"))
-    return Table(
+    def known(value: float | None, form: str) -> str:
+        return "–" if value is None else format(value, form)
+
+    def rate(camera: Mapping[str, Any], name: str) -> str:
+        found = camera["rates"].get(name)
+        return f"{found['value'] * 1e3:+.3f} ± {found['sd'] * 1e3:.3f}" if found else "–"
+
+    def calibrated(camera: Mapping[str, Any]) -> str:
+        low, high = camera["temperature_range"] or (math.nan, math.nan)
+        return f"{low:.0f} … {high:.0f}" if math.isfinite(low) else "–"
+
+    return Table.of(
         "Every camera",
-        ("station/camera", "last epoch", "on its way", "waiting", "results", "°C now",
-         "°C calibrated", *rates, "type"),
-        tuple(_row(camera) for camera in cameras),
+        cameras,
+        {
+            "station/camera": lambda c: f"{'● ' if c['findings'] else ''}{_name(c)}",
+            "last epoch": lambda c: short_duration(c["lag_s"]),
+            "on its way": lambda c: short_duration(c["on_the_way_s"]),
+            "waiting": lambda c: known(c["waiting"], "d"),
+            "results": lambda c: "–" if c["ok"] is None else percent(c["ok"]),
+            "°C now": lambda c: known(c["temperature"], ".1f"),
+            "°C calibrated": calibrated,
+            "c µm/K": lambda c: rate(c, "c"),
+            "x₀ µm/K": lambda c: rate(c, "x0"),
+            "y₀ µm/K": lambda c: rate(c, "y0"),
+            "type": lambda c: str(c["type"]),
+        },
         "●: see above.",
-    )  # fmt: skip
-
-
-def _row(camera: Mapping[str, Any]) -> tuple[str, ...]:
-    low, high = camera["temperature_range"] or (math.nan, math.nan)
-    rates = {
-        name: f"{r['value'] * 1e3:+.3f} ± {r['sd'] * 1e3:.3f}"
-        for name, r in camera["rates"].items()
-    }
-    return (
-        f"{'● ' if camera['findings'] else ''}{_name(camera)}",
-        short_duration(camera["lag_s"]),
-        short_duration(camera["on_the_way_s"]),
-        "–" if camera["waiting"] is None else str(camera["waiting"]),
-        f"{camera['ok']:.0%}" if math.isfinite(camera["ok"]) else "–",
-        f"{camera['temperature']:.1f}" if math.isfinite(camera["temperature"]) else "–",
-        f"{low:.0f} … {high:.0f}" if math.isfinite(low) else "–",
-        *(rates.get(name, "–") for name in ("c", "x0", "y0")),
-        camera["type"],
     )
 
 
 def _drawings(
     number: int, kind: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]
-) -> list[Drawing]:
-    of_name = {_name(c): c for c in cameras}
-    specimens = [(name, of_name[name]) for name in kind["cameras"]]
+) -> list[Figure]:
+    specimens = [c for c in cameras if _name(c) in kind["cameras"]]
     return [
         _drawing(f"type-{number}-{rate}", rate, kind["rates"][rate], specimens)
         for rate in kind["rates"]
@@ -133,18 +125,17 @@ def _drawings(
 
 
 def _drawing(
-    name: str, rate: str, of_type: Mapping[str, Any],
-    specimens: Sequence[tuple[str, Mapping[str, Any]]],
-) -> Drawing:  # fmt: skip
+    name: str, rate: str, of_type: Mapping[str, Any], specimens: Sequence[Mapping[str, Any]]
+) -> Figure:  # fmt: skip
     """A type's specimens, from the lowest rate to the highest, in the band of the type."""
     found = sorted(
         (
             1e3 * c["rates"][rate]["value"],
             1e3 * BAND * c["rates"][rate]["sd"],
-            specimen,
+            _name(c),
             any(f["kind"] == "odd" for f in c["findings"]),
         )
-        for specimen, c in specimens
+        for c in specimens
     )
     mean, spread = 1e3 * of_type["value"], 1e3 * BAND * of_type["sd_between"]
     labelled = len(found) <= _MOST_LABELLED
@@ -164,8 +155,8 @@ def _drawing(
         label_axes(axis, f"{parameter_label(rate)} in µm/K")
         if not labelled:
             label_axes(axis, y="cameras, lowest first")
-    return of_drawing(
-        drawing, name, f"{parameter_label(rate)} of each camera",
+    return Figure(
+        name, f"{parameter_label(rate)} of each camera",
         "Bars and band: 95 %, of each camera and of the type; line: the type's mean; orange: "
-        "unlike its type.",
+        "unlike its type.", drawing=drawing,
     )  # fmt: skip

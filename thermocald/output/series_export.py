@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -18,18 +18,12 @@ from thermocald.analysis.series.epochs import csv_text
 from thermocald.errors import DriverMissing, UsageError
 from thermocald.files import make_folder, new_file
 from thermocald.result import jsonable
-from thermocald.store.recording.reader import open_recording
-from thermocald.store.sources import open_source
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from thermocald.analysis.series.epochs import Columns, Epochs
-    from thermocald.arrays import Array
-    from thermocald.store.series import StoredEpoch
 
 
 UNITS = ("px", "um", "deg")
@@ -70,112 +64,37 @@ def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle
     return ExportStyle(frozenset(wanted), time, mark, decimal)
 
 
-@dataclass(frozen=True, slots=True)
-class Besides:
-    """What a source knows of its epochs besides the adjustment.
-
-    pixel_pitch mm; thermometers {channel: (E,) °C at the frames}; extra {name: (E,) numbers, or E
-    texts}: what the camera reported, light, blur, the filter's state, unknown columns of a file.
-    """
-
-    pixel_pitch: float | None = None
-    thermometers: dict[str, Array] = field(default_factory=dict)
-    extra: Columns = field(default_factory=dict)
-
-
-def besides(
-    source: Path, series: str | None, numbers: NDArray[np.int64], *, extra: bool = False
-) -> Besides:
-    """What is known besides of epochs `numbers` (E,).
-
-    source: a recording (folder) or a store; series: `CAMERA/SERIES` or `SERIES` of a store; extra:
-    False leaves the extra columns unread.
-    """
-    texts: dict[str, tuple[str, ...]] = {}
-    values: dict[str, Array] = {}
-    if source.is_dir():
-        recording = open_recording(source)
-        known = recording.columns.numbers
-        readings = {name: recording.columns.at_frame(name) for name in recording.channels}
-        pitch = recording.camera.sensor.pixel_pitch
-        texts = dict(recording.columns.extra) if extra else {}
-    else:
-        with open_source(source) as store:
-            camera, _, name = (series or "").rpartition("/")
-            stored = store.find_series(camera or None, name or None)
-            known = store.series_columns(stored, ["epoch"])["epoch"].astype(np.int64)
-            readings = store.temperatures_at_frame(stored)
-            pitch = stored.head.camera.sensor.pixel_pitch
-            if extra:
-                values = _extra_of(store.epochs(stored, details=False), known)
-    rows = np.searchsorted(known, numbers)
-    there = np.append(known, -1)[rows] == numbers
-    rows = np.where(there, rows, -1)
-
-    def placed(columns: dict[str, Array]) -> dict[str, Array]:
-        return {name: np.append(column, np.nan)[rows] for name, column in columns.items()}
-
-    others: Columns = {**placed(values)}
-    for name, column in texts.items():
-        others[name] = tuple("" if i < 0 else column[i] for i in rows)
-    return Besides(pitch, placed(readings), others)
-
-
 def column_parts(
-    table: Epochs, style: ExportStyle, others: Besides | None = None
+    table: Epochs, style: ExportStyle, pixel_pitch: float, others: Columns | None = None
 ) -> Iterator[Columns]:
-    """The columns of `columns_of`, some thousand rows at a time: a year has to fit into memory."""
-    others, done = others or Besides(), 0
+    """Yield the columns of `columns_of`, some thousand rows at a time: a year has to fit."""
+    done = 0
     for part in table.parts():
         rows = slice(done, done + len(part.number))
-        extra: Columns = {name: values[rows] for name, values in others.extra.items()}
-        readings = {name: values[rows] for name, values in others.thermometers.items()}
-        yield columns_of(part, style, Besides(others.pixel_pitch, readings, extra))
+        here = {name: values[rows] for name, values in (others or {}).items()}
+        yield columns_of(part, style, pixel_pitch, here)
         done = rows.stop
 
 
-def _extra_of(epochs: Iterable[StoredEpoch], known: NDArray[np.int64]) -> dict[str, Array]:
-    """The extra columns of stored epochs by name, in the order of `known` (E,)."""
-    place = {int(n): i for i, n in enumerate(known)}
-    found: dict[str, Array] = {}
-    for stored in epochs:
-        row = place.get(stored.epoch.number)
-        if row is None:
-            continue
-        for name, value in stored.extra.items():
-            found.setdefault(name, np.full(len(known), np.nan))[row] = value
-    return {name: found[name] for name in sorted(found)}
+def columns_of(table: Epochs, style: ExportStyle, pixel_pitch: float, others: Columns) -> Columns:
+    """Return the columns of a series in some style, then the others, as they are.
 
-
-def columns_of(
-    table: Epochs,
-    style: ExportStyle,
-    others: Besides | None = None,
-) -> Columns:
-    """The columns of a series in some style, then thermometers and extra columns, as they are.
-
-    UsageError where px are wanted and the pixel's size is not known.
+    pixel_pitch: mm.
     """
-    others = others or Besides()
-    pixel_pitch = others.pixel_pitch
-    if "px" in style.units and pixel_pitch is None:
-        raise UsageError("--units px: the size of the pixels is not known here")
     columns: Columns = {}
     for name, values in table.columns().items():
         suffix, factor = _unit(name.removeprefix("sd_"), style, pixel_pitch)
         columns[name + suffix] = values if not suffix else np.asarray(values) * factor
     if style.time == "iso":
         columns["frame_time"] = tuple(_iso(t) for t in table.frame_time.tolist())
-    for name, readings in others.thermometers.items():
-        columns[f"temperature {name}"] = readings
-    for name, column in others.extra.items():
+    for name, column in others.items():
         columns[name if name not in columns else f"extra {name}"] = column
     return columns
 
 
-def _unit(name: str, style: ExportStyle, pixel_pitch: float | None) -> tuple[str, float]:
+def _unit(name: str, style: ExportStyle, pixel_pitch: float) -> tuple[str, float]:
     """The ending of a parameter's name, and the factor from mm or rad."""
-    if name in _IN_IMAGE and "px" in style.units and pixel_pitch is not None:
+    if name in _IN_IMAGE and "px" in style.units:
         return "_px", 1.0 / pixel_pitch
     if name in (*_IN_IMAGE, *_PLACE) and "um" in style.units:
         return "_um", 1000.0
@@ -190,12 +109,12 @@ def _iso(seconds: float) -> str:
 
 
 def as_csv(parts: Iterable[Columns], style: ExportStyle) -> Iterator[str]:
-    """The columns as text; numbers keep every digit, what is not known stays empty."""
+    """Yield the columns as text; numbers keep every digit, what is not known stays empty."""
     return csv_text(parts, style.separator, style.decimal)
 
 
 def as_json(parts: Iterable[Columns]) -> Iterator[str]:
-    """The columns as one JSON list with a row per epoch; what is not known is null."""
+    """Yield the columns as one JSON list with a row per epoch; what is not known is null."""
     start = "[\n"
     for columns in parts:
         lists = [c.tolist() if isinstance(c, np.ndarray) else c for c in columns.values()]

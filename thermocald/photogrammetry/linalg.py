@@ -37,7 +37,7 @@ def unit_diagonal(N: Array, ridge: float = 0.0) -> tuple[Array, Array]:
     scaled = N * scale[..., :, None] * scale[..., None, :]
     if ridge:
         empty = np.diagonal(N, axis1=-2, axis2=-1) <= 0
-        scaled = scaled + (ridge + empty)[..., None] * np.eye(N.shape[-1])
+        np.einsum("...ii->...i", scaled)[...] += ridge + empty
     return scaled, scale
 
 
@@ -92,6 +92,12 @@ def best_level(N: Array, b: Array) -> Array:
     """Return the values (p,) that epochs with normal equations (E, p, p), (E, p) have in common."""
     level: Array = np.linalg.lstsq(N.sum(axis=0), b.sum(axis=0), rcond=1e-12)[0]
     return level
+
+
+def subtract_level(N: Array, b: Array) -> Array:
+    """Return right-hand sides (E, p) less what the epochs have in common (`best_level`)."""
+    out: Array = b - N @ best_level(N, b)
+    return out
 
 
 def inverse_of_determined(N: Array) -> Array:
@@ -164,6 +170,6 @@ def correlation_matrix(covariance: Array) -> Array:
     return r
 
 
-def mad_sd(values: Array, axis: int | None = None) -> Any:
+def mad_sd(values: NDArray[np.floating[Any]], axis: int | None = None) -> Any:
     """Standard deviation from the median absolute value, NaN ignored, as residuals have mean 0."""
     return MAD_TO_SD * np.nanmedian(np.abs(values), axis=axis)

@@ -33,7 +33,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     rays,
 )
 from thermocald.photogrammetry.field.planes import plane_fit
-from thermocald.photogrammetry.linalg import MAD_TO_SD
+from thermocald.photogrammetry.linalg import mad_sd
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -261,7 +261,7 @@ class Orientation:
         """Robust standard deviation of the residuals in px."""
         if len(self.residuals) == 0:
             return np.inf
-        return MAD_TO_SD * float(np.median(np.abs(self.residuals)))
+        return float(mad_sd(self.residuals))
 
 
 def orient(
@@ -351,7 +351,7 @@ def refine(
     for _ in range(_ITERATIONS):
         r = np.nan_to_num(image_points - uv, nan=1e3)
         distance = np.abs(r).max(axis=1)
-        scale = max(MAD_TO_SD * float(np.median(np.abs(r))), _LEAST_SD_PX)
+        scale = max(float(mad_sd(r)), _LEAST_SD_PX)
         weight = np.minimum(1.0, _CUT * scale / np.maximum(distance, 1e-9)) / scale**2
         weight[distance > 12 * scale] *= 1e-3
         design = np.nan_to_num(A[:, :, free]).reshape(-1, len(free))

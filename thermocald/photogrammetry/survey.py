@@ -9,7 +9,7 @@ bend by millimetres or were put up askew are what a survey is for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,18 +23,20 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.field.planes import target_normals
+from thermocald.photogrammetry.field.planes import sheet_normals, target_normals
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.frame.measurement import circle_observations
+from thermocald.photogrammetry.frame.measurement import predict_circles
 from thermocald.photogrammetry.network.adjustment import Network, Photo, adjust_network, advice
 from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
+from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.frame_status import inspect_frame
 from thermocald.photogrammetry.targets.image_file import decode_grey
-from thermocald.photogrammetry.targets.markers import locate_markers, measure_corners, to_8_bit
+from thermocald.photogrammetry.targets.markers import locate_markers, to_8_bit
 from thermocald.photogrammetry.targets.outline import LocalMap, find_circles, local_maps
-from thermocald.photogrammetry.targets.ring_code import read_codes
+from thermocald.photogrammetry.targets.ring_code import SEARCHES, have_rings, is_ring, read_codes
+from thermocald.result import with_sds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -45,82 +47,40 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Image
 
 
-# Scale and polarity (-1 dark on light) in which codes are looked for, until so many are found.
-_SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))
 _ENOUGH_CODES = 12
-_LARGEST_TILT_COSINE = 0.2
 _GROSS_PX = 8.0
+RingCode = tuple[int, int]
+"""Bits and number."""
 
 
-@dataclass(slots=True)
-class Codes:
-    """Codes as they turn up: names and rows, fixed from the beginning where a field is given."""
+def codes_in(
+    image: Image, rows: dict[RingCode, int], grows: bool
+) -> tuple[Observations, dict[int, float]]:
+    """Measure the ring-coded targets of an image as ellipses; also their semi-major axes in px.
 
-    rows: dict[tuple[int, int], int]
-    names: list[str]
-    grows: bool
-
-    @property
-    def known(self) -> frozenset[tuple[int, int]] | None:
-        """The codes that may occur, None for all."""
-        return None if self.grows else frozenset(self.rows)
-
-    def by_name(self) -> dict[str, str]:
-        """The codes of the targets that have one."""
-        return {self.names[row]: ring_code.write(*key) for key, row in self.rows.items()}
-
-    def row(self, bits: int, number: int) -> int | None:
-        """The row of a code, a new one if the field is not given; None for a foreign one."""
-        key = (bits, number)
-        if key not in self.rows and self.grows:
-            self.rows[key] = len(self.names)
-            self.names.append(f"R{number}" if bits == 12 else f"R14-{number}")
-        return self.rows.get(key)
-
-
-def known_codes(nominal: TestField | None) -> Codes:
-    """The codes of a field, or none yet if there is no field."""
-    if nominal is None:
-        return Codes({}, [], grows=True)
-    rows = {
-        ring_code.parse(code): row
-        for row, code in enumerate(nominal.codes)
-        if ring_code.is_ring(code)
-    }
-    return Codes(rows, list(nominal.names), grows=False)
-
-
-def codes_in(image: Image, codes: Codes) -> tuple[Observations, dict[int, float]]:
-    """The ring-coded targets of an image, measured as ellipses, and their semi-major axes in px."""
+    rows: of the codes, which gets those that are new if it `grows`; else they are left out.
+    """
     grey = to_8_bit(image)
-    best = None
-    for scale, polarity in _SEARCHES if codes.grows or codes.rows else ():
+    maps, best = LocalMap.none(), dict[RingCode, int]()
+    for scale, polarity in SEARCHES if grows or rows else ():
         candidates = find_circles(grey, scale, polarity)
-        found = read_codes(grey, candidates, codes.known)
-        if best is None or len(found) > len(best[1]):
-            best = candidates.maps, found
+        found = read_codes(grey, candidates, polarity)
+        found = {code: place for code, place in found.items() if grows or code in rows}
+        if len(found) > len(best):
+            maps, best = candidates.select(np.array(list(found.values()))), found
         if len(found) >= _ENOUGH_CODES:
             break
-    kept: list[tuple[int, int]] = []
-    maps = LocalMap(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 3)))
-    if best is not None:
-        maps, found = best
-        numbered = [
-            (codes.row(int(bits), int(number)), int(place))
-            for bits, number, place in zip(found.bits, found.numbers, found.rows, strict=True)
-        ]
-        kept = [(row, place) for row, place in numbered if row is not None]
-        maps = maps.select(np.array([place for _, place in kept], dtype=np.int64))
-    rows = np.array([row for row, _ in kept], dtype=np.int64)
-    fit = fit_circles(image, maps, np.ones(len(rows), dtype=bool))
+    targets = np.array([rows.setdefault(code, len(rows)) for code in best], dtype=np.int64)
+    fit = fit_circles(image, maps, np.ones(len(targets), dtype=bool))
     # the fit says how the outline that it began with is to be stretched
     m11, m12, m22 = fit.parameters[:, 2:5].T
     stretch = np.stack([1 + m11, m12, m12, 1 + m22], axis=-1).reshape(-1, 2, 2)
-    outlines = LocalMap(maps.centre, maps.linear @ np.linalg.inv(stretch), maps.second)
-    axes = outlines.semi_axes[:, 0] if len(rows) else np.zeros(0)
+    outlines = replace(maps, linear=maps.linear @ np.linalg.inv(stretch))
+    axes = outlines.semi_axes[:, 0]
+    good = fit.good
     return (
-        circle_observations(rows, fit, fit.good),
-        {int(r): float(a) for r, a, good in zip(rows, axes, fit.good, strict=True) if good},
+        fit.observations(targets, good),
+        dict(zip(targets[good].tolist(), axes[good].tolist(), strict=True)),
     )
 
 
@@ -131,36 +91,20 @@ def targets_in(
     camera: CameraModel,
     exterior: ExteriorOrientation,
 ) -> Observations:
-    """Every target of a field in a photograph of known orientation, eccentricity included.
+    """Measure every target of a field in a photograph of known orientation, eccentricity included.
 
-    normals (n, 3), NaN where unknown: such a circle is taken as facing the camera. A circle that is
-    not within some pixels of its place is another one and is left out.
+    normals (n, 3), NaN where unknown. A circle that is not within some pixels of its place is
+    another one and is left out.
     """
     corners = measure_corners(image, locate_markers(image, field))
-    rows = np.flatnonzero(field.circles & np.isfinite(field.diameters))
-    points = field.points[rows]
-    view = exterior.centre - points
-    view /= np.linalg.norm(view, axis=1, keepdims=True)
-    n = np.where(np.isfinite(normals[rows]), normals[rows], view)
-    maps = local_maps(
-        camera.sensor, camera.interior.as_array(), exterior.as_array(), points, n,
-        field.diameters[rows] / 2,
-    )  # fmt: skip
-    seen = (
-        np.isfinite(maps.linear).all(axis=(1, 2))
-        & np.isfinite(maps.second).all(axis=(1, 2))
-        & camera.sensor.contains(np.nan_to_num(maps.centre, nan=-1e9))
-        & (np.abs(np.sum(view * n, axis=1)) > _LARGEST_TILT_COSINE)
-    )
-    rows, maps = rows[seen], maps.select(seen)
-    coded = ring_code.have_rings(field, rows)
-    fit = fit_circles(image, maps, coded)
+    rows, maps = predict_circles(field, camera, exterior, normals)
+    fit = fit_circles(image, maps, have_rings(field, rows))
     off = np.linalg.norm(fit.points - maps.centre, axis=1)
-    return corners.joined(circle_observations(rows, fit, fit.good & (off < _GROSS_PX)))
+    return corners.joined(fit.observations(rows, fit.good & (off < _GROSS_PX)))
 
 
 _ONE_SIZE = 0.15
-_NEIGHBOURS = 8
+_NEIGHBOURS = 8  # of a target on its sheet
 _SAME_SHEET_COSINE = 0.97  # between the normals of neighbours on one sheet, which may be bent
 _SAME_SHEET_STEP = 0.1  # of their distance: how far one may lie off the other's plane
 
@@ -198,25 +142,6 @@ def sheet_labels(points: Array) -> NDArray[np.int64]:
     return labels
 
 
-def sheet_normals(points: Array, labels: NDArray[np.int64]) -> Array:
-    """Unit normals (n, 3), of either sign, of targets by their nearest on the same sheet; NaN for
-    those on none.
-    """
-    normals = np.full((len(points), 3), np.nan)
-    for label in np.unique(labels[labels >= 0]):
-        rows = np.flatnonzero(labels == label)
-        if len(rows) < 4:
-            continue
-        whole = np.linalg.svd(points[rows] - points[rows].mean(axis=0))[2][2]
-        for row in rows:
-            order = np.argsort(np.linalg.norm(points[rows] - points[row], axis=1))
-            near = points[rows[order[: _NEIGHBOURS + 1]]]
-            _, size, axes = np.linalg.svd(near - near.mean(axis=0))
-            # a single line of targets does not say how the paper is turned about it
-            normals[row] = axes[2] if size[1] > 0.1 * size[0] else whole
-    return normals
-
-
 def expected_field(network: Network, nominal: TestField, *, trusted_only: bool) -> TestField:
     """The nominal field where the network has put it: surveyed coordinates, and for all others the
     nominal ones, moved as their surveyed neighbours were.
@@ -231,9 +156,7 @@ def expected_field(network: Network, nominal: TestField, *, trusted_only: bool) 
             nominal.points[rows], network.points - nominal.points[rows], nominal.points[others]
         )
     points[rows] = network.points
-    moved = TestField.build(
-        nominal.names, points, nominal.sigmas, nominal.diameters, nominal.kinds, nominal.codes
-    )
+    moved = replace(nominal, points=points)
     return moved.subset(np.sort(rows)) if trusted_only else moved
 
 
@@ -255,15 +178,25 @@ def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
     return result
 
 
-def field_of_codes(
-    network: Network, codes: Mapping[str, str], radii: Mapping[tuple[str, str], float]
-) -> TestField:
-    """The coded targets of a network as a field.
+def _name_of(code: RingCode) -> str:
+    """Name a target of which nothing else is known."""
+    bits, number = code
+    return f"R{number}" if bits == 12 else f"R14-{number}"
 
-    codes: by target; radii: semi-major axes px by photograph and target, from which the diameters
-    are found: what a disc of 1 mm would measure there, lying as its neighbours do.
+
+def _code_of(name: str) -> str:
+    """Return the code of a target of that name."""
+    number = name.rpartition("-")[2].lstrip("R")
+    return ring_code.write(14 if "-" in name else 12, int(number))
+
+
+def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> TestField:
+    """Return the coded targets of a network as a field.
+
+    radii: semi-major axes px by photograph and target, from which the diameters are found: what a
+    disc of 1 mm would measure there, lying as its neighbours do.
     """
-    normals = sheet_normals(network.points, sheet_labels(network.points))
+    normals = sheet_normals(network.points, sheet_labels(network.points), _NEIGHBOURS + 1)
     ratios: dict[str, list[float]] = {name: [] for name in network.names}
     interior = network.camera.interior.as_array()
     for s in network.stations:
@@ -283,19 +216,15 @@ def field_of_codes(
         diameters[:] = together
     return TestField.build(
         network.names, network.points, network.sigmas, diameters,
-        codes=[codes[name] for name in network.names],
+        codes=[_code_of(name) for name in network.names],
     )  # fmt: skip
 
 
 def surveyed_field(network: Network, template: TestField) -> TestField:
     """The field of the network's targets: coordinates and sigmas surveyed, the rest as it was."""
     order = np.argsort([template.index[name] for name in network.names])
-    rows = [template.index[network.names[i]] for i in order]
-    part = template.subset(rows)
-    return TestField.build(
-        part.names, network.points[order], network.sigmas[order], part.diameters, part.kinds,
-        part.codes,
-    )  # fmt: skip
+    part = template.subset([template.index[network.names[i]] for i in order])
+    return replace(part, points=network.points[order], sigmas=network.sigmas[order])
 
 
 _PASSES = 2
@@ -327,32 +256,27 @@ class Survey:
     def as_dict(self) -> dict[str, Any]:
         """Return the document that `testfield survey` writes with `--json`."""
         n = self.network
-        targets = []
-        for i, name in enumerate(n.names):
-            row: dict[str, Any] = {"target": name}
-            for axis, letter in enumerate("XYZ"):
-                row[letter] = float(n.points[i, axis])
-                row[f"sd_{letter}"] = float(n.sigmas[i, axis])
-            row |= {
+        targets = [
+            {
+                "target": name,
+                **with_sds("XYZ", n.points[i], n.sigmas[i]),
                 "covariance": n.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3],
                 "rays": int(n.n_rays[i]),
                 "angle_deg": float(np.degrees(n.angles[i])),
             }
-            targets.append(row)
-        interior: dict[str, float] = {}
-        for k, name in enumerate(IOP_NAMES):
-            interior[name] = float(getattr(n.camera.interior, name))
-            interior[f"sd_{name}"] = float(n.interior_covariance[k, k] ** 0.5)
+            for i, name in enumerate(n.names)
+        ]
+        iop_sd = np.sqrt(n.interior_covariance.diagonal()[: len(IOP_NAMES)])
+        interior = with_sds(IOP_NAMES, n.camera.interior.as_array(), iop_sd)
         stations = [
             {
                 "photo": s.photo,
                 "targets": s.n_targets,
-                **{k: float(v) for k, v in zip(EOP_NAMES, s.exterior.as_array(), strict=True)},
-                **{f"sd_{k}": v for k, v in zip(EOP_NAMES[3:], s.sd_centre, strict=True)},
+                **asdict(s.exterior),
+                **with_sds(EOP_NAMES[3:], s.exterior.centre, s.sd_centre),
             }
             for s in n.stations
         ]
-        sensor = n.camera.sensor
         return {
             "format": "thermocald-survey/1",
             "datum": n.datum,
@@ -360,16 +284,10 @@ class Survey:
             "redundancy": n.redundancy,
             "relative_accuracy": n.relative_accuracy,
             "sd_scale": n.sd_scale,
-            "camera": {
-                "width": sensor.width, "height": sensor.height, "pixel_pitch": sensor.pixel_pitch,
-                "free": list(n.free), **interior,
-            },
+            "camera": {**asdict(n.camera.sensor), "free": list(n.free), **interior},
             "targets": targets,
             "stations": stations,
-            "rejected": [
-                {"photo": r.photo, "target": r.target, "residual_px": r.residual, "test": r.test}
-                for r in n.rejected
-            ],
+            "rejected": n.rejected,
             "unused": n.unused,
             "measured": self.measured,
             "advice": advice(n),
@@ -413,10 +331,8 @@ def survey(
     calibrated camera if `free` leaves them out; progress: told what is being done.
     Raises GeometryError if the photographs cannot carry it, ImageError if they are unusable.
     """
-    codes = known_codes(nominal)
-    sensor, photos, sizes, said = _first_look(pictures, pixel_pitch, nominal, codes, progress)
+    sensor, names, photos, sizes, said = _first_look(pictures, pixel_pitch, nominal, progress)
     progress("first adjustment")
-    names = tuple(codes.names)
     known = None if nominal is None else nominal.points
     scale = _provisional(distances, photos, names, nominal)
     network = adjust_network(
@@ -425,31 +341,25 @@ def survey(
     for number in range(_PASSES):
         # with the nominal field the plain circles come in the first pass, and take part in the
         # second with outlines that know how their neighbours lie
+        of_field = None
         if nominal is None:
-            expected = field_of_codes(network, codes.by_name(), sizes)
+            expected = field_of_codes(network, sizes)
+            labels = sheet_labels(expected.points)
         else:
             expected = expected_field(network, nominal, trusted_only=number > 0)
-        normals = sheet_normals(expected.points, _sheets(expected, nominal))
+            rows = [nominal.index[name] for name in expected.names]
+            # the nominal field knows best which sheet a target is on: its sheets are plane
+            of_field, labels = nominal.points[rows], sheet_labels(nominal.points)[rows]
+        normals = sheet_normals(expected.points, labels, _NEIGHBOURS + 1)
         photos = _look_again(pictures, network, expected, normals, said, progress)
         progress(f"adjustment {number + 2} of {_PASSES + 1}")
+        # targets that the network does not have begin where they are expected
+        start = replace(network, names=expected.names, points=expected.points)
         network = adjust_network(
-            sensor, photos, expected.names, distances, free=free, start=_renamed(network, expected),
-            nominal=None if nominal is None else _nominal_points(expected, nominal),
-        )  # fmt: skip
+            sensor, photos, expected.names, distances, free=free, start=start, nominal=of_field
+        )
     template = expected if nominal is None else nominal
     return Survey(network, surveyed_field(network, template), said)
-
-
-def _nominal_points(field: TestField, nominal: TestField) -> Array:
-    points: Array = nominal.points[[nominal.index[name] for name in field.names]]
-    return points
-
-
-def _sheets(field: TestField, nominal: TestField | None) -> NDArray[np.int64]:
-    """On which sheet each target is; the nominal field knows best, its sheets are still plane."""
-    if nominal is None:
-        return sheet_labels(field.points)
-    return sheet_labels(nominal.points)[[nominal.index[name] for name in field.names]]
 
 
 def _provisional(
@@ -484,14 +394,18 @@ def _first_look(
     pictures: Sequence[Picture],
     pixel_pitch: float,
     nominal: TestField | None,
-    codes: Codes,
     progress: Callable[[str], None],
-) -> tuple[Sensor, list[Photo], dict[tuple[str, str], float], dict[str, str]]:
-    """Codes and markers in every photograph, the targets' sizes in px, and what went wrong."""
+) -> tuple[Sensor, tuple[str, ...], list[Photo], dict[tuple[str, str], float], dict[str, str]]:
+    """Measure codes and markers in every photograph; return the names that the targets' rows count,
+    the targets' sizes in px, and what went wrong.
+    """
     sensor: Sensor | None = None
-    photos: list[Photo] = []
-    sizes: dict[tuple[str, str], float] = {}
+    seen: dict[str, Observations] = {}
+    sizes: dict[tuple[str, int], float] = {}
     said: dict[str, str] = {}
+    rows: dict[RingCode, int] = {}
+    if nominal is not None:
+        rows = {ring_code.parse(c): row for row, c in enumerate(nominal.codes) if is_ring(c)}
     for picture in pictures:
         progress(f"codes in {picture.name}")
         image = picture.load()
@@ -503,19 +417,21 @@ def _first_look(
             said[picture.name] = status.reason
             continue
         sensor = sensor or Sensor(image.shape[1], image.shape[0], pixel_pitch)
-        seen, radii = codes_in(image, codes)
+        found, radii = codes_in(image, rows, grows=nominal is None)
+        sizes.update({(picture.name, row): radius for row, radius in radii.items()})
         if nominal is not None:
-            seen = measure_corners(image, locate_markers(image, nominal)).joined(seen)
-        sizes.update({(picture.name, codes.names[row]): radii[row] for row in radii})
-        said[picture.name] = f"{len(seen)} coded targets"
-        if len(seen):
-            photos.append(Photo(picture.name, seen))
-    if sensor is None or not photos:
+            found = measure_corners(image, locate_markers(image, nominal)).joined(found)
+        said[picture.name] = f"{len(found)} coded targets"
+        if len(found):
+            seen[picture.name] = found
+    if sensor is None or not seen:
         raise ImageError(
             "no photograph shows a coded target: "
             + "; ".join(f"{name}: {words}" for name, words in said.items())
         )
-    return sensor, photos, sizes, said
+    names = tuple(map(_name_of, rows)) if nominal is None else nominal.names
+    named = {(photo, names[row]): radius for (photo, row), radius in sizes.items()}
+    return sensor, names, [Photo(name, o) for name, o in seen.items()], named, said
 
 
 def _look_again(
@@ -540,11 +456,3 @@ def _look_again(
         if len(seen):
             photos.append(Photo(picture.name, seen))
     return photos
-
-
-def _renamed(network: Network, expected: TestField) -> Network:
-    """The network as a start for photographs whose targets count the rows of another field.
-
-    Targets that it does not have begin where they are expected.
-    """
-    return replace(network, names=expected.names, points=expected.points)

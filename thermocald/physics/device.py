@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.files import read_yaml
+from thermocald.files import QuantityReader, read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, ExteriorOrientation, Sensor
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.physics.heat import (
@@ -57,7 +57,7 @@ from thermocald.physics.heat import (
     read_network,
     read_thermometer,
 )
-from thermocald.physics.model_file import QuantityReader, read_sensor
+from thermocald.physics.model_file import read_sensor
 from thermocald.physics.scene import Look
 
 if TYPE_CHECKING:
@@ -113,9 +113,7 @@ def read_programme(path: Path) -> Programme:
     """Read a programme file; ConfigurationError names file and key, and where there is a gap."""
     document = read_yaml(path)
     top = QuantityReader(path, document)
-    found = top.text("format")
-    if found != PROGRAMME_FORMAT:
-        raise top.fail("format", f"is {found[:60]!r}; this program reads {PROGRAMME_FORMAT!r}")
+    top.require_format(PROGRAMME_FORMAT)
     top.only(
         ("format", "name", "series", "epochs", "interval", "jitter", "reading", "begin", "initial",
          "ambient", "boundaries", "sources")
@@ -217,9 +215,7 @@ def read_camera_device(path: Path) -> CameraDevice:
     """Read a camera file; ConfigurationError names file and key."""
     document = read_yaml(path)
     top = QuantityReader(path, document)
-    found = top.text("format")
-    if found != CAMERA_FORMAT:
-        raise top.fail("format", f"is {found[:60]!r}; this program reads {CAMERA_FORMAT!r}")
+    top.require_format(CAMERA_FORMAT)
     top.only(
         ("format", "name", "width", "height", "pixel_pitch", "exterior", "distance", "measuring",
          "look", "heat", "thermometers")

@@ -18,13 +18,14 @@ are linear: for a `signal` they bear the names of the parameters they act on.
 from __future__ import annotations
 
 from abc import ABC
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, IOP_NAMES, PARAMETER_NAMES
+from thermocald.physics.operators import OPERATORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -59,24 +60,15 @@ class Influence:
     scale: Array
     noise_factor: Array
     blur_factor: Array
-    displacements: tuple[Displacement, ...] = field(default=())
+    displacements: tuple[Displacement, ...]
 
     @classmethod
-    def none(cls, epochs: int) -> Self:
+    def none(cls, epochs: int) -> Influence:
         """Return an influence that changes nothing."""
         one = np.ones(epochs)
-        return cls(np.zeros((epochs, 10)), np.zeros((epochs, 6)), np.ones((epochs, 3)), one, one)
-
-    @classmethod
-    def of_parameters(cls, changes: Mapping[str, Array], epochs: int) -> Self:
-        """Add changes (E,) of IOP and EOP by their names."""
-        result = cls.none(epochs)
-        for name, change in changes.items():
-            if name in IOP_NAMES:
-                result.iop[:, IOP_NAMES.index(name)] += change
-            else:
-                result.eop[:, EOP_NAMES.index(name)] += change
-        return result
+        return Influence(
+            np.zeros((epochs, 10)), np.zeros((epochs, 6)), np.ones((epochs, 3)), one, one, ()
+        )
 
     def __add__(self, other: Influence) -> Influence:
         """Add another influence."""
@@ -299,11 +291,6 @@ class Effect(ABC):
         """Return the same for every further column that it reads, {channel: (E, R)}."""
         return {}
 
-    def propagate(self, history: History, errors: Array, **nonlinear: Any) -> Array:
-        """Carry errors (R, m) K of the readings to drive or first signal (E, m), first order."""
-        result: Array = self.sensitivity(history, **nonlinear) @ np.nan_to_num(errors)
-        return result
-
     def unresolved(
         self,
         history: History,
@@ -370,12 +357,17 @@ class Effect(ABC):
         epochs = len(history.times)
         if self.kind == "image":
             return replace(Influence.none(epochs), **self.image_changes(history, values))
+        found = Influence.none(epochs)
         searched, coefficients = self.split(values)
-        if self.kind != "signal" or not any(coefficients.values()):
-            return Influence.none(epochs)
-        course = self.signal(history, **searched)
-        changes = {name: course @ self.weights(values, name) for name in coefficients}
-        return Influence.of_parameters(changes, epochs)
+        if self.kind == "signal" and any(coefficients.values()):
+            course = self.signal(history, **searched)
+            for name in coefficients:
+                change = course @ self.weights(values, name)
+                if name in IOP_NAMES:
+                    found.iop[:, IOP_NAMES.index(name)] += change
+                else:
+                    found.eop[:, EOP_NAMES.index(name)] += change
+        return found
 
     def image_changes(
         self,
@@ -441,6 +433,31 @@ class Effect(ABC):
                 mover, said = (self, mine) if mine else (other, theirs)
                 return f"{action}: {mover.noun} {said}"
         return f"record longer and under another programme than now ({self.noun}, {other.noun})"
+
+
+class Remembering(Effect):
+    """An effect that sends the reference temperature through an operator with memory.
+
+    operator: its key in `operators.OPERATORS`; its constants are the effect's parameters.
+    """
+
+    operator: ClassVar[str]
+
+    def _constants(self, values: Mapping[str, Any]) -> list[float]:
+        return [values.get(name, p.default) for name, p in self.nonlinear.items()]
+
+    def drive(self, history: History, **nonlinear: Any) -> Array:
+        p, trajectory = history.polygon(), OPERATORS[self.operator].trajectory
+        assert trajectory is not None
+        return trajectory(p.times, p.values, *self._constants(nonlinear), history.times)
+
+    def signal(self, history: History, **nonlinear: Any) -> Array:
+        return self.drive(history, **nonlinear)[:, None]
+
+    def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
+        p, matrix = history.polygon(), OPERATORS[self.operator].matrix
+        assert matrix is not None
+        return matrix(p.times, p.values, *self._constants(nonlinear), history.times) @ p.matrix
 
 
 class OfTime(Effect):

@@ -74,6 +74,11 @@ class Node:
         """How many operators stand above each other."""
         return 0 if self.is_leaf else 1 + max(n.depth for n in self.inputs)
 
+    @property
+    def size(self) -> int:
+        """How many operators it holds."""
+        return sum(not n.is_leaf for n in self.walk())
+
     def walk(self) -> Iterator[Node]:
         """Yield the node and all below it."""
         yield self

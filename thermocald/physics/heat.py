@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array
-    from thermocald.physics.model_file import QuantityReader
+    from thermocald.files import QuantityReader
 
 
 @dataclass(frozen=True, eq=False)

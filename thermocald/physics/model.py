@@ -32,7 +32,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive
-from thermocald.physics.effect import Displacement, Influence
+from thermocald.physics.effect import Influence
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -111,21 +111,14 @@ class ModelEffect:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
-    """What a model says of E times.
+class Prediction(Influence):
+    """What a model says of E times: the influence of all effects, on the whole camera.
 
-    iop (E, 10), eop (E, 6) (zeros where the model has no exterior orientation), drive (E,) °C: the
-    temperature behind the linear terms; scale (E, 3), displacements: of the object points;
-    noise_factor, blur_factor (E,): of the image measurement.
+    iop (E, 10), eop (E, 6): orientations themselves (eop is what effects add where the model has no
+    exterior orientation); drive (E,) °C: the temperature behind the linear terms.
     """
 
-    iop: Array
-    eop: Array
     drive: Array
-    scale: Array
-    displacements: tuple[Displacement, ...]
-    noise_factor: Array
-    blur_factor: Array
 
     @property
     def moves_points(self) -> bool:
@@ -216,7 +209,7 @@ class ThermalModel:
         iop = self.carried(linear + total.iop)
         eop = total.eop + (self.exterior.as_array() if self.exterior else 0.0)
         return Prediction(
-            iop, eop, drive, total.scale, total.displacements, total.noise_factor, total.blur_factor
+            iop, eop, total.scale, total.noise_factor, total.blur_factor, total.displacements, drive
         )
 
     def carried(self, linear: Array) -> Array:
@@ -233,9 +226,9 @@ class ThermalModel:
         place = list(names).index("interior.c") if "interior.c" in names else None
         return angle_derivatives(linear, self.interior.c, J, place)
 
-    def with_effect(self, effect: ModelEffect, **changes: Any) -> ThermalModel:
+    def with_effect(self, effect: ModelEffect) -> ThermalModel:
         """Return the next version of the model, with one effect more."""
-        return replace(self, effects=(*self.effects, effect), version=self.version + 1, **changes)
+        return replace(self, effects=(*self.effects, effect), version=self.version + 1)
 
     def without(self, *names: str) -> ThermalModel:
         """Return the next version of the model, without some of its effects."""
@@ -264,3 +257,41 @@ class ThermalModel:
                 if isinstance(value, int | float)
             ]
         return tuple(numbers)
+
+    def value(self, name: str) -> float:
+        """Return one of its numbers, called as in `parameter_names`."""
+        group, key = name.split(".", 1)
+        if group == "interior":
+            return float(getattr(self.interior, key))
+        if group == "rates":
+            return float(self.rates.get(key, 0.0))
+        return float(next(e for e in self.effects if e.name == group).values[key])
+
+    def sd(self, name: str) -> float:
+        """Return the standard deviation of one of its numbers, 0 where none is known."""
+        group, key = name.split(".", 1)
+        if group in ("interior", "rates"):
+            return float(self.sds.get(name, 0.0))
+        return float(next(e for e in self.effects if e.name == group).sds.get(key, 0.0))
+
+    def with_values(self, numbers: Mapping[str, float]) -> ThermalModel:
+        """Return the model with other values of some numbers of rates and effects."""
+        own: dict[str, dict[str, float]] = {}
+        for name, value in numbers.items():
+            group, key = name.split(".", 1)
+            own.setdefault(group, {})[key] = value
+        effects = tuple(
+            replace(e, values={**e.values, **own[e.name]}) if e.name in own else e
+            for e in self.effects
+        )
+        return replace(self, rates={**self.rates, **own.get("rates", {})}, effects=effects)
+
+    def covariance_of(self, names: Sequence[str]) -> Array:
+        """Return the covariance (k, k) of some numbers, from their sds where there is no matrix."""
+        if self.covariance is None or not set(names) & set(self.covariance_names):
+            return np.diag([self.sd(name) ** 2 for name in names])
+        place = {name: i for i, name in enumerate(self.covariance_names)}
+        rows = np.array([place.get(name, -1) for name in names])
+        known = rows >= 0
+        full = np.array(self.covariance)[np.ix_(rows, rows)]
+        return np.where(np.outer(known, known), full, 0.0)

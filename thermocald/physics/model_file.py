@@ -19,10 +19,6 @@ validity: {temperature: [21.0, 52.0]}        # °C it was fitted on
 fitted_on: […]
 covariance: {parameters: [interior.c, …], matrix: [[…], …]}                   # optional
 
-Numbers with units in files written by hand: `3.04`, or `{value: 3.04, sd: 0.01, unit: mm}`.
-
-A bare number has the unit the documentation states; a unit that is written out must be that one.
-
 Effects in files: entries of a model file, and files of their own, such as a proposal.
 
 format: thermocald-effect/1
@@ -36,15 +32,13 @@ A formula is plain text that is read and never executed.
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass
-from difflib import get_close_matches
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.files import dump_yaml, read_yaml, write_text
+from thermocald.files import QuantityReader, dump_yaml, read_yaml, write_quantity, write_text
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -57,131 +51,8 @@ from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.physics.model import BASES, RATED, Distortion, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
-
-
-@dataclass(frozen=True, slots=True)
-class Quantity:
-    """A value and its standard deviation (None where none is known), in the unit asked for."""
-
-    value: float
-    sd: float | None = None
-
-
-def write_quantity(value: float, unit: str, sd: float | None = None) -> dict[str, Any]:
-    """Return the mapping that a file holds for a number."""
-    document: dict[str, Any] = {"value": float(value)}
-    if sd is not None and math.isfinite(sd):
-        document["sd"] = float(sd)
-    return {**document, "unit": unit}
-
-
-class QuantityReader:
-    """One mapping of a file; errors name the file and the dotted key."""
-
-    def __init__(self, path: Path | str, mapping: Any, prefix: str = "") -> None:
-        self._path = path
-        self._prefix = prefix
-        if not isinstance(mapping, dict):
-            what = "is missing" if mapping is None else "must hold `key: value` pairs"
-            raise ConfigurationError(f"{path}, {prefix.rstrip('.') or 'the file'}: {what}")
-        self.mapping: Mapping[str, Any] = mapping
-
-    def fail(self, key: str, message: str) -> ConfigurationError:
-        """Make an error at a key; the caller raises it."""
-        return ConfigurationError(f"{self._path}, key {self._prefix}{key}: {message}")
-
-    def only(self, known: Iterable[str]) -> None:
-        """Refuse keys that nobody reads."""
-        names = list(known)
-        for key in self.mapping:
-            if key not in names:
-                near = get_close_matches(str(key), names, 1)
-                hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
-                raise self.fail(str(key), f"is unknown; {hint}")
-
-    def text(self, key: str, default: str | None = None) -> str:
-        """Read text; a number counts as its digits."""
-        value = self.mapping.get(key, default)
-        if value is None:
-            raise self.fail(key, "is missing")
-        if isinstance(value, bool) or not isinstance(value, str | int | float):
-            raise self.fail(key, "must be text")
-        return str(value)
-
-    def number(
-        self, key: str, unit: str, default: float | None = None,
-        low: float = -math.inf, above: float = -math.inf, high: float = math.inf,
-    ) -> float:  # fmt: skip
-        """Read the value of a quantity: at least `low`, more than `above`, at most `high`."""
-        value = self.quantity(key, unit, default).value
-        if value < low:
-            raise self.fail(key, f"is {value:g} {unit}; it must be at least {low:g}")
-        if value <= above:
-            raise self.fail(key, f"is {value:g} {unit}; it must be above {above:g}")
-        if value > high:
-            raise self.fail(key, f"is {value:g}; it is at most {high:g}")
-        return value
-
-    def share(self, key: str, default: float) -> float:
-        """Read a share, at least 0 and below 1."""
-        value = self.number(key, "1", default, low=0.0)
-        if value >= 1:
-            raise self.fail(key, f"is {value:g}; it is a share below 1")
-        return value
-
-    def quantity(self, key: str, unit: str, default: float | None = None) -> Quantity:
-        """Read a number in `unit`; an error if it is missing, no number, or of another unit."""
-        raw = self.mapping.get(key, default)
-        if raw is None:
-            raise self.fail(key, f"is missing; it is a number in {unit}")
-        sd: float | None = None
-        if isinstance(raw, dict):
-            inner = QuantityReader(self._path, raw, f"{self._prefix}{key}.")
-            inner.only(("value", "sd", "unit"))
-            found = inner.text("unit", unit)
-            if found != unit:
-                raise inner.fail("unit", f"is {found!r}; it must be {unit!r}: convert the value")
-            if "value" not in raw:
-                raise inner.fail("value", "is missing")
-            if raw.get("sd") is not None:
-                sd = inner._float("sd", raw["sd"])
-                if sd < 0:
-                    raise inner.fail("sd", f"is {sd:g}; a standard deviation is not negative")
-            raw = raw["value"]
-        return Quantity(self._float(key, raw), sd)
-
-    def _float(self, key: str, raw: Any) -> float:
-        try:
-            # PyYAML reads 1e-3 as text, since YAML 1.1 wants a point
-            value = float(raw) if isinstance(raw, str | int | float) else math.nan
-        except (ValueError, OverflowError):
-            value = math.nan
-        if isinstance(raw, bool) or not math.isfinite(value):
-            raise self.fail(key, f"{str(raw)[:40]!r} is not a finite number")
-        return value
-
-    def whole(self, key: str, unit: str, low: int = 1) -> int:
-        """Read a whole number."""
-        value = self.number(key, unit, low=low)
-        if value != int(value):
-            raise self.fail(key, f"is {value:g}; it must be a whole number")
-        return int(value)
-
-    def inner(self, key: str) -> QuantityReader:
-        """Enter the mapping at a key."""
-        if self.mapping.get(key) is None:
-            raise self.fail(key, "is missing")
-        return QuantityReader(self._path, self.mapping[key], f"{self._prefix}{key}.")
-
-    def items(self, key: str) -> Iterator[QuantityReader]:
-        """Yield the mappings of a list at a key; none where the key is absent."""
-        values = self.mapping.get(key) or []
-        if not isinstance(values, list):
-            raise self.fail(key, "must be a list (lines that begin with `-`)")
-        for number, value in enumerate(values, start=1):
-            yield QuantityReader(self._path, value, f"{self._prefix}{key}[{number}].")
 
 
 EFFECT_FORMAT = "thermocald-effect/1"
@@ -190,9 +61,7 @@ EFFECT_FORMAT = "thermocald-effect/1"
 def read_effects(path: Path) -> list[ModelEffect]:
     """Read the effects of an effect file; ConfigurationError names file and key."""
     top = QuantityReader(path, read_yaml(path))
-    found = top.text("format")
-    if found != EFFECT_FORMAT:
-        raise top.fail("format", f"is {found[:60]!r}; an effect file is {EFFECT_FORMAT!r}")
+    top.require_format(EFFECT_FORMAT, "an effect file is")
     top.only(("format", "statement", "effects", "evidence"))
     out = [effect_of(entry) for entry in top.items("effects")]
     if not out:
@@ -275,9 +144,7 @@ def write_model(path: Path, model: ThermalModel) -> None:
 def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> ThermalModel:
     """Read the model in a file's mapping; `path` is for the messages."""
     top = QuantityReader(path, document)
-    found = top.text("format")
-    if found != MODEL_FORMAT:
-        raise top.fail("format", f"is {found[:60]!r}; this program reads {MODEL_FORMAT!r}")
+    top.require_format(MODEL_FORMAT)
     top.only(_KEYS)
     camera = top.inner("camera")
     sds: dict[str, float] = {}
@@ -375,7 +242,7 @@ def _read_validity(
     for channel, pair in reader.mapping.items():
         if not isinstance(pair, list) or len(pair) != 2:
             raise reader.fail(str(channel), "must be [lowest, highest] degC")
-        low, high = (reader._float(str(channel), v) for v in pair)
+        low, high = (reader.finite(str(channel), v) for v in pair)
         if low > high:
             raise reader.fail(str(channel), f"begins at {low:g} and ends at {high:g} degC")
         ranges[str(channel)] = (low, high)

@@ -30,7 +30,6 @@ from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, S
 from thermocald.physics import catalogue
 from thermocald.physics.device import (
     CameraDevice,
-    Measuring,
     Programme,
     default_heat,
     read_camera_device,
@@ -133,11 +132,6 @@ PRESETS: Mapping[str, Preset] = {
 """The presets by name."""
 
 
-def preset_names() -> tuple[str, ...]:
-    """List the names of the presets."""
-    return tuple(PRESETS)
-
-
 def _device(preset: Preset) -> CameraDevice:
     """Return a module close to a body that gives its heat to the air: 63 % of the way in 300 s."""
     loss = 0.2375
@@ -155,9 +149,8 @@ def _device(preset: Preset) -> CameraDevice:
         "board_temperature": SimulatedThermometer("board"),
     }
     return CameraDevice(
-        preset.camera, preset.sensor, network, thermometers, distance=preset.distance_mm,
-        measuring=Measuring(),
-    )  # fmt: skip
+        preset.camera, preset.sensor, network, thermometers, distance=preset.distance_mm
+    )
 
 
 def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
@@ -260,7 +253,7 @@ def given_simulation(
         return simulation
     if model is None or programme is None:
         raise UsageError(
-            f"give --preset ({', '.join(preset_names())}), or --model and --programme "
+            f"give --preset ({', '.join(PRESETS)}), or --model and --programme "
             "(--camera and --testfield as well, where the usual ones do not fit)"
         )
     thermal = read_model(model)

@@ -175,22 +175,9 @@ def surface_normals(field: TestField) -> Array:
 def _find_basis(normal: Array) -> tuple[Array, Array]:
     """Return `right` and `down` in the plane, for a viewer whom the normal points at."""
     helper = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
-    right = np.array(
-        [
-            helper[1] * normal[2] - helper[2] * normal[1],
-            helper[2] * normal[0] - helper[0] * normal[2],
-            helper[0] * normal[1] - helper[1] * normal[0],
-        ]
-    )
+    right = np.cross(helper, normal)
     right = right / np.sqrt(right[0] * right[0] + right[1] * right[1] + right[2] * right[2])
-    up = np.array(
-        [
-            normal[1] * right[2] - normal[2] * right[1],
-            normal[2] * right[0] - normal[0] * right[2],
-            normal[0] * right[1] - normal[1] * right[0],
-        ]
-    )
-    return right, -up
+    return right, -np.cross(normal, right)
 
 
 def _lay_arc(turns: Array) -> Array:

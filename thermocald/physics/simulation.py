@@ -12,8 +12,9 @@ readings) leaves the others (the image noise) as they were.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import repeat
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -101,8 +102,6 @@ class Simulation:
     @cached_property
     def truth(self) -> Prediction:
         """What the model says at the frames' times."""
-        from dataclasses import replace
-
         model = replace(self.model, exterior=self.exterior)
         return model.predict(self.true_history, self.field)
 
@@ -170,11 +169,12 @@ class Simulation:
                 rows = np.flatnonzero(seen[k])
                 yield Observations(rows, measured[k, rows], stated[rows])
 
-    def epochs(self) -> Iterator[Epoch]:
-        """Yield the epochs of the recording with their observations."""
+    def epochs(self, observed: bool = True) -> Iterator[Epoch]:
+        """Yield the epochs of the recording, with their observations or bare."""
         begin = self.programme.begin
         readings = list(self.readings.items())
-        for i, observations in enumerate(self.observations()):
+        found = self.observations() if observed else repeat(None, self.programme.epochs)
+        for i, observations in enumerate(found):
             yield Epoch(
                 number=i + 1,
                 frame_time=float(begin + self.frame_times[i]),
@@ -207,7 +207,7 @@ class Simulation:
         """
         frames = self.frames() if with_frames else None
         with RecordingWriter(path, self.head, self.field) as writer:
-            for epoch in self._frame_epochs() if with_frames else self.epochs():
+            for epoch in self.epochs(observed=not with_frames):
                 image = next(frames) if frames is not None else None
                 writer.append(epoch, None if image is None else _jpeg(image))
                 advance(1)
@@ -255,16 +255,6 @@ class Simulation:
                 f"{drift['c_mm'] * 1000:.1f} µm"
             )
         ]
-
-    def _frame_epochs(self) -> Iterator[Epoch]:
-        begin = self.programme.begin
-        for i in range(self.programme.epochs):
-            yield Epoch(
-                i + 1,
-                float(begin + self.frame_times[i]),
-                float(begin + self.reading_times[i]),
-                {name: float(values[i]) for name, values in self.readings.items()},
-            )
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:

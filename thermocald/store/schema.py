@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     Steps = Sequence[Sequence[str]]
 
-# columns of an epoch: name in SQL, SQLite's type, PostgreSQL's; SQL ignores case: X0 is centre_X0
+# columns of an epoch: name in SQL, SQLite's type, PostgreSQL's
 _PARAMETERS = (
     "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2", "omega", "phi", "kappa",
     "centre_X0", "centre_Y0", "centre_Z0",
@@ -37,6 +37,17 @@ _EPOCH: tuple[tuple[str, tuple[str, str]], ...] = (
     *((f"{prefix}{name}", _REAL) for name in _PARAMETERS for prefix in ("", "sd_")),
     *((name, _TEXT) for name in ("temperatures", "extra", "rejected", "frame", "note", "reason")),
 )
+EPOCH_TEXTS = tuple(name for name, types in _EPOCH if types == _TEXT)
+EPOCH_NUMBERS = tuple(name for name, types in _EPOCH if types != _TEXT)
+COLUMN_NAMES = tuple(
+    name.replace("centre_", "") for name in EPOCH_NUMBERS if name not in ("revision", "measured")
+)
+"""Numbers of an epoch as the program calls them."""
+
+
+def sql_name(name: str) -> str:
+    """The column of a number: SQL ignores case, and x0 must not be X0."""
+    return f"{name[:-2]}centre_{name[-2:]}" if name[-2:] in ("X0", "Y0", "Z0") else name
 
 
 def _epoch_columns(kind: int) -> str:
@@ -75,13 +86,13 @@ _FILE_1 = (
         for table in _APPEND_ONLY
         for change in ("update", "delete")
     ),
-    # derived from `epoch`, and rebuilt from it at any time: whole columns as arrays
+    "CREATE INDEX epoch_revised ON epoch (series_id, number) WHERE revision > 0",
+    # derived from `epoch`: whole columns as arrays, up to the row `last_id`
     """CREATE TABLE column_chunk (
         id INTEGER PRIMARY KEY, series_id INTEGER NOT NULL REFERENCES series(id),
         name TEXT NOT NULL, first_row INTEGER NOT NULL, last_number INTEGER NOT NULL,
-        data BLOB NOT NULL, checksum INTEGER NOT NULL, UNIQUE (series_id, name, first_row))""",
-    # calibrations of epochs whose chunk had been written before
-    "CREATE TABLE late_epoch (epoch_id INTEGER PRIMARY KEY, series_id INTEGER NOT NULL)",
+        last_id INTEGER NOT NULL, data BLOB NOT NULL, checksum INTEGER NOT NULL,
+        UNIQUE (series_id, name, first_row))""",
     "CREATE TABLE status_code (code INTEGER PRIMARY KEY, status TEXT NOT NULL UNIQUE)",
 )
 

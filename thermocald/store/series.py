@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from thermocald.errors import StoreError
-from thermocald.store.recording.readings import interpolate_readings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -24,39 +23,14 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.camera.camera_model import (
-        ExteriorOrientation,
-        InteriorOrientation,
-    )
+    from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.recording.head import Head
+    from thermocald.store.recording.observation_file import ObservationRows
 
 NOT_CALIBRATED = "not_calibrated"  # the status of an epoch that has not been adjusted yet
 _LISTED = 20
 _CLOCK_TOLERANCE_S = 10.0
-
-
-class _Adjusted(Protocol):
-    """What this module reads of a photogrammetry.adjustment.Adjustment."""
-
-    @property
-    def status(self) -> str: ...
-    @property
-    def reason(self) -> str: ...
-    @property
-    def interior(self) -> InteriorOrientation | None: ...
-    @property
-    def exterior(self) -> ExteriorOrientation | None: ...
-    @property
-    def covariance(self) -> Array: ...
-    @property
-    def sigma0(self) -> float: ...
-    @property
-    def redundancy(self) -> int: ...
-    @property
-    def n_observations(self) -> int: ...
-    @property
-    def rejected(self) -> Sequence[int]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +52,7 @@ class EpochResult:
     rejected: tuple[int, ...] = ()
 
     @classmethod
-    def from_adjustment(cls, adjustment: _Adjusted) -> Self:
+    def from_adjustment(cls, adjustment: Adjustment) -> Self:
         """The part of an adjustment that is kept."""
         values = np.full(16, np.nan)
         if adjustment.interior is not None:
@@ -170,26 +144,11 @@ class StoredEpoch:
     revision: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ObservationRows:
-    """Observations of many epochs, a row each, in any order.
-
-    numbers, targets (n,): their epochs and rows of the test field; points, sigmas (n, 2) px;
-    covariances (n,) px² of x with y, 0 where it is not known, None where it nowhere is.
-    """
-
-    numbers: NDArray[np.int64]
-    targets: NDArray[np.int64]
-    points: Array
-    sigmas: Array
-    covariances: Array | None
-
-
 class SeriesReader(ABC):
     """An open store that is read, of a file or of a server; use it in a `with` block.
 
     Each has its own way to list series and to read their columns and epochs as they were stamped;
-    finding a series, corrected times and temperatures at the times of its frames follow from these.
+    finding a series and corrected times follow from these.
     """
 
     path: Path
@@ -255,9 +214,9 @@ class SeriesReader(ABC):
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns over all epochs by name, (E,) each: a million epochs in a fraction of a second.
 
-        Names are `epoch`, `frame_time`, `c`, `sd_c`, `sigma0`, a temperature channel (°C as read;
-        see `temperatures_at_frame`), an extra column such as `blur_px`; numbers are float64, NaN
-        where an epoch has none; `status` is text.
+        Names are `epoch`, `frame_time`, `c`, `sd_c`, `sigma0`, a temperature channel (°C as read),
+        an extra column such as `blur_px`; numbers are float64, NaN where an epoch has none;
+        `status` is text.
         """
         columns = self.stamped_columns(series, names)
         timed = {"frame_time", "temperature_time"} & set(names)
@@ -304,17 +263,6 @@ class SeriesReader(ABC):
             )
         return found[0]
 
-    def temperatures_at_frame(self, series: StoredSeries) -> dict[str, Array]:
-        """Every channel at the times of the frames, {name: (E,) °C}."""
-        names = ["frame_time", "temperature_time", *series.head.channels]
-        columns = self.series_columns(series, names)
-        return {
-            name: interpolate_readings(
-                columns["frame_time"], columns["temperature_time"], columns[name]
-            )
-            for name in series.head.channels
-        }
-
     def _label(self, series: StoredSeries) -> str:
         return f"{series.camera}/{series.name}"
 
@@ -332,14 +280,10 @@ class SeriesTimes:
     reading: Array
     corrections: Array
 
-    def of(self, number: int) -> tuple[float, float]:
-        """(frame time, temperature time) of an epoch, s."""
-        row = int(np.searchsorted(self.numbers, number))
-        return float(self.frame[row]), float(self.reading[row])
-
     def correct(self, stored: StoredEpoch) -> StoredEpoch:
         """The epoch with its corrected times."""
-        frame_time, temperature_time = self.of(stored.epoch.number)
+        row = int(np.searchsorted(self.numbers, stored.epoch.number))
+        frame_time, temperature_time = float(self.frame[row]), float(self.reading[row])
         epoch = replace(stored.epoch, frame_time=frame_time, temperature_time=temperature_time)
         return replace(stored, epoch=epoch)
 

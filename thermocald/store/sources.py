@@ -8,14 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from thermocald.errors import StoreError
+from thermocald.files import is_database
 from thermocald.store.server.connection import ServerAddress, is_server
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.store.series import SeriesReader
-
-_SQLITE = b"SQLite format 3\0"
 
 
 def open_source(source: Path) -> SeriesReader:
@@ -37,13 +36,7 @@ def open_source(source: Path) -> SeriesReader:
 
 def is_store(source: Path) -> bool:
     """Whether a source is a store: a server's address, or a file that SQLite wrote."""
-    if is_server(source):
-        return True
-    try:
-        with source.open("rb") as file:
-            return file.read(len(_SQLITE)) == _SQLITE
-    except OSError:
-        return False
+    return is_server(source) or is_database(source)
 
 
 def source_name(source: Path) -> str:

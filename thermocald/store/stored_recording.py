@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.series.blocks import runs
-from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.store.recording.observation_file import grid_runs
 from thermocald.store.recording.reader import EpochColumns
 
 if TYPE_CHECKING:
@@ -18,13 +17,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from thermocald.arrays import Array
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
+    from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.store.recording.head import Head
     from thermocald.store.series import SeriesReader, StoredSeries
-
-
-_GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # of a block: 12 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +57,17 @@ class StoredRecording:
             {name: found[name] for name in channels}, (), {},
         )  # fmt: skip
 
+    def extra_columns(self) -> dict[str, Array]:
+        """Return by name what else is stored of each epoch, (E,), NaN where it has none."""
+        place = {int(number): row for row, number in enumerate(self.columns.numbers)}
+        found: dict[str, Array] = {}
+        for stored in self.store.epochs(self.series, details=False):
+            for name, value in stored.extra.items():
+                column = found.setdefault(name, np.full(len(place), np.nan))
+                if (row := place.get(stored.epoch.number)) is not None:
+                    column[row] = value
+        return dict(sorted(found.items()))
+
     def __len__(self) -> int:
         return len(self.columns)
 
@@ -84,18 +93,11 @@ class StoredRecording:
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
         """Grids of consecutive epochs, each with its first epoch (from 0); only of windows."""
-        size = min(max(_GRID_POINTS // len(self.testfield), 1), _GRID_EPOCHS)
-        for rows in runs(len(self), size, windows):
-            yield rows.start, self._grid(self.columns.numbers[rows])
-
-    def _grid(self, numbers: NDArray[np.int64]) -> ObservationGrid:
-        """The grid of some consecutive epochs."""
-        found = self.store.observation_rows(self.series, int(numbers[0]), int(numbers[-1]))
-        rows = np.searchsorted(numbers, found.numbers)
-        # an epoch that came while the series was read is not among them
-        known = numbers[np.minimum(rows, len(numbers) - 1)] == found.numbers
-        covariances = None if found.covariances is None else found.covariances[known]
-        return ObservationGrid.from_rows(
-            (len(numbers), len(self.testfield)), rows[known], found.targets[known],
-            found.points[known], found.sigmas[known], covariances,
-        )  # fmt: skip
+        numbers = self.columns.numbers
+        for run in grid_runs(len(self), len(self.testfield), windows):
+            wanted = numbers[run]
+            found = self.store.observation_rows(self.series, int(wanted[0]), int(wanted[-1]))
+            # an epoch that came while the series was read is not among them
+            found = found.rows(np.isin(found.epochs, wanted))
+            found = replace(found, epochs=np.searchsorted(numbers, found.epochs))
+            yield run.start, found.grid(run.start, run.stop, len(self.testfield))

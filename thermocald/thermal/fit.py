@@ -2,21 +2,27 @@
 
 Linear coefficients come from generalised least squares under the likelihood of `likelihood`,
 non-linear ones by Gauss-Newton on the same normal equations.
+
+What the distortion of a camera follows while it warms, its angles or places in the image, is the
+same number of unknowns. The series are asked before any hypothesis is: camera and, if that is worth
+its unknowns, mount move as a straight line in the temperature and some cosines in time, and the
+basis that leaves less is the camera's, where the difference is significant.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from thermocald.photogrammetry.linalg import scaled_inverse, scaled_solve
+from thermocald.photogrammetry.camera.camera_model import EOP
+from thermocald.photogrammetry.linalg import scaled_inverse, scaled_solve, unit_diagonal
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive, drive_matrix, driven_history
-from thermocald.thermal.hypothesis import BASE, Block, Fit, Term, sum_normals
+from thermocald.physics.model import BASES, Distortion, choose_basis
+from thermocald.thermal.hypothesis import BASE, Block, Fit, Term
 from thermocald.thermal.likelihood import (
-    NormalEquations,
     ReadingErrorTerm,
     Weighting,
     add_error_term,
@@ -25,12 +31,15 @@ from thermocald.thermal.likelihood import (
 from thermocald.thermal.series import COLUMNS, ReducedSeries, unit_directions
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
+
+
+T = TypeVar("T")
 
 # relative standard deviation with which the readings themselves tell their noise
 _NOISE_KNOWN = 0.05
@@ -48,35 +57,39 @@ class HypothesisFitter:
         self.thermometer_factor = 1.0
         self.held: frozenset[str] = frozenset()  # non-linear parameters, such as `effect.tau`
         self.priors: dict[str, tuple[float, float]] = {}  # of these: value known beforehand, sd
-        self._trajectories: dict[Any, tuple[Array, Array | None, str]] = {}
-        self._drives: dict[Any, tuple[Array, Array]] = {}
-        self._further: dict[Any, list[tuple[Array, str]]] = {}
-        self._slope_jumps: dict[int, Array] = {}
+        self._kept: dict[str, dict[Any, Any]] = {}
 
     def share_trajectories(self, other: HypothesisFitter) -> None:
         """Use the trajectories that a fitter of the same histories has computed."""
-        self._trajectories, self._drives = other._trajectories, other._drives
-        self._further = other._further
-        self._slope_jumps = other._slope_jumps
+        self._kept = other._kept
+
+    def _once(self, what: str, key: Any, compute: Callable[[], T], most: int = 60) -> T:
+        """Compute something once; of more than `most` nothing before is kept."""
+        kept = self._kept.setdefault(what, {})
+        if key not in kept:
+            if len(kept) > most:
+                kept.clear()
+            kept[key] = compute()
+        found: T = kept[key]
+        return found
 
     # -- trajectories ---------------------------------------------------------------------------
 
     def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array]:
         """Return the trajectory (E,) that drives the linear terms, and its operator (E, states)."""
         drives = _drives(terms, series)
-        key = (series, tuple((name, tuple(values.items())) for name, values in drives))
-        if key not in self._drives:
+
+        def compute() -> tuple[Array, Array]:
             reduced = self.series[series]
-            history = reduced.history
-            operator = drive_matrix(history, drives)
+            operator = drive_matrix(reduced.history, drives)
             assert operator is not None
-            if len(self._drives) > 60:
-                self._drives.clear()
-            self._drives[key] = (
-                reduced.averaged(drive(history, drives)),
-                reduced.states(history.reference, operator),
+            return (
+                reduced.averaged(drive(reduced.history, drives)),
+                reduced.states(reduced.history.reference, operator),
             )
-        return self._drives[key]
+
+        key = (series, tuple((name, tuple(values.items())) for name, values in drives))
+        return self._once("drive", key, compute)
 
     def drive_trajectory(self, terms: Sequence[Term], series: int) -> Array:
         """Return the trajectory (E,) alone: for scanning, where no operator is needed."""
@@ -100,7 +113,8 @@ class HypothesisFitter:
             series, term.effect, tuple(sorted(values.items())), drives if through else None,
             operators,
         )  # fmt: skip
-        if key not in self._trajectories:
+
+        def compute() -> tuple[Array, Array | None, str]:
             history = evidence.history
             before: csr_array | None = None
             if through:
@@ -115,24 +129,36 @@ class HypothesisFitter:
                 if sparse.nnz:
                     whole = sparse if before is None else sparse @ before
                     operator = evidence.states(channel, whole)
-            if len(self._trajectories) > 600:
-                self._trajectories.clear()
-            self._trajectories[key] = (trajectory, operator, channel)
-        return self._trajectories[key]
+            return trajectory, operator, channel
+
+        return self._once("trajectory", key, compute, 600)
 
     def further_operators(self, term: Term, series: int) -> list[tuple[Array, str]]:
         """Return operators (E, states) and channels of the further columns that a signal reads."""
         values = term.values(series)
         if values is None:
             return []
-        key = (series, term.effect, tuple(sorted(values.items())))
-        if key not in self._further:
+
+        def compute() -> list[tuple[Array, str]]:
             evidence = self.series[series]
             found = term.kind.further_sensitivities(evidence.history, **values)
-            if len(self._further) > 60:
-                self._further.clear()
-            self._further[key] = [(evidence.states(c, m), c) for c, m in found.items()]
-        return self._further[key]
+            return [(evidence.states(c, m), c) for c, m in found.items()]
+
+        key = (series, term.effect, tuple(sorted(values.items())))
+        return self._once("further", key, compute)
+
+    def list_operators(
+        self, terms: Sequence[Term], blocks: Sequence[Block], series: int
+    ) -> Iterator[tuple[Block, Array | None, str]]:
+        """Yield how the readings' errors reach each block: operator or None, channel."""
+        for block in blocks:
+            if block.series not in (None, series) or block.trajectories > 1:
+                continue
+            if block.term < 0:
+                reference = self.series[series].history.reference
+                yield block, self.drive(terms, series)[1], reference
+            else:
+                yield block, *self.trajectories(terms[block.term], series, terms)[1:]
 
     # -- fitting ---------------------------------------------------------------------------
 
@@ -182,16 +208,10 @@ class HypothesisFitter:
     ) -> Weighting:
         """Fix the covariance of a series at some coefficients."""
         carried: list[ReadingErrorTerm] = []
-        for block in blocks:
-            if block.series not in (None, series) or block.trajectories > 1:
-                continue
+        for block, operator, channel in self.list_operators(terms, blocks, series):
             d = np.zeros(len(COLUMNS))
             d[[COLUMNS.index(p) for p in block.parameters]] = x[block.start : block.stop]
-            if block.term < 0:
-                operator: Array | None = self.drive(terms, series)[1]
-                channel = self.series[series].history.reference
-            else:
-                _, operator, channel = self.trajectories(terms[block.term], series, terms)
+            if block.term >= 0:
                 for further, name in self.further_operators(terms[block.term], series):
                     carried = add_error_term(carried, ReadingErrorTerm(d, further, name))
             if operator is not None and d.any():
@@ -242,11 +262,9 @@ class HypothesisFitter:
 
     def _slope_jump(self, series: int) -> Array:
         """Return how uncertain the rate (E,) of the reference is where it jumps."""
-        if series not in self._slope_jumps:
-            evidence = self.series[series]
-            instrument = evidence.thermometers[evidence.history.reference]
-            self._slope_jumps[series] = instrument.slope_jump(evidence.times)
-        return self._slope_jumps[series]
+        evidence = self.series[series]
+        instrument = evidence.thermometers[evidence.history.reference]
+        return self._once("slope", series, lambda: instrument.slope_jump(evidence.times))
 
     def fit(
         self,
@@ -264,34 +282,33 @@ class HypothesisFitter:
         which = range(len(self.series))
         designs = [self.design(terms, blocks, s) for s in which]
         x = np.zeros(K) if start is None or len(start) != K else start
-        weightings: list[Weighting] = []
-        reduced: list[NormalEquations] = []
-        A = np.zeros((K, K))
         for turn in range(max_iterations + (0 if x.any() else 1)):
             weightings = [self.weighting(terms, blocks, x, s) for s in which]
             reduced = [w.reduce(d[0], d[1]) for w, d in zip(weightings, designs, strict=True)]
-            A, c = sum_normals(designs, reduced, K, only)
+            fitted = Fit(
+                terms, tuple(blocks), x, np.zeros((K, K)), 0.0, 0.0, tuple(weightings),
+                tuple(designs), tuple(reduced),
+            )  # fmt: skip
+            A, c = fitted.normals(only)
             new = scaled_solve(A, c, _RIDGE)
             done = turn > 0 and np.max(np.abs(new - x)) <= 1e-3 * np.max(np.abs(new))
             x = new
             if done:
                 break
-        fitted = Fit(
-            terms, tuple(blocks), x, scaled_inverse(A, _RIDGE), 0.0, 0.0, tuple(weightings),
-            tuple(designs), tuple(reduced),
-        )  # fmt: skip
         chosen = which if only is None else only
         return replace(
             fitted,
-            chi2=sum(fitted.chi2_of(s) for s in chosen),
+            coefficients=x,
+            covariance=scaled_inverse(A, _RIDGE),
+            chi2=sum(fitted.chi2_of(s, x) for s in chosen),
             logdet=sum(reduced[s].logdet for s in chosen),
         )
 
-    def thermometer_scale(self, fit: Fit) -> tuple[float, float]:
-        """Find the factor of the readings' noise that makes a hypothesis most likely, and the
-        objective
-        there. Hypotheses that smooth the readings more than others are separated by nothing else
-        but an error of the noise.
+    def suit_thermometers(self, fit: Fit) -> float:
+        """Return the objective under the readings' noise that makes a hypothesis most likely.
+
+        Hypotheses that smooth the readings more than others are separated by nothing else but an
+        error of the noise.
         """
         from scipy.optimize import minimize_scalar
 
@@ -308,7 +325,7 @@ class HypothesisFitter:
             )
         finally:
             self.thermometer_factor = kept
-        return kept * float(np.exp(found.x)), float(found.fun)
+        return float(found.fun)
 
     # -- non-linear parameters ------------------------------------------------------------
 
@@ -429,3 +446,43 @@ class HypothesisFitter:
 def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:
     """List the drives among some terms, as `catalogue.drive` takes them."""
     return [(t.effect, t.values(series) or {}) for t in terms if t.is_drive]
+
+
+_ORDERS = 8  # of cosines over a series, with which the camera may move
+_MOVING = (np.arange(3), np.r_[0:3, EOP.start : EOP.stop])  # c, x0, y0; with the mount
+
+
+def choose_distortion(series: Sequence[ReducedSeries]) -> tuple[Distortion, float]:
+    """Return what the distortion follows in all series of a camera together, and how sure that is
+    in standard deviations.
+    """
+    sums = {basis: np.sum([_squares(s.in_basis(basis)) for s in series], axis=0) for basis in BASES}
+    unknowns = sum(min(_ORDERS, len(s.times) // 4) + 1 for s in series)
+    cost = np.minimum(*(sums[b] for b in BASES)) + 2.0 * unknowns * np.array(
+        list(map(len, _MOVING))
+    )
+    moving = int(np.argmin(cost))
+    rows = sum(int((s.n > 0).sum()) for s in series)
+    free = max(rows * len(series[0].scale) - unknowns * len(_MOVING[moving]), 1)
+    noise = max(float(min(sums[b][moving] for b in BASES)) / free, 1.0)
+    return choose_basis({b: float(sums[b][moving]) / noise for b in BASES})
+
+
+def _squares(series: ReducedSeries) -> Array:
+    """Return what smooth movement leaves of a series' sum of squares, for either of `_MOVING`."""
+    T = series.averaged(series.history.temperature())
+    orders = np.arange(1, min(_ORDERS, len(T) // 4) + 1)
+    t = (series.times - series.times[0]) / max(float(np.ptp(series.times)), 1e-9)
+    smooth = np.column_stack([np.ones(len(t)), T - T.mean(), np.cos(np.pi * np.outer(t, orders))])
+    products = smooth[:, :, None] * smooth[:, None, :]
+    normal = np.einsum("ekl,epq->kplq", products, series.N, optimize=True)
+    right = smooth.T @ series.b
+    K, P = right.shape
+    found = []
+    for moving in _MOVING:
+        chosen = np.concatenate([np.arange(P), *(k * P + moving for k in range(1, K))])
+        own = np.ix_(chosen, chosen)
+        scaled, scale = unit_diagonal(normal.reshape(K * P, K * P)[own])
+        rest = right.ravel()[chosen] * scale
+        found.append(float(rest @ np.linalg.lstsq(scaled, rest, rcond=1e-10)[0]))
+    return float(series.yy.sum()) - np.array(found)

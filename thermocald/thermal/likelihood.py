@@ -92,54 +92,33 @@ class Sums:
         between = movement.onto(self.cross.others)
         return replace(
             self,
-            cross=Couplings.of(movement, self.N, self.cross.others),
+            cross=Couplings(
+                movement.directions.T @ self.N,
+                movement.operator,
+                movement.spans,
+                self.cross.others,
+            ),
             normal=np.block([[own, between.T], [between, self.normal]]),
             right=np.concatenate([movement.onto(self.b[None])[0], self.right]),
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Still:
-    """A series whatever its movement: two are equal where all else is the same."""
-
-    evidence: ReducedSeries
-
-    @property
-    def _parts(self) -> tuple[object, ...]:
-        e = self.evidence
-        return e.N, e.b, e.yy, e.hidden, e.tremble
-
-    def __hash__(self) -> int:
-        return hash(tuple(map(id, self._parts)))
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, _Still):
-            return False
-        return all(a is b for a, b in zip(self._parts, other._parts, strict=True))
-
-
-@lru_cache(maxsize=4)
-def _sum_tremble(still: _Still) -> Sums:
-    """Sum a series with what trembles from epoch to epoch."""
-    evidence, hidden = still.evidence, still.evidence.hidden
-    cross, right = np.zeros((0, *evidence.b.shape)), np.zeros(0)
-    normal = np.zeros((0, 0))
-    if hidden is not None:
-        cross, normal, right = hidden.cross, np.diag(hidden.normal), hidden.right.sum(axis=1)
-    sums = Sums(
-        evidence.N, evidence.b, float(evidence.yy.sum()), 0.0, Couplings.still(cross), normal, right
-    )  # fmt: skip
-    if evidence.tremble is None:
-        return sums
-    every = np.arange(len(evidence.N))
-    D = np.broadcast_to(evidence.tremble, (len(every), *evidence.tremble.shape))
-    return sums.blurred(D, every)
-
-
 @lru_cache(maxsize=4)
 def sum_series(evidence: ReducedSeries) -> Sums:
-    """Sum a series with what moves: first the movement, then hidden targets."""
-    return _sum_tremble(_Still(evidence)).alongside(evidence.movement)
+    """Sum a series with what moves: first the movement, then hidden targets; and what trembles from
+    epoch to epoch.
+    """
+    hidden = evidence.hidden
+    E, P = evidence.b.shape
+    cross, normal, right = np.zeros((0, E, P)), np.zeros((0, 0)), np.zeros(0)
+    if hidden is not None:
+        cross, normal, right = hidden.cross, np.diag(hidden.normal), hidden.right.sum(axis=1)
+    still = Couplings(np.zeros((E, 0, P)), np.zeros((E, 0)), (), cross)
+    sums = Sums(evidence.N, evidence.b, float(evidence.yy.sum()), 0.0, still, normal, right)
+    if evidence.tremble is not None:
+        D = np.broadcast_to(evidence.tremble, (E, *evidence.tremble.shape))
+        sums = sums.blurred(D, np.arange(E))
+    return sums.alongside(evidence.movement)
 
 
 _MANY = 0.15  # trajectories per epoch above which epochs are whitened, for all that follow
@@ -158,14 +137,11 @@ class Weighting:
     b: Array
     yy: float
     logdet: float
-    # (R, ·) blocks: L⁻¹ Oᵀ… ; empty lists where no thermometer matters
-    operators: tuple[Array, ...]
-    places: tuple[slice, ...]  # of their states
-    directions: tuple[Array, ...]  # d_k (P,)
-    dN: tuple[Array, ...]  # d_kᵀN_e (E, P)
+    # of each reading error: operator (E, states), places of its states, d (P,), dᵀN_e (E, P)
+    errors: tuple[tuple[Array, slice, Array, Array], ...]
     moving: int
     effects: Couplings
-    factor: Array | None
+    factor: Array  # L (states, states), lower
     data: Array  # L⁻¹ Jᵀ b (R,)
     level: Array  # L⁻¹ Jᵀ constants (R, P)
     level_normal: Array  # inverse-ready (P, P) of the constants, thermometer included
@@ -180,16 +156,12 @@ class Weighting:
 
     def carried(self, trajectories: Array, directions: Array) -> Array:
         """Return L⁻¹ Jᵀ of regressors: trajectories (E, R), directions (P, R) → (states, R)."""
-        from scipy.linalg import solve_triangular
-
-        assert self.factor is not None
         total = np.zeros((len(self.factor), trajectories.shape[1]))
-        for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
+        for operator, at, _, dN in self.errors:
             total[at] += operator.T @ ((dN @ directions) * trajectories)
         if len(self.effects):
             total[: len(self.effects)] = self.effects.driven(trajectories, directions)
-        out: Array = solve_triangular(self.factor, total, lower=True, check_finite=False)
-        return out
+        return whiten(self.factor, total)
 
     def carried_stack(self, s: Array, directions: Array) -> Array:
         """Return L⁻¹ Jᵀ of every trajectory (E, G) along every direction (P, k) → (states, G k)."""
@@ -202,45 +174,35 @@ class Weighting:
 
     def by_epoch(self, direction: Array) -> Array:
         """Return L⁻¹ Jᵀ (states, E) of shifts of single epochs along a direction (P,); keep it."""
-        from scipy.linalg import solve_triangular
-
         key = direction.tobytes()
         if key not in self.kept:
-            assert self.factor is not None
             total = np.zeros((len(self.factor), len(self.N)))
-            for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
+            for operator, at, _, dN in self.errors:
                 total[at] += (operator * (dN @ direction)[:, None]).T
             if len(self.effects):
                 total[: len(self.effects)] = self.effects.along(direction)
-            self.kept[key] = solve_triangular(
-                self.factor, total, lower=True, overwrite_b=True, check_finite=False
-            )
+            self.kept[key] = whiten(self.factor, total)
         return self.kept[key]
 
     def weighted(self, parameters: Array) -> Array:
         """Return images (E, P, R) of trajectories of all parameters (E, P, R) under S⁻¹ after the
         levels: their sums along other trajectories are inner products.
         """
-        from scipy.linalg import cho_solve, solve_triangular
+        from scipy.linalg import cho_solve
 
         b: Array = self.N @ parameters
-        level_b, carried = b.sum(axis=0), None
-        if self.factor is not None:
-            right = np.zeros((len(self.factor), b.shape[2]))
-            for operator, at, d in zip(self.operators, self.places, self.directions, strict=True):
-                right[at] += operator.T @ (d @ b)
-            right[: len(self.effects)] = self.effects.onto(parameters)
-            carried = solve_triangular(self.factor, right, lower=True, check_finite=False)
-            level_b = level_b - self.level.T @ carried
+        right, few = np.zeros((len(self.factor), b.shape[2])), len(self.effects)
+        for operator, at, d, _ in self.errors:
+            right[at] += operator.T @ (d @ b)
+        right[:few] = self.effects.onto(parameters)
+        carried = whiten(self.factor, right)
+        level_b = b.sum(axis=0) - self.level.T @ carried
         level = cho_solve((self.level_factor, True), level_b)
         b = b - self.N @ level
-        if carried is not None:
-            left = carried - self.level @ level
-            states = solve_triangular(self.factor, left, lower=True, trans=1, check_finite=False)
-            for operator, at, dN in zip(self.operators, self.places, self.dN, strict=True):
-                b -= dN[:, :, None] * (operator @ states[at])[:, None, :]
-            b -= self.effects.images(states[: len(self.effects)])
-        return b
+        states = whiten(self.factor, carried - self.level @ level, transposed=True)
+        for operator, at, _, dN in self.errors:
+            b -= dN[:, :, None] * (operator @ states[at])[:, None, :]
+        return b - self.effects.images(states[:few])
 
     def joint(self, trajectories: Array, directions: Array) -> tuple[Array, Array, Array]:
         """Return normal equations alongside the levels: A (R, R), c (R,), K (P, R).
@@ -253,23 +215,14 @@ class Weighting:
         A = np.sum(VNV * trajectories[:, :, None] * trajectories[:, None, :], axis=0)
         c = np.einsum("ei,ei->i", trajectories, self.b @ directions)
         K = np.einsum("epi,ei->pi", NV, trajectories)
-        if self.factor is not None:
-            U = self.carried(trajectories, directions)
-            A = A - U.T @ U
-            c = c - U.T @ self.data
-            K = K - self.level.T @ U
-        return A, c, K
+        U = self.carried(trajectories, directions)
+        return A - U.T @ U, c - U.T @ self.data, K - self.level.T @ U
 
     def reduce(self, trajectories: Array, directions: Array) -> NormalEquations:
         """Return normal equations after the levels: trajectories (E, R), directions (P, R)."""
-        return self._without_level(*self.joint(trajectories, directions))
-
-    def _without_level(self, A: Array, c: Array, K: Array) -> NormalEquations:
-        from scipy.linalg import solve_triangular
-
-        Q = solve_triangular(self.level_factor, np.column_stack([K, self.level_b]), lower=True)
-        q = Q[:, -1]
-        Q = Q[:, :-1]
+        A, c, K = self.joint(trajectories, directions)
+        Q = whiten(self.level_factor, np.column_stack([K, self.level_b]))
+        Q, q = Q[:, :-1], Q[:, -1]
         return NormalEquations(A - Q.T @ Q, c - Q.T @ q, self.yy - float(q @ q), self.logdet)
 
     def scan(
@@ -280,8 +233,6 @@ class Weighting:
         base: trajectories (E, R), directions (P, R) of what the model holds already.
         Returns, after the levels: A (G, mk, mk), c (G, mk), cross with the base (G, mk, R).
         """
-        from scipy.linalg import solve_triangular
-
         G, E, m = trajectories.shape
         P, k = directions.shape
         s = np.moveaxis(trajectories, 0, 1).reshape(E, G * m)  # candidate by candidate
@@ -298,17 +249,14 @@ class Weighting:
         cross_weights: Array = np.einsum("epa,pr,er->ear", NV, Vb, Cb, optimize=True)
         B = (s.T @ cross_weights.reshape(E, -1)).reshape(G, m * k, R)
         Kb = np.einsum("epq,qi,ei->pi", self.N, Vb, Cb, optimize=True)
-        U = None
-        if self.factor is not None:
-            U = self.carried_stack(s, directions)
-            Ub = self.carried(Cb, Vb)
-            Ug = U.reshape(len(U), G, m * k)
-            A = A - np.einsum("rgi,rgj->gij", Ug, Ug, optimize=True)
-            c = c - (U.T @ self.data).reshape(G, m * k)
-            B = B - (U.T @ Ub).reshape(G, m * k, R)
-            K = K - self.level.T @ U
-            Kb = Kb - self.level.T @ Ub
-        Q = solve_triangular(self.level_factor, np.column_stack([K, Kb, self.level_b]), lower=True)
+        U, Ub = self.carried_stack(s, directions), self.carried(Cb, Vb)
+        Ug = U.reshape(len(U), G, m * k)
+        A = A - np.einsum("rgi,rgj->gij", Ug, Ug, optimize=True)
+        c = c - (U.T @ self.data).reshape(G, m * k)
+        B = B - (U.T @ Ub).reshape(G, m * k, R)
+        K = K - self.level.T @ U
+        Kb = Kb - self.level.T @ Ub
+        Q = whiten(self.level_factor, np.column_stack([K, Kb, self.level_b]))
         n = G * m * k
         Qg = Q[:, :n].reshape(P, G, m * k)
         A = A - np.einsum("pgi,pgj->gij", Qg, Qg, optimize=True)
@@ -361,20 +309,19 @@ def prepare(
 
     thermometer_factor: multiplies the standard deviations of the readings.
     """
-    from scipy.linalg import cholesky, solve_triangular
+    from scipy.linalg import cholesky
 
-    sums = _blur_unresolved(evidence, carried)
+    sums = sum_series(evidence)
+    # what no reading resolves is noise of single epochs
+    for c in carried:
+        if c.unresolved is not None and c.unresolved.any():
+            bent = np.flatnonzero(c.unresolved)
+            sums = sums.blurred(c.unresolved[bent, None, None] * c.direction[:, None], bent)
+    own = _factorise_own(evidence) if sums is sum_series(evidence) else _factorise(sums)
     touched = _find_touched(sums.N, carried)
-    P = sums.N.shape[1]
-    fixed = len(sums.right)
-    if not carried and not fixed:
-        k0, N0 = sums.b.sum(axis=0), sums.N.sum(axis=0)
-        return Weighting(
-            sums.N, sums.b, sums.yy, sums.logdet, (), (), (), (), 0, sums.cross, None,
-            np.zeros(0), np.zeros((0, P)), N0, k0, _factorise_levels(N0),
-        )  # fmt: skip
+    P, fixed = sums.N.shape[1], len(sums.right)
     places: dict[str, slice] = {}
-    sds, deviations = [], {}
+    sds, deviations = [np.zeros(0)], {}
     start = fixed
     for name in dict.fromkeys(c.channel for c in carried):
         sd = evidence.state_sd(name)[touched[name]] * thermometer_factor
@@ -382,50 +329,61 @@ def prepare(
         deviations[name] = evidence.state_deviation(name)[touched[name]]
         sds.append(sd)
         start += len(sd)
+    whole = np.concatenate(sds)
     # the readings' own deviation from the smooth trajectory, carried to the camera
     shift = np.zeros((len(sums.N), P))
-    states = [(c.direction, c.operator[:, touched[c.channel]], places[c.channel]) for c in carried]
-    for item, (direction, operator, _) in zip(carried, states, strict=True):
-        shift += np.outer(operator @ deviations[item.channel], direction)
-    own = _factorise_own(evidence) if sums is sum_series(evidence) else _factorise(sums)
+    errors = []
+    for item in carried:
+        operator = item.operator[:, touched[item.channel]]
+        shift += np.outer(operator @ deviations[item.channel], item.direction)
+        dN = sums.N @ item.direction
+        errors.append((operator, places[item.channel], item.direction, dN))
     sums = sums.shifted(shift)
-    dN = [sums.N @ c.direction for c in carried]
     factor = np.zeros((start, start))
     factor[:fixed, :fixed] = own
     logdet = sums.logdet + 2 * float(np.sum(np.log(np.diag(own))))
-    if carried:
-        whole = np.concatenate(sds)
-        inner = [slice(at.start - fixed, at.stop - fixed) for _, _, at in states]
-        M = np.diag(1.0 / whole**2)
-        _add_products(M, [o for _, o, _ in states], inner, [d for d, _, _ in states], dN)
-        beside = np.zeros((fixed, start - fixed))
-        for (d, operator, _), here in zip(states, inner, strict=True):
+    if errors:
+        M, beside = np.diag(1.0 / whole**2), np.zeros((fixed, start - fixed))
+        inner = [(o, slice(at.start - fixed, at.stop - fixed), d, w) for o, at, d, w in errors]
+        _add_products(M, inner)
+        for operator, here, d, _ in inner:
             beside[:, here] += sums.cross.along(d) @ operator
-        if fixed:
-            low = solve_triangular(own, beside, lower=True, check_finite=False)
-            M -= low.T @ low
-            factor[fixed:, :fixed] = low.T
+        low = whiten(own, beside)
+        M -= low.T @ low
+        factor[fixed:, :fixed] = low.T
         last = cholesky(M.T, lower=True, overwrite_a=True, check_finite=False)
         factor[fixed:, fixed:] = last
         logdet += 2 * float(np.sum(np.log(np.diag(last) * whole)))
     right = np.zeros((start, P + 1))
-    for (d, operator, at), w in zip(states, dN, strict=True):
-        right[at] += operator.T @ np.column_stack([w, sums.b @ d])
+    for operator, at, d, dN in errors:
+        right[at] += operator.T @ np.column_stack([dN, sums.b @ d])
     right[:fixed, :P] = sums.cross.total()
     right[:fixed, P] = sums.right
-    right = solve_triangular(factor, right, lower=True, check_finite=False)
+    right = whiten(factor, right)
     level, data = right[:, :P], right[:, P]
     N0 = sums.N.sum(axis=0) - level.T @ level
-    k0 = sums.b.sum(axis=0) - level.T @ data
-    held = _factorise_levels(N0)
+    # levels that the field cannot tell apart are held by 1000 px, or as loosely as rounding allows
+    held = 1e-6 + 1e-13 * float(np.trace(N0))
+    level_factor = np.linalg.cholesky(N0 + held * np.eye(P))
     moving = len(evidence.movement) if evidence.movement is not None else 0
     if moving:  # the movement's size is estimated: the levels' share counts (restricted)
-        logdet += 2 * float(np.sum(np.log(np.diag(held))))
+        logdet += 2 * float(np.sum(np.log(np.diag(level_factor))))
     return Weighting(
-        sums.N, sums.b, sums.yy - float(data @ data), logdet, tuple(o for _, o, _ in states),
-        tuple(at for _, _, at in states), tuple(d for d, _, _ in states), tuple(dN),
-        moving, sums.cross, factor, data, level, N0, k0, held,
+        sums.N, sums.b, sums.yy - float(data @ data), logdet, tuple(errors), moving, sums.cross,
+        factor, data, level, N0, sums.b.sum(axis=0) - level.T @ data, level_factor,
     )  # fmt: skip
+
+
+def whiten(factor: Array, right: Array, transposed: bool = False) -> Array:
+    """Solve L X = right (n, ·) for a lower triangular L (n, n), or LᵀX = right; n may be 0."""
+    from scipy.linalg import solve_triangular
+
+    if not len(factor):
+        return right
+    out: Array = solve_triangular(
+        factor, right, lower=True, trans=int(transposed), check_finite=False
+    )
+    return out
 
 
 def _find_touched(
@@ -445,31 +403,29 @@ def _find_touched(
     return {name: np.flatnonzero(r) if r.any() else slice(1) for name, r in reached.items()}
 
 
-def _add_products(
-    M: Array, operators: list[Array], places: list[slice], directions: list[Array], dN: list[Array]
-) -> None:
+def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> None:
     """Add JᵀN J of the readings' errors to the upper half of M.
 
     Operators on the same states are combined by the root of what they weigh together, epoch by
     epoch: a product of a matrix with itself takes half the work.
     """
-    groups: dict[int, list[int]] = {}
-    for i, at in enumerate(places):
-        groups.setdefault(at.start, []).append(i)
+    groups: dict[int, list[tuple[Array, slice, Array, Array]]] = {}
+    for error in errors:
+        groups.setdefault(error[1].start, []).append(error)
     own = list(groups.values())
-    for g, rows in enumerate(own):
-        weights = np.stack([[dN[i] @ directions[j] for j in rows] for i in rows])  # (k, k, E)
+    for g, group in enumerate(own):
+        weights = np.stack([[dN @ d for _, _, d, _ in group] for _, _, _, dN in group])  # (k, k, E)
         size, turn = np.linalg.eigh(np.moveaxis(weights, 2, 0))  # it may be singular
         root = turn * np.sqrt(np.maximum(size, 0.0))[:, None, :]
-        here = places[rows[0]]
-        for r in range(len(rows)):
-            half = _combine([operators[i] for i in rows], root[:, :, r])
+        here = group[0][1]
+        for r in range(len(group)):
+            half = _combine([operator for operator, *_ in group], root[:, :, r])
             M[here, here] += half.T @ half
         for others in own[g + 1 :]:
-            for i in rows:
-                shares = np.stack([dN[i] @ directions[j] for j in others], axis=1)
-                far = _combine([operators[j] for j in others], shares)
-                M[here, places[others[0]]] += operators[i].T @ far
+            for operator, _, _, dN in group:
+                shares = np.stack([dN @ d for _, _, d, _ in others], axis=1)
+                far = _combine([o for o, *_ in others], shares)
+                M[here, others[0][1]] += operator.T @ far
 
 
 def _combine(operators: list[Array], shares: Array) -> Array:
@@ -478,17 +434,6 @@ def _combine(operators: list[Array], shares: Array) -> Array:
     for k, operator in enumerate(operators[1:], 1):
         out += shares[:, k, None] * operator
     return out
-
-
-def _blur_unresolved(evidence: ReducedSeries, carried: list[ReadingErrorTerm]) -> Sums:
-    """Sum a series, with what no reading resolves as noise of single epochs."""
-    unresolved = [(c.direction, c.unresolved) for c in carried if c.unresolved is not None]
-    sums = sum_series(evidence)
-    for direction, sd in unresolved:
-        if sd.any():
-            bent = np.flatnonzero(sd)
-            sums = sums.blurred(sd[bent, None, None] * direction[:, None], bent)
-    return sums
 
 
 @lru_cache(maxsize=4)
@@ -505,12 +450,3 @@ def _factorise(sums: Sums) -> Array:
         return sums.normal
     factor: Array = cholesky(sums.normal, lower=True, check_finite=False)
     return factor
-
-
-def _factorise_levels(N0: Array) -> Array:
-    """Factorise; the levels that the field cannot tell apart are held by 1000 px, or as
-    loosely as rounding lets them.
-    """
-    held = 1e-6 + 1e-13 * float(np.trace(N0))
-    factor = np.linalg.cholesky(N0 + held * np.eye(len(N0)))
-    return np.asarray(factor, dtype=float)

@@ -22,16 +22,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.linalg import (
-    best_level,
+    mad_sd,
     orthonormal_combinations,
     scaled_inverse,
+    subtract_level,
 )
 from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.likelihood import whiten
 from thermocald.thermal.random_effects import Movement, waves
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from thermocald.arrays import Array
     from thermocald.thermal.hypothesis import Fit, Term
@@ -112,14 +114,21 @@ def find_combinations(series: Sequence[ReducedSeries]) -> Array:
     return W[:, good]
 
 
+def solve_combinations(N: Array, b: Array, W: Array) -> tuple[Array, Array]:
+    """Solve each epoch for the combinations W (P, m), held by a weak prior: their normal equations
+    (E, m, m) and values (E, m).
+    """
+    normal = np.einsum("pi,epq,qj->eij", W, N, W) + 0.1 * np.eye(W.shape[1])
+    return normal, np.linalg.solve(normal, (b @ W)[..., None])[..., 0]
+
+
 def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
     """Guess the covariance (m, m) from the power of the misfit's half-waves beyond the noise."""
     total = np.zeros((W.shape[1], W.shape[1]))
     count = 0
     for s, e in enumerate(fitter.series):
         w = fit.weightings[s]
-        rest = w.left(fit.parameters(s))
-        z = (rest - w.N @ best_level(w.N, rest)) @ W
+        z = subtract_level(w.N, w.left(fit.parameters(s))) @ W
         A = waves(e.times, min(WAVES, len(e.times) // 2)).T @ z
         k = np.arange(1, len(A) + 1)
         total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * np.eye(len(total))
@@ -139,8 +148,7 @@ def weight_leaps_down(fitter: HypothesisFitter, fit: Fit, W: Array) -> list[Redu
     out = []
     for s, e in enumerate(fitter.series):
         w = fit.weightings[s]
-        normal = np.einsum("pi,epq,qj->eij", W, w.N, W) + 0.1 * np.eye(W.shape[1])
-        y = np.linalg.solve(normal, (w.left(fit.parameters(s)) @ W)[..., None])[..., 0]
+        normal, y = solve_combinations(w.N, w.left(fit.parameters(s)), W)
         padded = np.pad(y, ((2, 2), (0, 0)), mode="edge")
         calm = np.median(np.stack([padded[k : k + len(y)] for k in range(5)]), axis=0)
         leap = np.einsum("ei,eij,ej->e", y - calm, normal, y - calm)
@@ -156,8 +164,8 @@ def estimate_mount_motion(
     fitter: HypothesisFitter,
     terms: Sequence[Term],
     mount: Mount,
-    start: Array | None = None,
-    max_iterations: int = 8,
+    start: Array | None,
+    max_iterations: int,
 ) -> tuple[HypothesisFitter, Fit, Mount]:
     """Estimate the movement alongside a hypothesis: a fitter that has it, the fit in it, the
     estimate.
@@ -201,22 +209,18 @@ def _estimate_amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
 
     Levels and coefficients are unknown too: their uncertainty is in the covariance.
     """
-    from scipy.linalg import solve_triangular
-
     known = scaled_inverse(fit.normals()[0], 1e-10)
     out = []
     for w, (C, V, index) in zip(fit.weightings, fit.designs, strict=True):
-        assert w.factor is not None
         x = fit.coefficients[index]
         U = w.carried(C, V)
         K = np.einsum("epq,qi,ei->pi", w.N, V, C, optimize=True) - w.level.T @ U
         F = w.level_factor
-        B = solve_triangular(F, K, lower=True)
-        right = solve_triangular(F, w.level_b - K @ x, lower=True)
-        level = solve_triangular(F.T, right, lower=False)
+        B = whiten(F, K)
+        level = whiten(F, whiten(F, w.level_b - K @ x), transposed=True)
         data = w.data - U @ x - w.level @ level
-        Q = solve_triangular(F, w.level.T, lower=True).T
-        inverse = solve_triangular(w.factor, np.eye(len(w.factor), w.moving), lower=True)
+        Q = whiten(F, w.level.T).T
+        inverse = whiten(w.factor, np.eye(len(w.factor), w.moving))
         by_level = Q.T @ inverse
         size, turn = np.linalg.eigh(known[np.ix_(index, index)])
         by_x = (turn * np.sqrt(np.maximum(size, 0.0))).T @ (U - Q @ B).T @ inverse
@@ -238,16 +242,18 @@ def measure_jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Arra
     W, good = orthonormal_combinations(e.N.mean(axis=0))
     z = (_subtract_fit(fitter, fit, series) @ W)[e.n > 0]
     d = np.diff(z, 2, axis=0)
-    spread = np.median(np.abs(d), axis=0) * 1.4826
+    spread = mad_sd(d, axis=0)
     observed = np.array(
         [np.mean(x[np.abs(x) <= 4 * s] ** 2) for x, s in zip(d.T, spread, strict=True)]
     )
     white = 6.0 / e.correlation
     second = np.diff(np.eye(len(e.times)), 2, axis=0)
     carried = np.zeros((W.shape[1], W.shape[1]))
-    for operator, channel, direction in _list_reading_errors(fitter, fit, series):
+    for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
+        if operator is None:
+            continue
         jump = (second @ operator) * e.state_sd(channel)
-        share = W.T @ e.N.mean(axis=0) @ direction
+        share = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
         carried += np.mean(np.sum(jump**2, axis=1)) * np.outer(share, share)
     usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
     turned = _find_directions(d[usual][:, good], white, carried[np.ix_(good, good)], 2)
@@ -262,9 +268,7 @@ def measure_jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Arra
 def _subtract_fit(fitter: HypothesisFitter, fit: Fit, series: int) -> Array:
     """Return what a fit and one level leave of the right-hand sides (E, P) of a series."""
     e = fitter.series[series]
-    rest = e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(series))
-    out: Array = rest - e.N @ best_level(e.N, rest)
-    return out
+    return subtract_level(e.N, e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(series)))
 
 
 def detect_tremble(evidence: ReducedSeries) -> bool:
@@ -279,7 +283,7 @@ def detect_tremble(evidence: ReducedSeries) -> bool:
     d = np.diff((evidence.values @ M @ W)[evidence.n > 0], _FAST, axis=0)
     if len(d) < criteria.FEWEST:
         return False
-    spread = np.median(np.abs(d), axis=0) * 1.4826
+    spread = mad_sd(d, axis=0)
     usual = np.all(np.abs(d) <= 4 * spread + 1e-12, axis=1)
     white = comb(2 * _FAST, _FAST) / evidence.correlation
     return _find_directions(d[usual], white, np.zeros((len(W.T), len(W.T))), _FAST) is not None
@@ -356,32 +360,17 @@ def _measure_fast_power(
     fast = waves(e.times, len(e.times) - 1)[:, slower:].T
     z = fast @ (_subtract_fit(fitter, fit, series) @ W)
     power: Array = z.T @ z / len(fast)
-    for operator, channel, direction in _list_reading_errors(fitter, fit, series):
+    for block, operator, channel in fitter.list_operators(fit.terms, fit.blocks, series):
+        if operator is None:
+            continue
         carried = fast @ operator
         noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
         # the fit has smoothed readings: what smoothing took off them is not in the rest
         taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
         left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
-        along = W.T @ e.N.mean(axis=0) @ direction
+        along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
         power -= left * np.outer(along, along)
     return power, W
-
-
-def _list_reading_errors(
-    fitter: HypothesisFitter, fit: Fit, series: int
-) -> Iterator[tuple[Array, str, Array]]:
-    """Yield how the readings' errors reach the parameters: operator, channel, direction (P,)."""
-    for block in fit.blocks:
-        if block.trajectories > 1 or block.series not in (None, series):
-            continue
-        operator: Array | None
-        if block.term < 0:
-            operator = fitter.drive(fit.terms, series)[1]
-            channel = fitter.series[series].history.reference
-        else:
-            _, operator, channel = fitter.trajectories(fit.terms[block.term], series, fit.terms)
-        if operator is not None:
-            yield operator, channel, fit.direction(block)[0]
 
 
 def add_jumps_to_noise(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:

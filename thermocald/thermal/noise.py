@@ -78,7 +78,7 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
     """
     data = _list_variances(series)
     temperature = [e.history.temperature() - e.T0 for e in series]
-    k, gain, _ = _estimate_slope(temperature, data)
+    gain = _estimate_slope(temperature, data)[1]
     others: list[tuple[float, str]] = []
     for name in series[0].history.readings:
         if name != series[0].history.reference and all(name in e.history.readings for e in series):
@@ -92,10 +92,10 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
     other_gain, other = max([*others, (by_time, "time")])
     if gain < criteria.GROWTH or gain < by_time + criteria.CLEAR:
         return None
-    rough = _measure_roughness(temperature, data, k)
-    if gain / rough < criteria.GROWTH:
+    found = estimate_noise_slope(series)
+    if found.gain < criteria.GROWTH:
         return None
-    return replace(estimate_noise_slope(series), other_gain=other_gain / rough, other=other)
+    return replace(found, other_gain=other_gain * found.gain / gain, other=other)
 
 
 def estimate_noise_slope(series: Sequence[ReducedSeries]) -> NoiseGrowth:

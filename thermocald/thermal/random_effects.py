@@ -147,28 +147,27 @@ class Movement:
         return out
 
     @cached_property
-    def spans(self) -> tuple[tuple[int, slice], ...]:
-        """Each direction with an amplitude that counts, and where its amplitudes are."""
-        modes, first = np.unique(self.states[0], return_index=True)
-        stops = [*first[1:].tolist(), len(self)]
-        parts = zip(modes.tolist(), first.tolist(), stops, strict=True)
-        return tuple((mode, slice(start, stop)) for mode, start, stop in parts)
+    def spans(self) -> tuple[slice, ...]:
+        """Where the amplitudes of each direction that count are."""
+        stops = np.cumsum(np.bincount(self.states[0], minlength=len(self.sd))).tolist()
+        return tuple(slice(a, b) for a, b in zip([0, *stops], stops, strict=False))
 
     def own(self, N: Array) -> Array:
         """Sum (F, F) products of the amplitudes' shifts under normal matrices N (E, P, P)."""
         between = self.directions.T @ N @ self.directions
         out = np.zeros((len(self), len(self)))
-        for i, (mode, here) in enumerate(self.spans):
-            for other, there in self.spans[i:]:
-                weighted = between[:, mode, other, None] * self.operator[:, there]
-                out[here, there] = self.operator[:, here].T @ weighted
+        for i, here in enumerate(self.spans):
+            for j, there in enumerate(self.spans[i:], i):
+                out[here, there] = self.operator[:, here].T @ (
+                    between[:, i, j, None] * self.operator[:, there]
+                )
                 out[there, here] = out[here, there].T
         return out
 
     def onto(self, data: Array) -> Array:
         """Sum (n, F) data or couplings (n, E, P) over what each amplitude moves."""
         along = np.moveaxis(data @ self.directions, 2, 0)  # (m, n, E)
-        parts = [along[mode] @ self.operator[:, span] for mode, span in self.spans]
+        parts = [along[mode] @ self.operator[:, span] for mode, span in enumerate(self.spans)]
         out: Array = np.concatenate(parts, axis=1)
         return out
 
@@ -211,19 +210,6 @@ class Couplings:
     operator: Array
     spans: tuple[slice, ...]
     others: Array
-
-    @classmethod
-    def still(cls, others: Array) -> Couplings:
-        """Couple nothing that moves."""
-        _, E, P = others.shape
-        return cls(np.zeros((E, 0, P)), np.zeros((E, 0)), (), others)
-
-    @classmethod
-    def of(cls, movement: Movement, N: Array, others: Array) -> Couplings:
-        """Couple a movement of epochs with normal matrices N (E, P, P)."""
-        modes = [mode for mode, _ in movement.spans]
-        moved = movement.directions[:, modes].T @ N
-        return cls(moved, movement.operator, tuple(span for _, span in movement.spans), others)
 
     def __len__(self) -> int:
         return int(self.operator.shape[1]) + len(self.others)

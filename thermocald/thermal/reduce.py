@@ -55,28 +55,30 @@ if TYPE_CHECKING:
     from thermocald.physics.model import Distortion
 
 
-def no_temperature(source: SeriesInput, reference: str) -> str:
-    """Write the sentence for a reference temperature that was hardly ever read."""
-    return (
-        f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
-        f"than {criteria.MIN_EPOCHS} readings. Discovery compares the camera with a thermometer; "
-        "record one"
-    )
-
-
-def require(source: SeriesInput) -> None:
-    """Raise DataError where temperature, epochs, duration or field do not carry a discovery."""
+def require(source: SeriesInput, strict: bool) -> None:
+    """Raise DataError where temperature, epochs, duration or field do not carry a discovery; where
+    not `strict`, the fit of a thermal model.
+    """
     if not source.readings:
         raise DataError(
             f"{source.name}: the recording has no temperature column. Discovery compares the "
             "camera with a thermometer; record one"
+            if strict
+            else f"{source.name}: has no temperature column; a thermal model needs one"
         )
+    seen = source.grid.observed.sum(axis=1)
+    if not strict:
+        if np.sum(seen >= criteria.ENOUGH_TARGETS) < criteria.LEAST_EPOCHS:
+            raise DataError(
+                f"{source.name}: fewer than {criteria.LEAST_EPOCHS} epochs show "
+                f"{criteria.ENOUGH_TARGETS} targets or more"
+            )
+        return
     reference = next(iter(source.readings))
     if np.isfinite(source.readings[reference]).sum() < criteria.MIN_EPOCHS and (
         len(source.frame_times) >= criteria.MIN_EPOCHS
     ):
-        raise DataError(no_temperature(source, reference))
-    seen = source.grid.observed.sum(axis=1)
+        raise _no_temperature(source, reference)
     good = int(np.sum(seen >= criteria.MIN_TARGETS))
     if good < criteria.MIN_EPOCHS:
         raise DataError(
@@ -98,16 +100,13 @@ def require(source: SeriesInput) -> None:
         )
 
 
-def require_for_fit(source: SeriesInput) -> None:
-    """Raise DataError where temperature or epochs do not carry the fit of a thermal model."""
-    if not source.readings:
-        raise DataError(f"{source.name}: has no temperature column; a thermal model needs one")
-    enough = source.grid.observed.sum(axis=1) >= criteria.ENOUGH_TARGETS
-    if enough.sum() < criteria.LEAST_EPOCHS:
-        raise DataError(
-            f"{source.name}: fewer than {criteria.LEAST_EPOCHS} epochs show "
-            f"{criteria.ENOUGH_TARGETS} targets or more"
-        )
+def _no_temperature(source: SeriesInput, reference: str) -> DataError:
+    """Make the error for a reference temperature that was hardly ever read."""
+    return DataError(
+        f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
+        f"than {criteria.MIN_EPOCHS} readings. Discovery compares the camera with a thermometer; "
+        "record one"
+    )
 
 
 def require_change(source: SeriesInput, reference: str, channel: Thermometer) -> None:
@@ -124,6 +123,8 @@ def require_change(source: SeriesInput, reference: str, channel: Thermometer) ->
 
 _HALF = 2  # neighbours on either side
 _PART = 2048  # epochs at a time
+_LAGS = 20  # epochs, of autocorrelations
+_ITERATIONS = 60  # of conjugate gradients
 
 
 def _parts(epochs: int) -> Iterator[slice]:
@@ -270,10 +271,7 @@ def reduce_series(
     Raises DataError where the data cannot carry it: it says what is missing.
     """
     least = criteria.MIN_EPOCHS if strict else criteria.LEAST_EPOCHS
-    if strict:
-        require(source)
-    else:
-        require_for_fit(source)
+    require(source, strict)
     times = source.frame_times - source.frame_times[0]
     reading_times = source.reading_times - source.frame_times[0]
     usable = np.isfinite(reading_times)
@@ -285,7 +283,7 @@ def reduce_series(
     }
     reference = next(iter(source.readings))
     if reference not in present:
-        raise DataError(no_temperature(source, reference))
+        raise _no_temperature(source, reference)
     noises = None
     if source.noises is not None:
         noises = {name: source.noises[name][usable] for name in present}
@@ -403,7 +401,7 @@ def _improve_offsets(
     return (offsets, *cameras(offsets))
 
 
-def _solve_offsets(weights: Array, v: Array, N: Array, A: Array, max_iterations: int = 60) -> Array:
+def _solve_offsets(weights: Array, v: Array, N: Array, A: Array) -> Array:
     """Solve for one offset per target (T, 2) that residuals v (E, T, 2) of free cameras ask for.
 
     Targets hidden for long pull at the cameras of the other epochs: offsets and cameras are solved
@@ -422,7 +420,7 @@ def _solve_offsets(weights: Array, v: Array, N: Array, A: Array, max_iterations:
     r = np.sum(weights * v, axis=0)
     z = inverse * r
     p, rz = z, float(np.sum(r * z))
-    for _ in range(max_iterations):
+    for _ in range(_ITERATIONS):
         if np.max(np.abs(z)) < 1e-5:
             break
         q = normal(p)
@@ -436,13 +434,13 @@ def _solve_offsets(weights: Array, v: Array, N: Array, A: Array, max_iterations:
     return out
 
 
-def _measure_slowness(v: Array, lags: int = 20) -> float:
+def _measure_slowness(v: Array) -> float:
     """Measure by how much slow variances exceed white noise: 1 + 2 Σ autocorrelations.
 
     From the residuals of all targets together; the mean of each target has been taken out.
     """
     E = len(v)
-    lags = min(lags, E // 4)
+    lags = min(_LAGS, E // 4)
     x = v - np.nan_to_num(np.nanmean(v)) if np.isfinite(v).any() else v
     filled = np.nan_to_num(x)
     there = np.isfinite(x).astype(float)

@@ -23,7 +23,7 @@ epoch.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -36,13 +36,14 @@ from thermocald.photogrammetry.linalg import (
 )
 from thermocald.thermal import criteria
 from thermocald.thermal.hypothesis import BASE, Candidate, Fit
-from thermocald.thermal.series import ReducedSeries, solve
+from thermocald.thermal.series import ReducedSeries, solve, unit_directions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.arrays import Array, Index
     from thermocald.thermal.fit import HypothesisFitter
+    from thermocald.thermal.hypothesis import Term
     from thermocald.thermal.likelihood import Weighting
 
 
@@ -188,6 +189,33 @@ def normals_beside(
     return eliminate(A, c, size)
 
 
+def normals_of_term(
+    fitter: HypothesisFitter,
+    fit: Fit,
+    term: Term,
+    names: Sequence[str],
+    weightings: Sequence[Weighting] | None = None,
+    leave: frozenset[int] = frozenset(),
+) -> tuple[Array, Array]:
+    """Return normal equations A (k, k), c (k,) of a term's trajectory in some columns.
+
+    The fit's own coefficients are eliminated, as `normals_beside` does.
+    """
+    k = len(names)
+    further: list[tuple[Array, Array, Index] | None] = []
+    for s in range(len(fit.weightings)):
+        if term.values(s) is None:
+            further.append(None)
+            continue
+        if term.is_drive:
+            trajectory = fitter.drive(fit.terms, s)[0]
+        else:
+            trajectory = fitter.trajectories(term, s, fit.terms, operators=False)[0][:, 0]
+        centred = (trajectory - trajectory.mean())[:, None]
+        further.append((np.tile(centred, k), unit_directions(names), np.arange(k)))
+    return normals_beside(fit, further, k, weightings, leave)
+
+
 def _sum_gains(parts: Sequence[tuple[Array, Array, Array]], base_A: Array, base_c: Array) -> Array:
     """Sum the parts, eliminate the base: χ² (G, n), -inf where a trajectory is next to nothing."""
     A, c, B = (np.asarray(sum(p[i] for p in parts)) for i in range(3))
@@ -216,6 +244,11 @@ class Adequacy:
     misfit_px: RMS over image coordinates of the smooth rest.
     """
 
+    JSON: ClassVar = {
+        "scores": "", "amplitudes": "", "directions": "", "trajectories": "", "excess": "",
+        "significance": "sigmas",
+    }  # fmt: skip
+
     scores: Array
     amplitudes: Array
     directions: Array
@@ -228,10 +261,6 @@ class Adequacy:
     def adequate(self) -> bool:
         """Nothing significant is left, or nothing that matters."""
         return self.significance < criteria.SIGNIFICANT or self.misfit_px < criteria.NEGLIGIBLE_PX
-
-    def as_dict(self) -> dict[str, float]:
-        """Return the test for an effect's evidence."""
-        return {"sigmas": float(self.significance), "misfit_px": float(self.misfit_px)}
 
 
 def cosines(times: Array, orders: int) -> Array:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -110,14 +110,6 @@ class Blocks:
     within_free: float
     first: NDArray[np.int64]
 
-    def pooled_mean(self, values: Array) -> Array:
-        """Return the mean over the knots of each state."""
-        return np.asarray((self.pool.T @ values) / self.pool.sum(axis=0))
-
-    def pooled_sd(self, sd: Array) -> Array:
-        """Return the standard deviation of the mean over the knots of each state."""
-        return np.asarray(np.sqrt(self.pool.T @ sd**2) / self.pool.sum(axis=0))
-
 
 @dataclass(frozen=True, eq=False)
 class ReducedSeries:
@@ -183,15 +175,18 @@ class ReducedSeries:
 
     def rescaled(self, scale: Array) -> ReducedSeries:
         """Change the px per unit of each column (19,)."""
-        f = self.scale / scale  # a scaled value is unit × scale
+        return self._in_columns(np.diag(self.scale / scale), scale=scale)
+
+    def _in_columns(self, M: Array, **changes: Any) -> ReducedSeries:
+        """Express movements in other columns: M (19, 19) takes new values to present ones."""
         return replace(
             self,
-            scale=scale,
-            columns=self.columns * f,
-            N=self.N * np.outer(f, f),
-            b=self.b * f,
-            values=self.values / f,
-            hidden=replace(self.hidden, vectors=self.hidden.vectors * f) if self.hidden else None,
+            columns=self.columns @ M,
+            N=M.T @ self.N @ M,
+            b=self.b @ M,
+            values=self.values @ np.linalg.inv(M).T,
+            hidden=replace(self.hidden, vectors=self.hidden.vectors @ M) if self.hidden else None,
+            **changes,
         )
 
     @property
@@ -204,16 +199,8 @@ class ReducedSeries:
         if distortion == self.distortion:
             return self
         new = scaled_basis(self.at.iop, self.scale, distortion)
-        M = np.linalg.solve(self.along, new)
-        return replace(
-            self,
-            distortion=distortion,
-            columns=self.columns @ M,
-            N=M.T @ self.N @ M,
-            b=self.b @ M,
-            values=self.values @ np.linalg.inv(M).T,
-            hidden=replace(self.hidden, vectors=self.hidden.vectors @ M) if self.hidden else None,
-        )
+        M = np.asarray(np.linalg.solve(self.along, new), dtype=float)
+        return self._in_columns(M, distortion=distortion)
 
     def orientations(self, parameters: Array) -> Array:
         """Return the interior orientations (E, 10) of movements (E, 19) in the columns' units."""
@@ -259,12 +246,18 @@ class ReducedSeries:
     def state_sd(self, channel: str) -> Array:
         """Return the standard deviations of the independent errors, K."""
         sd = self.thermometers[channel].sd
-        return sd if self.blocks is None else self.blocks.pooled_sd(sd)
+        if self.blocks is None:
+            return sd
+        pool = self.blocks.pool  # the sd of the mean over the knots of a state
+        return np.asarray(np.sqrt(pool.T @ sd**2) / pool.sum(axis=0))
 
     def state_deviation(self, channel: str) -> Array:
         """Return readings minus smooth trajectory as far as the independent errors hold it, K."""
         deviation = self.thermometers[channel].deviation
-        return deviation if self.blocks is None else self.blocks.pooled_mean(deviation)
+        if self.blocks is None:
+            return deviation
+        pool = self.blocks.pool
+        return np.asarray((pool.T @ deviation) / pool.sum(axis=0))
 
     def averaged(self, trajectory: Array) -> Array:
         """Average a trajectory (epochs, …) over the rows of the normal equations."""

@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
-from thermocald.photogrammetry.linalg import MAD_TO_SD
-from thermocald.photogrammetry.series.blocks import ObservationBlocks, recut
-from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.linalg import mad_sd
+from thermocald.photogrammetry.series.normals import ObservationBlocks, ObservationGrid, recut
 from thermocald.store.recording.reader import Recording
 from thermocald.thermal import criteria
 from thermocald.thermal.series import SeriesInput
@@ -64,27 +63,10 @@ class _Rows:
     count: Index
     grid: ObservationGrid
 
-    def without(self, windows: Sequence[slice]) -> _Rows:
-        """Leave out the rows inside some windows of epochs."""
-        keep = np.ones(len(self.first), dtype=bool)
-        for window in windows:
-            keep &= (self.first < window.start) | (self.first >= window.stop)
-        grid = ObservationGrid(self.grid.points[keep], self.grid.weights[keep])
-        return _Rows(self.first[keep], self.count[keep], grid)
-
-    def beside(self, others: Sequence[_Rows]) -> _Rows:
-        """Merge these rows with others in the order of time."""
-        parts = [self, *others]
-        first = np.concatenate([p.first for p in parts])
-        order = np.argsort(first, kind="stable")
-        return _Rows(
-            first[order],
-            np.concatenate([p.count for p in parts])[order],
-            ObservationGrid(
-                np.concatenate([p.grid.points for p in parts])[order],
-                np.concatenate([p.grid.weights for p in parts])[order],
-            ),
-        )
+    def at(self, rows: Index | NDArray[np.bool_]) -> _Rows:
+        """Return some of the rows."""
+        grid = ObservationGrid(self.grid.points[rows], self.grid.weights[rows])
+        return _Rows(self.first[rows], self.count[rows], grid)
 
 
 def condensed(
@@ -109,16 +91,21 @@ def condensed(
             trajectory, _average_neighbours(_fill_temperature(series), fine), length // fine, count
         )
         windows = [slice(k * length, min((k + 1) * length, E)) for k in chosen]
-        rows = rows.without(windows).beside(
-            [
-                _average_epochs(source.blocks([w]), w.start, w.stop - w.start, T, fine)[0]
-                for w in windows
-            ]
+        inside = [(rows.first >= w.start) & (rows.first < w.stop) for w in windows]
+        parts = [rows.at(~np.any(inside, axis=0))]
+        parts += [
+            _average_epochs(source.blocks([w]), w.start, w.stop - w.start, T, fine)[0]
+            for w in windows
+        ]
+        merged = ObservationGrid(
+            np.concatenate([p.grid.points for p in parts]),
+            np.concatenate([p.grid.weights for p in parts]),
         )
-    seen = rows.grid.observed.any(axis=1) | (rows.count > 0)
-    keep = np.flatnonzero(seen)
-    return _put_on_rows(series, rows.first[keep], rows.count[keep],
-                    ObservationGrid(rows.grid.points[keep], rows.grid.weights[keep]))  # fmt: skip
+        begins = np.concatenate([p.first for p in parts])
+        rows = _Rows(begins, np.concatenate([p.count for p in parts]), merged)
+        rows = rows.at(np.argsort(begins, kind="stable"))
+    rows = rows.at(rows.grid.observed.any(axis=1) | (rows.count > 0))
+    return _put_on_rows(series, rows.first, rows.count, rows.grid)
 
 
 def _put_on_rows(
@@ -251,7 +238,7 @@ def _find_gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.boo
     pick = np.maximum(np.isfinite(ordered).sum(axis=1) - 1, 0) // 2
     off = np.abs(off - np.take_along_axis(ordered, pick[:, None], axis=1))
     known = np.isfinite(off)
-    scale = MAD_TO_SD * float(np.median(off[known])) if known.any() else 0.0
+    scale = float(mad_sd(off[known])) if known.any() else 0.0
     out[:n] |= (np.where(known, off, 0.0) > criteria.GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
     return out
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.series.blocks import spread_windows
+from thermocald.photogrammetry.series.normals import spread_windows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -173,34 +173,37 @@ def _measure_bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
 def smooth_channel(
     times: Array,
     readings: Array,
+    own: NDArray[np.bool_],
     latent: NDArray[np.bool_],
     resolution: float | None,
     noises: Array | None = None,
 ) -> Thermometer:
-    """Smooth one column on knots: its times, those of others (NaN), and its latent ones.
+    """Smooth one column on knots: its times, its latent ones, and those of other columns (NaN),
+    which carry nothing.
 
-    times (K,) s ascending, readings (K,) °C with NaN where missing; latent (K,): True where a knot
-    is a latent time of this column, or of another; noises (K,) K: where readings are means of many.
+    times (K,) s ascending, readings (K,) °C with NaN where missing; own, latent (K,): True where a
+    knot is a time at which this column was read, or a latent one of it; noises (K,) K: where
+    readings are means of many.
     """
-    noise = (
-        estimate_reading_noise(times, readings, resolution) if noises is None else _usual(noises)
-    )
-    valid = np.isfinite(readings)
-    own = ~latent
-    t, y = times[own], readings[own]
-    filled = np.interp(t, t[np.isfinite(y)], y[np.isfinite(y)])
-    smooth = filled
-    if valid.sum() >= 8 and float(np.ptp(readings[valid])) > 3 * noise:
-        smooth = _smooth(filled, np.isfinite(y).astype(float), noise)
-    trajectory = np.full(len(times), np.nan)
-    trajectory[own] = smooth
-    sd = np.full(len(times), noise) if noises is None else noises.copy()
-    if not np.isfinite(y).all():
-        # what may happen between two readings: a share of the step across the gap
-        missing = np.flatnonzero(own)[~np.isfinite(y)]
-        sd[missing] = (2.0 * noise + np.abs(np.gradient(smooth)))[~np.isfinite(y)]
     from scipy.sparse import csr_array, lil_array
 
+    if noises is None:
+        noise = estimate_reading_noise(times, readings, resolution)
+    else:
+        noise = float(np.median(noises[own]))
+    valid = np.isfinite(readings)
+    t, y = times[own], readings[own]
+    there = np.isfinite(y)
+    smooth = filled = np.interp(t, t[there], y[there])
+    if valid.sum() >= 8 and float(np.ptp(readings[valid])) > 3 * noise:
+        smooth = _smooth(filled, there.astype(float), noise)
+    trajectory, sd = np.full(len(times), np.nan), np.full(len(times), 1e-6)
+    trajectory[own] = smooth
+    sd[own] = noise if noises is None else noises[own]
+    if not there.all():
+        # what may happen between two readings: a share of the step across the gap
+        missing = np.flatnonzero(own)[~there]
+        sd[missing] = (2.0 * noise + np.abs(np.gradient(smooth)))[~there]
     mixing = lil_array((len(times), len(times)))
     mixing.setdiag(np.ones(len(times)))
     rows = np.flatnonzero(latent)
@@ -292,10 +295,6 @@ def _smooth(values: Array, weights: Array, noise: float) -> Array:
     return np.asarray(chosen, dtype=float)
 
 
-def _usual(noises: Array) -> float:
-    return float(np.median(noises))
-
-
 def thermometers(
     times: Array,
     readings: Mapping[str, Array],
@@ -316,33 +315,12 @@ def thermometers(
     for name, r in readings.items():
         on_knots = np.full(len(knots), np.nan)
         on_knots[from_reading] = r[first[from_reading]]
-        own = np.isin(knots, latent[name])
-        here = from_reading | own
-        known = None if noises is None else noises[name][first[here]]
-        part = smooth_channel(knots[here], on_knots[here], own[here], resolutions.get(name), known)
-        channels[name] = extend(_put_on_knots(part, knots, here))
+        own_latent = np.isin(knots, latent[name])
+        known = None
+        if noises is not None:
+            known = np.full(len(knots), np.nan)
+            known[from_reading] = noises[name][first[from_reading]]
+        own = from_reading & ~own_latent
+        channel = smooth_channel(knots, on_knots, own, own_latent, resolutions.get(name), known)
+        channels[name] = extend(channel)
     return next(iter(channels.values())).times, channels
-
-
-def _put_on_knots(channel: Thermometer, knots: Array, here: NDArray[np.bool_]) -> Thermometer:
-    """Put a column's instrument on all knots; those of other columns are NaN and carry nothing."""
-    from scipy.sparse import csr_array
-
-    K, rows = len(knots), np.flatnonzero(here)
-    trajectory, deviation, sd = np.full(K, np.nan), np.zeros(K), np.full(K, 1e-6)
-    real = np.zeros(K, dtype=bool)
-    trajectory[here], deviation[here], sd[here] = channel.trajectory, channel.deviation, channel.sd
-    real[here] = channel.real
-    part = channel.mixing.tocoo()
-    others = np.flatnonzero(~here)
-    mixing = csr_array(
-        (
-            np.concatenate([part.data, np.ones(len(others))]),
-            (
-                np.concatenate([rows[part.row], others]),
-                np.concatenate([rows[part.col], others]),
-            ),
-        ),
-        shape=(K, K),
-    )
-    return Thermometer(knots, trajectory, deviation, sd, mixing, real, channel.noise)

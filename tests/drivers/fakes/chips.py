@@ -64,7 +64,6 @@ CALIBRATION = (
     )
     + bytes([0, 75])
 )
-HUMIDITY = (361).to_bytes(2, "little") + bytes([0, 20, 0x50 | 3, 3, 30])
 ADC_T, ADC_P, ADC_H = 519888, 415148, 30000
 
 
@@ -74,7 +73,6 @@ def bme280(adc_t=ADC_T, identity=0x60, status=0, humidity=ADC_H):
 
     chip = Chip({0xD0: bytes([identity]), 0xF3: bytes([status])})
     block(0x88, CALIBRATION)
-    block(0xE1, HUMIDITY)
     block(0xF7, bytes(8))
 
     def measure(self, register, data):

@@ -94,6 +94,7 @@ class StandIn:
             "ScalerCrop": (0, 0, 96, 64),
             **type(self).extra,
         }
+        self.given = metadata
         width, height = self.configuration["main"]["size"]
         array = np.full((height * 3 // 2, width + 32), 128, np.uint8)  # rows padded to the stride
         array[:height, :width] = np.add.outer(np.arange(height), np.arange(width)) % 251

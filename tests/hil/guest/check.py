@@ -42,8 +42,6 @@ def described(frame):
         "monotonic": frame.monotonic,
         "sequence": frame.sequence,
         "shape": list(frame.image.shape),
-        "stale": frame.metadata.get("stale_frames_dropped"),
-        "timestamp": frame.metadata.get("timestamp"),
     }
 
 
@@ -148,7 +146,7 @@ def vivid():
     asked = camera(NODE, 640, 360, "GREY", controls={"brightness": 77, "contrast": 100})
     device.close()
     with asked:
-        result["controls"] = outcome(lambda: dict(asked.capture().metadata["controls"]))
+        result["controls"] = outcome(lambda: dict(asked.capture().settings))
     result["no_control"] = outcome(camera(NODE, 640, 360, "GREY", controls={"zoomiest": 1}).open)
     result["no_size"] = outcome(camera(NODE, 641, 360, "GREY").open)
     result["output_node"] = outcome(camera(OUTPUT_NODE, 640, 360, "GREY").open)
@@ -177,11 +175,11 @@ def vivid():
 def push(name):
     """Press one of vivid's fault buttons."""
     from linuxpy.video import device as video
-    from thermocald_drivers.v4l2_stream import _plain_name
+    from thermocald_drivers.v4l2_stream import plain_name
 
     with open(NODE, "r+b", buffering=0) as file:
         for control in video.iter_read_controls(file):
-            if _plain_name(control.name.decode()) == name:
+            if plain_name(control.name.decode()) == name:
                 video.set_control(file, control.id, 1)
                 return
     raise SystemExit(f"vivid has no control {name}")
@@ -357,7 +355,7 @@ def ds18b20(*names, count="4"):
     result["opened"] = outcome(device.open)
     for _ in range(int(count)):
         result["readings"].append(
-            outcome(lambda: (r := device.read()) and [dict(r.values), r.metadata.get("missing")])
+            outcome(lambda: (r := device.read()) and [dict(r.values), dict(r.missing) or None])
         )
     device.close()
     return result

@@ -37,7 +37,7 @@ def main():
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else HOME / "store/thermocald.db"
     found = {"series": {}, "events": []}
     with Store.open(path) as store:
-        store.check()
+        assert store.examine().damaged == ()
         for series in store.all_series():
             found["series"][series.camera] = [
                 {

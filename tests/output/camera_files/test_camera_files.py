@@ -401,11 +401,11 @@ def test_covariance_in_opencv_is_that_of_the_scatter(tmp_path, plain):
     assert sd == pytest.approx(np.sqrt(np.diag(stated)))
     rng = np.random.default_rng(1)
     samples = rng.multivariate_normal(plain.interior.as_array(), Q, 400)
-    from thermocald.photogrammetry.camera.conversions import BrownOpenCV
+    from thermocald.photogrammetry.camera.conversions import opencv
 
     values = np.array(
         [
-            BrownOpenCV(5).from_brown(CameraModel(plain.sensor, plain.interior.from_array(s)))
+            opencv(5).from_brown(CameraModel(plain.sensor, plain.interior.from_array(s)))
             for s in samples
         ]
     )

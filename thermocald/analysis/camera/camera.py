@@ -21,7 +21,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.physics.effect import PARAMETER_UNITS
-from thermocald.result import Result, jsonable, new_figure
+from thermocald.result import Result, jsonable, new_figure, with_sds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -182,9 +182,9 @@ class Camera(Result):
         >>> K.shape, distortion.shape
         ((3, 3), (5,))
         """
-        from thermocald.photogrammetry.camera.conversions import BrownOpenCV, to_family
+        from thermocald.photogrammetry.camera.conversions import BROWN, convert, opencv
 
-        found = to_family(self.model, BrownOpenCV(5), None).values
+        found = convert(self.sensor, BROWN, self.values, opencv(5)).values
         fx, fy, cx, cy = found[:4]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(found[4:])
 
@@ -214,8 +214,7 @@ class Camera(Result):
             "camera": self.name,
             "temperature": self.temperature,
             "extrapolated_K": self.extrapolated,
-            **dict(zip(IOP_NAMES, self.values.tolist(), strict=True)),
-            **{f"sd_{name}": sd for name, sd in self.sd.items()},
+            **with_sds(IOP_NAMES, self.values, self.sd.values()),
             "covariance": self.covariance,
         }
         document: dict[str, Any] = jsonable(found)

@@ -4,32 +4,36 @@ from __future__ import annotations
 
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from thermocald.errors import GeometryError, ImageError, UsageError
 from thermocald.photogrammetry.camera.camera_model import (
+    EOP_NAMES,
+    IOP_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
 )
 from thermocald.photogrammetry.camera_files import CameraFile
 from thermocald.photogrammetry.epoch.adjustment import (
-    Adjustment,
     AdjustmentSettings,
     cold_start,
     pose_only,
 )
 from thermocald.photogrammetry.frame.measurement import Prior, measure
+from thermocald.photogrammetry.linalg import correlation_matrix
 from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
 from thermocald.photogrammetry.targets.image_file import decode_grey
+from thermocald.result import with_sds
+from thermocald.store.logger.photographs import moment_taken
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -52,6 +56,11 @@ class PhotographResult:
     which took part. Empty where there is no pose.
     """
 
+    JSON: ClassVar = {
+        "path": "image", "exterior_sd": "", "points": "", "residuals": "", "used": "",
+        "time": "time", "n_rejected": "n_rejected", "exterior": "", "pose": "exterior",
+    }  # fmt: skip
+
     path: Path | str
     status: str
     reason: str
@@ -64,6 +73,24 @@ class PhotographResult:
     residuals: Array = field(default_factory=lambda: np.empty((0, 2)))
     used: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
 
+    @property
+    def time(self) -> str | None:
+        """When it was taken, as its EXIF says."""
+        taken = moment_taken(Path(self.path))
+        return None if taken is None else taken.isoformat()
+
+    @property
+    def n_rejected(self) -> int:
+        """How many targets were rejected."""
+        return len(self.rejected)
+
+    @property
+    def pose(self) -> dict[str, float] | None:
+        """Its exterior orientation with `sd_` of each parameter, as a document has it."""
+        if self.exterior is None:
+            return None
+        return with_sds(EOP_NAMES, self.exterior.as_array(), self.exterior_sd)
+
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
@@ -73,6 +100,11 @@ class Photographs:
     what was given and held; covariance (16, 16).
     """
 
+    JSON: ClassVar = {
+        "interior": "", "estimated": "interior_estimated", "covariance": "",
+        "n_photographs": "n_photographs", "orientation": "interior", "correlations": "correlations",
+    }  # fmt: skip
+
     status: str
     reason: str
     interior: InteriorOrientation | None
@@ -81,6 +113,38 @@ class Photographs:
     sigma0: float
     redundancy: int
     photographs: tuple[PhotographResult, ...]
+
+    @property
+    def n_photographs(self) -> int:
+        """How many there are."""
+        return len(self.photographs)
+
+    @property
+    def orientation(self) -> dict[str, float] | None:
+        """The interior orientation, with `sd_` of what was estimated, as a document has it."""
+        if self.interior is None:
+            return None
+        free, values = self._estimated, self.interior.as_array()
+        sds = np.sqrt(self.covariance.diagonal()[free])
+        return asdict(self.interior) | with_sds(_names(free), values[free], sds)
+
+    @property
+    def correlations(self) -> dict[str, Any] | None:
+        """Correlations of what was estimated of the interior orientation."""
+        if self.interior is None or not self.estimated:
+            return None
+        free = self._estimated
+        matrix = correlation_matrix(self.covariance[np.ix_(free, free)])
+        return {"names": _names(free), "matrix": matrix}
+
+    @property
+    def _estimated(self) -> NDArray[np.int64]:
+        """Which parameters of the interior orientation were estimated."""
+        return np.flatnonzero((self.covariance.diagonal()[:10] > 0) & self.estimated)
+
+
+def _names(rows: NDArray[np.int64]) -> list[str]:
+    return [IOP_NAMES[i] for i in rows]
 
 
 def calibrate_photographs(
@@ -109,15 +173,9 @@ def calibrate_photographs(
                 failures[k] = (found.status.word, found.status.reason)
         if advance is not None:
             advance(1)
+    names = [str(p) for p in paths]
     return calibrate_observations(
-        [str(p) for p in paths],
-        measured,
-        failures,
-        testfield,
-        sensor,
-        settings,
-        nominal_c,
-        interior,
+        names, measured, failures, testfield, sensor, settings, nominal_c, interior
     )
 
 
@@ -131,190 +189,166 @@ def calibrate_observations(
     nominal_c: float | None = None,
     interior: InteriorOrientation | None = None,
 ) -> Photographs:
-    """The same from image points; failures: {position: (status, reason)} known beforehand."""
-    failures = dict(failures)
-    good = [k for k, o in enumerate(measured) if o is not None and k not in failures]
+    """Calibrate image points; failures: {position: (status, reason)} known beforehand."""
+    seen = {k: o for k, o in enumerate(measured) if o is not None}
+    given = _Given(names, seen, dict(failures), testfield, sensor, settings, nominal_c, interior)
     reason = "no photograph shows enough targets"
-    if settings.free and good:
+    if not settings.free:
+        reason = "the interior orientation is held (--free none)"
+    elif given.usable:
         try:
-            start = _first_camera(sensor, testfield, measured, good, settings, nominal_c, interior)
-            rows, together = _together(sensor, testfield, measured, good, settings, start)
-            if poor := _poor(measured, rows, together):
-                failures |= poor
-                good = [k for k in good if k not in poor]
-                start = together.interior
-                rows, together = _together(sensor, testfield, measured, good, settings, start)
+            rows, together = given.adjust_together(given.first_camera())
+            if poor := given.poor_ones(rows, together):
+                given.failures.update(poor)
+                rows, together = given.adjust_together(together.interior)
         except GeometryError as error:
             reason = str(error)
         else:
             reason = "; ".join(together.reasons)
             if not reason:
-                return _estimated(names, measured, failures, testfield, rows, together)
-    elif not settings.free:
-        reason = "the interior orientation is held (--free none)"
-    results = []
-    for k, name in enumerate(names):
-        o = measured[k]
-        n = 0 if o is None else len(o)
-        if k in failures or o is None:
-            results.append(PhotographResult(name, *failures[k], n))
-        elif interior is None:
-            why = f"without an interior orientation there is no pose: {reason}"
-            results.append(PhotographResult(name, "weak_geometry", why, n))
-        else:
-            pose = pose_only(sensor, testfield, o, interior, settings)
-            results.append(_posed(name, pose, testfield, o))
-    return Photographs(
-        "held" if not settings.free else "weak_geometry",
-        reason,
-        interior,
-        False,
-        np.zeros((16, 16)),
-        float("nan"),
-        0,
-        tuple(results),
-    )
+                return given.estimated(rows, together)
+    return given.held(reason)
 
 
-def _first_camera(
-    sensor: Sensor,
-    testfield: TestField,
-    measured: Sequence[Observations | None],
-    good: Sequence[int],
-    settings: AdjustmentSettings,
-    nominal_c: float | None,
-    interior: InteriorOrientation | None,
-) -> InteriorOrientation:
-    """Return the camera of the photograph with most targets, to start from."""
-    o = max((o for k in good if (o := measured[k]) is not None), key=len)
-    first = cold_start(sensor, testfield, o, settings, nominal_c, interior)
-    start = first.interior or interior
-    if start is None:
-        points = testfield.points[o.targets]
-        start = approximate_orientation(sensor, points, o.points, nominal_c)[0]
-    if not first.ok and interior is None:
-        # Distortion from a weak photograph would only mislead the others.
-        start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
-    return start
+@dataclass(frozen=True, slots=True, eq=False)
+class _Given:
+    """Image points of photographs, by their position, and why others have none."""
 
+    names: Sequence[str]
+    seen: dict[int, Observations]
+    failures: dict[int, tuple[str, str]]
+    testfield: TestField
+    sensor: Sensor
+    settings: AdjustmentSettings
+    nominal_c: float | None
+    interior: InteriorOrientation | None
 
-def _together(
-    sensor: Sensor,
-    testfield: TestField,
-    measured: Sequence[Observations | None],
-    good: Sequence[int],
-    settings: AdjustmentSettings,
-    interior: InteriorOrientation,
-) -> tuple[list[int], CommonInterior]:
-    """Adjust the photographs whose targets a pose explains; returns which, and the result."""
-    poses: dict[int, ExteriorOrientation] = {}
-    chosen, fitting = [], []
-    for k in good:
-        if (o := measured[k]) is None:
-            continue
-        with suppress(GeometryError):
-            points = testfield.points[o.targets]
-            _, poses[k], fits = approximate_orientation(sensor, points, o.points, interior=interior)
-            chosen.append(o)
-            fitting.append(fits)
-    if not chosen:
-        raise GeometryError("no pose explains the targets of any photograph")
-    start = list(poses.values())
-    return list(poses), adjust_common_interior(
-        sensor, testfield, chosen, interior, start, settings, fitting
-    )
+    @property
+    def usable(self) -> dict[int, Observations]:
+        """The photographs that nothing speaks against."""
+        return {k: o for k, o in self.seen.items() if k not in self.failures}
 
-
-def _poor(
-    measured: Sequence[Observations | None],
-    rows: Sequence[int],
-    together: CommonInterior,
-) -> dict[int, tuple[str, str]]:
-    """Return {position: (status, reason)} of photographs whose residuals are not the others'."""
-    size = {
-        k: float(np.sqrt(np.median(np.sum((r / o.sigmas) ** 2, axis=1))))
-        for k, r in zip(rows, together.residuals, strict=True)
-        if (o := measured[k]) is not None and len(o) >= _ENOUGH_TARGETS
-    }
-    if together.reasons or len(size) < _FEWEST_TO_COMPARE:
-        return {}
-    usual = max(float(np.median(list(size.values()))), 1.0)
-    poor = {}
-    for k, r in zip(rows, together.residuals, strict=True):
-        if (ratio := size.get(k, 0.0) / usual) > _POOR:
-            why = (
-                f"residuals of {np.sqrt(np.mean(r**2)):.2f} px, {ratio:.0f} times those of the "
-                "other photographs: moved while exposed, or a board that was bent; left out"
-            )
-            poor[k] = ("large_residuals", why)
-    return poor
-
-
-def _estimated(
-    names: Sequence[str],
-    measured: Sequence[Observations | None],
-    failures: dict[int, tuple[str, str]],
-    testfield: TestField,
-    rows: Sequence[int],
-    together: CommonInterior,
-) -> Photographs:
-    results = []
-    position = {k: i for i, k in enumerate(rows)}
-    for k, name in enumerate(names):
-        o = measured[k]
-        n = 0 if o is None else len(o)
-        if k in failures or o is None or k not in position:
-            why = failures.get(k, ("no_orientation", "no pose explains its targets"))
-            results.append(PhotographResult(name, *why, n))
-            continue
-        i = position[k]
-        used, residuals = together.used[i], together.residuals[i]
-        results.append(
-            PhotographResult(
-                name,
-                "ok",
-                "",
-                n,
-                tuple(testfield.names[t] for t in o.targets[~used]),
-                float(np.sqrt(np.mean(residuals[used] ** 2))),
-                together.exteriors[i],
-                np.sqrt(np.diag(together.exterior_covariances[i])),
-                o.points,
-                residuals,
-                used,
-            )
+    def first_camera(self) -> InteriorOrientation:
+        """Return the camera of the photograph with most targets, to start from."""
+        o = max(self.usable.values(), key=len)
+        first = cold_start(
+            self.sensor, self.testfield, o, self.settings, self.nominal_c, self.interior
         )
-    return Photographs(
-        "ok",
-        "",
-        together.interior,
-        True,
-        together.covariance,
-        together.sigma0,
-        together.redundancy,
-        tuple(results),
-    )
+        start = first.interior or self.interior
+        if start is None:
+            points = self.testfield.points[o.targets]
+            start = approximate_orientation(self.sensor, points, o.points, self.nominal_c)[0]
+        if not first.ok and self.interior is None:
+            # Distortion from a weak photograph would only mislead the others.
+            start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
+        return start
 
+    def adjust_together(self, interior: InteriorOrientation) -> tuple[list[int], CommonInterior]:
+        """Adjust the photographs whose targets a pose explains; return which, and the result."""
+        rows, poses, chosen, fitting = [], [], [], []
+        for k, o in self.usable.items():
+            with suppress(GeometryError):
+                points = self.testfield.points[o.targets]
+                _, pose, fits = approximate_orientation(
+                    self.sensor, points, o.points, interior=interior
+                )
+                rows.append(k)
+                poses.append(pose)
+                chosen.append(o)
+                fitting.append(fits)
+        if not chosen:
+            raise GeometryError("no pose explains the targets of any photograph")
+        return rows, adjust_common_interior(
+            self.sensor, self.testfield, chosen, interior, poses, self.settings, fitting
+        )
 
-def _posed(
-    name: str, pose: Adjustment, testfield: TestField, observations: Observations
-) -> PhotographResult:
-    if not pose.ok:
-        return PhotographResult(name, pose.status, pose.reason, pose.n_observations)
-    kept = ~np.isin(pose.targets, pose.rejected)
-    return PhotographResult(
-        name,
-        "ok",
-        "",
-        pose.n_observations,
-        tuple(testfield.names[t] for t in pose.rejected),
-        float(np.sqrt(np.mean(pose.residuals[kept] ** 2))),
-        pose.exterior,
-        pose.sd[10:],
-        observations.points,
-        pose.residuals,
-        kept,
-    )
+    def poor_ones(
+        self, rows: Sequence[int], together: CommonInterior
+    ) -> dict[int, tuple[str, str]]:
+        """Return {position: (status, reason)} of photographs whose residuals are too large."""
+        residuals = dict(zip(rows, together.residuals, strict=True))
+        size = {
+            k: float(np.sqrt(np.median(np.sum((r / self.seen[k].sigmas) ** 2, axis=1))))
+            for k, r in residuals.items()
+            if len(r) >= _ENOUGH_TARGETS
+        }
+        if together.reasons or len(size) < _FEWEST_TO_COMPARE:
+            return {}
+        usual = max(float(np.median(list(size.values()))), 1.0)
+        poor = {}
+        for k, own in size.items():
+            if own / usual > _POOR:
+                why = (
+                    f"residuals of {np.sqrt(np.mean(residuals[k] ** 2)):.2f} px, {own / usual:.0f} "
+                    "times those of the other photographs: moved while exposed, or a board that "
+                    "was bent; left out"
+                )
+                poor[k] = ("large_residuals", why)
+        return poor
+
+    def estimated(self, rows: Sequence[int], together: CommonInterior) -> Photographs:
+        """Return the camera that the photographs have in common."""
+        results = []
+        for k, name in enumerate(self.names):
+            if k in self.failures or k not in rows:
+                why = self.failures.get(k, ("no_orientation", "no pose explains its targets"))
+                results.append(self._failed(k, *why))
+                continue
+            i, o = rows.index(k), self.seen[k]
+            pose, sd = together.exteriors[i], np.sqrt(np.diag(together.exterior_covariances[i]))
+            used, residuals = together.used[i], together.residuals[i]
+            results.append(self._posed(name, o, o.targets[~used], used, residuals, pose, sd))
+        return Photographs(
+            "ok", "", together.interior, True, together.covariance, together.sigma0,
+            together.redundancy, tuple(results),
+        )  # fmt: skip
+
+    def held(self, reason: str) -> Photographs:
+        """Return poses with the camera as it was given, and why it was not estimated."""
+        results = []
+        for k, name in enumerate(self.names):
+            if k in self.failures:
+                results.append(self._failed(k, *self.failures[k]))
+            elif self.interior is None:
+                why = f"without an interior orientation there is no pose: {reason}"
+                results.append(self._failed(k, "weak_geometry", why))
+            else:
+                o = self.seen[k]
+                pose = pose_only(self.sensor, self.testfield, o, self.interior, self.settings)
+                if not pose.ok:
+                    results.append(self._failed(k, pose.status, pose.reason))
+                    continue
+                used = ~np.isin(pose.targets, pose.rejected)
+                results.append(
+                    self._posed(
+                        name, o, pose.rejected, used, pose.residuals, pose.exterior, pose.sd[10:]
+                    )
+                )
+        status = "weak_geometry" if self.settings.free else "held"
+        nothing = np.zeros((16, 16))
+        return Photographs(
+            status, reason, self.interior, False, nothing, float("nan"), 0, tuple(results)
+        )
+
+    def _failed(self, k: int, status: str, reason: str) -> PhotographResult:
+        n = len(self.seen[k]) if k in self.seen else 0
+        return PhotographResult(self.names[k], status, reason, n)
+
+    def _posed(
+        self,
+        name: str,
+        o: Observations,
+        rejected: Iterable[int],
+        used: NDArray[np.bool_],
+        residuals: Array,
+        exterior: ExteriorOrientation | None,
+        sd: Array,
+    ) -> PhotographResult:
+        rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
+        names = tuple(self.testfield.names[t] for t in rejected)
+        return PhotographResult(
+            name, "ok", "", len(o), names, rms, exterior, sd, o.points, residuals, used
+        )
 
 
 def images_of(given: Sequence[Path]) -> list[Path]:

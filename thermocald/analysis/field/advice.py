@@ -17,14 +17,14 @@ from thermocald.analysis.field.check import (
     station_at,
     usual_station,
 )
-from thermocald.photogrammetry.camera.camera_model import (
-    EOP_NAMES,
-    CameraModel,
-    ExteriorOrientation,
-)
+from thermocald.numbers import parameter_label
+from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import CameraModel
     from thermocald.photogrammetry.field.testfield import TestField
 
 _NONE = 1e300  # a standard deviation that does not exist
@@ -39,12 +39,9 @@ _FLAT = 0.02  # depth of a field over its distance below which it is a plane
 class FieldAssessment:
     """What a camera gets out of a field from one place, and what would be better.
 
-    sigma_px: of an image coordinate; advice: sentences, the most helpful first.
+    advice: sentences, the most helpful first.
     """
 
-    field: TestField
-    camera: CameraModel
-    sigma_px: float
     check: FieldCheck
     advice: list[str]
 
@@ -59,8 +56,8 @@ class FieldAssessment:
         sizes = sorted(check.sizes)
         return {
             "format": "thermocald-testfield-check/1",
-            "targets": len(self.field),
-            "visible": [self.field.names[i] for i in check.visible],
+            "targets": len(check.field),
+            "visible": [check.field.names[i] for i in check.visible],
             "hidden": check.hidden,
             "station": dict(zip(EOP_NAMES, check.station.as_array().tolist(), strict=True)),
             "distance": check.distance,
@@ -68,8 +65,8 @@ class FieldAssessment:
             "coverage": check.coverage,
             "cells": check.cells.tolist(),
             "median_size_px": float(sizes[len(sizes) // 2]) if sizes else None,
-            "sigma_px": self.sigma_px,
-            "pixel_pitch": self.camera.sensor.pixel_pitch,
+            "sigma_px": check.sigma_px,
+            "pixel_pitch": check.camera.sensor.pixel_pitch,
             **sds,
             "calibrates": not check.weak,
             "weak": list(check.weak),
@@ -86,7 +83,7 @@ class FieldAssessment:
             lines = ["NOT ENOUGH: a series of a fixed camera gets no result from there"]
             lines += [f"  because: {reason}" for reason in check.weak]
         lines.append(
-            f"{len(check.visible)} of {len(self.field)} targets visible from ({X:.0f}, {Y:.0f}, "
+            f"{len(check.visible)} of {len(check.field)} targets visible from ({X:.0f}, {Y:.0f}, "
             f"{Z:.0f}) mm, {check.distance:.0f} mm away; they cover {check.coverage:.0%} of the "
             f"image, depth relief {check.depth_relief:.0%} of the distance"
         )
@@ -94,7 +91,7 @@ class FieldAssessment:
         lines.append(
             "  standard deviations in px    one image    in a series    with the field's own"
         )
-        for name, row in check.precision.pixels(self.camera.sensor.pixel_pitch).items():
+        for name, row in check.precision.pixels(check.camera.sensor.pixel_pitch).items():
             cells = [f"{v:.3g}" if v < _NONE else "none" for v in row]
             lines.append(f"    {name:<24} {cells[0]:>12} {cells[1]:>14} {cells[2]:>20}")
         return lines + [f"  better: {note}" for note in self.advice]
@@ -122,17 +119,15 @@ def assess_field(
         if look_at is not None or roll:
             station = station_at(station.centre, target, np.radians(roll))
     check = check_field(camera, field, station, sigma_px)
-    return FieldAssessment(field, camera, sigma_px, check, advise(camera, field, check, sigma_px))
+    return FieldAssessment(check, advise(check))
 
 
-def advise(
-    camera: CameraModel, field: TestField, check: FieldCheck, sigma_px: float = 0.03
-) -> list[str]:
-    """Sentences, the most helpful first; none if nothing would help by a seventh.
+def advise(check: FieldCheck) -> list[str]:
+    """Return sentences, the most helpful first; none if nothing would help by a seventh.
 
     That a field is one plane comes before all else: more targets in front of it are no print.
     """
-    points, sigmas = field.points[check.visible], field.sigmas[check.visible]
+    points, sigmas = check.field.points[check.visible], check.field.sigmas[check.visible]
     typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
     now = check.precision.epoch
     proposals: list[tuple[float, str]] = []
@@ -140,44 +135,30 @@ def advise(
     def propose(added: Array, what: str) -> None:
         both = np.concatenate([points, added])
         spread = np.concatenate([sigmas, np.repeat(typical, len(added), axis=0)])
-        then = precision(camera, check.station, both, spread, sigma_px).epoch
-        gain = _compare(now, then)
+        then = precision(check.camera, check.station, both, spread, check.sigma_px).epoch
+        with np.errstate(invalid="ignore"):  # what is not determined now is worth everything
+            gain = np.where(np.isfinite(now), then / now, 0.0)[:3]
+        gain = np.where(np.isfinite(then[:3]), gain, 1.0)
         best = int(np.argmin(gain))
         if gain[best] < _WORTH and np.all(np.isfinite(then[:3])):
-            proposals.append((float(gain[best]), f"{what}: {_change(camera, best, now, then)}"))
+            proposals.append((float(gain[best]), f"{what}: {_change(check, best, now, then)}"))
 
     near = check.distance * (1 - _RAISED)
     propose(
-        _along(camera, check.station, _spread(camera, 4, 2), near),
+        _along(check, np.array([(c, r) for r in range(2) for c in range(4)]), (4, 2), near),
         f"8 targets standing {check.distance * _RAISED:.0f} mm in front of the field, spread over "
         "the image",
     )
-    empty = [
-        (column, row)
-        for row in range(CELLS[1])
-        for column in range(CELLS[0])
-        if check.cells[row, column] == 0
-    ]
-    if empty:
-        middles = np.array([((c + 0.5) / CELLS[0], (r + 0.5) / CELLS[1]) for c, r in empty])
-        size = np.array([camera.sensor.width, camera.sensor.height])
+    empty = np.argwhere(check.cells == 0)[:, ::-1]
+    if len(empty):
         propose(
-            _beside(camera, check, middles * size - 0.5, points),
+            _beside(check, empty, points),
             f"{len(empty)} targets in the empty parts of the image ({_where(empty)})",
         )
     if len(points) < _FEW:
         propose(points, f"twice as many targets ({len(points)} are visible)")
     sentences = [text for _, text in sorted(proposals)]
     return [*_of_a_plane(check), *sentences, *_remarks(check)]
-
-
-def _compare(now: Array, then: Array) -> Array:
-    """What standard deviations of c, x0, y0 become, as shares (3,) of what they are."""
-    gain = np.ones(3)
-    for i in range(3):
-        if np.isfinite(then[i]):
-            gain[i] = then[i] / now[i] if np.isfinite(now[i]) else 0.0
-    return gain
 
 
 def _of_a_plane(check: FieldCheck) -> list[str]:
@@ -218,35 +199,33 @@ def _remarks(check: FieldCheck) -> list[str]:
     return notes
 
 
-def _change(camera: CameraModel, which: int, now: Array, then: Array) -> str:
-    name = ("c", "x0", "y0")[which]
-    pitch = camera.sensor.pixel_pitch
+def _change(check: FieldCheck, which: int, now: Array, then: Array) -> str:
+    pitch = check.camera.sensor.pixel_pitch
     before = f"{now[which] / pitch:.2g} px" if np.isfinite(now[which]) else "not determined"
+    name = parameter_label(FREE[which])
     return f"sd({name}) of one image {before} → {then[which] / pitch:.2g} px"
 
 
-def _spread(camera: CameraModel, columns: int, rows: int) -> Array:
-    """Image points (n, 2) px in the middles of so many parts of the image."""
-    x = (np.arange(columns) + 0.5) / columns * camera.sensor.width - 0.5
-    y = (np.arange(rows) + 0.5) / rows * camera.sensor.height - 0.5
-    u, v = np.meshgrid(x, y)
-    return np.column_stack([u.ravel(), v.ravel()])
-
-
 def _along(
-    camera: CameraModel, station: ExteriorOrientation, image_points: Array, depth: float
+    check: FieldCheck, parts: NDArray[np.int64], counts: tuple[int, int], depth: float
 ) -> Array:
-    """Object points (n, 3) mm that appear at image points in some depth."""
-    rays = camera.rays(image_points)
-    placed: Array = station.centre + (rays * (depth / -rays[:, 2:])) @ station.rotation.T
+    """Object points (n, 3) mm in some depth that appear in the middles of parts (column, row) of
+    the image, of which there are so many columns and rows.
+    """
+    sensor = check.camera.sensor
+    middles = (parts + 0.5) / counts * (sensor.width, sensor.height) - 0.5
+    rays = check.camera.rays(middles)
+    placed: Array = (
+        check.station.centre + (rays * (depth / -rays[:, 2:])) @ check.station.rotation.T
+    )
     return placed
 
 
-def _beside(camera: CameraModel, check: FieldCheck, image_points: Array, points: Array) -> Array:
-    """Object points (n, 3) mm that appear at image points: on the field's plane if it is one (and
-    is in view there), else in its mean depth.
+def _beside(check: FieldCheck, parts: NDArray[np.int64], points: Array) -> Array:
+    """Object points (n, 3) mm that appear in parts of the image: on the field's plane if it is one
+    (and is in view there), else in its mean depth.
     """
-    placed = _along(camera, check.station, image_points, check.distance)
+    placed = _along(check, parts, CELLS, check.distance)
     if check.flatness >= _FLAT:
         return placed
     centre = points.mean(axis=0)
@@ -259,7 +238,7 @@ def _beside(camera: CameraModel, check: FieldCheck, image_points: Array, points:
     return result
 
 
-def _where(empty: list[tuple[int, int]]) -> str:
+def _where(empty: NDArray[np.int64]) -> str:
     """Parts of the image in words."""
     rows = ("upper", "middle", "lower")
     columns = ("left", "centre left", "centre right", "right")

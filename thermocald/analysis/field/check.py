@@ -27,7 +27,8 @@ from thermocald.photogrammetry.epoch.geometry import (
     weaknesses,
 )
 from thermocald.photogrammetry.field.planes import field_normals
-from thermocald.photogrammetry.targets.outline import local_maps
+from thermocald.photogrammetry.linalg import scaled_inverse, unit_diagonal
+from thermocald.photogrammetry.targets.outline import facing, local_maps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 """The interior parameters whose standard deviations are predicted."""
+_USED = [PARAMETER_NAMES.index(name) for name in (*FREE, *EOP_NAMES)]
 CELLS = (4, 3)
 """The image is divided into so many columns and rows to see whether it is filled."""
 MIN_SIZE_PX = 8.0
@@ -59,28 +61,25 @@ class Precision:
 
     def pixels(self, sensor_pitch: float) -> dict[str, tuple[float, float, float]]:
         """Sd of c, x0, y0 in px: (epoch, series, level) by name."""
-        return {
-            name: (
-                float(self.epoch[i] / sensor_pitch),
-                float(self.series[i] / sensor_pitch),
-                float(self.level[i] / sensor_pitch),
-            )
-            for i, name in enumerate(FREE[:3])
-        }
+        rows = np.stack([self.epoch, self.series, self.level], axis=1)[:3] / sensor_pitch
+        return {name: tuple(row) for name, row in zip(FREE, rows.tolist(), strict=False)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldCheck:
     """The result: rows of visible targets, why the others are not, how they fill image and depth.
 
-    sizes: smaller diameter in px of each visible circle; cells: targets per part of the image
-    (rows, columns); coverage: share of the image inside the targets' hull; depth_relief: range of
-    depth over mean depth; distance: mean depth mm; flatness: how far the targets lie off their best
-    plane, over that distance; weak: why the program would call an image of it too weak for a
-    result, empty if it would not.
+    sigma_px: of an image coordinate; sizes: smaller diameter in px of each visible circle; cells:
+    targets per part of the image (rows, columns); coverage: share of the image inside the targets'
+    hull; depth_relief: range of depth over mean depth; distance: mean depth mm; flatness: how far
+    the targets lie off their best plane, over that distance; weak: why the program would call an
+    image of it too weak for a result, empty if it would not.
     """
 
+    camera: CameraModel
+    field: TestField
     station: ExteriorOrientation
+    sigma_px: float
     visible: NDArray[np.int64]
     hidden: dict[str, str]
     sizes: Array
@@ -179,43 +178,41 @@ def check_field(
     points, sigmas = field.points[rows], field.sigmas[rows]
     image = camera.project(station, points)
     depth = -((points - station.centre) @ station.rotation)[:, 2]
-    reached = precision(camera, station, points, sigmas, sigma_px)
+    centred = points - points.mean(axis=0)
+    normal = np.linalg.svd(centred, full_matrices=False)[2][2]
+    w, h = camera.sensor.width, camera.sensor.height
+    cells, _, _ = np.histogram2d(
+        image[:, 1], image[:, 0], bins=(CELLS[1], CELLS[0]),
+        range=((-0.5, h - 0.5), (-0.5, w - 0.5)),
+    )  # fmt: skip
     return FieldCheck(
-        station=station,
+        camera,
+        field,
+        station,
+        sigma_px,
         visible=rows,
         hidden=hidden,
         sizes=sizes,
-        cells=_cells(camera, image),
+        cells=cells.astype(np.int64),
         coverage=image_coverage(camera.sensor, image),
         depth_relief=float(np.ptp(depth) / depth.mean()),
         distance=float(depth.mean()),
-        flatness=_off_plane(points) / float(depth.mean()),
-        precision=reached,
+        flatness=float(np.ptp(centred @ normal)) / float(depth.mean()),
+        precision=precision(camera, station, points, sigmas, sigma_px),
         weak=tuple(_weak(camera, station, points, image, sigma_px)),
     )
-
-
-def _off_plane(points: Array) -> float:
-    """The range of distances from the best plane, mm."""
-    centred = points - points.mean(axis=0)
-    normal = np.linalg.svd(centred, full_matrices=False)[2][2]
-    return float(np.ptp(centred @ normal))
 
 
 def _weak(
     camera: CameraModel, station: ExteriorOrientation, points: Array, image: Array, sigma_px: float
 ) -> list[str]:
     """The reasons for which `adjust` would give an image of these points no result."""
-    values = np.concatenate([camera.interior.as_array(), station.as_array()])
-    _, A, _ = partials(camera.sensor, values[:10], values[10:], points)
-    use = [PARAMETER_NAMES.index(name) for name in (*FREE, *EOP_NAMES)]
-    noise = np.broadcast_to(np.eye(2) * sigma_px**2, (len(points), 2, 2))
-    N = _normal_matrix(A[:, :, use], noise)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    A, _ = _partials(camera, station, points)
+    N = _normal_matrix(A, _noise(points, sigma_px))
     covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
     # what nothing determines gets a variance that is large, and correlations that are 1
-    inverse = np.linalg.inv(N * scale * scale[:, None] + 1e-13 * np.eye(len(use)))
-    covariance[np.ix_(use, use)] = inverse * scale * scale[:, None]
+    covariance[np.ix_(_USED, _USED)] = scaled_inverse(N, 1e-13)
+    values = np.concatenate([camera.interior.as_array(), station.as_array()])
     return weaknesses(camera.sensor, points, image, values, covariance, FREE, GeometryBounds())
 
 
@@ -224,12 +221,7 @@ def _visible(
 ) -> tuple[NDArray[np.int64], dict[str, str], Array]:
     """Rows that can be measured, reasons for the others, smaller diameters in px of the former."""
     image = camera.project(station, field.points)
-    normals = field_normals(field)
-    view = station.centre - field.points
-    view /= np.linalg.norm(view, axis=1, keepdims=True)
-    unknown = ~np.isfinite(normals[:, 0])
-    normals = np.where(unknown[:, None], view, normals)
-    cosine = np.abs(np.sum(view * normals, axis=1))
+    normals, cosine = facing(station.centre, field.points, field_normals(field))
     round_ = np.isfinite(field.diameters)
     radii = np.where(round_, field.diameters, 1.0) / 2
     maps = local_maps(
@@ -252,18 +244,7 @@ def _visible(
         elif round_[i] and minor[i] < MIN_SIZE_PX:
             hidden[name] = f"smaller than {MIN_SIZE_PX:g} px"
     rows = np.array([i for i, name in enumerate(field.names) if name not in hidden], dtype=int)
-    sizes = minor[rows]
-    return rows, hidden, sizes[round_[rows]]
-
-
-def _cells(camera: CameraModel, image: Array) -> NDArray[np.int64]:
-    """Targets per part of the image, (rows, columns)."""
-    w, h = camera.sensor.width, camera.sensor.height
-    counts, _, _ = np.histogram2d(
-        image[:, 1], image[:, 0], bins=(CELLS[1], CELLS[0]),
-        range=((-0.5, h - 0.5), (-0.5, w - 0.5)),
-    )  # fmt: skip
-    return counts.astype(np.int64)
+    return rows, hidden, minor[rows][round_[rows]]
 
 
 def precision(
@@ -274,18 +255,28 @@ def precision(
     sigma_px: float,
 ) -> Precision:
     """The standard deviations that targets at points (n, 3) mm with sigmas (n, 3) mm give."""
-    _, A, d_object = partials(camera.sensor, camera.interior.as_array(), station.as_array(), points)
-    use = [PARAMETER_NAMES.index(name) for name in (*FREE, *EOP_NAMES)]
-    A = A[:, :, use]
-    k = len(FREE)
-    noise = np.broadcast_to(np.eye(2) * sigma_px**2, (len(points), 2, 2))
-    of_field = (d_object * sigmas[:, None, :] ** 2) @ np.swapaxes(d_object, 1, 2)
+    A, by_point = _partials(camera, station, points)
+    k, noise = len(FREE), _noise(points, sigma_px)
+    of_field = (by_point * sigmas[:, None, :] ** 2) @ np.swapaxes(by_point, 1, 2)
     N = _normal_matrix(A, noise)
     return Precision(
         epoch=_sds(N)[:k],
         series=_sds(N[:k, :k]),
         level=_sds(_normal_matrix(A, noise + of_field))[:k],
     )
+
+
+def _partials(
+    camera: CameraModel, station: ExteriorOrientation, points: Array
+) -> tuple[Array, Array]:
+    """Partials of the image points (n, 2, …) by what is estimated, and by the targets."""
+    interior, exterior = camera.interior.as_array(), station.as_array()
+    _, by_parameter, by_point = partials(camera.sensor, interior, exterior, points)
+    return by_parameter[:, :, _USED], by_point
+
+
+def _noise(points: Array, sigma_px: float) -> Array:
+    return np.broadcast_to(np.eye(2) * sigma_px**2, (len(points), 2, 2))
 
 
 def _normal_matrix(A: Array, covariance: Array) -> Array:
@@ -295,8 +286,8 @@ def _normal_matrix(A: Array, covariance: Array) -> Array:
 
 def _sds(N: Array) -> Array:
     """Square roots of the diagonal of N⁻¹; inf for parameters in an undetermined direction."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
-    values, vectors = np.linalg.eigh(N * scale * scale[:, None])
+    scaled, scale = unit_diagonal(N)
+    values, vectors = np.linalg.eigh(scaled)
     undetermined = values < 1e-12 * values.max()
     parts = vectors**2 / np.where(undetermined, 1.0, values)
     variance = parts[:, ~undetermined].sum(axis=1)

@@ -21,7 +21,10 @@ __all__ = ["Approach", "Equilibrium", "EquilibriumWatch", "GivenInterior", "fit_
 State = Literal["unknown", "drifting", "ready"]
 
 _FEWEST = 8
-_GROUPS = 180  # of the window: epochs nearer to each other than a second are averaged
+_WINDOW_S = 180.0  # the least past that the drift is taken from; up to four times as much where a
+# straight line describes it
+_STEADY = 0.05  # px/min below which the camera counts as steady
+_GROUP_S = 1.0  # epochs nearer to each other are averaged
 _TAUS = 60
 _NARROWINGS = 6
 _WEIGHTY = 9  # points of the grid that carry the weight
@@ -187,17 +190,10 @@ class _Group:
 
 
 class EquilibriumWatch:
-    """Watches (c, x0, y0) in px over a sliding window.
+    """Watches (c, x0, y0) in px over a sliding window."""
 
-    window_s: the least past that the drift is taken from; up to four times as much where a straight
-    line describes it. bound: px/min below which the camera counts as steady.
-    """
-
-    def __init__(self, window_s: float = 180.0, bound: float = 0.05) -> None:
-        self.window_s = window_s
-        self.bound = bound
+    def __init__(self) -> None:
         self._past: deque[GivenInterior] = deque()
-        self._group_s = window_s / _GROUPS
         self._group = _Group(float("-inf"))
 
     def clear(self) -> None:
@@ -211,12 +207,12 @@ class EquilibriumWatch:
         Epochs that follow each other within a second are averaged: at 20 Hz the cost of an epoch is
         that of one per second, and does not grow.
         """
-        if one.time - self._group.begin < self._group_s and self._past:
+        if one.time - self._group.begin < _GROUP_S and self._past:
             self._past[-1] = self._group.with_one(one)
         else:
             self._group = _Group(one.time)
             self._past.append(self._group.with_one(one))
-        while self._past and one.time - self._past[0].time > 4.0 * self.window_s:
+        while self._past and one.time - self._past[0].time > 4.0 * _WINDOW_S:
             self._past.popleft()
 
     def assess(self, exterior: Array | None = None) -> Equilibrium:
@@ -238,9 +234,9 @@ class EquilibriumWatch:
         speed = 60.0 * float(np.linalg.norm(rate))
         direction = rate / max(float(np.linalg.norm(rate)), 1e-300)
         sd_speed = 60.0 * float(np.sqrt(np.sum((direction * sd_rate) ** 2)))
-        if speed + _SETTLED_SD * sd_speed < self.bound:
+        if speed + _SETTLED_SD * sd_speed < _STEADY:
             return Equilibrium("ready", speed, sd_speed)
-        if speed - _SETTLED_SD * sd_speed < self.bound:
+        if speed - _SETTLED_SD * sd_speed < _STEADY:
             return Equilibrium("unknown", speed, sd_speed)
         along = values @ direction
         sd_along = np.sqrt((sds**2) @ direction**2)
@@ -252,7 +248,7 @@ class EquilibriumWatch:
     def _rate(self, times: Array, values: Array, sds: Array) -> tuple[Array, Array]:
         """Slope from the longest past that straight lines describe, else from the window."""
         for multiple in (4.0, 2.0, 1.0):
-            recent = times >= times[-1] - multiple * self.window_s
+            recent = times >= times[-1] - multiple * _WINDOW_S
             if recent.sum() < _FEWEST:
                 recent[-_FEWEST:] = True
             if multiple == 1.0 or _straight(times[recent], values[recent], sds[recent]):
@@ -262,10 +258,10 @@ class EquilibriumWatch:
     def _approach(self, times: Array, values: Array, sds: Array) -> Approach | None:
         """From the longest past that one exponential describes: heating may just have begun."""
         for fraction in (1.0, 0.5, 0.25):
-            recent = times >= times[-1] - 4.0 * fraction * self.window_s
+            recent = times >= times[-1] - 4.0 * fraction * _WINDOW_S
             if recent.sum() < _FEWEST:
                 return None
-            found = fit_approach(times[recent], values[recent], sds[recent], self.bound / 60.0)
+            found = fit_approach(times[recent], values[recent], sds[recent], _STEADY / 60.0)
             if found is None or found.misfit < _WORST_MISFIT:
                 return found
         return None

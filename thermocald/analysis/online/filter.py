@@ -7,8 +7,14 @@ its chi-square shows a knock, a slip of the principal point, another lens.
 
 The errors of the test field are the same in all epochs. They are considered, not estimated: their
 covariance with the state is carried along, so that they cancel in the innovations and stay in the
-standard deviations of the estimate. The thermometer's noise counts as noise of the epoch, and while
-the temperature changes the prediction is trusted less: the camera may lag.
+standard deviations of the estimate. With the design matrices A (parameters) and B (coordinates),
+the weights W and Q = (AᵀWA)⁻¹ an epoch errs by G e + K d, where G = QAᵀW, K = GB, e the noise and d
+the errors of the coordinates. The level of the noise is measured from the differences between the
+residuals of consecutive epochs, in which the errors of the field cancel; sigma0 would mix in how
+well the field's standard deviations are stated.
+
+The thermometer's noise counts as noise of the epoch, and while the temperature changes the
+prediction is trusted less: the camera may lag.
 
 Sources: Schmidt (1966), Application of state-space methods to navigation problems, Advances in
 Control Systems 3 (consider states); innovation test: Bar-Shalom, Li and Kirubarajan (2001),
@@ -22,8 +28,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from thermocald.analysis.online.field_errors import EpochErrors
-from thermocald.photogrammetry.camera.camera_model import EOP, PARAMETER_NAMES
+from thermocald.photogrammetry.camera.camera_model import EOP, PARAMETER_NAMES, partials, project
+from thermocald.photogrammetry.epoch.gauss_markov import point_covariances
+from thermocald.photogrammetry.linalg import scaled_inverse
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,35 +38,151 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
+    from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-__all__ = ["FilterSettings", "Innovation", "OnlineFilter", "chi2_quantile"]
+
+_MEMORY = 50  # epochs over which the level of the noise is averaged
+_LEAST_DEGREES = 10.0
+_MOVED_PX = 30.0  # from here on the partials are others
+_OTHER_LENS = 0.02  # of c: another lens, and partials that correlate otherwise
+_LOWEST, _HIGHEST = 0.05, 20.0  # of the measured over the stated variance of an image point
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochErrors:
+    """How one epoch's 16 parameters err.
+
+    noise (16, 16): covariance from the image points alone, zero where held; influence (16, 3 T): of
+    the coordinates of all T targets, per mm, zero for targets that the epoch did not use.
+    """
+
+    noise: Array
+    influence: Array
+
+
+class FieldErrors:
+    """Splits the covariance of consecutive epochs before one test field.
+
+    variances (3 T,): of the targets' coordinates, mm²; level: measured over stated variance of the
+    image points, the first epoch's σ₀² until two are there.
+    """
+
+    def __init__(self, sensor: Sensor, testfield: TestField) -> None:
+        self.variances: Array = np.square(testfield.sigmas).ravel()
+        self.level = 1.0
+        self._sensor = sensor
+        self._field = testfield
+        self._before: tuple[Array, Array] | None = None
+        self._linearised: tuple[Array, Array, Array] | None = None
+        self._c = 0.0
+        self._compared = 0
+
+    def split(
+        self, adjustment: Adjustment, observations: Observations, field_variance: float = 1.0
+    ) -> EpochErrors:
+        """The errors of an epoch that has a result, from its own adjustment.
+
+        adjustment: of these observations; its covariance tells which parameters are free;
+        field_variance: by what the stated covariance of the coordinates is to be multiplied.
+        """
+        free = np.flatnonzero(np.diag(adjustment.covariance) > 0)
+        used = observations.select(~np.isin(observations.targets, adjustment.rejected))
+        rows = used.targets
+        A, B = self._design(adjustment.values)
+        A, B = A[rows], np.sqrt(field_variance) * B[rows]
+        image = _blocks(point_covariances(used, None, None))
+        total = _blocks(point_covariances(used, B, self._field.sigmas[rows] ** 2))
+        A = A[:, :, free]
+        WA = np.linalg.solve(total, A)
+        G = np.einsum("uv,niv->nui", scaled_inverse(np.einsum("niu,niv->uv", A, WA)), WA)
+        noise = np.einsum("nui,nij,nvj->uv", G, image, G)
+        information = np.einsum("niu,niv->uv", A, np.linalg.solve(image, A))
+        influence = np.zeros((16, len(self._field), 3))
+        influence[np.ix_(free, rows)] = np.einsum("nui,nik->unk", G, B)
+        self._measure_level(adjustment, used, influence.reshape(16, -1)[free], noise, information)
+        if not self._compared:
+            # One epoch alone: its own residuals, which hold the field's errors too.
+            redundancy = 2 * len(used) - len(free)
+            own = min(max(adjustment.sigma0**2, _LOWEST), _HIGHEST)
+            self.level = own if redundancy >= _LEAST_DEGREES else max(own, 1.0)
+        covariance = np.zeros((16, 16))
+        covariance[np.ix_(free, free)] = self.level * noise
+        return EpochErrors(covariance, influence.reshape(16, -1))
+
+    def _design(self, values: Array) -> tuple[Array, Array]:
+        """Partials of all targets, at one orientation while the camera stays about there.
+
+        Partials of every epoch's own values would differ by its noise, and a filter would take
+        these differences for information on the field.
+        """
+        points = self._field.points
+        at = self._linearised
+        if at is not None:
+            now = project(self._sensor, values[:10], values[10:], points)
+            moved = float(np.nanmedian(np.abs(now - at[0])))
+            if not moved < _MOVED_PX or abs(values[0] / self._c - 1.0) > _OTHER_LENS:
+                at = None
+        if at is None:
+            self._c = float(values[0])
+            at = self._linearised = partials(self._sensor, values[:10], values[10:], points)
+        return at[1], at[2]
+
+    def _measure_level(
+        self,
+        adjustment: Adjustment,
+        used: Observations,
+        influence: Array,
+        noise: Array,
+        information: Array,
+    ) -> None:
+        """Compare the residuals with those of the epoch before.
+
+        influence (u, 3 T), noise (u, u) of the free parameters; information (u, u): that of the
+        image points alone.
+        """
+        residuals = np.full((len(self._field), 2), np.nan)
+        residuals[adjustment.targets] = adjustment.residuals
+        whitened = np.full_like(residuals, np.nan)
+        whitened[used.targets] = residuals[used.targets] / used.sigmas
+        before, self._before = self._before, (whitened, influence)
+        if before is None or len(before[1]) != len(influence):
+            return
+        both = np.isfinite(before[0][:, 0]) & np.isfinite(whitened[:, 0])
+        u = float(len(influence))
+        # The weights hold the field too: only without it the trace is the number of unknowns.
+        overlap = min(float(np.sum(noise * information)), u)
+        degrees = 2.0 * np.count_nonzero(both) - 2.0 * u + overlap
+        if degrees < _LEAST_DEGREES:
+            return
+        found = float(np.sum((whitened[both] - before[0][both]) ** 2))
+        # Other targets in view: the field's errors shift the parameters by something else.
+        shift = influence - before[1]
+        found -= float(np.sum((shift * self.variances @ shift.T) * information))
+        found = min(max(found / (2.0 * degrees), _LOWEST), _HIGHEST)
+        self._compared = min(self._compared + 1, _MEMORY)
+        self.level += (found - self.level) / self._compared
+
+
+def _blocks(covariance: Array) -> Array:
+    """Covariances (n, 3), elements xx, yy, xy, as matrices (n, 2, 2)."""
+    xx, yy, xy = covariance.T
+    out: Array = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
+    return out
+
 
 Change = Literal["", "outlier", "knock", "slip", "wrong_lens", "change"]
 
 _WARM = (0, 1, 2)  # c, x0, y0 follow the temperature
 _EOP = tuple(range(10, 16))
-_OTHER_LENS = 0.02  # of c
 _FAR = 1e4  # prior sd of what is not known, in sd of the first epoch
 _TRUSTED, _DOUBTFUL = 4.0, 2.0  # a rise of temperature from here on, in sd of a reading
 _FEW_READINGS = 5
-
-
-@dataclass(frozen=True, slots=True)
-class FilterSettings:
-    """How the filter expects a camera to behave.
-
-    thermometer_sd K; wander_px: of c, x0, y0 per √epoch beyond the thermal model; lag: fraction of
-    a change of temperature that may reach the camera later; alpha: error probability of one test;
-    rate_sd_px: prior sd of the rates per kelvin; unknown_step K: what the temperature may change by
-    from epoch to epoch where there is no thermometer.
-    """
-
-    thermometer_sd: float = 0.05
-    wander_px: float = 0.003
-    lag: float = 0.5
-    alpha: float = 1e-6
-    rate_sd_px: float = 5.0
-    unknown_step: float = 0.3
+_THERMOMETER_SD = 0.05  # K
+_WANDER_PX = 0.003  # of c, x0, y0 per √epoch beyond the thermal model
+_LAG = 0.5  # share of a change of temperature that may reach the camera later
+_ALPHA = 1e-6  # error probability of one test
+_RATE_SD_PX = 5.0  # prior sd of the rates per kelvin
+_UNKNOWN_STEP = 0.3  # K from epoch to epoch where there is no thermometer
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,14 +219,8 @@ class OnlineFilter:
     last_temperature °C. All in the units of CONVENTIONS §2.
     """
 
-    def __init__(
-        self,
-        sensor: Sensor,
-        settings: FilterSettings | None = None,
-        common_variances: Array | None = None,
-    ) -> None:
+    def __init__(self, sensor: Sensor, common_variances: Array | None = None) -> None:
         self.sensor = sensor
-        self.settings = settings or FilterSettings()
         self.epochs = 0
         self.T0 = self.last_temperature = float("nan")
         self._common = np.empty(0) if common_variances is None else common_variances
@@ -134,7 +251,7 @@ class OnlineFilter:
         before = self._rise
         if not np.isnan(temperature):
             self._read(temperature)
-        unknown = self.settings.unknown_step if np.isnan(self.T0) else 0.0
+        unknown = _UNKNOWN_STEP if np.isnan(self.T0) else 0.0
         self._predict(np.hypot(self._rise - before, unknown))
         innovation = self._take_in(adjustment, errors)
         if not self._surprised and tremble is not None:
@@ -151,8 +268,8 @@ class OnlineFilter:
     @property
     def rates_covariance(self) -> Array:
         """(3, 3) of `rates`, mm²/K²."""
-        s = self._scale[len(self._free) :]
-        result: Array = self._P[len(self._free) :, len(self._free) :] * np.outer(s, s)
+        n = len(self._free)
+        result: Array = self._P[n:, n:] * np.outer(self._scale[n:], self._scale[n:])
         return result
 
     def values(self) -> Array:
@@ -179,13 +296,13 @@ class OnlineFilter:
             self.T0, self._readings = temperature, 1
         self.last_temperature = temperature
         rise = temperature - self.T0
-        sd = self.settings.thermometer_sd * np.sqrt(1.0 + 1.0 / self._readings)
+        sd = _THERMOMETER_SD * np.sqrt(1.0 + 1.0 / self._readings)
         trusted = 1.0 - (_TRUSTED * sd / rise) ** 2 if abs(rise) > _TRUSTED * sd else 0.0
         doubtful = (1.0 - trusted) * rise if abs(rise) > _DOUBTFUL * sd else 0.0
         if self._readings < _FEW_READINGS:
             doubtful = float(np.hypot(doubtful, sd))
         self._rise = trusted * rise
-        self._rise_variance = (trusted * self.settings.thermometer_sd) ** 2 + doubtful**2
+        self._rise_variance = (trusted * _THERMOMETER_SD) ** 2 + doubtful**2
         self._warmed = self._warmed or trusted > 0.0
         if not self._warmed:
             self._readings += 1
@@ -211,7 +328,7 @@ class OnlineFilter:
         R, K = self._scaled(errors)
         self._P = np.zeros((n + 3, n + 3))
         self._P[:n, :n] = R + K * self._common @ K.T
-        self._P[n:, n:] = np.eye(3) * self.settings.rate_sd_px**2
+        self._P[n:, n:] = np.eye(3) * _RATE_SD_PX**2
         # Truth minus estimate against the common errors: what they did to the first epoch.
         self._C = np.zeros((n + 3, len(self._common)))
         self._C[:n] = -K * self._common
@@ -257,9 +374,9 @@ class OnlineFilter:
 
     def _predict(self, step: float) -> None:
         n = len(self._free)
-        wander = self.settings.wander_px * self.sensor.pixel_pitch
+        wander = _WANDER_PX * self.sensor.pixel_pitch
         self._P[self._warm, self._warm] += (wander / self._scale[self._warm]) ** 2
-        self._P[:n, :n] += self._rate_moment() * (step * self.settings.lag) ** 2
+        self._P[:n, :n] += self._rate_moment() * (step * _LAG) ** 2
 
     def _take_in(self, adjustment: Adjustment, errors: EpochErrors) -> Innovation:
         n = len(self._free)
@@ -271,7 +388,7 @@ class OnlineFilter:
         common = K * self._common
         S, cross = self._innovation(H, K, common, R)
         chi2 = float(v @ np.linalg.solve(S, v))
-        bound = chi2_quantile(1.0 - self.settings.alpha, n)
+        bound = chi2_quantile(1.0 - _ALPHA, n)
         change: Change = ""
         if chi2 > bound:
             self._surprised += 1
@@ -318,7 +435,7 @@ class OnlineFilter:
             x = np.linalg.solve(A.T @ weight @ A, A.T @ weight @ v)
             rest = v - A @ x
             degrees = max(1, len(v) - len(columns))
-            bound = chi2_quantile(1.0 - self.settings.alpha, degrees)
+            bound = chi2_quantile(1.0 - _ALPHA, degrees)
             left[name] = float(rest @ weight @ rest) / bound
         best = min(left, key=lambda name: left[name])
         # x0, y0 and the tilt are nearly the same thing: what explains, not what explains alone

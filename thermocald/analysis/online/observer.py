@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.online.equilibrium import Equilibrium, EquilibriumWatch, GivenInterior
-from thermocald.analysis.online.field_errors import FieldErrors
-from thermocald.analysis.online.filter import OnlineFilter
+from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 
 if TYPE_CHECKING:

@@ -32,7 +32,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.series.adjustment import adjusted, result
-from thermocald.photogrammetry.series.known import KnownSeries
+from thermocald.photogrammetry.series.field_motion import taken_off
+from thermocald.photogrammetry.series.long_series import KnownSeries
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
@@ -108,55 +109,35 @@ class _Together:
     @cached_property
     def known(self) -> KnownSeries:
         """What they say of further epochs."""
-        return KnownSeries.of(self.found, self.sample)[0]
+        return KnownSeries.of(self.found, self.sample)
 
     @property
     def image_px(self) -> float:
         """How far the mount moves in the image."""
         return self.sample.movement.image_px(self.found.estimate.system.design.at.A)
 
-    def epoch(self, row: int, targets: int) -> _Epoch:
-        """One of the epochs."""
+    def epoch(self, row: int) -> _Epoch:
+        """Return one of the epochs."""
         s = self.sample
-        return self._epoch(
-            targets, s.status[row], s.reasons[row], s.values[row], s.covariance[row],
-            float(s.sigma0[row]), int(s.redundancy[row]), s.rejected[row], s.residuals[row],
+        return _Epoch(
+            s.status[row], s.reasons[row], s.values[row], s.covariance[row], float(s.sigma0[row]),
+            int(s.redundancy[row]), s.rejected[row], s.residuals[row],
         )  # fmt: skip
 
     def further(self, grid: ObservationGrid, epochs: int) -> _Epoch:
-        """An epoch that came later, adjusted with what is known of its series."""
-        block = self.known.adjusted(_still(grid, self.moved).targets(self.seen), epochs)
-        covariance = self.known.covariance(block, self.known.shared.mean)
-        status, reasons = self.known.judged(block, covariance)
-        estimate = block.estimate
-        return self._epoch(
-            grid.points.shape[1], status[0], reasons[0], estimate.values[0], covariance[0],
-            float(block.sigma0[0]), int(block.redundancy[0]),
-            block.grid.observed[0] & ~block.use[0], estimate.residuals[0],
+        """Adjust an epoch that came later with what is known of its series."""
+        if self.moved:
+            grid = taken_off(grid, self.moved, slice(-1, None))
+        seen = grid.targets(self.seen)
+        block = self.known.adjusted(seen, epochs)
+        rejected = np.zeros(grid.observed.shape, dtype=bool)
+        residuals = np.full_like(grid.points, np.nan)
+        rejected[:, self.seen] = seen.observed & ~block.use
+        residuals[:, self.seen] = block.estimate.residuals
+        return _Epoch(
+            block.status[0], block.reasons[0], block.estimate.values[0], block.covariance[0],
+            float(block.sigma0[0]), int(block.redundancy[0]), rejected[0], residuals[0],
         )  # fmt: skip
-
-    def _epoch(
-        self, targets: int, status: str, reason: str, values: Array, covariance: Array,
-        sigma0: float, redundancy: int, rejected: Mask, residuals: Array,
-    ) -> _Epoch:  # fmt: skip
-        every, left = np.zeros(targets, dtype=bool), np.full((targets, 2), np.nan)
-        every[self.seen], left[self.seen] = rejected, residuals
-        return _Epoch(status, reason, values, covariance, sigma0, redundancy, every, left)
-
-
-def _still(
-    grid: ObservationGrid, moved: tuple[FieldMovement, ...], epoch: int = -1
-) -> ObservationGrid:
-    """One epoch as if the field had stood still; epoch: its row among those that told of it."""
-    mask = np.zeros(grid.observed.shape, dtype=bool)
-    points = grid.points
-    for m in moved:
-        if m.kind == "wander":
-            mask[:, m.rows] = True
-        else:
-            points = points.copy(order="K")
-            points[:, m.rows] -= m.trajectory[min(epoch, len(m.trajectory) - 1)] * m.image
-    return ObservationGrid(points, grid.weights).reject(mask)
 
 
 def _going_on(times: Array) -> Array:
@@ -188,10 +169,8 @@ class RunningSeries:
         self._field = testfield
         offsets = offsets and bool((testfield.sigmas > 0).any())
         series = replace(SeriesSettings.of(settings, exterior), target_offsets=offsets)
-        if not settings.snooping_alpha:
-            series = replace(series, snooping_alpha=0.0)
         self._asked = series
-        self._own = replace(series, exterior="per_epoch", snooping_alpha=settings.snooping_alpha)
+        self._own = replace(series, exterior="per_epoch")
         size = min(_WINDOW, max(_WINDOW_POINTS // max(len(testfield), 1), _FEWEST))
         self._kept: deque[_Kept] = deque(maxlen=size)
         self._restarted = 0
@@ -381,7 +360,7 @@ class RunningSeries:
         """The last epoch's own result, None where epochs share nothing that changes it, and that
         in the series.
         """
-        newest, n, T = self._kept[-1], len(self._kept), len(self._field)
+        newest, n = self._kept[-1], len(self._kept)
         known = self._series is not None and not self._shows_more(newest.grid)
         if self._series is not None and known and self.epochs < self._look_at[1]:
             whole = self._series.further(newest.grid, n)
@@ -389,14 +368,14 @@ class RunningSeries:
                 return self._further(newest.grid, whole), whole
         row = self._look()
         assert self._series is not None
-        whole = self._series.epoch(row, T)
+        whole = self._series.epoch(row)
         if not self._offsets:
             return None, whole
         due = self._each is None or self.epochs >= self._look_at[0]
         if not due and whole.status not in _AGAINST:
             return self._further(newest.grid, whole), whole
         self._each = self._look_at_each()
-        own = self._each.epoch(row, T)
+        own = self._each.epoch(row)
         return replace(own, rejected=own.rejected | self._gross()[row]), whole
 
     def _further(self, grid: ObservationGrid, whole: _Epoch) -> _Epoch | None:
@@ -415,8 +394,7 @@ class RunningSeries:
         """
         assert self._series is not None
         s = self._series.sample
-        rejected = s.spread(self._series.seen, len(self._field)).rejected
-        return rejected & s.ok[:, None] & self._binds
+        return s.rejected & s.ok[:, None] & self._binds
 
     @property
     def _binds(self) -> bool:
@@ -457,11 +435,11 @@ class RunningSeries:
         self._look_at[1] = self._again(share)
         if len(kept) < FEWEST_EPOCHS:
             return row
-        from thermocald.analysis.series.still_field import still_field  # 2 MB
+        from thermocald.analysis.series.adjusted import still_field  # 2 MB
 
         moved, still = still_field(
-            self._sensor, self._field, grid, series.sample.spread(series.seen, len(self._field)),
-            start, np.array([k.number for k in kept]), time,
+            self._sensor, self._field, grid, series.sample, start,
+            np.array([k.number for k in kept]), time,
         )  # fmt: skip
         if moved:
             self._series = self._together(still, start, s, moved)
@@ -472,13 +450,7 @@ class RunningSeries:
         assert self._series is not None
         kept, grid, start, _ = self._laid_out()
         moved = self._series.moved
-        still = [
-            _still(ObservationGrid(grid.points[k : k + 1], grid.weights[k : k + 1]), moved, k)
-            for k in range(len(grid))
-        ]
-        grid = ObservationGrid(
-            np.concatenate([g.points for g in still]), np.concatenate([g.weights for g in still])
-        ).reject(self._gross())
+        grid = taken_off(grid, moved).reject(self._gross())
         s = replace(self._own, drift_period=self._period)
         if self._binds:
             # the series has tested every point: only what is far off is left to a second test
@@ -498,7 +470,7 @@ class RunningSeries:
             self._sensor, self._field.subset(seen), grid.targets(seen), start, s,
             field_variance=field_variance,
         )  # fmt: skip
-        return _Together(seen, found, result(found), moved)
+        return _Together(seen, found, result(found).spread(seen, len(self._field)), moved)
 
     def _moved_level(self, kept: list[_Kept], sample: SeriesAdjustment) -> Array:
         """By how much (16,) the epochs as adjusted now differ from what was reported of them."""

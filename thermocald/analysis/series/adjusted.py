@@ -1,14 +1,17 @@
-"""A series adjusted together, as a table: at once, or in blocks where it is long."""
+"""A series adjusted together, as a table: at once, or in blocks where it is long.
+
+The test field is then as if it had stood still: its movements are looked for in the residuals of a
+first adjustment, which a second one does without.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.series.still_field import still_field
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
@@ -16,32 +19,70 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
 )
+from thermocald.photogrammetry.field.planes import field_sheets
 from thermocald.photogrammetry.series.adjustment import adjust_series
-from thermocald.photogrammetry.series.blocks import (
-    ObservedBlocks,
-    WithoutTargets,
-    gathered,
-    released,
-    spread_windows,
+from thermocald.photogrammetry.series.field_motion import (
+    FEWEST_EPOCHS,
+    FieldMovement,
+    FieldSeries,
+    board_movements,
+    put_back,
+    taken_off,
+    wandering_targets,
 )
 from thermocald.photogrammetry.series.long_series import adjust_long_series, together_at_most
 from thermocald.photogrammetry.series.mount import drift_period
+from thermocald.photogrammetry.series.normals import (
+    WithoutTargets,
+    gathered,
+    linearise,
+    spread_windows,
+)
+from thermocald.thermal.reduce import find_spikes
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
     from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import Observations, TestField
-    from thermocald.photogrammetry.series.blocks import ObservationBlocks
-    from thermocald.photogrammetry.series.long_series import LongAdjustment, RowWriter
-    from thermocald.photogrammetry.series.normals import ObservationGrid
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.series.long_series import LongAdjustment
+    from thermocald.photogrammetry.series.normals import ObservationBlocks, ObservationGrid
     from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
     from thermocald.store.recording.head import Head
 
-__all__ = ["table_of_series"]
+
+def still_field(
+    sensor: Sensor, testfield: TestField, grid: ObservationGrid, result: SeriesAdjustment,
+    camera: Array, numbers: NDArray[np.int64], time_s: Array,
+) -> tuple[tuple[FieldMovement, ...], ObservationGrid]:  # fmt: skip
+    """What moved in a series, and its observations without that.
+
+    result: of a first adjustment; camera (16,): where it is linearised; numbers, time_s (E,): the
+    epochs'.
+    """
+    if len(numbers) < FEWEST_EPOCHS:
+        return (), grid
+    at = linearise(sensor, testfield, camera[IOP], camera[EOP])
+    # what data snooping rejects after a knock is the board; single leaps are not
+    good = grid.observed & ~find_spikes(result.residuals, grid.observed)
+    residuals = np.where(good[..., None], result.residuals, np.nan)
+    ratio = result.noise_ratio if np.isfinite(result.noise_ratio) else 1.0
+    weights = grid.weights / max(ratio, 1e-6) ** 2
+    series = FieldSeries(
+        time_s - time_s[0], residuals, weights, at.A, at.B, testfield.points,
+        field_sheets(testfield), testfield.names, numbers,
+    )  # fmt: skip
+    boards = board_movements(series)
+    for m in boards:
+        series = put_back(series, m)
+    single = wandering_targets(series)
+    moved = (*boards, *single)
+    return moved, taken_off(grid, moved) if moved else grid
+
 
 _SOME = 20_000  # epochs that tell the start values
 _AS_READ = ("number", "frame_time", "temperature")
@@ -51,72 +92,49 @@ def table_of_series(
     head: Head,
     testfield: TestField,
     apart: Epochs,
-    observations: Sequence[Observations | None] | ObservationBlocks,
+    source: ObservationBlocks,
     settings: SeriesSettings,
     start: Array | None = None,
     jobs: int = 1,
+    advance: Callable[[int], None] | None = None,
 ) -> Epochs:
-    """The series adjusted together, from the table of its epochs one by one.
+    """Return the series adjusted together, from the table of its epochs one by one.
 
     start (16,): where the adjustment begins, by default the medians of the epochs one by one. A
-    series of more epochs than are adjusted at once goes in blocks, on `jobs` processes. Raises
-    DataError where no epoch has a result to start from.
+    series of more epochs than are adjusted at once goes in blocks, on `jobs` processes, and tells
+    `advance` how many epochs are done. Raises DataError where no epoch has a result to start from.
     """
-    ok = apart.ok
-    if start is None and not ok.any():
+    rows = np.flatnonzero(apart.ok)
+    if start is None and not len(rows):
         counts = Counter(reason for reason in apart.reasons if reason)
         why = max(counts, key=lambda reason: counts[reason], default="-")
         raise DataError(f"{head.name}: no epoch has a result; most often: {why}")
     if start is None:
-        start = _middle(apart.values, ok)
+        start = np.median(apart.values[rows[:: max(len(rows) // _SOME, 1)]], axis=0)
     apart = replace(apart, head=head)
     settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
-    source = (
-        observations if hasattr(observations, "blocks") else ObservedBlocks(testfield, observations)
-    )
-    if len(source) <= together_at_most(len(testfield)):
-        return _together(head, testfield, apart, start, source, settings)
-    return _in_blocks(head, testfield, apart, start, source, settings, jobs)
-
-
-def _middle(values: Array, ok: NDArray[np.bool_]) -> Array:
-    """Medians (16,) over the epochs with a result, of many epochs over some thousand."""
-    rows = np.flatnonzero(ok)
-    rows = rows[:: max(len(rows) // _SOME, 1)]
-    middle: Array = np.median(values[rows], axis=0)
-    released(values)
-    return middle
-
-
-def _together(
-    head: Head, testfield: TestField, apart: Epochs, start: Array,
-    source: ObservationBlocks, settings: SeriesSettings,
-) -> Epochs:  # fmt: skip
-    """The table of a series that is adjusted as one, its field put back where it moved."""
+    if len(source) > together_at_most(len(testfield)):
+        return _in_blocks(testfield, apart, start, source, settings, jobs, advance)
     grid = gathered(source, [slice(0, len(source))])
-    found = _as_one(head, testfield, apart, start, grid, settings)
+    found = _as_one(testfield, apart, start, grid, settings)
     assert found.adjustment is not None
     moved, still = still_field(
-        head.camera.sensor,
-        testfield,
-        grid,
-        found.adjustment,
-        start,
-        apart.number,
+        head.camera.sensor, testfield, grid, found.adjustment, start, apart.number,
         apart.frame_time,
-    )
+    )  # fmt: skip
     if not moved:
         return found
-    return replace(_as_one(head, testfield, apart, start, still, settings), field_movements=moved)
+    return replace(_as_one(testfield, apart, start, still, settings), field_movements=moved)
 
 
 def _as_one(
-    head: Head, testfield: TestField, apart: Epochs, start: Array,
-    grid: ObservationGrid, settings: SeriesSettings,
+    testfield: TestField, apart: Epochs, start: Array, grid: ObservationGrid,
+    settings: SeriesSettings,
 ) -> Epochs:  # fmt: skip
-    """The table of one adjustment of all epochs."""
+    """Return the table of one adjustment of all epochs."""
+    assert apart.head is not None
     result = adjust_series(
-        head.camera.sensor, testfield, grid, InteriorOrientation.from_array(start[IOP]),
+        apart.head.camera.sensor, testfield, grid, InteriorOrientation.from_array(start[IOP]),
         ExteriorOrientation.from_array(start[EOP]), settings,
     )  # fmt: skip
 
@@ -127,92 +145,70 @@ def _as_one(
             mask = ~result.observed
             rough = replace(rough, snooping_alpha=0.0, target_noise=False)
         mask[:, rows] = True
-        return _as_one(head, testfield, apart, start, grid.reject(mask), rough)
+        return _as_one(testfield, apart, start, grid.reject(mask), rough)
 
-    return replace(_table(apart, testfield, result, result, result), without=without)
+    return replace(_table(apart, testfield, result, result), without=without)
 
 
 def _in_blocks(
-    head: Head, testfield: TestField, apart: Epochs, start: Array,
-    source: ObservationBlocks, settings: SeriesSettings, jobs: int,
+    testfield: TestField, apart: Epochs, start: Array, source: ObservationBlocks,
+    settings: SeriesSettings, jobs: int, advance: Callable[[int], None] | None = None,
 ) -> Epochs:  # fmt: skip
-    """The table of a long series."""
+    """Return the table of a long series."""
+    assert apart.head is not None
     found = adjust_long_series(
-        head.camera.sensor, testfield, source, InteriorOrientation.from_array(start[IOP]),
-        ExteriorOrientation.from_array(start[EOP]), settings, jobs=jobs,
+        apart.head.camera.sensor, testfield, source, InteriorOrientation.from_array(start[IOP]),
+        ExteriorOrientation.from_array(start[EOP]), settings, jobs=jobs, advance=advance,
     )  # fmt: skip
-    rows, sample = found.rows, found.sample
+    sample, sampled = found.sample, found.sampled
 
     def without(targets: NDArray[np.int64], quick: bool) -> Epochs:
         rough = replace(settings, exterior=sample.exterior)
         fewer = WithoutTargets(source, targets)
         if not quick:
-            return _in_blocks(head, testfield, apart, start, fewer, rough, jobs)
+            return _in_blocks(testfield, apart, start, fewer, rough, jobs)
         rough = replace(rough, snooping_alpha=0.0, target_noise=False)
-        grid = gathered(fewer, spread_windows(len(source), len(found.sampled)))
-        used = grid.reject(~sample.observed)
+        grid = gathered(fewer, spread_windows(len(source), len(sampled)))
         some = replace(
             apart.part(slice(0, 0)),
-            **{n: getattr(apart, n)[found.sampled] for n in _AS_READ},
-            status=tuple(apart.status[i] for i in found.sampled),
-            reasons=tuple(apart.reasons[i] for i in found.sampled),
+            **{n: getattr(apart, n)[sampled] for n in _AS_READ},
+            status=tuple(apart.status[i] for i in sampled),
+            reasons=tuple(apart.reasons[i] for i in sampled),
         )
-        return _as_one(head, testfield, some, start, used, rough)
+        return _as_one(testfield, some, start, grid.reject(~sample.observed), rough)
 
-    table = _table(apart, testfield, rows, found, sample)
-    return replace(table, without=without, sampled=found.sampled)
+    return replace(_table(apart, testfield, found, sample), without=without, sampled=sampled)
 
 
 def _table(
-    apart: Epochs, testfield: TestField, rows: SeriesAdjustment | RowWriter,
-    whole: SeriesAdjustment | LongAdjustment, sample: SeriesAdjustment,
+    apart: Epochs, testfield: TestField, whole: SeriesAdjustment | LongAdjustment,
+    sample: SeriesAdjustment,
 ) -> Epochs:  # fmt: skip
-    """The table of adjusted epochs (`rows`), of the series as a whole, and of epochs in full."""
-    rejected = _count(rows.rejected)
-    status, reasons = _said(rows, apart)
+    """Return the table of adjusted epochs; sample: those that are known in full."""
+    rows, groups = whole.rows, {}
+    # what the epoch itself said of a frame without a result says more than "no observations"
+    for row in np.flatnonzero(~rows.ok & ~apart.ok).tolist():
+        if rows.status[row] == "no_observations":
+            rows.status[row], rows.reasons[row] = apart.status[row], apart.reasons[row]
+    seen = np.flatnonzero(sample.observed.any(axis=0))
+    for label in dict.fromkeys(testfield.groups[seen].tolist()):
+        members = seen[testfield.groups[seen] == label]
+        groups[testfield.names[members[0]]] = members
     return replace(
         apart,
         values=rows.values,
         sd=rows.sd,
-        sigma0=np.where(rows.ok, rows.sigma0, np.nan),
-        n_observations=_count(rows.observed) + rejected,
-        n_rejected=rejected,
-        status=status,
-        reasons=reasons,
+        sigma0=rows.sigma0,
+        n_observations=rows.observed,
+        n_rejected=rows.rejected,
+        status=tuple(rows.status),
+        reasons=tuple(rows.reasons),
         exterior=sample.exterior,
         level_sd=whole.level_sd,
         adjustment=sample,
-        groups=_groups(testfield, sample),
+        groups=groups,
         trend_sd=whole.trend_sd,
         perspective_sd=sample.perspective_sd,
         redundancy=rows.redundancy,
         stillness=rows.stillness,
     )
-
-
-def _count(targets: NDArray[Any]) -> NDArray[np.int64]:
-    """How many targets (E,), from their numbers or a mask (E, T)."""
-    count: NDArray[np.int64] = targets if targets.ndim == 1 else targets.sum(axis=1)
-    return count
-
-
-def _said(
-    rows: SeriesAdjustment | RowWriter, apart: Epochs
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Words and sentences of the epochs; what the epoch itself said of a frame without a result
-    says more than "no observations".
-    """
-    status, reasons = list(rows.status), list(rows.reasons)
-    for row in np.flatnonzero(~rows.ok & ~apart.ok).tolist():
-        if status[row] == "no_observations":
-            status[row], reasons[row] = apart.status[row], apart.reasons[row]
-    return tuple(status), tuple(reasons)
-
-
-def _groups(testfield: TestField, result: SeriesAdjustment) -> dict[str, NDArray[np.int64]]:
-    """The groups of targets that take part, by the name of their first."""
-    seen = result.observed.any(axis=0)
-    rows: dict[int, list[int]] = {}
-    for row in np.flatnonzero(seen):
-        rows.setdefault(int(testfield.groups[row]), []).append(int(row))
-    return {testfield.names[members[0]]: np.array(members) for members in rows.values()}

@@ -19,13 +19,10 @@ from thermocald.analysis.series.epochs import LEVEL, Course
 from thermocald.analysis.statistics.dependence import holm, slope_noise, slope_p_value
 from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.series.blocks import released
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from numpy.typing import NDArray
 
     from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
@@ -51,13 +48,6 @@ class _Line:
     p: float
 
 
-def _column(values: Array, ok: NDArray[np.bool_], column: int) -> Array:
-    """One parameter of the epochs with a result; the others of a long series leave memory."""
-    out: Array = values[ok, column]
-    released(values)
-    return out
-
-
 def _thinned(*columns: Array) -> list[Array]:
     """Means of neighbours where there are more values than a line needs; the rest left out."""
     n = len(columns[0])
@@ -74,7 +64,7 @@ def _lines(table: Epochs, names: tuple[str, ...]) -> dict[str, _Line]:
     t = table.frame_time[ok]
     for name in names:
         column = IOP_NAMES.index(name)
-        y, sd = _column(table.values, ok, column), _column(table.sd, ok, column)
+        y, sd = table.values[ok, column], table.sd[ok, column]
         if len(y) < _FEWEST or not np.isfinite(sd).all() or np.ptp(t) == 0:
             continue
         tilt = float(table.trend_sd[column])
@@ -99,7 +89,7 @@ def courses(table: Epochs, names: tuple[str, ...] = ("c", "x0", "y0")) -> list[C
         return _lines(left, tuple(lines)) if left.ok.sum() >= _FEWEST else {}
 
     for line, (slope, sd_slope, p_warm) in zip(lines.values(), warm, strict=True):
-        rests_on = _single_support(table, line, without) if line.p < LEVEL else ""
+        rests_on = _single_support(table, line, without) if line.p < LEVEL else None
         y, sd = line.values, line.sds
         result.append(
             Course(
@@ -158,16 +148,16 @@ def with_drifts(table: Epochs) -> Epochs:
 
 def _single_support(
     table: Epochs, line: _Line, lines_without: Callable[[str], dict[str, _Line]]
-) -> str:
-    """The group of targets that alone makes a parameter drift, or "".
+) -> str | None:
+    """The group of targets that alone makes a parameter drift, or None.
 
     lines_without: all lines of the series without a group. Without the group that is named the
     change must shrink by more than half and no longer be significant, corrected as with it: a group
     whose absence only makes the change less certain is not accused.
     """
     if table.without is None or len(table.groups) < 3:
-        return ""
-    best, least = "", _SHRUNK * abs(line.change)
+        return None
+    best, least = None, _SHRUNK * abs(line.change)
     for first in _suspects(table):
         without = lines_without(first).get(line.name)
         if without is None or without.p < LEVEL:

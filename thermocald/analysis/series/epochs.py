@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -22,12 +22,11 @@ from thermocald.acquisition.calibrator import calibrated_epochs
 from thermocald.errors import DataError, DriverMissing
 from thermocald.figures import BAND
 from thermocald.files import write_parts
+from thermocald.numbers import parameter_label, signed
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
-from thermocald.photogrammetry.series.blocks import released
 from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
 from thermocald.physics.effect import PARAMETER_UNITS
-from thermocald.result import Result, jsonable, new_figure
-from thermocald.store.recording.reader import interpolate_readings
+from thermocald.result import Result, document_of, jsonable, new_figure
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -80,12 +79,17 @@ class Course:
     mean; scatter: standard deviation over the epochs; sd: stated by the adjustments, RMS; change:
     of a straight line from the first to the last epoch, with sd_change; p: that chance gives as
     much, corrected for the number of parameters; drifts: p below 1 %, with and without any single
-    group of targets; rests_on: the group without which there would be no drift, or "";
+    group of targets; rests_on: the group without which there would be no drift;
     per_kelvin, sd_per_kelvin, p_temperature: slope on the reference temperature, its standard
     deviation and its p-value, corrected, NaN where that is constant or not known;
     last_minus_first: between the first and the last epoch; sd_by_perspective: of that, if the
     mount could stand anywhere in each: a mount that moves slowly is excluded no better.
     """
+
+    JSON: ClassVar = {
+        "sd": "stated_sd", "sd_by_perspective": "sd_last_minus_first_by_perspective", "drifts": "",
+        "moves": "drift", "scatter_over_sd": "scatter_over_sd",
+    }  # fmt: skip
 
     name: str
     mean: float
@@ -95,7 +99,7 @@ class Course:
     sd_change: float
     p: float
     drifts: bool
-    rests_on: str = ""
+    rests_on: str | None = None
     per_kelvin: float = float("nan")
     p_temperature: float = float("nan")
     last_minus_first: float = float("nan")
@@ -111,32 +115,24 @@ class Course:
     @property
     def in_words(self) -> str:
         """How much it moves, or `none`."""
+        if self.p_temperature < LEVEL:
+            return self.movement
         if self.moves:
-            if self.p_temperature < LEVEL:
-                return f"{self.per_kelvin * 1000:+.3f} ± {self.sd_per_kelvin * 1000:.3f} µm/K"
             return f"in time (p {self.p:.1g})"
         return f"none (only target {self.rests_on} moves)" if self.rests_on else "none"
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the entry of a document."""
-        return {
-            "name": self.name,
-            "mean": self.mean,
-            "scatter": self.scatter,
-            "stated_sd": self.sd,
-            "scatter_over_sd": self.scatter / self.sd,
-            "change": self.change,
-            "sd_change": self.sd_change,
-            "last_minus_first": self.last_minus_first,
-            "sd_last_minus_first": self.sd_last_minus_first,
-            "sd_last_minus_first_by_perspective": self.sd_by_perspective,
-            "p": self.p,
-            "drift": self.moves,
-            "per_kelvin": self.per_kelvin,
-            "sd_per_kelvin": self.sd_per_kelvin,
-            "p_temperature": self.p_temperature,
-            "rests_on": self.rests_on or None,
-        }
+    @property
+    def movement(self) -> str:
+        """How much it moves: by the kelvin where it follows the temperature, else altogether."""
+        if self.p_temperature < LEVEL:
+            return signed(1e3 * self.per_kelvin, 1e3 * self.sd_per_kelvin, "µm/K")
+        moved = signed(1e3 * self.last_minus_first, 1e3 * self.sd_last_minus_first, "µm")
+        return f"{moved} from the first epoch to the last"
+
+    @property
+    def scatter_over_sd(self) -> float:
+        """How much more the parameter scatters than its standard deviations state."""
+        return self.scatter / self.sd
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -211,11 +207,9 @@ class Epochs(Result):
         )  # fmt: skip
 
     def parts(self) -> Iterator[Epochs]:
-        """All rows, some thousand at a time; what was used of a long series leaves memory."""
+        """Yield all rows, some thousand at a time."""
         for first in range(0, max(len(self.number), 1), _ROWS):
             yield self.part(slice(first, first + _ROWS))
-            released(self.values)
-            released(self.sd)
 
     @cached_property
     def ok(self) -> NDArray[np.bool_]:
@@ -269,7 +263,7 @@ class Epochs(Result):
             "field_movements": [
                 {**m.as_dict(), "sentence": m.sentence} for m in self.field_movements
             ],
-            "parameters": [{**c.as_dict(), "sd_mean_level": level[c.name]} for c in self.drifts],
+            "parameters": [{**document_of(c), "sd_mean_level": level[c.name]} for c in self.drifts],
             "without_result": [
                 {"epoch": int(self.number[i]), "status": self.status[i], "reason": self.reasons[i]}
                 for i in np.flatnonzero(~ok).tolist()
@@ -280,12 +274,26 @@ class Epochs(Result):
         converted: dict[str, Any] = jsonable(document)
         return converted
 
+    def answer(self) -> str:
+        """Return how c, x0 and y0 move, or that they do not; what was calibrated without drifts."""
+        drawn = [course for course in self.drifts if course.name in _DRAWN]
+        if not drawn:
+            return super().answer()
+        moving = [f"{parameter_label(c.name)} moves by {c.movement}" for c in drawn if c.moves]
+        still = [parameter_label(c.name) for c in drawn if not c.moves]
+        if still:
+            moving.append(f"{', '.join(still)} {'do' if len(still) > 1 else 'does'} not drift")
+        seen = self.temperature[self.ok & np.isfinite(self.temperature)]
+        within = f"between {seen.min():.0f} and {seen.max():.0f} °C " if len(seen) else ""
+        return f"In {len(self)} epochs {within}{'; '.join(moving)}"
+
     def lines(self) -> list[str]:
         """Return what `thermocald replay` prints."""
         document = self.as_dict()
         stands = _EXTERIOR_WORDS[self.exterior]
         calibrated = f"{document['ok']} of {document['epochs']} epochs calibrated"
-        rejected = f"{document['rejected']} rejected observations"
+        count = document["rejected"]
+        rejected = f"{count} rejected observation{'' if count == 1 else 's'}"
         out = [f"{calibrated}, exterior orientation {stands}, {rejected}"]
         if document["sigma0"] is not None:
             out.append(
@@ -348,7 +356,7 @@ class Epochs(Result):
             y, sd = 1e3 * getattr(self, name)[ok], 1e3 * getattr(self, f"sd_{name}")[ok]
             y = y - y[:1]
             axis.errorbar(x, y, BAND * np.nan_to_num(sd), fmt=".", ms=3, lw=0.6)
-            axis.set_ylabel(f"change of {name} in µm")
+            axis.set_ylabel(f"change of {parameter_label(name)} in µm")
             axis.grid(alpha=0.3)
         if against != "temperature":
             from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
@@ -527,13 +535,13 @@ def _table_of(drifts: Sequence[Course]) -> list[str]:
 def calibrate_epochs(
     epochs: Iterable[Epoch],
     calibrator: Calibrator,
-    temperature: Mapping[int, float],
+    temperature: Array,
     advance: Callable[[int], None] | None = None,
     jobs: int = 1,
 ) -> tuple[Epochs, list[Observations | None]]:
     """Adjust epochs one by one; their table, and the observations for a series adjustment.
 
-    temperature: {epoch number: °C at the frame's time}; jobs: processes.
+    temperature (E,): °C at the frames' times; jobs: processes.
     """
     rows, observations = [], []
     for done in calibrated_epochs(calibrator, epochs, jobs):
@@ -545,7 +553,7 @@ def calibrate_epochs(
     table = Epochs(
         np.array([n for n, _, _ in rows], dtype=np.int64),
         np.array([t for _, t, _ in rows]),
-        np.array([temperature.get(n, np.nan) for n, _, _ in rows]),
+        temperature,
         np.array([a.values if a.ok else np.full(16, np.nan) for _, _, a in rows]).reshape(-1, 16),
         np.array([a.sd if a.ok else np.full(16, np.nan) for _, _, a in rows]).reshape(-1, 16),
         np.array([a.sigma0 if a.ok else np.nan for _, _, a in rows]),
@@ -556,14 +564,6 @@ def calibrate_epochs(
         "per_epoch",
     )
     return table, observations
-
-
-def frame_temperatures(
-    number: NDArray[np.int64], frame_time: Array, reading_time: Array, readings: Array
-) -> dict[int, float]:
-    """{epoch number: °C at the frame's time}, from readings at their own times."""
-    values = interpolate_readings(frame_time, reading_time, readings)
-    return dict(zip(number.tolist(), values.tolist(), strict=True))
 
 
 def csv_text(parts: Iterable[Columns], separator: str = ",", decimal: str = ".") -> Iterator[str]:

@@ -1,29 +1,42 @@
-"""The table of a recording: its epochs one by one, then the series; a long one in blocks."""
+"""The table of a recording: its epochs one by one, then the series; a long one in blocks.
+
+And series in a store: a recording replayed into one, and the table of what is stored.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import sys
+import time
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.calibrator import EPOCHS_OF_A_BLOCK, Calibrator, calibrated_epochs
 from thermocald.analysis.series.adjusted import table_of_series
-from thermocald.analysis.series.epochs import Epochs, calibrate_epochs, frame_temperatures
-from thermocald.errors import DataError
+from thermocald.analysis.series.drift import with_drifts
+from thermocald.analysis.series.epochs import Epochs, calibrate_epochs
+from thermocald.errors import DataError, UsageError
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.long_series import together_at_most
+from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
+from thermocald.store.database.store import Store
+from thermocald.store.series import EpochResult
+from thermocald.store.stored_recording import StoredRecording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations
-    from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.store.recording.reader import Recording
+    from thermocald.store.series import StoredSeries
 
-__all__ = ["recorded_table"]
 
 _STARTS = 25  # epochs of a long series that are calibrated by themselves, for a start
 
@@ -48,22 +61,15 @@ def recorded_table(
     head, targets = recording.head, recording.testfield
     if recording.has_observations and len(recording) > together_at_most(len(targets)):
         start = _start(recording, calibrator)
-        source = _Watched(recording, advance)
         apart = _not_calibrated(recording)
-        table = table_of_series(head, targets, apart, source, adjusted, start, jobs)
+        table = table_of_series(head, targets, apart, recording, adjusted, start, jobs, advance)
         return table, recording.observations
-    columns = recording.columns
-    temperature = {}
-    if recording.channels:
-        readings = columns.readings_of(next(iter(recording.channels)))
-        temperature = frame_temperatures(columns.numbers, columns.frame_time, *readings)
     apart, observations = calibrate_epochs(
-        recording.iter_epochs(), calibrator, temperature, advance, jobs
+        recording.iter_epochs(), calibrator, _temperature(recording), advance, jobs
     )
-    return (
-        table_of_series(head, targets, apart, observations, adjusted, jobs=jobs),
-        lambda row: observations[row],
-    )
+    grid = ObservationGrid.from_observations(targets, observations)
+    table = table_of_series(head, targets, apart, grid, adjusted, jobs=jobs)
+    return table, lambda row: observations[row]
 
 
 def _start(recording: Recording, calibrator: Calibrator) -> Array:
@@ -80,7 +86,7 @@ def _start(recording: Recording, calibrator: Calibrator) -> Array:
             reasons.append(result.reason)
     if not found:
         why = max(reasons, key=reasons.count) if reasons else "no target was measured"
-        raise DataError(f"{recording.name}: no epoch has a result; most often: {why}")
+        raise DataError(f"{recording.head.name}: no epoch has a result; most often: {why}")
     start: Array = np.median(found, axis=0)
     return start
 
@@ -89,33 +95,123 @@ def _not_calibrated(recording: Recording) -> Epochs:
     """The table of a recording's epochs that nobody has calibrated one by one."""
     columns, E = recording.columns, len(recording)
     nothing, none = np.broadcast_to(np.nan, (E, 16)), np.broadcast_to(np.int64(0), (E,))
-    channel = next(iter(recording.channels), None)
-    temperature = np.full(E, np.nan) if channel is None else columns.at_frame(channel)
     return Epochs(
-        columns.numbers, columns.frame_time, temperature, nothing, nothing, nothing[:, 0],
-        none, none, ("ok",) * E, ("",) * E,
-        "per_epoch",
+        columns.numbers, columns.frame_time, _temperature(recording), nothing, nothing,
+        nothing[:, 0], none, none, ("ok",) * E, ("",) * E, "per_epoch",
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Watched:
-    """A recording whose first reading is counted."""
+def _temperature(source: Recording | StoredRecording) -> Array:
+    """Return the reference temperature (E,) °C at the frames' times, NaN where unknown."""
+    reference = next(iter(source.head.channels), None)
+    if reference is None:
+        return np.full(len(source), np.nan)
+    return source.columns.at_frame(reference)
 
-    recording: Recording
-    advance: Callable[[int], None] | None
-    begun: list[bool] = field(default_factory=list)
 
-    def __len__(self) -> int:
-        return len(self.recording)
+def replay_into(
+    path: Path,
+    recording: Recording,
+    settings: AdjustmentSettings,
+    exterior: str,
+    advance: Callable[[int], None],
+    jobs: int = 1,
+) -> Epochs:
+    """Calibrate a recording's epochs into a store, from where an earlier replay stopped.
 
-    def blocks(
-        self, windows: Sequence[slice] | None = None
-    ) -> Iterator[tuple[int, ObservationGrid]]:
-        first_time = windows is None and not self.begun
-        if first_time:
-            self.begun.append(True)
-        for first, grid in self.recording.blocks(windows):
-            yield first, grid
-            if first_time and self.advance is not None:
-                self.advance(len(grid))
+    Returns the epochs with their drifts. jobs: processes; of a block of epochs that was
+    interrupted those that are stored are calibrated again, so that the others are as they would be.
+
+    Raises StoreError; DataError where the store's series of this name is of something else.
+    """
+    # A replay can be repeated: the end of the process must not lose anything, a power cut may.
+    with Store.open(path, "append", durable=False) as store:
+        series = _series(store, recording, settings)
+        last = store.last_epoch(series)
+        calibrator = Calibrator.of_recording(recording, settings)
+        stored = 0 if last is None else int(np.searchsorted(recording.columns.numbers, last + 1))
+        stored -= stored % EPOCHS_OF_A_BLOCK
+        advance(stored)
+        epochs = islice(recording.iter_epochs(), stored, None)
+        for done in calibrated_epochs(calibrator, epochs, jobs):
+            if last is None or done.epoch.number > last:
+                result = EpochResult.from_adjustment(done.adjustment)
+                store.append(series, done.epoch, result, extra=done.extra)
+            advance(1)
+        # while the store is open: targets are left out of a long series by reading it again
+        source = StoredRecording(store, series)
+        return with_drifts(table_of_stored(source, settings, exterior, jobs))
+
+
+def _series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
+    wanted = {"exterior": "per_epoch", "free": list(settings.free)}
+    for series in store.all_series():
+        if (series.camera, series.name) != (recording.camera.name, recording.series):
+            continue
+        if series.head != recording.head or series.testfield.names != recording.testfield.names:
+            raise DataError(
+                f"{store.path}: holds a series {series.camera}/{series.name} of another recording; "
+                "use another store, or change `series` in recording.yaml"
+            )
+        if series.settings.get("free") != wanted["free"]:
+            raise UsageError(
+                f"{store.path}: series {series.name!r} was calibrated with --free "
+                f"{','.join(series.settings.get('free', []))}; keep to that, or use another store"
+            )
+        return series
+    return store.create_series(
+        recording.head, recording.testfield, settings=wanted, created_utc=time.time()
+    )
+
+
+def table_of_stored(
+    source: StoredRecording, settings: AdjustmentSettings, exterior: str, jobs: int = 1
+) -> Epochs:
+    """Return the table of a series in an open store. Raises DataError where it has no epochs."""
+    store, series, size = source.store, source.series, len(source)
+    if size == 0:
+        raise DataError(f"{store.path}: series {series.name!r} has no epochs")
+    names = ["sigma0", "n_observations", "n_rejected", "status"]
+    columns = {n: c[:size] for n, c in store.series_columns(series, names).items()}
+    ok = columns["status"] == "ok"
+    if exterior != "stored":
+        series.head.require_calibrated(str(store.path))
+    known = ok | series.head.predicted
+    reasons = [""] * size
+    if not ok.all():
+        rows = {int(n): i for i, n in enumerate(source.columns.numbers) if not ok[i]}
+        for stored in store.epochs(series, details=False):
+            if stored.epoch.number in rows:
+                reasons[rows[stored.epoch.number]] = stored.result.reason
+    apart = Epochs(
+        source.columns.numbers,
+        source.columns.frame_time,
+        _temperature(source),
+        _parameters(source, "", known),
+        # those of a long series take as much memory as its values, and nothing else reads them
+        _parameters(source, "sd_", known)
+        if exterior == "stored"
+        else np.broadcast_to(np.nan, (size, 16)),
+        np.where(ok, columns["sigma0"], np.nan),
+        columns["n_observations"].astype(np.int64),
+        columns["n_rejected"].astype(np.int64),
+        tuple(map(sys.intern, columns["status"].tolist())),
+        tuple(reasons),
+        "per_epoch",
+        head=series.head,
+    )
+    if not ok.any() or exterior == "stored":
+        return apart
+    return table_of_series(
+        series.head, series.testfield, apart, source, SeriesSettings.of(settings, exterior),
+        jobs=jobs,
+    )  # fmt: skip
+
+
+def _parameters(source: StoredRecording, prefix: str, ok: NDArray[np.bool_]) -> Array:
+    """Return the columns (E, 16) of all parameters."""
+    out = np.empty((len(ok), 16))
+    for k, name in enumerate(PARAMETER_NAMES):
+        column = source.store.series_columns(source.series, [f"{prefix}{name}"])[f"{prefix}{name}"]
+        out[:, k] = np.where(ok, column[: len(ok)], np.nan)
+    return out

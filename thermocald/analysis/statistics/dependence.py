@@ -1,4 +1,4 @@
-"""How a parameter depends on the temperature: correlation, its significance, and the slope.
+"""The dependence of a parameter on the temperature: correlation, significance, and slope.
 
 Pearson's r with the t-test as the reference has it (Elias et al. 2020, section 4.3), which counts
 every epoch as independent, and alongside it a test that holds for noise with a memory. The slope is
@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -67,7 +67,7 @@ _LONG_MEMORY = 0.15  # of the series
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlopeNoise:
-    """What the noise of a series makes of the slope on `x`.
+    """The noise of a series and what it makes of the slope on `x`.
 
     sd: of the slope; n: values; n_effective: independent values that determine it as well;
     lag_one: correlation of the noise of neighbouring epochs; memory: epochs after which the
@@ -112,16 +112,10 @@ def slope_noise(
     # Frequencies at which x is its own noise say nothing of the slope.
     power = u * u
     around = np.convolve(power, np.full(_NEIGHBOURS, 1.0 / _NEIGHBOURS), "same")[: len(u)]
-    unknown = around < min(_ABOVE_NOISE * sd_x**2, float(around.max()))
-    del around
-    uu, ur = power, u  # in their place: of a year of epochs every array counts
-    uu -= sd_x**2
-    uu[unknown] = 0.0
-    ur *= r
-    ur += slope * sd_x**2
-    ur[unknown] = 0.0
-    r *= r
-    uu, ur, rr = at.sums(uu), at.sums(ur), at.sums(r)
+    known = around >= min(_ABOVE_NOISE * sd_x**2, float(around.max()))
+    uu = at.sums(np.where(known, power - sd_x**2, 0.0))
+    ur = at.sums(np.where(known, u * r + slope * sd_x**2, 0.0))
+    rr = at.sums(r * r)
     phi, coloured, tau, prior = _models(max(_LONGEST, float(n)))
     spectrum = at.spectra(mixtures(phi, coloured))
 
@@ -194,37 +188,22 @@ def fit_straight_line(
         total = float(np.sum(weight))
         xb, yb = float(np.dot(weight, u0)) / total, float(np.dot(weight, v0)) / total
         u, v = u0 - xb, v0 - yb
-        beta = u * var_y
-        beta += slope * v * var_x
-        beta *= weight
+        beta = (u * var_y + slope * v * var_x) * weight
         weighted = weight * beta
         previous, slope = slope, float(np.dot(weighted, v) / np.dot(weighted, u))
-        del weighted, v  # of a year of epochs every array counts
-        u *= u
-        if abs(slope - previous) <= _CONVERGED / np.sqrt(float(np.dot(weight, u))):
+        if abs(slope - previous) <= _CONVERGED / np.sqrt(float(np.dot(weight, u * u))):
             break
-    del u
     weight = np.broadcast_to(1.0 / (var_y + slope**2 * var_x), x.shape)
-    adjusted = beta
-    adjusted += xb
-    adjusted_mean = float(np.dot(weight, adjusted)) / total
-    adjusted -= adjusted_mean
-    adjusted *= adjusted
-    sd_slope = float(1.0 / np.sqrt(np.dot(weight, adjusted)))
-    del adjusted, beta
-    at_zero = adjusted_mean + mean_x
-    u0 -= xb
-    u0 *= slope
-    v0 -= yb
-    v0 -= u0
-    residual = v0
-    residual *= residual
+    adjusted = beta + xb
+    middle = float(np.dot(weight, adjusted)) / total
+    sd_slope = float(1.0 / np.sqrt(np.dot(weight, (adjusted - middle) ** 2)))
+    residual = v0 - yb - (u0 - xb) * slope
     return StraightLine(
         slope,
         sd_slope,
         mean_y + yb - slope * (mean_x + xb),
-        float(np.hypot(1 / np.sqrt(total), at_zero * sd_slope)),
-        float(np.dot(weight, residual)),
+        float(np.hypot(1 / np.sqrt(total), (middle + mean_x) * sd_slope)),
+        float(np.dot(weight, residual**2)),
         n - 2,
     )
 
@@ -245,6 +224,10 @@ class Dependence:
     the two noises explain; too_short: the noise remembers so much of the series that sd_slope is an
     order of magnitude only.
     """
+
+    JSON: ClassVar = {
+        "lag_one": "residual_lag_one", "p_value": "p", "misfit": "scatter_over_noise",
+    }  # fmt: skip
 
     n: int
     r: float
@@ -306,7 +289,6 @@ def dependence(
         raise ValueError("a dependence needs four epochs, values and a temperature that vary")
     x, y = temperature - temperature.mean(), values - values.mean()
     r = float(np.clip(np.dot(x, y) / np.sqrt(np.dot(x, x) * np.dot(y, y)), -1.0, 1.0))
-    del x, y  # of a year of epochs every array counts
 
     line = fit_straight_line(temperature, values, temperature_sd, sds)
     misfit = line.misfit

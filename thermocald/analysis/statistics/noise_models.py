@@ -25,16 +25,18 @@ Sources: Whittle (1953), Estimation and information in stationary time series; B
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+
+from thermocald.photogrammetry.linalg import mad_sd
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 
 # Beyond this many low frequencies, which carry the slow correlation, neighbours are pooled.
@@ -264,28 +266,14 @@ class DriftTest:
     sds; epochs: how many were used.
     """
 
-    p_value: float = field(metadata={"json": "p"})
+    JSON: ClassVar = {"p_value": "p"}
+
+    p_value: float
     p_excess: float
     variance_ratio: float
     noise_ratio: float
     sd_noise_ratio: float
     epochs: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Spectrum:
-    """Squared cosine coefficients, pooled: sums (m,), at which frequencies.
-
-    first (k,): the coefficients themselves, of those frequencies that are not pooled.
-    """
-
-    power: Array
-    at: Frequencies
-    first: Array
-
-    @property
-    def count(self) -> Array:
-        return self.at.count
 
 
 def drift_test(
@@ -310,15 +298,24 @@ def drift_test(
     standardised = _without_spikes(standardised)
     calm = _without_jumps(standardised)
     at = Frequencies.of(n, times)
-    whole, fast = _spectrum(standardised, at), _spectrum(calm, at)
-    bands = _bands(n, window, whole)
-    trend = _trend(at, np.arange(n, dtype=float) if times is None else times, len(fast.first))
-    results = [_slow_against_fast(whole, fast, trend, band) for band in bands]
+    whole, fast = at.coefficients(standardised), at.coefficients(calm)
+    power = at.sums(whole**2)
+    single = int(np.argmax(at.count > 1)) if at.count[-1] > 1 else len(at.count)
+    bands = _bands(n, window, at)
+    trend = _trend(at, np.arange(n, dtype=float) if times is None else times, single)
+    spectra = at.spectra(MODELS)
+    fast_power = at.sums(fast**2)
+    results = [
+        _slow_against_fast(
+            power, _without_trend(fast_power, fast[:single], trend, band), at, spectra, band
+        )
+        for band in bands
+    ]
     noise_ratio, sd_noise_ratio = _noise(values, sds)
     mean_square = float(np.mean(sds**2))
     return DriftTest(
         min(1.0, len(bands) * min(results)),
-        _excess(whole, fast, bands[0], float(np.sum(redundancy))),
+        _excess(power, fast_power, at, spectra, bands[0], float(np.sum(redundancy))),
         float(np.var(values, ddof=1)) / mean_square,
         noise_ratio,
         sd_noise_ratio,
@@ -326,10 +323,13 @@ def drift_test(
     )
 
 
-def _scale_of_steps(steps: Array) -> tuple[float, float]:
-    """Median of the increments and their robust standard deviation."""
-    middle = float(np.median(steps))
-    return middle, 1.4826 * float(np.median(np.abs(steps - middle)))
+def _few_far(distance: Array, steps: Array) -> Mask:
+    """Mark the distances (m,) that are far by the scatter of the increments (n - 1,) of a series.
+
+    None where they are many: then they are noise.
+    """
+    far: Mask = np.abs(distance) > _JUMP * mad_sd(steps - np.median(steps))
+    return far if far.sum() <= _MOST_JUMPS * (len(steps) + 1) else np.zeros_like(far)
 
 
 def _without_spikes(y: Array) -> Array:
@@ -338,11 +338,9 @@ def _without_spikes(y: Array) -> Array:
     # the middle one of three neighbours
     between = np.minimum(y[:-2], y[1:-1])
     np.maximum(between, np.minimum(np.maximum(y[:-2], y[1:-1]), y[2:]), out=between)
-    _, scale = _scale_of_steps(np.diff(y))
     inner = out[1:-1]
-    spike = np.abs(inner - between) > _JUMP * scale
-    if spike.sum() <= _MOST_JUMPS * len(y):
-        inner[spike] = between[spike]
+    spike = _few_far(inner - between, np.diff(y))
+    inner[spike] = between[spike]
     return out
 
 
@@ -352,52 +350,46 @@ def _without_jumps(y: Array) -> Array:
     Many are noise themselves, of few values: rounded, or to and fro.
     """
     steps = np.diff(y)
-    middle, scale = _scale_of_steps(steps)
-    jump = np.abs(steps - middle) > _JUMP * scale
-    calm = np.where(jump & (jump.sum() <= _MOST_JUMPS * len(y)), middle, steps)
+    middle = np.median(steps)
+    calm = np.where(_few_far(steps - middle, steps), middle, steps)
     return np.concatenate([[0.0], np.cumsum(calm)])
 
 
-def _spectrum(y: Array, at: Frequencies) -> _Spectrum:
-    coefficients = at.coefficients(y)
-    single = int(np.argmax(at.count > 1)) if at.count[-1] > 1 else len(at.count)
-    return _Spectrum(at.sums(coefficients**2), at, coefficients[:single].copy())
-
-
-def _bands(n: int, window: int, spectrum: _Spectrum) -> list[int]:
+def _bands(n: int, window: int, at: Frequencies) -> list[int]:
     """Ends of the slow bands, as positions in the pooled spectrum; at least one."""
     most = max(2, n // window)
     ends = [min(_FIRST_BAND, most)]
     while ends[-1] * _WIDENING <= most:
         ends.append(ends[-1] * _WIDENING)
-    reached = np.cumsum(spectrum.count)
+    reached = np.cumsum(at.count)
     return [int(np.searchsorted(reached, end)) + 1 for end in ends]
 
 
-def _slow_against_fast(whole: _Spectrum, fast: _Spectrum, trend: Array, band: int) -> float:
-    """p-value of the slow band, continued from the fast one."""
+def _slow_against_fast(
+    power: Array, high: Array, at: Frequencies, models: Array, band: int
+) -> float:
+    """p-value of the slow band, continued from the fast one under models (g, m).
+
+    power (m,): of the series; high: of its calm part beyond the band.
+    """
     from scipy.stats import f
 
-    models = whole.at.spectra(MODELS)
-    high = _without_trend(fast, trend, band)
-    degrees = float(fast.count[band:].sum()) - 2.0
+    degrees = float(at.count[band:].sum()) - 2.0
     if degrees < _LEAST_FAST:
         return 1.0
     size = np.maximum((high / models[:, band:]).sum(axis=1) / degrees, _NOTHING)
-    deviance = degrees * np.log(size)
-    deviance = deviance + np.log(models[:, band:]) @ fast.count[band:]
-    slow = float(whole.count[:band].sum())
-    ratio = (whole.power[:band] / models[:, :band]).sum(axis=1) / slow / size
+    deviance = degrees * np.log(size) + np.log(models[:, band:]) @ at.count[band:]
+    slow = float(at.count[:band].sum())
+    ratio = (power[:band] / models[:, :band]).sum(axis=1) / slow / size
     return largest_p_value(np.asarray(f.sf(ratio, slow, degrees)), deviance)
 
 
-def _without_trend(fast: _Spectrum, trend: Array, band: int) -> Array:
-    """Power of the fast part without what a trend leaks into it.
+def _without_trend(power: Array, first: Array, trend: Array, band: int) -> Array:
+    """Power beyond a band without what a trend leaks into it; first (k,): of single frequencies.
 
     Cosines end flat; a drift that does not is a line and a parabola more, which are taken out.
     """
-    power = fast.power[band:].copy()
-    high = fast.first[band:]
+    power, high = power[band:].copy(), first[band:]
     if len(high) > 2:
         basis, _ = np.linalg.qr(trend[band:])
         power[: len(high)] = (high - basis @ (basis.T @ high)) ** 2
@@ -410,18 +402,19 @@ def _trend(at: Frequencies, times: Array, count: int) -> Array:
     return np.stack([at.coefficients(t**k)[:count] for k in (1, 2)], axis=1)
 
 
-def _excess(whole: _Spectrum, fast: _Spectrum, band: int, redundancy: float) -> float:
+def _excess(
+    power: Array, fast: Array, at: Frequencies, models: Array, band: int, redundancy: float
+) -> float:
     """p-value of the variance of the standardised series, which the sds say is 1."""
     from scipy.stats import f
 
-    models = whole.at.spectra(MODELS)
-    deviance = (fast.power[band:] / models[:, band:]).sum(axis=1)
-    deviance = deviance + np.log(models[:, band:]) @ fast.count[band:]
+    deviance = (fast[band:] / models[:, band:]).sum(axis=1)
+    deviance = deviance + np.log(models[:, band:]) @ at.count[band:]
     # A sum of squares of unequal variances: Satterthwaite's degrees of freedom.
-    expected = models @ whole.count
-    degrees = expected**2 / (models**2 @ whole.count)
+    expected = models @ at.count
+    degrees = expected**2 / (models**2 @ at.count)
     return largest_p_value(
-        np.asarray(f.sf(whole.power.sum() / expected, degrees, max(redundancy, 1.0))), deviance
+        np.asarray(f.sf(power.sum() / expected, degrees, max(redundancy, 1.0))), deviance
     )
 
 

@@ -115,7 +115,7 @@ class Population:
         return self.mean + covariance @ push, covariance
 
     def _weights_error(self, found: Array, push: Array, information: Array) -> tuple[Array, Array]:
-        """What Σ's own errors do to the values, (k, k): of its variances, and of its correlations.
+        """Return what Σ's own errors do to the values, (k, k): its variances, and its correlations.
 
         After Kackar and Harville (1984).
         """

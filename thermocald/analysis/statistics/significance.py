@@ -13,12 +13,15 @@ of the coefficients.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
@@ -33,25 +36,15 @@ _STRETCH = 1.5
 class MovingFTest:
     """The F-test of every epoch of a series.
 
-    index: epochs (m,) that are window centres; variance, mean_square_sd (m,): moving variance and
-    moving mean of the squared standard deviations; critical (m,): of their ratio at `alpha`;
-    degrees_variance; degrees_sd (m,); left_out: epochs without a test (ends and gaps).
+    index: epochs (m,) that are window centres; ratio (m,): of the moving variance over the moving
+    mean of the squared standard deviations; critical (m,): of it at the level; degrees_sd (m,): of
+    freedom of the mean squared standard deviations.
     """
 
-    window: int
-    alpha: float
     index: NDArray[np.int64]
-    variance: Array
-    mean_square_sd: Array
+    ratio: Array
     critical: Array
-    degrees_variance: int
     degrees_sd: NDArray[np.int32]
-    left_out: int
-
-    @property
-    def ratio(self) -> Array:
-        """Variance over mean squared standard deviation (m,)."""
-        return self.variance / self.mean_square_sd
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -65,30 +58,22 @@ class MovingFTest:
 
 
 def moving_mean(values: Array, window: int) -> Array:
-    """Means of `window` consecutive values (n,) → (n - window + 1,), centred on i + window//2."""
+    """Return means of `window` consecutive values (n,) → (n - window + 1,)."""
     return _moving(values, window, np.mean)
 
 
 def moving_variance(values: Array, window: int) -> Array:
-    """Sample variances (n-1) of `window` consecutive values (n,) → (n - window + 1,)."""
-    return _moving(values, window, _variance)
+    """Return sample variances (n-1) of `window` consecutive values (n,) → (n - window + 1,)."""
+    return _moving(values, window, partial(np.var, ddof=1))
 
 
-def _variance(block: Array, axis: int) -> Array:
-    return np.asarray(np.var(block, axis=axis, ddof=1))
-
-
-def _moving(values: Array, window: int, statistic: object) -> Array:
-    assert callable(statistic)
+def _moving(values: Array, window: int, statistic: Callable[..., Any]) -> Array:
     if len(values) < window:
         return np.empty(0)
     views = np.lib.stride_tricks.sliding_window_view(values, window)
-    result = np.empty(len(views))
     # In chunks: running sums would cancel where the drift is large against the noise.
-    for start in range(0, len(views), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        result[part] = statistic(views[part], axis=1)
-    return result
+    parts = (views[start : start + _CHUNK] for start in range(0, len(views), _CHUNK))
+    return np.concatenate([statistic(part, axis=1) for part in parts])
 
 
 def unbroken_windows(time_s: Array, window: int) -> NDArray[np.int64]:
@@ -127,18 +112,8 @@ def moving_f_test(
     different = np.flatnonzero(np.bincount(degrees_sd))
     quantiles = np.zeros(int(different.max(initial=0)) + 1)
     quantiles[different] = f.isf(alpha, window - 1, np.maximum(different, 1.0))
-    critical = quantiles[degrees_sd]
-    return MovingFTest(
-        window,
-        alpha,
-        starts + window // 2,
-        moving_variance(values, window)[starts],
-        moving_mean(sds**2, window)[starts],
-        critical,
-        window - 1,
-        degrees_sd,
-        len(values) - len(starts),
-    )
+    ratio = moving_variance(values, window)[starts] / moving_mean(sds**2, window)[starts]
+    return MovingFTest(starts + window // 2, ratio, quantiles[degrees_sd], degrees_sd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +124,11 @@ class IopCorrelations:
     largest deviation from the median; epochs: how many matrices were used.
     """
 
+    JSON: ClassVar = {"largest": "largest_deviation"}
+
     median: Array
     noise: Array
-    largest: Array = field(metadata={"json": "largest_deviation"})
+    largest: Array
     epochs: int
 
 

@@ -3,30 +3,39 @@
 Only epochs with a result are rows; what the others lacked is counted by reason. Standard deviations
 are those that one epoch adds to its series: what all epochs have in common (the exterior
 orientation, the test field) cancels in every comparison between epochs.
+
+Unless `exterior="per_epoch"` all epochs are adjusted together from their observations. With it a
+store's series is read as it was stored, column by column, with a sample of its covariance matrices.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.analysis.statistics.significance import correlations_of
+from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.series.blocks import released
+from thermocald.store.recording.readings import interpolate_readings
+from thermocald.store.stored_recording import StoredRecording
+from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.photogrammetry.series.field_motion import FieldMovement
-
-__all__ = ["Clip", "MeasuredSeries", "Thermometer"]
+    from thermocald.store.recording.reader import Recording
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +49,7 @@ class Thermometer:
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Where to cut the image around one target in the first and the last frame that exist.
+    """A piece of the image around one target, in the first and the last frame that exist.
 
     first, last: image files; first_epoch, last_epoch: their numbers; centre: px in the first.
     """
@@ -97,23 +106,17 @@ class MeasuredSeries:
     @cached_property
     def free(self) -> tuple[str, ...]:
         """The IOP that were estimated, in their order."""
-        return tuple(n for n in IOP_NAMES if bool(np.any(self._column(self.sds, n) > 0)))
+        return tuple(n for n in IOP_NAMES if bool(np.any(self.column(n)[1] > 0)))
 
     @cached_property
     def mean(self) -> Array:
         """The mean interior orientation (10,) of the epochs."""
-        return np.array([np.mean(self._column(self.values, name)) for name in IOP_NAMES])
-
-    @staticmethod
-    def _column(values: Array, name: str) -> Array:
-        """A copy (E,): columns of a series of a year are on disk, and leave memory again."""
-        out: Array = values[:, IOP_NAMES.index(name)].copy()
-        released(values)
-        return out
+        return np.array([np.mean(self.column(name)[0]) for name in IOP_NAMES])
 
     def column(self, name: str) -> tuple[Array, Array]:
-        """Values and standard deviations (E,) of one parameter of the interior orientation."""
-        return self._column(self.values, name), self._column(self.sds, name)
+        """Return copies of the values and standard deviations (E,) of one IOP."""
+        k = IOP_NAMES.index(name)
+        return self.values[:, k].copy(), self.sds[:, k].copy()
 
     @property
     def reference(self) -> Thermometer | None:
@@ -124,3 +127,136 @@ class MeasuredSeries:
     def interval_s(self) -> float:
         """Median time between epochs, NaN for a single one."""
         return float(np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
+
+
+_MOST_MATRICES = 5000
+
+
+def refuse_copies(series: Sequence[MeasuredSeries]) -> None:
+    """Raise DataError where two series hold the same epochs."""
+    for i, one in enumerate(series):
+        for other in series[:i]:
+            if len(one) > 1 and len(one) == len(other) and np.array_equal(one.values, other.values):
+                raise DataError(
+                    f"{one.source} holds the same epochs as {other.source}; give each series once"
+                )
+
+
+def measured_series(
+    source: Recording | StoredRecording,
+    table: Epochs,
+    observations: Callable[[int], Observations | None],
+    label: str,
+    thermometer_sd: float | None = None,
+) -> MeasuredSeries:
+    """Return calibrated epochs as the study reads them.
+
+    table: of the series, adjusted together or as they were stored; observations: what an epoch
+    (from 0) shows; label: what the study treats as one camera; thermometer_sd K, by default from
+    the readings. Raises DataError where no epoch has a result.
+    """
+    ok, without_result = _assessed(table)
+    if not ok.any():
+        lost = ", ".join(f"{n} × {reason}" for reason, n in without_result.items())
+        raise DataError(f"{source.title}: no epoch has a result ({lost or 'it has no epochs'})")
+    adjustment = table.adjustment
+    if isinstance(source, StoredRecording) and adjustment is None:
+        redundancy = source.store.series_columns(source.series, ["redundancy"])["redundancy"]
+        exterior = str(source.series.settings.get("exterior", table.exterior))
+        rows = _spread(int(ok.sum()))
+        numbers = table.number[ok][rows].tolist()
+        covariances = source.store.covariances(source.series, numbers)[:, :10, :10]
+        have = np.isfinite(covariances).all(axis=(1, 2))
+        rows, covariances = rows[have], covariances[have]
+    else:
+        assert adjustment is not None  # a table with a result has one
+        redundancy, exterior = table.redundancy, table.exterior
+        of = np.arange(len(ok)) if table.sampled is None else table.sampled
+        some = np.flatnonzero(ok[of] & adjustment.ok)
+        some = some[_spread(len(some))]
+        rows = (np.cumsum(ok) - 1)[of[some]]
+        covariances = adjustment.covariance[some][:, :10, :10]
+    time_s = table.frame_time[ok]
+    return MeasuredSeries(
+        label,
+        source.head.series,
+        source.head.camera.name,
+        source.head.camera.sensor,
+        source.title,
+        table.number[ok],
+        time_s - time_s[0],
+        _thermometers(source, time_s, thermometer_sd),
+        table.values[ok, :10],
+        table.sd[ok, :10],
+        table.sigma0[ok],
+        redundancy[: len(ok)][ok],
+        correlations_of(covariances),
+        rows,
+        exterior,
+        without_result,
+        _clip(source, ok, observations),
+        float(time_s[0]),
+        "" if adjustment is None else adjustment.choice,
+        float("nan") if adjustment is None else adjustment.noise_ratio,
+        table.field_movements,
+    )
+
+
+def _assessed(table: Epochs) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    """Return which epochs have every number that others have, and {reason: epochs without result}.
+
+    A covariance matrix at the edge of singularity can have negative variances, that is not an sd.
+    """
+    ok = table.ok
+    lost = sorted((word, n) for word, n in Counter(table.status).items() if word != "ok")
+    counted = {word.replace("_", " "): n for word, n in lost}
+    whole = ok & np.isfinite(table.values[:, :10]).all(axis=1)
+    known = np.isfinite(table.sd[:, :10])
+    whole &= known[:, known[ok].any(axis=0)].all(axis=1)
+    if missing := int(np.count_nonzero(ok & ~whole)):
+        counted["no standard deviation"] = missing
+    return whole, counted
+
+
+def _thermometers(
+    source: Recording | StoredRecording, times: Array, sd: float | None
+) -> tuple[Thermometer, ...]:
+    """Return every channel at some times (E,) s UTC, its noise as given or from the readings."""
+    found = []
+    for name, channel in source.head.channels.items():
+        read, readings = source.columns.readings_of(name)
+        values = interpolate_readings(times, read, readings)
+        noise = estimate_reading_noise(read, readings, channel.resolution) if sd is None else sd
+        found.append(Thermometer(name, values, noise))
+    return tuple(found)
+
+
+def _spread(count: int) -> NDArray[np.int64]:
+    """Return some thousand rows at most, evenly over `count`."""
+    return np.unique(np.linspace(0, count - 1, min(count, _MOST_MATRICES)).astype(np.int64))
+
+
+def _clip(
+    source: Recording | StoredRecording,
+    ok: NDArray[np.bool_],
+    observations: Callable[[int], Observations | None],
+) -> Clip | None:
+    """Return a clip about the target nearest to the centre that both ends show; None without."""
+    ends = source.framed(ok)
+    if len(ends) != 2 or not all(frame.is_file() for _, frame in ends):
+        return None
+    (i, first_frame), (k, last_frame) = ends
+    first, last = observations(i), observations(k)
+    if first is None or last is None:
+        return None
+    both = np.isin(first.targets, last.targets)
+    if not both.any():
+        return None
+    points = first.points[both]
+    nearest = int(np.argmin(np.linalg.norm(points - source.head.camera.sensor.centre, axis=1)))
+    target = source.testfield.names[int(first.targets[both][nearest])]
+    numbers = source.columns.numbers
+    return Clip(
+        target, first_frame, last_frame, int(numbers[i]), int(numbers[k]),
+        (float(points[nearest, 0]), float(points[nearest, 1])),
+    )  # fmt: skip

@@ -1,37 +1,112 @@
-"""Monte-Carlo: what a drifting interior orientation does to points on an object plane.
+"""Effects of a drifting interior orientation on an object plane parallel to the sensor.
 
-Sets of IOP are drawn from a normal distribution with given standard deviations and correlations;
-every image point of a grid is projected with every set on a plane parallel to the sensor, and its
-distance to the expected point is clustered (Elias et al. 2020, sections 3.2 and 4.4). Drawing,
-projection and clustering go through the sets in chunks, so memory does not grow with their number.
-Seeded: the same seed gives the same sets, whatever the chunks.
+The plane lies at a distance in front of the projection centre; a point is where the ray of an image
+point meets it, (X, Y) mm in camera axes. First-order errors: distances of a bivariate normal
+variable (Hoyt 1947, Proc. IRE 35, 652-657).
+
+Monte-Carlo: sets of IOP are drawn from a normal distribution with given standard deviations and
+correlations; every image point of a grid is projected with every set on a plane parallel to the
+sensor, and its distance to the expected point is clustered (Elias et al. 2020, sections 3.2 and
+4.4). Drawing, projection and clustering go through the sets in chunks, so memory does not grow with
+their number. Seeded: the same seed gives the same sets, whatever the chunks.
 
 It answers for the drawn distribution only. IOP that drift with the temperature are not normally
-distributed, and x0 and y0 that drift together are drawn with the adjustments' correlation.
+distributed, and x0 and y0 that drift together are drawn with the adjustments' correlation. So every
+epoch's interior orientation itself is taken too, against three that a user may hold fixed: that of
+the first epoch, the mean of the series, the last.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from thermocald.analysis.camera.undistortion import image_grid
-from thermocald.analysis.study.object_plane import on_plane, plane_jacobian
+from thermocald.analysis.statistics.dependence import correlation_matrix
 from thermocald.errors import GeometryError
 from thermocald.parallel import in_order
-from thermocald.photogrammetry.camera.camera_model import image_to_mm
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP_NAMES,
+    distort,
+    distortion_jacobian,
+    image_to_mm,
+    partials,
+    rays,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
+    from thermocald.analysis.study.measured import MeasuredSeries
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
 
-__all__ = ["CLUSTERS_MM", "MonteCarlo", "draw_root", "plane_errors", "simulate_errors"]
+
+_ANGLES = 720
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceLaw:
+    """Law of the distances |d| of a centred bivariate normal error d.
+
+    axes (k, 2): standard deviations along the two axes of each point's ellipse, mm.
+    """
+
+    axes: Array
+
+    def cumulative(self, distance: ArrayLike) -> Array:
+        """P(|d| < distance) of each point (k, m), for distances (m,) mm."""
+        r2 = np.square(np.atleast_1d(np.asarray(distance, dtype=float)))
+        theta = (np.arange(_ANGLES) + 0.5) * (np.pi / _ANGLES)
+        spread = (self.axes[:, :1] * np.cos(theta)) ** 2 + (self.axes[:, 1:] * np.sin(theta)) ** 2
+        with np.errstate(divide="ignore", over="ignore"):
+            inside = -np.expm1(-r2[None, :, None] / (2 * spread[:, None, :]))
+        return np.asarray(np.mean(inside, axis=-1))
+
+    def mean(self) -> Array:
+        """E|d| of each point (k,) mm."""
+        from scipy.special import ellipe
+
+        large = np.max(self.axes, axis=1)
+        small = np.min(self.axes, axis=1)
+        ratio = np.divide(small, large, out=np.zeros_like(small), where=large > 0)
+        return np.asarray(np.sqrt(2 / np.pi) * large * ellipe(1 - ratio**2))
+
+    def expected_maximum(self, draws: int) -> Array:
+        """Expected largest |d| among `draws` independent errors, of each point (k,) mm."""
+        large = np.max(self.axes, axis=1)
+        steps = np.linspace(0.0, 8.0, 1601)
+        result = np.zeros(len(large))
+        for k in np.flatnonzero(large > 0):
+            law = DistanceLaw(self.axes[k : k + 1])
+            missing = 1 - law.cumulative(steps * large[k])[0] ** draws
+            result[k] = large[k] * float(np.sum((missing[1:] + missing[:-1]) * np.diff(steps)) / 2)
+        return result
+
+
+def on_plane(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: float) -> Array:
+    """Image points (k, 2) px → points (k, 2) mm on the plane; GeometryError where no ray exists."""
+    direction = rays(sensor, iop, points)
+    return np.asarray(-distance_mm * direction[:, :2] / direction[:, 2:])
+
+
+def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: float) -> Array:
+    """∂(X, Y)/∂iop (k, 2, 10) of image points (k, 2) px: mm per unit of each IOP."""
+    plane = on_plane(sensor, iop, points, distance_mm)
+    object_points = np.column_stack([plane, np.full(len(plane), -distance_mm)])
+    _, by_parameter, by_object = partials(sensor, iop, np.zeros(6), object_points)
+    solved = np.linalg.solve(by_object[:, :, :2], by_parameter[:, :, :10])
+    return np.asarray(-solved, dtype=np.float64)
+
+
+def propagate(jacobian: Array, covariance: Array) -> Array:
+    """Covariances (k, 2, 2) mm² of the plane points from the covariance (10, 10) of the IOP."""
+    return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2))
+
 
 CLUSTERS_MM = (15.0, 50.0, 100.0)
 _CHUNK = 1024
@@ -124,8 +199,7 @@ def simulate_errors(
     k = len(points)
     limits = np.asarray(clusters_mm)
     counts = np.zeros((k, len(limits) + 1), dtype=np.int64)
-    total, largest = np.zeros(k), np.zeros(k)
-    first, second = np.zeros((k, 2)), np.zeros((k, 2, 2))
+    largest, sums = np.zeros(k), np.zeros((k, 6))
     sample: list[Array] = []
     rng = np.random.default_rng(seed)
     folded = 0
@@ -133,26 +207,26 @@ def simulate_errors(
         (rng.standard_normal((min(_CHUNK, sets - done), len(root))), max(_SAMPLE - done, 0))
         for done in range(0, sets, _CHUNK)
     )
-    for part in in_order(_simulated, (project, iop, root, limits), draws, jobs):
-        folded += part.folded
-        counts += part.counts
-        total += part.total
-        np.maximum(largest, part.largest, out=largest)
-        first += part.first
-        second += part.second
-        if part.sample.size:
-            sample.append(part.sample)
+    for drawn, ok, part_counts, part_largest, part_sums, first_errors in in_order(
+        _simulated, (project, iop, root, limits), draws, jobs
+    ):
+        folded += drawn - ok
+        counts += part_counts
+        np.maximum(largest, part_largest, out=largest)
+        sums += part_sums
+        sample.append(first_errors)
         if progress is not None:
-            progress(part.sets)
+            progress(drawn)
     used = sets - folded
     if used < 2:
         raise GeometryError(
             f"{folded} of {sets} drawn sets of IOP fold the image over itself: the standard "
             "deviations of the distortion parameters are too large to simulate with"
         )
-    mean_error = first / used
-    second[:, 1, 0] = second[:, 0, 1]
-    covariance = second / used - mean_error[:, :, None] * mean_error[:, None, :]
+    means = sums / used
+    mean_error = means[:, 1:3]
+    second = means[:, [3, 5, 5, 4]].reshape(k, 2, 2)
+    covariance = second - mean_error[:, :, None] * mean_error[:, None, :]
     return MonteCarlo(
         sets,
         seed,
@@ -161,7 +235,7 @@ def simulate_errors(
         points,
         project.expected,
         counts,
-        total / used,
+        means[:, 0],
         largest,
         mean_error,
         covariance,
@@ -170,42 +244,28 @@ def simulate_errors(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """Some of the sets, as in `MonteCarlo`; total, first, second: sums, not means."""
-
-    sets: int
-    folded: int
-    counts: NDArray[np.int64]
-    total: Array
-    largest: Array
-    first: Array
-    second: Array
-    sample: Array
-
-
-def _simulated(known: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]) -> _Part:
-    """Sets from standard normal numbers (n, r), and how many of them a sample still needs.
+def _simulated(
+    known: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]
+) -> tuple[int, int, NDArray[np.int64], Array, Array, Array]:
+    """Simulate sets from standard normal numbers (n, r); of how many a sample still needs them.
 
     known: the projection, the mean IOP (10,), the root (r, 10) of their covariance, the clusters.
+    Returns how many sets were drawn and how many have rays; counts, largest as in `MonteCarlo`;
+    sums (k, 6) of distances, errors, their squares and product; errors (s, k, 2) of the sample.
     """
     (project, iop, root, limits), (normal, wanted) = known, draws
     dx, dy, ok = project(iop + normal @ root)
-    folded = int(np.count_nonzero(~ok))
-    if folded:
+    if not ok.all():
         dx, dy = dx[:, ok], dy[:, ok]
-    k = len(dx)
+    k, n = dx.shape
     distance = np.sqrt(dx * dx + dy * dy)
     beyond = [np.count_nonzero(distance >= limit, axis=1) for limit in limits]
-    edges = np.stack([np.full(k, distance.shape[1]), *beyond, np.zeros(k, dtype=np.int64)])
-    second = np.zeros((k, 2, 2))
-    second[:, 0, 0] = np.einsum("ij,ij->i", dx, dx)
-    second[:, 1, 1] = np.einsum("ij,ij->i", dy, dy)
-    second[:, 0, 1] = np.einsum("ij,ij->i", dx, dy)
-    return _Part(
-        len(normal), folded, -np.diff(edges, axis=0).T, distance.sum(axis=1),
-        distance.max(axis=1, initial=0.0), np.stack([dx.sum(axis=1), dy.sum(axis=1)], axis=1),
-        second, np.stack([dx[:, :wanted], dy[:, :wanted]], axis=-1).swapaxes(0, 1),
+    edges = np.stack([np.full(k, n), *beyond, np.zeros(k, dtype=np.int64)])
+    squares = [np.einsum("ij,ij->i", a, b) for a, b in ((dx, dx), (dy, dy), (dx, dy))]
+    sums = [distance.sum(axis=1), dx.sum(axis=1), dy.sum(axis=1), *squares]
+    return (
+        len(normal), n, -np.diff(edges, axis=0).T, distance.max(axis=1, initial=0.0),
+        np.stack(sums, axis=1), np.stack([dx[:, :wanted].T, dy[:, :wanted].T], axis=-1),
     )  # fmt: skip
 
 
@@ -243,79 +303,116 @@ class _PlaneErrors:
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def __call__(self, sets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Sets (n, 10) → errors in X and Y (k, n) mm, and which sets have rays at all (n,)."""
+        sets = np.asfortranarray(sets)
         step = (sets - self._iop).T
-        x = self._ideal[:, :1] + self._by_iop[:, 0] @ step
-        y = self._ideal[:, 1:] + self._by_iop[:, 1] @ step
-        distortion = _Distortion(sets)
-        xm = self._mm[:, :1] - sets[:, 1]
-        ym = self._mm[:, 1:] - sets[:, 2]
-        ok = np.ones(len(sets), dtype=bool)
-        rx, ry = distortion.residual(x, y, xm, ym)
-        jxx, jxy, jyx, jyy = distortion.jacobian(x, y)
+        # (k, n, 1): the camera model has one point of each camera at a time
+        x = (self._ideal[:, :1] + self._by_iop[:, 0] @ step)[..., None]
+        y = (self._ideal[:, 1:] + self._by_iop[:, 1] @ step)[..., None]
+        xm, ym = self._mm[:, 0, None, None], self._mm[:, 1, None, None]
+        jxx, jxy, jyx, jyy = distortion_jacobian(sets, x, y)
         inverse = 1.0 / (jxx * jyy - jxy * jyx)
-        ok &= (inverse > 0).all(axis=0)
+        ok: NDArray[np.bool_] = np.asarray((inverse > 0).all(axis=(0, 2)))
         jxx, jxy, jyx, jyy = jyy * inverse, jxy * inverse, jyx * inverse, jxx * inverse
         for _ in range(_STEPS):
-            x += jxx * rx - jxy * ry
-            y += jyy * ry - jyx * rx
-            rx, ry = distortion.residual(x, y, xm, ym)
+            xd, yd = distort(sets, x, y)
+            rx, ry = xm - xd, ym - yd
             if max(rx.max(), -rx.min(), ry.max(), -ry.min()) <= self._tolerance:
                 break
+            x += jxx * rx - jxy * ry
+            y += jyy * ry - jyx * rx
         else:
-            ok &= ((np.abs(rx) <= self._tolerance) & (np.abs(ry) <= self._tolerance)).all(axis=0)
+            far = np.fmax(np.abs(rx), np.abs(ry))
+            ok &= (far <= self._tolerance).all(axis=(0, 2))
         scale = self._distance / sets[:, 0]
-        return x * scale - self.expected[:, :1], y * scale - self.expected[:, 1:], ok
+        found_x, found_y = x[..., 0] * scale, y[..., 0] * scale
+        return found_x - self.expected[:, :1], found_y - self.expected[:, 1:], ok
 
 
-class _Distortion:
-    """The distortion of sets of IOP (n, 10) at points (k, n) mm; leaves out terms that are zero."""
+REFERENCES = ("first", "mean", "last")
+"""The interior orientations that are held fixed, by name."""
 
-    def __init__(self, sets: Array) -> None:
-        columns = np.ascontiguousarray(sets.T)
-        _, _, _, self._a1, self._a2, self._a3, self._b1, self._b2, self._c1, self._c2 = columns
-        self._order = 3 if self._a3.any() else 2
-        self._decentred = bool(self._b1.any() or self._b2.any())
-        self._affine = bool(self._c1.any() or self._c2.any())
+_MOST_EPOCHS = 2000  # of one series, spread evenly
 
-    def residual(self, x: Array, y: Array, xm: Array, ym: Array) -> tuple[Array, Array]:
-        """Measured points (xm, ym), about the principal point, minus the distorted (x, y)."""
-        self._r2 = r2 = x * x + y * y
-        radial = r2 * self._a3 if self._order == 3 else np.zeros_like(r2)
-        radial += self._a2
-        radial *= r2
-        radial += self._a1
-        radial *= r2
-        radial += 1
-        self._one = radial
-        if self._decentred:
-            # B1 (r² + 2x²) + 2 B2 xy = 2x (B1 x + B2 y) + B1 r², and so for y.
-            cross = self._b1 * x
-            cross += self._b2 * y
-            cross *= 2
-            self._cross = cross
-            radial = radial + cross
-        rx, ry = xm - x * radial, ym - y * radial
-        if self._decentred:
-            rx -= self._b1 * r2
-            ry -= self._b2 * r2
-        if self._affine:
-            rx -= self._c1 * x + self._c2 * y
-        return rx, ry
 
-    def jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-        """∂(distorted)/∂(x, y) at the points of the last `residual`."""
-        slope = self._r2 * (6 * self._a3) if self._order == 3 else np.zeros_like(x)
-        slope += 4 * self._a2
-        slope *= self._r2
-        slope += 2 * self._a1
-        sx = slope * x
-        jxx, jyy = self._one + sx * x, self._one + slope * y * y
-        jxy = sx * y
-        if self._decentred:
-            b1, b2 = 2 * self._b1, 2 * self._b2
-            jxx += self._cross + 2 * b1 * x
-            jyy += self._cross + 2 * b2 * y
-            jxy += b2 * x + b1 * y
-        if not self._affine:
-            return jxx, jxy, jxy, jyy
-        return jxx + self._c1, jxy + self._c2, jxy, jyy
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Errors on the plane along the path, all series together, against one fixed orientation.
+
+    reference: first, mean or last; fractions (m+1,): of the distances of all epochs and image
+    points per cluster; mean mm; mean_largest: mean over the image points of their largest, mm;
+    epochs: how many were used.
+    """
+
+    JSON: ClassVar = {"mean": "mean_mm", "mean_largest": "mean_of_maxima_mm"}
+
+    reference: str
+    fractions: Array
+    mean: float
+    mean_largest: float
+    epochs: int
+
+
+def trajectories(
+    series: Sequence[MeasuredSeries],
+    distance_mm: float,
+    size: int,
+    clusters_mm: Sequence[float],
+) -> tuple[Trajectory, ...]:
+    """The path of one camera against its first, mean and last interior orientation.
+
+    size: image points per row and column; each series has a path and references of its own. Raises
+    GeometryError where a reference has no ray for an image point.
+    """
+    found = []
+    for reference in REFERENCES:
+        distances = [
+            _distances(one, reference, distance_mm, size) for one in series if len(one) > 1
+        ]
+        if not distances:
+            return ()
+        every = np.concatenate(distances)
+        below = [float(np.mean(every < limit)) for limit in clusters_mm]
+        found.append(
+            Trajectory(
+                reference,
+                np.diff(below, prepend=0.0, append=1.0),
+                float(every.mean()),
+                float(np.mean([d.max(axis=0).mean() for d in distances])),
+                len(every),
+            )
+        )
+    return tuple(found)
+
+
+def _distances(one: MeasuredSeries, reference: str, distance_mm: float, size: int) -> Array:
+    """Distances (e, k) mm on the plane of image points (k,) at epochs (e,)."""
+    rows = np.unique(np.linspace(0, len(one) - 1, min(len(one), _MOST_EPOCHS)).astype(int))
+    fixed = {
+        "first": one.values[0],
+        "mean": one.mean,
+        "last": one.values[-1],
+    }[reference]
+    points = image_grid(one.sensor, size)
+    errors = plane_errors(one.sensor, fixed, one.values[rows], points, distance_mm)
+    distances = np.linalg.norm(errors, axis=-1)
+    return np.asarray(distances[np.isfinite(distances).all(axis=1)])
+
+
+def correlations_over_time(series: Sequence[MeasuredSeries]) -> Array:
+    """Pearson's r (10, 10) of the IOP over the epochs, about each series' own mean.
+
+    NaN for parameters that were held or did not change.
+    """
+    columns = []
+    every = [name for name in IOP_NAMES if any(name in one.free for one in series)]
+    for name in every:
+        within = []
+        for one in series:
+            values = one.column(name)[0] if name in one.free else np.full(len(one), np.nan)
+            values -= values.mean()
+            within.append(values)
+        columns.append(within[0] if len(within) == 1 else np.concatenate(within))
+    rows = [IOP_NAMES.index(name) for name in every]
+    matrix = np.full((len(IOP_NAMES), len(IOP_NAMES)), np.nan)
+    matrix[np.ix_(rows, rows)] = correlation_matrix(columns)
+    return matrix

@@ -11,12 +11,12 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from thermocald.analysis.series.recorded import recorded_table
-from thermocald.analysis.study.input import measured_series
+from thermocald.analysis.study.measured import measured_series
 from thermocald.analysis.study.study import StudySettings, study_camera
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.physics.presets import PRESETS, preset_simulation
@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from thermocald.analysis.study.montecarlo import MonteCarlo
     from thermocald.analysis.study.study import CameraStudy
 
-__all__ = ["Comparison", "Quoted", "compare", "reference_series", "reference_studies"]
+    _Row = tuple[str, str, str, float, float, float]
+    """As a Comparison, without its camera."""
+
 
 SERIES = (("M1", 1), ("M2", 2))
 """Names and seeds of the two series of each camera."""
@@ -37,7 +39,7 @@ SERIES = (("M1", 1), ("M2", 2))
 
 @dataclass(frozen=True, slots=True)
 class Quoted:
-    """What the reference says of a camera; None where its text does not.
+    """The figures of a camera that the reference quotes; None where its text does not.
 
     below: percentage of errors below 1.5 cm; mean_cm, maxima_cm: mean error and mean of the nine
     maxima; direction: where the principal point goes as it warms up; opposed: x0 and y0 run
@@ -98,6 +100,8 @@ class Comparison:
     low, high: what counts as reproduced.
     """
 
+    JSON: ClassVar = {"text": "reference", "low": "", "high": "", "reproduced": "reproduced"}
+
     camera: str
     quantity: str
     unit: str
@@ -108,19 +112,8 @@ class Comparison:
 
     @property
     def reproduced(self) -> bool:
-        """Whether ours lies within the bounds."""
+        """Return whether ours lies within the bounds."""
         return self.low <= self.ours <= self.high
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the entry of a document."""
-        return {
-            "camera": self.camera,
-            "quantity": self.quantity,
-            "unit": self.unit,
-            "reference": self.text,
-            "ours": self.ours,
-            "reproduced": self.reproduced,
-        }
 
 
 def reference_series(
@@ -159,66 +152,48 @@ def reference_studies(
 
 
 def compare(camera: CameraStudy) -> list[Comparison]:
-    """What the reference says of this preset, and what the study found."""
-    quoted = QUOTED[camera.label]
-    mc = camera.montecarlo
+    """Hold what the study found against what the reference says of this preset."""
+    quoted, mc = QUOTED[camera.label], camera.montecarlo
     if mc is None:
         return []
-    found = _changes(camera, quoted) + _correlations(camera, quoted)
+    rows = [*_changes(camera, quoted), *_correlations(camera, quoted)]
     for name in ("c", "x0", "y0"):
-        ratio = [s.significance[name].success_ratio for s in camera.series]
-        found.append(_row(camera, f"F-test of {name}, success ratio", "", "near 1",
-                          float(np.mean(ratio)), 0.9))  # fmt: skip
-    return found + _object_space(camera, quoted, mc)
+        ratio = float(np.mean([s.significance[name].success_ratio for s in camera.series]))
+        rows.append((f"F-test of {name}, success ratio", "", "near 1", ratio, 0.9, np.inf))
+    rows += _object_space(quoted, mc)
+    return [Comparison(camera.label, *row) for row in rows]
 
 
-def _row(
-    camera: CameraStudy,
-    quantity: str,
-    unit: str,
-    text: str,
-    ours: float,
-    low: float = -np.inf,
-    high: float = np.inf,
-) -> Comparison:
-    return Comparison(camera.label, quantity, unit, text, float(ours), low, high)
-
-
-def _about(
-    camera: CameraStudy, quantity: str, unit: str, quote: float | None, ours: float, bound: float
-) -> list[Comparison]:
-    """A quoted number, and by how much ours may differ; nothing where it is not quoted."""
+def _about(quantity: str, unit: str, quote: float | None, ours: float, bound: float) -> list[_Row]:
+    """Compare a quoted number, with how much ours may differ; nothing where it is not quoted."""
     if quote is None:
         return []
-    return [_row(camera, quantity, unit, f"{quote:g}", ours, quote - bound, quote + bound)]
+    return [(quantity, unit, f"{quote:g}", float(ours), quote - bound, quote + bound)]
 
 
-def _changes(camera: CameraStudy, quoted: Quoted) -> list[Comparison]:
-    """What moved, how far, and where to."""
+def _changes(camera: CameraStudy, quoted: Quoted) -> list[_Row]:
+    """Compare what moved, how far, and where to."""
     deviations = [study.deviations for study in camera.series]
     pitch = camera.series[0].series.sensor.pixel_pitch
     moved = [np.hypot(d["x0"].change, d["y0"].change) / pitch for d in deviations]
     px = float(np.mean(moved))
-    found = _about(camera, "principal point, last − first", "px", quoted.moved_px, px, 0.5)
-    low, high = _DIRECTIONS[quoted.direction]
-    found.append(
-        _row(camera, "principal point, direction", "°", quoted.direction, _direction(camera),
-             low, high)
-    )  # fmt: skip
+    rows = _about("principal point, last − first", "px", quoted.moved_px, px, 0.5)
+    where = _direction(camera)
+    rows.append(
+        ("principal point, direction", "°", quoted.direction, where, *_DIRECTIONS[quoted.direction])
+    )
     change = float(np.mean([d["c"].change for d in deviations]))
-    found += _about(camera, "principal distance, last − first", "mm", quoted.c_mm, change, 0.0005)
+    rows += _about("principal distance, last − first", "mm", quoted.c_mm, change, 0.0005)
     focus = [abs(s.focus.change) for s in camera.series if s.focus is not None]
     if focus:
         depth = float(np.mean(focus))
-        found += _about(camera, "depth of field at 1 m, change", "mm", quoted.focus_mm, depth, 1.0)
+        rows += _about("depth of field at 1 m, change", "mm", quoted.focus_mm, depth, 1.0)
     ratio = max(float(s.series.sigma0.max() / s.series.sigma0[0]) for s in camera.series)
-    return found + _about(
-        camera, "σ₀ at its highest over the first", "", quoted.sigma0_ratio, ratio, 0.35
-    )
+    return rows + _about("σ₀ at its highest over the first", "", quoted.sigma0_ratio, ratio, 0.35)
 
 
 def _direction(camera: CameraStudy) -> float:
-    """Where the principal point stands when it is farthest, degrees from right towards up."""
+    """Return where the principal point stands at its farthest, degrees from right towards up."""
     steps = []
     for study in camera.series:
         path = study.series.values[:, 1:3] - study.series.values[0, 1:3]
@@ -227,56 +202,43 @@ def _direction(camera: CameraStudy) -> float:
     return float(np.degrees(np.arctan2(y, x)))
 
 
-def _correlations(camera: CameraStudy, quoted: Quoted) -> list[Comparison]:
-    """With the temperature, and of x0 with y0."""
+def _correlations(camera: CameraStudy, quoted: Quoted) -> list[_Row]:
+    """Compare correlations with the temperature, and of x0 with y0."""
+    with_temperature = [
+        {name: abs(d.r) for name, d in s.channels[0].dependences.items()} for s in camera.series
+    ]
 
-    def with_temperature(names: Sequence[str]) -> float:
-        return float(
-            np.mean(
-                [
-                    max(abs(s.channels[0].dependences[name].r) for name in names)
-                    for s in camera.series
-                ]
-            )
-        )
+    def mean_of_largest(*names: str) -> float:
+        return float(np.mean([max(r[name] for name in names) for r in with_temperature]))
 
-    found = []
+    rows: list[_Row] = []
     for name in ("c", "x0", "y0"):
-        r = min(abs(s.channels[0].dependences[name].r) for s in camera.series)
-        found.append(_row(camera, f"|r| of {name} with the temperature", "", "nearly 1", r, _CLOSE))
+        least = min(r[name] for r in with_temperature)
+        rows.append((f"|r| of {name} with the temperature", "", "nearly 1", least, _CLOSE, np.inf))
     if quoted.B_follows is not None:
-        found.append(
-            _row(camera, "largest |r| of B1, B2 with the temperature", "", "strong",
-                 with_temperature(("B1", "B2")), _STRONG)
-        )  # fmt: skip
+        largest = mean_of_largest("B1", "B2")
+        quantity = "largest |r| of B1, B2 with the temperature"
+        rows.append((quantity, "", "strong", largest, _STRONG, np.inf))
     text, low, high = ("high", _STRONG, 1.0) if quoted.sigma0_follows else ("not high", 0.0, _WEAK)
-    found.append(
-        _row(camera, "|r| of σ₀ with the temperature", "", text, with_temperature(("sigma0",)),
-             low, high)
-    )  # fmt: skip
+    sigma0 = mean_of_largest("sigma0")
+    rows.append(("|r| of σ₀ with the temperature", "", text, sigma0, low, high))
     if quoted.opposed is not None:
         r = float(camera.over_time[1, 2])
-        found.append(_row(camera, "r of x0 with y0 over time", "", "near −1", r, -1.0, -_CLOSE))
-    return found
+        rows.append(("r of x0 with y0 over time", "", "near −1", r, -1.0, -_CLOSE))
+    return rows
 
 
-def _object_space(camera: CameraStudy, quoted: Quoted, mc: MonteCarlo) -> list[Comparison]:
-    """All classes of Table 7 of which the text speaks, means and maxima."""
-    percent = 100 * mc.fractions
-    found = _about(camera, "errors below 1.5 cm at 10 m", "%", quoted.below, float(percent[0]), 3.0)
-    beyond = float(percent[2] + percent[3])
+def _object_space(quoted: Quoted, mc: MonteCarlo) -> list[_Row]:
+    """Compare all classes of Table 7 of which the text speaks, means and maxima."""
+    percent = (100 * mc.fractions).tolist()
+    rows = _about("errors below 1.5 cm at 10 m", "%", quoted.below, percent[0], 3.0)
     if quoted.far == "likely":
-        found.append(_row(camera, "errors of 5 to 10 cm", "%", "likely", percent[2], _LIKELY))
+        rows.append(("errors of 5 to 10 cm", "%", "likely", percent[2], _LIKELY, np.inf))
     elif quoted.far == "unlikely":
-        found.append(
-            _row(camera, "errors above 5 cm", "%", "unlikely", beyond, high=_UNLIKELY)
-        )  # fmt: skip
-    found.append(_row(camera, "errors above 10 cm", "%", "hardly ever", percent[3], high=_UNLIKELY))
-    found += _about(
-        camera, "mean error at 10 m", "cm", quoted.mean_cm, mc.overall_mean / 10, 0.1
-    )  # fmt: skip
-    found += _about(
-        camera, "mean of the maximum errors", "cm", quoted.maxima_cm, mc.mean_largest / 10,
-        0.15 * quoted.maxima_cm,
-    )  # fmt: skip
-    return found
+        beyond = percent[2] + percent[3]
+        rows.append(("errors above 5 cm", "%", "unlikely", beyond, -np.inf, _UNLIKELY))
+    rows.append(("errors above 10 cm", "%", "hardly ever", percent[3], -np.inf, _UNLIKELY))
+    rows += _about("mean error at 10 m", "cm", quoted.mean_cm, mc.overall_mean / 10, 0.1)
+    bound = 0.15 * quoted.maxima_cm
+    largest = mc.mean_largest / 10
+    return rows + _about("mean of the maximum errors", "cm", quoted.maxima_cm, largest, bound)

@@ -1,12 +1,21 @@
 """One measured series studied: deviations, significance, temperature dependence.
 
 What cannot be computed is None, and `notes` says why.
+
+Deviations are last minus first of every parameter, the path of the principal point, and the
+displacement of image points when everything in front of the camera stands still (Elias et al. 2020,
+Table 2 and Figures 3 to 6).
+
+Depth of field by the exact formulas of the thin lens (Luhmann et al. 2014, section 3.1.2): with the
+hyperfocal distance H = f²/(N u) + f, focused at s, sharp from s (H - f)/(H + s - 2f) to
+s (H - f)/(H - s). The reference quotes changes of 2 to 5 mm at 1 m but neither f-number nor circle
+of confusion.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -19,34 +28,104 @@ from thermocald.analysis.statistics.dependence import (
 )
 from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.analysis.statistics.significance import moving_f_test, unbroken_windows
-from thermocald.analysis.study.depth_of_field import (
-    DepthOfField,
-    circle_of_confusion,
-    depth_of_field,
-)
-from thermocald.analysis.study.deviations import (
-    Deviation,
-    deviation,
-    image_displacement,
-    sd_of_sigma0,
-)
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project, rays
+from thermocald.result import document_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from thermocald.analysis.study.measured import MeasuredSeries, Thermometer
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
 
-__all__ = [
-    "ChannelStudy",
-    "FocusChange",
-    "SeriesStudy",
-    "Significance",
-    "StudySettings",
-    "study_series",
-]
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Last minus first value with its standard deviation, the largest departure, the range.
+
+    largest: signed, from the first value; range: largest minus smallest value; both tell a camera
+    that comes back from one that never left, and of noise alone they are some sds as well.
+    """
+
+    first: float
+    last: float
+    change: float
+    sd_change: float
+    largest: float
+    range: float
+    sd_over_time: float
+
+    @property
+    def returned(self) -> bool:
+        """Return whether it went much farther than it ended: `change` alone would hide it."""
+        return abs(self.largest) > max(1.5 * abs(self.change), 6 * self.sd_change)
+
+
+def deviation(values: Array, sds: Array) -> Deviation | None:
+    """Deviation of a column (n,) with its standard deviations (n,); NaN epochs are left out.
+
+    The first and the last epoch are taken as independent, which they are when the standard
+    deviations hold what one epoch adds to its series. None where fewer than two values are left.
+    """
+    have = np.flatnonzero(np.isfinite(values))
+    if len(have) < 2:
+        return None
+    first, last = int(have[0]), int(have[-1])
+    difference = values[have] - values[first]
+    return Deviation(
+        float(values[first]),
+        float(values[last]),
+        float(difference[-1]),
+        float(np.hypot(sds[first], sds[last])),
+        float(difference[np.argmax(np.abs(difference))]),
+        float(np.ptp(difference)),
+        float(np.std(values[have], ddof=1)),
+    )
+
+
+def sd_of_sigma0(sigma0: Array, redundancy: Array) -> Array:
+    """Standard deviation of the standard deviation of unit weight: sigma0 / √(2 r)."""
+    return np.asarray(sigma0 / np.sqrt(2 * np.maximum(redundancy, 1.0)))
+
+
+def image_displacement(sensor: Sensor, first: Array, later: Array, points: Array) -> Array:
+    """Move image points (k, 2) px of a still scene as the IOP change from first to later.
+
+    first (10,), later (10,) or (n, 10); returns px (k, 2) or (n, k, 2), y down. Raises
+    GeometryError where the first IOP have no ray for a point.
+    """
+    direction = rays(sensor, first, points)
+    # The same rays seen again: a camera at the origin before points 1 m away along them.
+    scene = direction / -direction[:, 2:] * 1000.0
+    seen = project(sensor, later, np.zeros((*later.shape[:-1], 6)), scene)
+    return np.asarray(seen - points)
+
+
+def circle_of_confusion(sensor: Sensor) -> float:
+    """The blur still taken as sharp, mm: 1/2000 of the image diagonal, two to three pixels here."""
+    return float(np.hypot(sensor.width, sensor.height)) * sensor.pixel_pitch / 2000
+
+
+def depth_of_field(
+    principal_distance: float, focus_distance: float, f_number: float, confusion: float
+) -> tuple[float, float]:
+    """Return from where to where a lens focused at `focus_distance` is sharp, all mm.
+
+    Focused beyond the hyperfocal distance it is sharp to infinity. The principal distance stands
+    for the focal length, which it exceeds by f²/s: 0.4 % at 1 m for these lenses. Raises ValueError
+    for lengths that are not positive.
+    """
+    f, s = principal_distance, focus_distance
+    if min(f, f_number, confusion) <= 0 or s <= f:
+        raise ValueError(
+            f"no depth of field for c {f} mm focused at {s} mm, f/{f_number}, circle {confusion} mm"
+        )
+    hyperfocal = f * f / (f_number * confusion) + f
+    near = s * (hyperfocal - f) / (hyperfocal + s - 2 * f)
+    far = s * (hyperfocal - f) / (hyperfocal - s) if hyperfocal > s else float("inf")
+    return near, far
+
 
 _COURSE = 500
 _GAP_IN_INTERVALS = 1.5
@@ -55,7 +134,7 @@ _LEAST_DEPENDENCE = 4
 
 @dataclass(frozen=True, slots=True)
 class StudySettings:
-    """What the user may choose; lengths mm, temperatures K.
+    """The choices of a user; lengths mm, temperatures K.
 
     window, alpha: of the F-test; sets, seed, distance_mm, grid, clusters_mm: of the Monte-Carlo;
     focus_mm, f_number, confusion_mm: of the depth of field, None: 1/2000 of the image diagonal;
@@ -86,17 +165,30 @@ class Significance:
     p-values corrected for the number of parameters.
     """
 
+    JSON: ClassVar = {
+        "critical": "critical_ratio", "course": "", "drift": "", "p_holm": "", "p_excess_holm": "",
+        "drift_test": "drift_test",
+    }  # fmt: skip
+
     success_ratio: float
     tests: int
     left_out: int
     degrees_variance: int
     degrees_sd: float
-    critical: float = field(metadata={"json": "critical_ratio"})
+    critical: float
     median_ratio: float
-    course: Array = field(metadata={"json": ""})
-    drift: DriftTest | None = field(metadata={"json": ""})
-    p_holm: float = field(default=float("nan"), metadata={"json": ""})
-    p_excess_holm: float = field(default=float("nan"), metadata={"json": ""})
+    course: Array
+    drift: DriftTest | None
+    p_holm: float
+    p_excess_holm: float
+
+    @property
+    def drift_test(self) -> dict[str, Any] | None:
+        """The test for the whole series with its corrected p-values, as a document has it."""
+        if self.drift is None:
+            return None
+        p_holm = {"p_holm": self.p_holm, "p_excess_holm": self.p_excess_holm}
+        return document_of(self.drift) | p_holm
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +210,14 @@ class ChannelStudy:
 class FocusChange:
     """Depth of field at the first and the last epoch, mm, and the change with its sd."""
 
-    first: DepthOfField
-    last: DepthOfField
+    JSON: ClassVar = {
+        "change": "change_mm", "sd_change": "sd_change_mm", "confusion": "confusion_mm",
+    }  # fmt: skip
+
+    near_first_mm: float
+    far_first_mm: float
+    near_last_mm: float
+    far_last_mm: float
     change: float
     sd_change: float
     confusion: float
@@ -127,7 +225,7 @@ class FocusChange:
 
 @dataclass(frozen=True, eq=False)
 class SeriesStudy:
-    """What one series says.
+    """The study of one series.
 
     deviations: by IOP, `sigma0`, and thermometer; grid, displacement (k, 2) px: image
     points of a still scene, first to last epoch, y down; columns, matrix (n, n): Pearson's r among
@@ -187,7 +285,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
 
 
 def _circumstances(series: MeasuredSeries) -> list[str]:
-    """What a reader must know of the series before its numbers."""
+    """Return what a reader must know of the series before its numbers."""
     notes = []
     lost = sum(series.without_result.values())
     if lost:
@@ -242,39 +340,28 @@ def _significance(
             f"{' but too many gaps' if len(series) >= settings.window else ''}: not tested."
         )
         return {}
+    columns = {name: series.column(name) for name in series.free}
+    drifts = {
+        name: drift_test(*column, series.redundancy, settings.window, series.time_s)
+        for name, column in columns.items()
+    }
+    tested = {name: drift for name, drift in drifts.items() if drift is not None}
+    p_holm = dict(zip(tested, holm([d.p_value for d in tested.values()]), strict=True))
+    p_excess = dict(zip(tested, holm([d.p_excess for d in tested.values()]), strict=True))
     result = {}
-    for name in series.free:
-        values, sds = series.column(name)
-        tested = _moving(series, values, sds, settings)
-        drift = drift_test(values, sds, series.redundancy, settings.window, series.time_s)
-        result[name] = replace(tested, drift=drift)
-    return _corrected(result)
-
-
-def _moving(
-    series: MeasuredSeries, values: Array, sds: Array, settings: StudySettings
-) -> Significance:
-    """The moving F-test of one parameter, summed up."""
-    test = moving_f_test(
-        values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
-    )
-    ratio = test.ratio
-    some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
-    return Significance(
-        test.success_ratio, len(test.index), test.left_out, test.degrees_variance,
-        float(np.median(test.degrees_sd)), float(np.median(test.critical)),
-        float(np.median(ratio)), np.column_stack([series.time_s[test.index[some]], ratio[some]]),
-        None,
-    )  # fmt: skip
-
-
-def _corrected(result: dict[str, Significance]) -> dict[str, Significance]:
-    """The p-values of the drift tests corrected for the number of parameters."""
-    tested = {name: one.drift for name, one in result.items() if one.drift is not None}
-    drift = holm([test.p_value for test in tested.values()])
-    excess = holm([test.p_excess for test in tested.values()])
-    for name, p, p_excess in zip(tested, drift, excess, strict=True):
-        result[name] = replace(result[name], p_holm=p, p_excess_holm=p_excess)
+    for name, (values, sds) in columns.items():
+        test = moving_f_test(
+            values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
+        )
+        ratio = test.ratio
+        some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
+        result[name] = Significance(
+            test.success_ratio, len(ratio), len(values) - len(ratio), settings.window - 1,
+            float(np.median(test.degrees_sd)), float(np.median(test.critical)),
+            float(np.median(ratio)),
+            np.column_stack([series.time_s[test.index[some]], ratio[some]]),
+            drifts[name], p_holm.get(name, float("nan")), p_excess.get(name, float("nan")),
+        )  # fmt: skip
     return result
 
 
@@ -293,7 +380,7 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
     t = thermometer.values[have]
     reason = ""
     if len(t) < _LEAST_DEPENDENCE:
-        reason = f"{name} was read at {len(t)} epochs: too few for a dependence on it."
+        reason = f"{name} has too few readings ({len(t)}) for a dependence on it."
     elif not np.ptp(t) > 0:
         reason = f"{name} stayed at {t[0]:.2f} °C: no dependence on it can be computed."
     elif float(np.var(t, ddof=1)) < 2 * sd**2:
@@ -303,14 +390,13 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
         )
     if reason:
         return ChannelStudy(thermometer, {}, {}, {}, reason)
-    found = {}
-    for column in (*series.free, "sigma0"):
-        if column == "sigma0":
-            values, sds = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
-        else:
-            values, sds = series.column(column)
-        if np.ptp(values[have]) > 0:
-            found[column] = dependence(values[have], sds[have], t, sd, series.time_s[have])
+    columns = {column: series.column(column) for column in series.free}
+    columns["sigma0"] = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
+    found = {
+        column: dependence(values[have], sds[have], t, sd, series.time_s[have])
+        for column, (values, sds) in columns.items()
+        if np.ptp(values[have]) > 0
+    }
     return ChannelStudy(
         thermometer,
         found,
@@ -343,19 +429,20 @@ def _focus(
     confusion = settings.confusion_mm or circle_of_confusion(series.sensor)
     c = deviations["c"]
     try:
-        first, last, nudged = (
+        ends = [
             depth_of_field(value, settings.focus_mm, settings.f_number, confusion)
             for value in (c.first, c.last, c.first * (1 + 1e-6))
-        )
+        ]
     except ValueError as error:
         notes.append(f"The depth of field cannot be computed: {error}.")
         return None
-    change = last.depth - first.depth
+    first, last, nudged = (far - near for near, far in ends)
+    change = last - first
     if not np.isfinite(change):
         notes.append(
             f"Focused at {settings.focus_mm / 1000:g} m everything up to infinity is sharp: the "
             "depth of field has no end that could change."
         )
         return None
-    slope = (nudged.depth - first.depth) / (c.first * 1e-6)
-    return FocusChange(first, last, change, abs(slope) * c.sd_change, confusion)
+    slope = (nudged - first) / (c.first * 1e-6)
+    return FocusChange(*ends[0], *ends[1], change, abs(slope) * c.sd_change, confusion)

@@ -12,14 +12,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.statistics.significance import IopCorrelations, median_correlations
-from thermocald.analysis.study.montecarlo import MonteCarlo, draw_root, simulate_errors
-from thermocald.analysis.study.object_plane import DistanceLaw, plane_jacobian, propagate
-from thermocald.analysis.study.series_study import SeriesStudy, StudySettings, study_series
-from thermocald.analysis.study.trajectory import (
+from thermocald.analysis.study.montecarlo import (
+    DistanceLaw,
+    MonteCarlo,
     Trajectory,
     correlations_over_time,
+    draw_root,
+    plane_jacobian,
+    propagate,
+    simulate_errors,
     trajectories,
 )
+from thermocald.analysis.study.series_study import SeriesStudy, StudySettings, study_series
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 

@@ -19,6 +19,7 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from thermocald.analysis.camera.difference import CameraDifference
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import (
@@ -59,7 +60,7 @@ class Calibration:
     temperature: float | None
 
     def span(self, clock: DeviceClock) -> Array:
-        """When the photographs were taken, s UTC; DataError where no file said it."""
+        """Return when the photographs were taken, s UTC; DataError where no file said it."""
         if not self.moments:
             raise DataError(
                 f"{self.path}: does not say when its photographs were taken; say their "
@@ -69,7 +70,7 @@ class Calibration:
 
 
 def is_calibration(path: Path) -> bool:
-    """Whether a file is a JSON document of `calibrate`, or a camera that it wrote."""
+    """Return whether a file is a document of `calibrate`, or a camera that it wrote."""
     try:
         with path.open(encoding="utf-8") as file:
             return path.suffix == ".json" and '"thermocald-ca' in file.read(200)
@@ -108,7 +109,7 @@ def read_calibration(path: Path, temperature: float | None = None) -> Calibratio
 
 
 def with_log(calibration: Calibration, log: TemperatureLog, clock: DeviceClock) -> Calibration:
-    """The calibration at the mean temperature of its photographs; DataError outside the log."""
+    """Give a calibration the mean temperature of its photographs; DataError outside the log."""
     times = calibration.span(clock)
     readings = interpolate_readings(times, log.times, next(iter(log.channels.values())))
     if not np.isfinite(readings).all():
@@ -116,26 +117,15 @@ def with_log(calibration: Calibration, log: TemperatureLog, clock: DeviceClock) 
     return replace(calibration, temperature=float(readings.mean()))
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationsFit:
-    """A model of several calibrations: sigma0 of their stated covariances; effect_missing: whether
-    the model leaves more than these allow; rms_px of each: its camera against the model.
-    """
-
-    model: ThermalModel
-    calibrations: tuple[Calibration, ...]
-    sigma0: float
-    effect_missing: bool
-    rms_px: tuple[float, ...]
-
-
 def fit_calibrations(
     calibrations: Sequence[Calibration],
     T0: float | None = None,
     temperature_sd: float = 0.1,
     channel: str = "temperature",
-) -> CalibrationsFit:
+) -> ThermalCamera:
     """Fit interior orientation and rates; temperature_sd K: of each calibration's temperature.
+
+    An effect is missing where the model leaves more than the stated covariances allow.
 
     Raises DataError for too few or too narrow temperatures, UsageError for cameras that differ.
     """
@@ -187,8 +177,8 @@ def fit_calibrations(
         validity={channel: (float(T.min()), float(T.max()))},
         name=first.name,
     )
-    rms = tuple(_rms(model, c, t) for c, t in zip(calibrations, T.tolist(), strict=True))
-    told: list[dict[str, Any]] = [
+    rms = [_rms(model, c, t) for c, t in zip(calibrations, T.tolist(), strict=True)]
+    fitted_on: list[dict[str, Any]] = [
         {"calibration": str(c.path), "temperature": round(t, 3), "photographs": c.photographs,
          "rms_px": round(r, 5)}
         for c, t, r in zip(calibrations, T.tolist(), rms, strict=True)
@@ -197,8 +187,8 @@ def fit_calibrations(
         "effect_missing": missing, "misfit_px": round(max(rms), 5),
         "significance_sigmas": round(sigma0, 1), "distortion_sigmas": round(sure, 1),
     }}  # fmt: skip
-    model = replace(model, fitted_on=tuple(told), evidence=evidence)
-    return CalibrationsFit(model, tuple(calibrations), sigma0, missing, rms)
+    fitted = {"sigma0": sigma0, "series": [], "calibrations": fitted_on, "prediction_test": []}
+    return ThermalCamera(replace(model, fitted_on=fitted_on, evidence=evidence), fitted)
 
 
 def _known(calibration: Calibration) -> float:
@@ -232,7 +222,7 @@ def _design(moved: Array, rated: list[int], dT: float) -> Array:
 def _adjusted(
     A: Array, y: Array, blocks: list[Array], by_rate: Array, temperature_sd: float
 ) -> tuple[Array, Array, float]:
-    """The unknowns, their covariance, and the weighted sum of squares that is left."""
+    """Estimate the unknowns; also returns their covariance and the sum of squares that is left."""
     slope = np.zeros(len(by_rate))
     for _ in range(2):  # what the temperature's sd does is known with the rates
         moved = temperature_sd**2 * np.outer(slope, slope)
@@ -246,7 +236,7 @@ def _adjusted(
 
 
 def _rms(model: ThermalModel, calibration: Calibration, temperature: float) -> float:
-    """By how much the image of a calibration and of the model differ, px."""
+    """Return by how much the images of a calibration and of the model differ, px."""
     values = model.interior.as_array() + (temperature - model.T0) * model.rate_vector
     values = model.carried(values)
     camera = CameraModel(model.sensor, InteriorOrientation.from_array(values))

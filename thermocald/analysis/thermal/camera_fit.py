@@ -7,13 +7,12 @@ has who did not calibrate, and the prior of one who measured at a few temperatur
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
-from thermocald.analysis.thermal.calibrations import fit_calibrations
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
@@ -21,17 +20,13 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation
 from thermocald.photogrammetry.linalg import scaled_inverse
 from thermocald.physics import catalogue
-from thermocald.physics.model import RATED, ModelEffect, ThermalModel
-from thermocald.physics.model_file import model_document
-from thermocald.thermal.basis import choose_distortion
+from thermocald.thermal.fit import choose_distortion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermocald.analysis.thermal.calibrations import Calibration
-    from thermocald.analysis.thermal.prediction_test import PredictedError
-    from thermocald.analysis.thermal.result import FittedModel
     from thermocald.arrays import Array
+    from thermocald.physics.model import ModelEffect, ThermalModel
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -60,9 +55,9 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
                 "temperature and effects must be the same; fit them with the same options"
             )
     names = _names(first)
-    values = np.array([[_value(m, n) for n in names] for m in models])
+    values = np.array([[m.value(n) for n in names] for m in models])
     n = len(models)
-    people = population(values, np.array([_covariance(m, names) for m in models]))
+    people = population(values, np.array([m.covariance_of(names) for m in models]))
     low = max(m.validity[c][0] for m in models for c in list(m.validity)[:1])
     high = min(m.validity[c][1] for m in models for c in list(m.validity)[:1])
     channel = next(iter(first.validity), "temperature")
@@ -80,7 +75,7 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
     )
 
 
-def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> FittedModel:
+def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> ThermalCamera:
     """A camera that was measured at few temperatures, fitted with what its type says of the rest.
 
     Non-linear parameters, which few temperatures may not show at all, have the type's as a prior
@@ -133,9 +128,9 @@ def shrunk_to_type(
         )
     n = len(kind.fitted_on)
     prior = np.array(kind.covariance)
-    own = _covariance(model, names)
+    own = model.covariance_of(names)
     people = Population(
-        np.array([_value(kind, name) for name in names]),
+        np.array([kind.value(name) for name in names]),
         prior / (n + 1),
         prior * n / (n + 1),
         np.zeros_like(prior),
@@ -145,7 +140,7 @@ def shrunk_to_type(
     free = (np.diag(own) > 0) & (np.diag(prior) > 0)
     information = np.zeros_like(prior)
     information[np.ix_(free, free)] = scaled_inverse(own[np.ix_(free, free)])
-    values = np.array([_value(model, name) for name in names])
+    values = np.array([model.value(name) for name in names])
     gradient = np.zeros(len(names))
     for name, (value, prior_sd) in (priors or {}).items():
         # the type counts once: what the fit knew of it is taken out again
@@ -172,8 +167,8 @@ def weight_of_type(model: ThermalModel, kind: ThermalModel) -> dict[str, float]:
     and standard deviation are the type's; near 0 where they say all. It is the variance of the
     parameter over its variance among the cameras of the type.
     """
-    names = [n for n in _names(kind) if not n.startswith("interior.") and _sd(kind, n) > 0]
-    return {n: min(1.0, (_sd(model, n) / _sd(kind, n)) ** 2) for n in names}
+    names = [n for n in _names(kind) if not n.startswith("interior.") and kind.sd(n) > 0]
+    return {n: min(1.0, (model.sd(n) / kind.sd(n)) ** 2) for n in names}
 
 
 def _with_values(
@@ -181,21 +176,15 @@ def _with_values(
 ) -> ThermalModel:
     found = dict(zip(names, values.tolist(), strict=True))
     sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
-    listed = []
-    for effect in model.effects:
-        own = {k: f"{effect.name}.{k}" for k in effect.values if f"{effect.name}.{k}" in found}
-        listed.append(
-            ModelEffect(
-                effect.name,
-                {**effect.values, **{k: found[f] for k, f in own.items()}},
-                {**effect.sds, **{k: sd[f] for k, f in own.items()}},
-            )
-        )
+    moved = model.with_values({n: v for n, v in found.items() if not n.startswith("interior.")})
+    effects = tuple(
+        replace(e, sds={**e.sds, **{k: sd[f] for k in e.values if (f := f"{e.name}.{k}") in sd}})
+        for e in moved.effects
+    )
     return replace(
-        model,
+        moved,
         interior=InteriorOrientation(**{p: found[f"interior.{p}"] for p in IOP_NAMES}),
-        rates={p: found[f"rates.{p}"] for p in RATED},
-        effects=tuple(listed),
+        effects=effects,
         sds={**model.sds, **{k: v for k, v in sd.items() if k.startswith(("interior.", "rates."))}},
         covariance_names=names,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
@@ -207,58 +196,28 @@ def _names(model: ThermalModel) -> tuple[str, ...]:
     return tuple(n for n in model.parameter_names() if not n.startswith("exterior."))
 
 
-def _value(model: ThermalModel, name: str) -> float:
-    group, key = name.split(".", 1)
-    if group == "interior":
-        return float(getattr(model.interior, key))
-    if group == "rates":
-        return float(model.rates.get(key, 0.0))
-    return float(next(e for e in model.effects if e.name == group).values[key])
-
-
-def _covariance(model: ThermalModel, names: tuple[str, ...]) -> Array:
-    """The covariance (k, k) of a model's numbers; else of its standard deviations."""
-    if model.covariance is None or not set(names) & set(model.covariance_names):
-        return np.diag([_sd(model, n) ** 2 for n in names])
-    place = {n: i for i, n in enumerate(model.covariance_names)}
-    full = np.array(model.covariance)
-    rows = [place.get(n, -1) for n in names]
-    known = np.array([r >= 0 for r in rows])
-    return np.where(np.outer(known, known), full[np.ix_(rows, rows)], 0.0)
-
-
-def _sd(model: ThermalModel, name: str) -> float:
-    group, key = name.split(".", 1)
-    if group in ("interior", "rates"):
-        return float(model.sds.get(name, 0.0))
-    return float(next(e for e in model.effects if e.name == group).sds.get(key, 0.0))
-
-
-_NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
-
-
 def fit_camera(
     series: Sequence[ReducedSeries], listed: Sequence[ModelEffect], T0: float | None
 ) -> ThermalCamera:
     """Fit one camera; of several series each is also predicted from a fit to the others."""
-    fitted = fit_thermal_model(series, listed, T0)
+    camera = fit_thermal_model(series, listed, T0)
+    model, fitted = camera.model, camera.fitted or {}
     held = []
     for k, left_out in enumerate(series if len(series) > 1 else ()):
         rest = [s for i, s in enumerate(series) if i != k]
-        model = fit_thermal_model(
-            rest, list(fitted.model.effects), fitted.model.T0, search=False,
-            distortion=fitted.model.distortion,
-        )  # fmt: skip
-        held.append(predicted_error(model.model, left_out, fitted.series[k].thermometer_sd))
-    return ThermalCamera(fitted.model, _document(fitted, held))
+        others = fit_thermal_model(
+            rest, model.effects, model.T0, search=False, distortion=model.distortion
+        )
+        held.append(predicted_error(others.model, left_out, fitted["series"][k].thermometer_sd))
+    return replace(camera, fitted={**fitted, "prediction_test": held})
 
 
 def fit_camera_of_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> ThermalCamera:
     """Fit one camera that was measured at few temperatures, helped by its type's model."""
-    fitted = fit_with_type(series, kind)
-    weights = weight_of_type(fitted.model, kind)
+    camera = fit_with_type(series, kind)
+    weights = weight_of_type(camera.model, kind)
     about = {"name": kind.camera, "cameras": len(kind.fitted_on), "weights": weights}
-    return ThermalCamera(fitted.model, {**_document(fitted, []), "type": about})
+    return replace(camera, fitted={**(camera.fitted or {}), "type": about})
 
 
 def fit_type(
@@ -272,51 +231,4 @@ def fit_type(
     distortion, _ = choose_distortion(series)
     models = [fit_thermal_model(s, listed, T0, distortion=distortion).model for s in own]
     found = type_model(models, name)
-    document = {
-        "format": "thermocald-fit/1",
-        "camera": name,
-        "cameras": cameras,
-        "reference_temperature": T0,
-        **_numbers(found),
-        "series": [],
-        "prediction_test": [],
-    }
-    return ThermalCamera(found, document)
-
-
-def fit_to_calibrations(
-    given: Sequence[Calibration], T0: float | None, temperature_sd: float, channel: str
-) -> ThermalCamera:
-    """Fit a camera to photographs that were calibrated at several temperatures."""
-    found = fit_calibrations(given, T0, temperature_sd, channel)
-    document = {
-        "format": "thermocald-fit/1",
-        "camera": found.model.camera,
-        "reference_temperature": found.model.T0,
-        **_numbers(found.model),
-        "sigma0": found.sigma0,
-        **found.model.evidence["fit"],
-        "series": [],
-        "calibrations": list(found.model.fitted_on),
-        "prediction_test": [],
-    }
-    return ThermalCamera(found.model, document)
-
-
-def _numbers(model: ThermalModel) -> dict[str, Any]:
-    written = model_document(model)
-    return {k: written[k] for k in _NUMBERS}
-
-
-def _document(fitted: FittedModel, held: Sequence[PredictedError]) -> dict[str, Any]:
-    return {
-        "format": "thermocald-fit/1",
-        "camera": fitted.model.camera,
-        "reference_temperature": fitted.model.T0,
-        **_numbers(fitted.model),
-        "sigma0": fitted.sigma0,
-        **fitted.model.evidence["fit"],
-        "band": not fitted.model.misses_an_effect,
-        "series": [asdict(s) | {"left_over_in_noise": s.left_over} for s in fitted.series],
-        "prediction_test": [asdict(h) for h in held],
-    }
+    return ThermalCamera(found, {"cameras": cameras, "series": [], "prediction_test": []})

@@ -18,18 +18,17 @@ from thermocald.analysis.camera.undistortion import Maps
 from thermocald.errors import ImageError
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_NAMES, IOP
 from thermocald.photogrammetry.camera.conversions import opencv_terms
-from thermocald.photogrammetry.targets.image_metadata import (
+from thermocald.photogrammetry.targets.image_file import (
+    EncodedImage,
     has_exif,
     with_comment,
     with_exif,
     with_metadata,
 )
-from thermocald.result import jsonable
+from thermocald.result import jsonable, with_sds
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
     from thermocald.acquisition.calibrator import CalibratedEpoch
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -58,7 +57,9 @@ class FrameCorrector:
         result = calibrated.adjustment
         if result.interior is None:
             raise ImageError(f"{result.status}: {result.reason}")
-        image = _decoded(encoded)
+        image = EncodedImage(encoded).as_it_is()
+        if image.dtype != np.uint8:
+            image = (image >> 8).astype(np.uint8)
         sensor = self.sensor
         if image.shape[:2] != (sensor.height, sensor.width):
             raise ImageError(
@@ -79,13 +80,9 @@ class FrameCorrector:
         epoch, result = calibrated.epoch, calibrated.adjustment
         pose = None
         if result.exterior is not None:
-            sd = np.sqrt(np.diag(result.covariance)[EOP]).tolist()
-            six = result.exterior.as_array().tolist()
-            pose = {
-                **dict(zip(EOP_NAMES, six, strict=True)),
-                **{f"sd_{n}": s for n, s in zip(EOP_NAMES, sd, strict=True)},
-                "origin_mm": self._origin,
-            }
+            sd = np.sqrt(np.diag(result.covariance)[EOP])
+            six = with_sds(EOP_NAMES, result.exterior.as_array(), sd)
+            pose = {**six, "origin_mm": self._origin}
         document: dict[str, Any] = jsonable(
             {
                 "format": "thermocald-frame/1",
@@ -103,12 +100,3 @@ class FrameCorrector:
             }
         )
         return document
-
-
-def _decoded(encoded: bytes) -> NDArray[np.uint8]:
-    """8 bit grey values (H, W) or colours (H, W, 3); the sensor does not turn with EXIF's flag."""
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags)
-    if image is None:
-        raise ImageError("the frame cannot be decoded")
-    return (image if image.dtype == np.uint8 else image >> 8).astype(np.uint8, copy=False)

@@ -9,25 +9,19 @@ as they do not cancel between both temperatures, and from the thermometer.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import ideal_points
+from thermocald.analysis.camera.undistortion import Maps, ideal_points
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import partials, project, rays
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
     from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.store.logger.temperatures import TemperatureLog
 
-_BLOCK = 100_000
 _SAMPLE = 997  # points of an image that tell how much it is corrected
 
 
@@ -56,26 +50,16 @@ def correct_points(
 
     temperature_sd K: of a reading of the log. DataError for times outside the log.
     """
-    target = camera.model.T0 if to is None else to
-    require_inside(log, times)
     unique, place = np.unique(times, return_inverse=True)
-    along = camera.along(
-        log.times, dict(log.channels), unique, extrapolate, relative_to=target,
-        temperature_sd=temperature_sd,
-    )  # fmt: skip
-    steady = camera.at(target, extrapolate=True).values
+    require_inside(log, times)
+    steady, along = _course(camera, log, unique, to, temperature_sd, extrapolate)
     sensor = camera.model.sensor
-    corrected, sds = np.empty_like(points), np.empty_like(points)
-    for first in range(0, len(points), _BLOCK):
-        rows = slice(first, first + _BLOCK)
-        state = along.values[place[rows]]
-        r = rays(sensor, state, points[rows, None, :])
-        direction = r / -r[..., 2:]
-        corrected[rows] = project(sensor, steady, np.zeros(6), direction[:, 0])
-        _, J, _ = partials(sensor, steady, np.zeros(6), direction[:, 0])
-        J = J[:, :, :10]
-        covariance = along.covariance[place[rows]]
-        sds[rows] = np.sqrt(np.einsum("ncp,npq,ncq->nc", J, covariance, J, optimize=True))
+    r = rays(sensor, along.values[place], points[:, None, :])
+    direction = (r / -r[..., 2:])[:, 0]
+    corrected = project(sensor, steady, np.zeros(6), direction)
+    _, J, _ = partials(sensor, steady, np.zeros(6), direction)
+    J = J[:, :, :10]
+    sds = np.sqrt(np.einsum("ncp,npq,ncq->nc", J, along.covariance[place], J, optimize=True))
     return Corrected(corrected, sds, along.temperatures[place], along.extrapolated[place])
 
 
@@ -93,13 +77,19 @@ def require_inside(log: TemperatureLog, times: Array) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageCorrection:
-    """For one image: maps x, y (H, W) of `cv2.remap` that turn it into one at the wanted
+    """For one image: maps, and values (10,) of its camera, that turn it into one at the wanted
     temperature; temperature °C; largest and rms shift px; left_over: rms sd px of the correction,
     both over a grid of points; extrapolated K.
     """
 
-    map_x: NDArray[np.float32]
-    map_y: NDArray[np.float32]
+    JSON: ClassVar = {
+        "maps": "", "values": "", "rms_px": "rms_correction_px",
+        "largest_px": "largest_correction_px", "left_over_px": "rms_left_over_px",
+        "extrapolated": "extrapolated_K",
+    }  # fmt: skip
+
+    maps: Maps
+    values: Array
     temperature: float
     rms_px: float
     largest_px: float
@@ -114,38 +104,45 @@ def image_corrections(
     to: float | None = None,
     temperature_sd: float = 0.0,
     extrapolate: bool = False,
-) -> Iterator[ImageCorrection]:
-    """One correction per time; arguments as those of `correct_points`, errors before the first."""
+) -> list[ImageCorrection]:
+    """One correction per time; arguments and errors as those of `correct_points`."""
     require_inside(log, times)
-    target = camera.model.T0 if to is None else to
-    steady = camera.at(target, extrapolate=True).values
-    along = camera.along(
-        log.times, dict(log.channels), times, extrapolate, relative_to=target,
-        temperature_sd=temperature_sd,
-    )  # fmt: skip
-    return _maps(camera.model.sensor, steady, along)
-
-
-def _maps(sensor: Sensor, steady: Array, along: Along) -> Iterator[ImageCorrection]:
-    v, u = np.mgrid[0 : sensor.height, 0 : sensor.width]
-    grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
-    ideal = ideal_points(sensor, steady, grid)
+    steady, along = _course(camera, log, times, to, temperature_sd, extrapolate)
+    sensor = camera.model.sensor
+    maps = Maps(sensor, steady, camera.model.T0 if to is None else to)
+    pixels = np.linspace(0, sensor.width * sensor.height - 1, _SAMPLE).astype(int)
+    points = np.stack([pixels % sensor.width, pixels // sensor.width], axis=1).astype(float)
+    ideal = ideal_points(sensor, steady, points)
     direction = np.concatenate([ideal, np.full((len(ideal), 1), -1.0)], axis=1)
-    sample = np.linspace(0, len(grid) - 1, _SAMPLE).astype(int)
-    _, J, _ = partials(sensor, steady, np.zeros(6), direction[sample])
+    _, J, _ = partials(sensor, steady, np.zeros(6), direction)
     J = J[:, :, :10]
-    shape = (sensor.height, sensor.width)
+    found = []
     for i, values in enumerate(along.values):
         seen = project(sensor, values, np.zeros(6), direction)
-        shift = np.linalg.norm(seen[sample] - grid[sample], axis=1)
+        shift = np.linalg.norm(seen - points, axis=1)
         variance = np.einsum("ncp,pq,ncq->nc", J, along.covariance[i], J, optimize=True)
-        maps = seen.astype(np.float32)
-        yield ImageCorrection(
-            maps[:, 0].reshape(shape),
-            maps[:, 1].reshape(shape),
-            float(along.temperatures[i]),
-            float(np.sqrt(np.mean(shift**2))),
-            float(shift.max()),
-            float(np.sqrt(np.mean(variance))),
-            float(along.extrapolated[i]),
+        found.append(
+            ImageCorrection(
+                maps,
+                values,
+                float(along.temperatures[i]),
+                float(np.sqrt(np.mean(shift**2))),
+                float(shift.max()),
+                float(np.sqrt(np.mean(variance))),
+                float(along.extrapolated[i]),
+            )
         )
+    return found
+
+
+def _course(
+    camera: ThermalCamera, log: TemperatureLog, times: Array, to: float | None,
+    temperature_sd: float, extrapolate: bool,
+) -> tuple[Array, Along]:  # fmt: skip
+    """Return the steady camera (10,) at a temperature, and the camera at some times against it."""
+    target = camera.model.T0 if to is None else to
+    along = camera.along(
+        log.times, log.channels, times, extrapolate, relative_to=target,
+        temperature_sd=temperature_sd,
+    )  # fmt: skip
+    return camera.at(target, extrapolate=True).values, along

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -53,20 +53,12 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.arrays import Array
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.frame.measurement import Measurement
     from thermocald.store.series import StoredEpoch
 
 _FEWEST = 3  # control points, with an earlier pose
 _CONFIRMED = 2  # epochs in a row that show another pose
-_MOVED_ALPHA = 1e-6
+_MOVED_CHI2 = 38.3  # six degrees of freedom, one in a million
 _UNMODELLED_PX = 0.05  # of a control point from frame to frame: light, air, the template
-
-
-class _Finder(Protocol):
-    """What measures control points in a frame: a Tracker or Templates."""
-
-    def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement: ...
-    def reset(self) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +112,7 @@ class GaugeCalibrator:
         self,
         thermal: ThermalCamera,
         control: TestField | None = None,
-        finder: _Finder | None = None,
+        finder: Tracker | Templates | None = None,
         mount_sd_deg: float = math.nan,
         snooping_alpha: float = 0.001,
     ) -> None:
@@ -267,21 +259,18 @@ class GaugeCalibrator:
         last = self.pose
         targets = np.empty(0, dtype=np.int64) if seen is None else seen.targets
         if last is None:
-            return replace(self._unposed("predicted", f"no pose so far: {why}", now))
+            return self._unposed("predicted", f"no pose so far: {why}", now)
         hours = max(epoch.frame_time - last.time, 0.0) / 3600.0
-        covariance = np.zeros((16, 16))
-        covariance[IOP, IOP] = now.camera.covariance
-        covariance[EOP, EOP] = last.covariance
         still = "; as if the mount had stood still since, for its movement is not known"
         if math.isfinite(self._mount):
-            covariance[range(10, 13), range(10, 13)] += self._mount**2 * hours
             still = f"; the mount may have moved for {hours:.2f} h"
-        blank = self._unposed("last_pose", why + still, now)
-        n = len(targets)
+        result = self._unposed("last_pose", why + still, now)
+        result.covariance[EOP, EOP] = last.covariance
+        if math.isfinite(self._mount):
+            result.covariance[range(10, 13), range(10, 13)] += self._mount**2 * hours
         return replace(
-            blank, exterior=last.eop, covariance=covariance, targets=targets,
-            residuals=np.full((n, 2), np.nan), redundancy_numbers=np.full((n, 2), np.nan),
-            test_values=np.full(n, np.nan),
+            result, exterior=last.eop, targets=targets,
+            residuals=np.full((len(targets), 2), np.nan),
         )  # fmt: skip
 
     def _watch(self, pose: Pose) -> None:
@@ -290,7 +279,7 @@ class GaugeCalibrator:
             self._reference = pose
             return
         found = self.compare(self._reference, pose)
-        if found is None or found.chi2 <= _bound(_MOVED_ALPHA, 6):
+        if found is None or found.chi2 <= _MOVED_CHI2:
             self._moved.clear()
             return
         self._moved.append(pose)
@@ -381,7 +370,7 @@ def plan_gauge(
     if control is None:
         return GaugeCalibrator(thermal, mount_sd_deg=mount), [0.0, 0.0, 0.0]
     given = ControlPoints.read(control, unit)
-    finder: _Finder
+    finder: Tracker | Templates
     if reference is None:
         if not any(given.field.codes):
             raise ConfigurationError(
@@ -405,9 +394,3 @@ def _matching(seen: Observations) -> Array:
 
 def _usual(status: str) -> bool:
     return status in ("predicted", "resected")
-
-
-def _bound(alpha: float, freedom: int) -> float:
-    from scipy.special import chdtri  # scipy.stats takes 20 MB
-
-    return float(chdtri(freedom, alpha))

@@ -41,17 +41,6 @@ _FREE = [IOP_NAMES.index(n) for n in FREE_INTERIOR]
 _ITERATIONS = 8
 
 
-@dataclass(frozen=True, eq=False)
-class Level:
-    """interior at T₀, exteriors of the series; field (8 + 6 S, 8 + 6 S): the covariance that the
-    test field's coordinates give them, in the order FREE_INTERIOR, then EOP_NAMES of each series.
-    """
-
-    interior: InteriorOrientation
-    exteriors: tuple[ExteriorOrientation, ...]
-    field: Array
-
-
 def series_means(
     series: ReducedSeries, prediction: Prediction
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -86,10 +75,12 @@ def projected(series: ReducedSeries, prediction: Prediction, part: slice) -> Arr
 
 def estimate_level(
     series: Sequence[ReducedSeries], models: Sequence[ThermalModel], interior: bool = True
-) -> Level:
-    """Gauss-Newton on the targets' means; models: one per series, with a start.
+) -> tuple[tuple[ThermalModel, ...], Array]:
+    """Estimate the level from the targets' means, by Gauss-Newton.
 
-    interior: whether the interior orientation is estimated too, or the series' orientation alone.
+    models: one per series, with a start; interior: whether the interior orientation is estimated
+    too, or the series' orientation alone. Returns the models with both, and the covariance (8, 8)
+    that the test field's coordinates give the interior orientation, in the order FREE_INTERIOR.
     """
     n = len(_FREE) if interior else 0
     shared = models[0].interior.as_array()
@@ -100,15 +91,19 @@ def estimate_level(
     size = n + 6 * len(series)
     field = series[0].source.field
     inverse, lever = np.zeros((size, size)), np.zeros((size, field.points.size))
+
+    def placed(model: ThermalModel, k: int) -> ThermalModel:
+        return replace(
+            model,
+            interior=InteriorOrientation.from_array(shared),
+            exterior=ExteriorOrientation.from_array(eops[k]),
+        )
+
     for _ in range(_ITERATIONS):
         M, g = np.zeros((size, size)), np.zeros(size)
         lever[:] = 0.0
         for k, (s, m) in enumerate(zip(series, models, strict=True)):
-            now = replace(
-                m,
-                interior=InteriorOrientation.from_array(shared),
-                exterior=ExteriorOrientation.from_array(eops[k]),
-            )
+            now = placed(m, k)
             prediction = now.predict(s.history, s.source.field)
             mean, weight, _ = series_means(s, prediction)
             at = linearise(s.source.sensor, s.source.field, prediction.iop.mean(axis=0), eops[k])
@@ -124,12 +119,8 @@ def estimate_level(
         eops = [e + d for e, d in zip(eops, step[n:].reshape(-1, 6), strict=True)]
         if step @ M @ step < 1e-4:  # a hundredth of a standard deviation
             break
-    moved = inverse @ (lever * field.sigmas.ravel())
-    return Level(
-        InteriorOrientation.from_array(shared),
-        tuple(ExteriorOrientation.from_array(e) for e in eops),
-        moved @ moved.T,
-    )
+    moved = inverse[:n] @ (lever * field.sigmas.ravel())
+    return tuple(placed(m, k) for k, m in enumerate(models)), moved @ moved.T
 
 
 _GROSS = 6.0  # standard deviations from the neighbours in time
@@ -139,10 +130,9 @@ _MARGIN = 16.0  # χ² beyond what a search may find by chance
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """time s and its sd; vector (3,) mm with covariance, zeros where nothing moved."""
+    """time s; vector (3,) mm with covariance, zeros where nothing moved."""
 
     time: float
-    sd_time: float
     vector: Array
     covariance: Array
 
@@ -179,8 +169,7 @@ def moved_targets(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
     gain = np.einsum("ei,ei->e", g, vectors)
     best = int(np.argmax(gain))
     t = others.times
-    time, width = 0.5 * (t[best] + t[best + 1]), t[best + 1] - t[best]
-    sd_time = float(width / np.sqrt(12.0))
+    time = float(0.5 * (t[best] + t[best + 1]))
     if gain[best] < 5 * np.log(len(t)) + _MARGIN:
-        return Moved(float(time), sd_time, np.zeros(3), np.zeros((3, 3)))
-    return Moved(float(time), sd_time, vectors[best], inverse_of_determined(N[best]))
+        return Moved(time, np.zeros(3), np.zeros((3, 3)))
+    return Moved(time, vectors[best], inverse_of_determined(N[best]))

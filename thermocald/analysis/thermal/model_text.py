@@ -1,4 +1,4 @@
-"""A thermal model in lines for people, with what its fit said."""
+"""A fitted thermal camera in lines for people."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.numbers import with_sd
 from thermocald.physics.model import SURE
+from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
 
 _UNSEEN = 0.5
 """From which weight of the type on a parameter is called the type's."""
@@ -92,7 +94,7 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         f"{h['floor_px']:.4f}), {h['object_mm']:.2f} mm at 10 m"
         for h in document.get("prediction_test", ())
     ]
-    lines += [f"  doubtful: {text}" for text in document.get("doubts", ())]
+    lines += [f"  {line}" for line in doubt_lines(document.get("doubts", ()))]
     return [part for line in lines for part in line.split("\n")]
 
 

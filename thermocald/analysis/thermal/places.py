@@ -24,9 +24,10 @@ from thermocald.figures import BAND
 from thermocald.files import read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP, InteriorOrientation
 from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on, resect
-from thermocald.result import Result, jsonable, new_figure
+from thermocald.result import Result, jsonable, new_figure, with_sds
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from matplotlib.figure import Figure
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.thermal.control_points import ControlPoints
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.analysis.thermal.timed_rows import RowBlock
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.store.logger.temperatures import TemperatureLog
@@ -120,7 +122,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Places(Result):
-    """Where image points lie.
+    """Places of image points.
 
     names (n); points (n, 3) in the unit and the coordinates of the control points, with their joint
     covariance (3n, 3n); without (n, 3): as the camera of the control points' time would have it;
@@ -146,7 +148,7 @@ class Places(Result):
 
     @property
     def shift_mm(self) -> Array:
-        """How far the thermal correction moves each place, (n,) mm."""
+        """The distance (n,) mm by which the thermal correction moves each place."""
         shift: Array = np.linalg.norm(self.points - self.without, axis=1) * UNITS[self.unit]
         return shift
 
@@ -154,8 +156,7 @@ class Places(Result):
         places = [
             {
                 "name": name, "temperature": T,
-                **dict(zip("XYZ", p, strict=True)),
-                **{f"sd_{axis}": v for axis, v in zip("XYZ", sd, strict=True)},
+                **with_sds("XYZ", p, sd),
                 "without_correction": dict(zip("XYZ", w, strict=True)), "correction_mm": shift,
             }
             for name, T, p, sd, w, shift in zip(
@@ -213,28 +214,28 @@ def measure_places(
     control: ControlPoints,
     when: float,
     surface: Plane | Line | Profile,
-    names: list[str],
-    times: Array,
-    observed: Array,
-    thermometer_sd: float = 0.0,
+    rows: Sequence[RowBlock],
     extrapolate: bool = False,
 ) -> Places:
     """Measure where image points lie on a plane or a line, each at its own time.
 
-    when: s UTC, the control points' time; times (n,) s UTC and observed (n, 4): x, y and their
-    standard deviations, px; thermometer_sd K, of a reading of the log. Raises DataError where there
-    is no pose or no temperature, GeometryError for rays that miss.
+    when: s UTC, the control points' time; rows: of the image points, their values (n, 4) x, y and
+    standard deviations, px. Raises DataError where there is no pose or no temperature,
+    GeometryError for rays that miss.
     """
+    observed = np.concatenate([b.values for b in rows])
+    times = np.concatenate([b.times for b in rows])
+    names = [r.get("name") or str(n) for b in rows for n, r in zip(b.lines, b.rows, strict=True)]
     if not len(observed):
         raise DataError("there is no image point to be measured")
     if not len(control.seen):
         raise DataError("the control points have no x, y, sx, sy: where were they seen?")
     require_inside(log, np.append(times, when))
-    readings = dict(log.channels)
-    then = camera.along(log.times, readings, [when], extrapolate, temperature_sd=thermometer_sd)
+    noise = camera.reading_sd
+    then = camera.along(log.times, log.channels, [when], extrapolate, temperature_sd=noise)
     seen_at = float(then.temperatures[0])
     moments, member = np.unique(times, return_inverse=True)
-    now = camera.along(log.times, readings, moments, extrapolate, seen_at, thermometer_sd)
+    now = camera.along(log.times, log.channels, moments, extrapolate, seen_at, noise)
     sensor = camera.model.sensor
     interior = InteriorOrientation.from_array(then.values[0])
     pose = resect(sensor, interior, then.covariance[0], control.field, control.seen)
@@ -259,7 +260,7 @@ def measure_places(
 def _levels(
     points: Array, covariance: Array, moments: Array, member: NDArray[np.int64]
 ) -> tuple[Level, ...]:
-    """The weighted means of the heights of each time, with what they have in common."""
+    """Average the heights of each time, weighted, with what they have in common."""
     found = []
     for k, time in enumerate(moments.tolist()):
         rows = np.flatnonzero(member == k)

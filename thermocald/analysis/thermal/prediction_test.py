@@ -1,4 +1,4 @@
-"""How well a thermal model predicts a series that it was not fitted on.
+"""The test of a thermal model on a series that it was not fitted on.
 
 Only what belongs to the series is estimated again: its level (one orientation, and a constant
 offset per target, since a field's coordinates are not perfect) and what its effects call fresh (a
@@ -57,33 +57,22 @@ _COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
 def derivatives(
     history: History, field: TestField, model: ThermalModel, names: Sequence[str]
 ) -> Array:
-    """∂ parameters / ∂ numbers of the model (E, 22, q), by central differences."""
+    """Return ∂ parameters / ∂ numbers of the model (E, 22, q), by central differences."""
     found = []
     for name in names:
         group, key = name.split(".", 1)
-        if group == "rates":
-            value = model.rates.get(key, 0.0)
-            step = 1e-3 * max(abs(value), 1e-6)
-            sides = [replace(model, rates={**model.rates, key: value + d}) for d in (step, -step)]
-        else:
-            place = next(i for i, e in enumerate(model.effects) if e.name == group)
-            effect = model.effects[place]
-            value = float(effect.values[key])
-            kind = catalogue.get(group)
-            searched = kind.nonlinear.get(key)
-            step = searched.difference_step(value) if searched else 1e-3 * max(abs(value), 1e-6)
-            sides = []
-            for moved in (value + step, value - step):
-                changed = replace(effect, values={**effect.values, key: moved})
-                listed = (*model.effects[:place], changed, *model.effects[place + 1 :])
-                sides.append(replace(model, effects=listed))
+        value = model.value(name)
+        step = 1e-3 * max(abs(value), 1e-6)
+        if group != "rates" and (searched := catalogue.get(group).nonlinear.get(key)):
+            step = searched.difference_step(value)
+        sides = (model.with_values({name: moved}) for moved in (value + step, value - step))
         one, other = (_packed(m.predict(history, field)) for m in sides)
         found.append((one - other) / (2.0 * step))
     return np.stack(found, axis=2) if found else np.zeros((len(history.times), 22, 0))
 
 
 def _packed(prediction: Prediction) -> Array:
-    """What a model says, as parameters (E, 22)."""
+    """Return a prediction as parameters (E, 22)."""
     d = np.zeros((len(prediction.iop), len(_COLUMNS)))
     d[:, :10], d[:, 10:16], d[:, 16:19] = prediction.iop, prediction.eop, prediction.scale
     for displacement in prediction.displacements:
@@ -92,7 +81,7 @@ def _packed(prediction: Prediction) -> Array:
 
 
 def reading_operators(history: History, model: ThermalModel) -> list[tuple[Array, str, csr_array]]:
-    """How the readings' errors reach the parameters: weights (22,), channel, operator (E, R)."""
+    """Return how reading errors reach the parameters: weights (22,), channel, operator (E, R)."""
     found: list[tuple[Array, str, csr_array]] = []
     rates = _rates(model)
     if np.any(rates):
@@ -114,7 +103,7 @@ def reading_operators(history: History, model: ThermalModel) -> list[tuple[Array
 def unresolved(
     history: History, model: ThermalModel, rate_jump: Array
 ) -> list[tuple[Array, Array]]:
-    """What the readings' times leave open: weights (22,) and standard deviations (E,)."""
+    """Return what the readings' times leave open: weights (22,) and standard deviations (E,)."""
     found = []
     for effect in model.effects:
         kind = catalogue.get(effect.name)
@@ -151,7 +140,7 @@ _ROUNDS = 3  # phases and events look for each other
 
 
 def with_own(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
-    """The model with the phases and events of a series; its T₀ and reference are the model's."""
+    """Give the model the phases and events of a series, whose T₀ and reference are the model's."""
     listed = {e.name: e for e in model.effects if catalogue.get(e.name).seen_in == "trajectory"}
     own = [e for e in listed if Term(e).is_separate]
     if not own:
@@ -246,9 +235,9 @@ _BAND = 1.959964  # standard deviations that hold 95 %
 
 @dataclass(frozen=True, slots=True)
 class PredictedError:
-    """Of one series: rms_px of measured minus predicted image points, floor_px: what noise alone
-    would leave, coverage: fraction of the coordinates inside their 95 % band, NaN where the model
-    misses an effect and no band is stated; object_mm: the rms on a plane at 10 m.
+    """The errors of one series: rms_px of measured minus predicted image points, floor_px: what
+    noise alone would leave, coverage: fraction of the coordinates inside their 95 % band, NaN where
+    the model misses an effect and no band is stated; object_mm: the rms on a plane at 10 m.
     """
 
     name: str
@@ -335,8 +324,8 @@ def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int6
             listed.append(e)
         model = replace(model, effects=tuple(listed))
     start = replace(model, exterior=ExteriorOrientation.from_array(series.at.eop))
-    level = estimate_level([others], [start], interior=False)
-    return replace(model, exterior=level.exteriors[0])
+    ((placed,), _) = estimate_level([others], [start], interior=False)
+    return placed
 
 
 def _partials(series: ReducedSeries, rows: NDArray[np.int64]) -> Array:

@@ -1,4 +1,4 @@
-"""What a thermal camera is asked for, as a document and as lines for people.
+"""Predictions of a thermal camera, as a document and as lines for people.
 
 A camera is steady from the time after which no point of the image, seen on a plane at the
 working distance, lies further from where the end of the history puts it than the wanted error.
@@ -35,22 +35,12 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import SeriesInput
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class WarmUp:
-    """steady_from: s since the start, None where the history ends before the camera is steady;
-    times (E,) s; error (E,) mm: the worst point's distance from where it ends.
-    """
+def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> tuple[float | None, Array]:
+    """Find from when on the camera is steady enough, s since the start.
 
-    steady_from: float | None
-    times: Array
-    error: Array
-
-
-def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> WarmUp:
-    """When the camera is steady enough. DataError for a single time.
-
-    A history that still moves by more than a tenth of the wanted error over its last tenth has not
-    shown its end: then there is no answer.
+    Returns None where the history ends before that: one that still moves by more than a tenth of
+    the wanted error over its last tenth has not shown its end. Also returns the worst point's
+    distance (E,) mm from where it ends. Raises DataError for fewer than ten times.
     """
     if len(along) < 10:
         raise DataError("a warm-up needs a history of at least 10 times")
@@ -63,12 +53,12 @@ def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> WarmUp:
     above = np.flatnonzero(error > wanted_mm)
     first = int(above[-1]) + 1 if len(above) else 0
     steady = float(times[first]) if settled and first < len(times) else None
-    return WarmUp(steady, times, error)
+    return steady, error
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prediction(Result):
-    """What a thermal camera predicts.
+    """The prediction of a thermal camera.
 
     thermal: the camera; document: what `predict` writes with `--json`; said: what it prints; state:
     of a camera at one temperature, else None.
@@ -115,7 +105,7 @@ def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> 
 def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool) -> Prediction:
     """Predict the camera along a log, a row a reading."""
     along = thermal.along(
-        log.times, dict(log.channels), extrapolate=extrapolate,
+        log.times, log.channels, extrapolate=extrapolate,
         temperature_sd=thermal.thermometer_sd or 0.0,
     )  # fmt: skip
     sds = along.sd
@@ -179,19 +169,19 @@ def advise_warm_up(
     along = thermal.along(
         history.reading_times, dict(history.readings), history.times, extrapolate=True
     )
-    advice = warm_up(along, distance * 1000.0, wanted)
+    steady_from, error = warm_up(along, distance * 1000.0, wanted)
     document = {
         "format": "thermocald-warm-up/1",
         "camera": thermal.model.camera,
         "distance_m": distance,
         "wanted_mm": wanted,
-        "steady_from_s": advice.steady_from,
-        "error_at_begin_mm": float(advice.error.max()),
+        "steady_from_s": steady_from,
+        "error_at_begin_mm": float(error.max()),
         "temperature_at_end": float(along.temperatures[-1]),
     }
-    if advice.steady_from is None:
+    if steady_from is None:
         said = "does not come to rest within this programme: let it run longer"
     else:
-        said = f"is steady to {wanted:g} mm at {distance:g} m after {advice.steady_from:.0f} s"
+        said = f"is steady to {wanted:g} mm at {distance:g} m after {steady_from:.0f} s"
     worst = f"(up to {document['error_at_begin_mm']:.1f} mm before)"
     return Prediction(thermal, document, [f"{thermal.model.camera} {said} {worst}"])

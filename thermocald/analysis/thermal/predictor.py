@@ -21,11 +21,9 @@ from thermocald.analysis.camera.undistortion import image_grid
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.analysis.thermal.live_camera import LiveCamera
-    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.analysis.thermal.thermal_camera import LiveCamera, ThermalCamera
     from thermocald.arrays import Array
 
-USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
 _LONG_S = 30 * 86400.0  # after so long at one temperature everything has settled
 _DAY_S = 6 * 3600.0  # temperatures farther apart in time have little in common
 _USUAL_RANGE_K = 20.0  # of a model that does not say on what it was fitted
@@ -55,20 +53,15 @@ class PredictedCamera:
 
     @property
     def has_reading(self) -> bool:
-        """Whether the temperature of its time is known."""
+        """Return whether the temperature of its time is known."""
         return self.age_s <= _GAP_S
 
 
 class Predictor:
-    """Follows the readings of one camera's thermometers.
+    """Follows the readings of one camera's thermometers."""
 
-    thermometer_sd: K, of a reading; by default what the fit found.
-    """
-
-    def __init__(self, thermal: ThermalCamera, thermometer_sd: float | None = None) -> None:
+    def __init__(self, thermal: ThermalCamera) -> None:
         self.thermal = thermal
-        noise = thermometer_sd if thermometer_sd is not None else thermal.thermometer_sd
-        self.noise_k = USUAL_THERMOMETER_SD if noise is None else noise
         # beyond the temperatures of the fit it is judged here, tick by tick and without a warning
         self._free = replace(thermal, model=replace(thermal.model, validity={}))
         named = (e.values.get("channel") for e in thermal.model.effects)
@@ -114,17 +107,17 @@ class Predictor:
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
         covariance = camera.covariance + np.outer(unknown, unknown)
-        drifted = math.hypot(self.noise_k, self._change(age) if age > _GAP_S else 0.0)
+        drifted = math.hypot(self.thermal.reading_sd, self._change(age) if age > _GAP_S else 0.0)
         covariance = covariance + drifted**2 * np.outer(rates, rates)
-        beyond = far = 0.0
+        beyond, far = 0.0, False
         if (validity := self.thermal.validity) is not None:
-            beyond, far = validity.distance(T)
+            beyond, far = validity.beyond(T), validity.is_far(T)
             covariance = covariance + np.diag((rates * beyond) ** 2)
         model = self.thermal.model
         now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
         shift = _largest_px(now, unknown)
         spread = math.hypot(drifted, beyond)
-        return PredictedCamera(now, age, spread, unknown, shift, beyond, bool(far))
+        return PredictedCamera(now, age, spread, unknown, shift, beyond, far)
 
     def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
         """The reference and the channels that the model names; None where one was not read yet."""
@@ -168,7 +161,7 @@ class Predictor:
         return {name: value + self._change(seconds) for name, value in row.items()}
 
     def _change(self, seconds: float) -> float:
-        """How much a temperature changes in a time, K: one standard deviation."""
+        """Return by how much a temperature changes in a time, K: one standard deviation."""
         v = self.thermal.validity
         spread = (_USUAL_RANGE_K if v is None else v.high - v.low) / math.sqrt(12.0)
         return spread * math.sqrt(-math.expm1(-2.0 * seconds / _DAY_S))
@@ -180,7 +173,7 @@ class Predictor:
 
 
 def _largest_px(camera: Camera, shift: Array) -> float:
-    """By how much a change of the interior orientation moves an image point at most, px."""
+    """Return by how much a change of the interior orientation moves an image point at most."""
     if not np.abs(shift).any():
         return 0.0
     moved = replace(camera, covariance=np.outer(shift, shift))

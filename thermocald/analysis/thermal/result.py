@@ -10,19 +10,21 @@ interior orientation that the model predicts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from thermocald.analysis.thermal.level import (
     FREE_INTERIOR,
-    Level,
     estimate_level,
     projected,
     series_means,
 )
 from thermocald.analysis.thermal.terms import unknowns_of_base, unknowns_of_term
+from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     ExteriorOrientation,
@@ -56,37 +58,15 @@ _FEWEST = 30  # epochs, of one series or of the short ones together, that a test
 _FEWEST_TO_CARRY = 6  # epochs whose rest can be carried into the covariance, tested or not
 
 
-@dataclass(frozen=True, eq=False)
-class Missing:
-    """What a model leaves over in its series.
+def examine_rest(
+    fitter: HypothesisFitter, fit: Fit, free: list[int]
+) -> tuple[dict[str, Any], Array, Array]:
+    """Test what the model leaves in every series, in the short ones together.
 
-    found: whether an effect is missing, None where a series was not examined and no other misses
-    one; misfit_px: RMS of the smooth rest, the worst series'; significance: in standard deviations;
-    unknowns (K + L, K + L), parameters (8, 8): what it adds to the covariance of the fit's unknowns
-    and of the interior orientation, px-scaled; left_over: what the worst series leaves, in noise.
-    """
-
-    found: bool | None
-    misfit_px: float
-    significance: float
-    unknowns: Array
-    parameters: Array
-    left_over: float = 1.0
-
-    def as_mapping(self) -> dict[str, Any]:
-        """As the evidence of a model file has it."""
-        return {
-            "effect_missing": self.found,
-            "misfit_px": round(float(self.misfit_px), 5),
-            "significance_sigmas": round(float(self.significance), 1),
-            "not_examined": None if self.found is not None else f"fewer than {_FEWEST} epochs",
-            "left_over_in_noise": round(float(self.left_over), 3),
-        }
-
-
-def missing(fitter: HypothesisFitter, fit: Fit, free: list[int]) -> Missing:
-    """Test every series, the short ones together; free: columns of the interior orientation that
-    take the rest up.
+    free: columns of the interior orientation that take the rest up. Returns whether an effect is
+    missing, None where a series was not examined and no other misses one, with the RMS px of the
+    smooth rest and its significance, of the worst series; and what the rest adds to the covariance
+    of the fit's unknowns (K + L, K + L) and of the interior orientation (8, 8), px-scaled.
     """
     size = len(fit.covariance)
     unknowns, parameters = np.zeros((size, size)), np.zeros((len(free), len(free)))
@@ -113,9 +93,12 @@ def missing(fitter: HypothesisFitter, fit: Fit, free: list[int]) -> Missing:
         half = np.mean(a.trajectories**2, axis=1)
         parameters += taken @ np.einsum("j,jde->de", half, power) @ taken.T / len(fitter.series)
     unseen = min(epochs) < _FEWEST and (not examined or min(epochs) < _FEWEST_TO_CARRY)
-    return Missing(
-        None if unseen and not found else found, misfit, significance, unknowns, parameters
-    )
+    verdict = {
+        "effect_missing": None if unseen and not found else bool(found),
+        "misfit_px": round(float(misfit), 5),
+        "significance_sigmas": round(float(significance), 1),
+    }
+    return verdict, unknowns, parameters
 
 
 def _together(tests: list[Adequacy]) -> float:
@@ -142,7 +125,7 @@ def _power(a: Adequacy) -> Array:
 
 
 def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power: Array) -> Array:
-    """What the rest of one series may have done to the fit's unknowns (K + L, K + L)."""
+    """Return what the rest of one series may have done to the fit's unknowns (K + L, K + L)."""
     C, V, index = fit.designs[series]
     dC, dV, mapping = fitter.derivatives(fit, list(fit.searched), series)
     base = (np.hstack([C, dC]), np.hstack([V, dV]))
@@ -162,11 +145,13 @@ _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
 @dataclass(frozen=True, slots=True)
 class SeriesFit:
-    """How well one series is explained: RMS px of the image points, thermometer's noise K, what
+    """The fit of one series: RMS px of the image points, thermometer's noise K, what
     the noise of both leaves, px.
 
     means: on how many means of epochs a long series was fitted, and the RMS is of; else None.
     """
+
+    JSON: ClassVar = {"left_over": "left_over_in_noise"}
 
     name: str
     epochs: int
@@ -181,29 +166,6 @@ class SeriesFit:
         return self.rms_px / self.noise_px
 
 
-@dataclass(frozen=True, eq=False)
-class FittedModel:
-    """A fitted model and what the fit says about itself.
-
-    names (p,): of the unknowns, as `ThermalModel.covariance_names` writes them, what belongs to
-    series k as `exterior.X0@k`; covariance (p, p); sigma0: of the image points against their stated
-    sigmas; missing: whether an effect is missing. The model's own events and phases are those of
-    the first series.
-    """
-
-    model: ThermalModel
-    names: tuple[str, ...]
-    covariance: Array
-    sigma0: float
-    series: tuple[SeriesFit, ...]
-    missing: Missing
-
-    def sd(self, name: str) -> float:
-        """The standard deviation of one unknown."""
-        i = self.names.index(name)
-        return float(np.sqrt(self.covariance[i, i]))
-
-
 @dataclass(eq=False)
 class _Parts:
     """A fit on its way to a model: series as they came, and the numbers of its terms."""
@@ -214,13 +176,15 @@ class _Parts:
     listed: Sequence[ModelEffect]
     growth: NoiseGrowth | None
     moved: Sequence[Moved]
-    unknowns: list[Unknown] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def unknowns(self) -> list[Unknown]:
+        """The numbers of the model that have a standard deviation in the fit."""
         scale = self.series[0].scale
-        self.unknowns = unknowns_of_base(self.fit, scale)
+        found = unknowns_of_base(self.fit, scale)
         for i in range(len(self.fit.terms)):
-            self.unknowns += unknowns_of_term(self.fit, i, scale)
+            found += unknowns_of_term(self.fit, i, scale)
+        return found
 
     def effect(self, e: ModelEffect, k: int) -> ModelEffect:
         """One effect with the values of series k."""
@@ -253,54 +217,48 @@ class _Parts:
         times = self.fitter.series[k].times
         return float(0.5 * (time + times[max(int(np.searchsorted(times, time - 1e-6)) - 1, 0)]))
 
-    def model(self, k: int, level: Level | None) -> ThermalModel:
-        """The model with what belongs to series k."""
+    def model(self, k: int) -> ThermalModel:
+        """The model with what belongs to series k, at the level that it was linearised at."""
         s = self.series[k]
         rates = {u.name.split(".")[1]: u.value for u in self.unknowns[: len(RATED)]}
         return ThermalModel(
             s.source.camera,
             s.source.sensor,
             s.T0,
-            level.interior if level else InteriorOrientation.from_array(self.series[0].at.iop),
+            InteriorOrientation.from_array(self.series[0].at.iop),
             rates,
             tuple(self.effect(e, k) for e in self.listed),
-            level.exteriors[k] if level else ExteriorOrientation.from_array(s.at.eop),
+            ExteriorOrientation.from_array(s.at.eop),
             distortion=s.distortion,
             name=s.source.camera,
             version=1,
         )
 
-    def covariance(self, gap: Missing, level: Level) -> tuple[list[str], Array]:
-        """Names and covariance of all unknowns: interior, drifts, each series' own."""
+    def covariance(
+        self, unknowns: Array, parameters: Array, field: Array
+    ) -> tuple[list[str], Array]:
+        """Return names and covariance of interior, drifts, and the first series' own numbers.
+
+        unknowns, parameters: what the rest adds, as of `examine_rest`; field (8, 8): what the test
+        field's coordinates add to the interior orientation.
+        """
         n, size = len(_INTERIOR), len(self.fit.covariance)
-        Q = scaled_inverse(_joint_normal(self.fitter, self.fit))
-        Q[:n, :n] += gap.parameters
-        Q[n : n + size, n : n + size] += gap.unknowns
+        Q = scaled_inverse(_joint_normal(self.fitter, self.fit))[: n + size, : n + size]
+        Q[:n, :n] += parameters
+        Q[n:, n:] += unknowns
         scale = self.series[0].scale
-        names = [f"interior.{p}" for p in FREE_INTERIOR]
-        rows = [np.zeros(len(Q)) for _ in names]
-        for i, c in enumerate(_INTERIOR):
-            rows[i][:n] = self.series[0].along[c, _INTERIOR] / scale[c]
-        for u in self.unknowns:
-            names.append(u.name)
-            rows.append(np.concatenate([np.zeros(n), u.row, np.zeros(len(Q) - n - size)]))
-        for k in range(len(self.series)):
-            for i, c in enumerate(_EXTERIOR):
-                row = np.zeros(len(Q))
-                row[n + size + 6 * k + i] = 1.0 / scale[c]
-                names.append(f"exterior.{EOP_NAMES[i]}@{k}")
-                rows.append(row)
-        R = np.array(rows)
+        first = [u for u in self.unknowns if "@" not in u.name]
+        names = [*(f"interior.{p}" for p in FREE_INTERIOR), *(u.name for u in first)]
+        R = np.zeros((len(names), n + size))
+        R[:n, :n] = self.series[0].along[np.ix_(_INTERIOR, _INTERIOR)] / scale[_INTERIOR, None]
+        for row, u in zip(R[n:], first, strict=True):
+            row[n:] = u.row
         covariance = R @ Q @ R.T
-        own = [*range(n), *range(len(names) - 6 * len(self.series), len(names))]
-        covariance[np.ix_(own, own)] += level.field
-        for k, m in enumerate(self.moved):
+        covariance[:n, :n] += field
+        if self.moved:
             e = next(e for e in self.listed if catalogue.get(e.name).seen_in == "targets")
-            suffix = f"@{k}" if k else ""
-            names += [f"{e.name}.{key}{suffix}" for key in catalogue.get(e.name).linear]
-            old = len(covariance)
-            covariance = np.pad(covariance, (0, 3))
-            covariance[old:, old:] = m.covariance
+            names += [f"{e.name}.{key}" for key in catalogue.get(e.name).linear]
+            covariance = block_diag(covariance, self.moved[0].covariance)
         return names, covariance
 
     def image_sigma(self) -> float:
@@ -315,9 +273,9 @@ class _Parts:
             count += int(s.n[ok].sum())
         return float(np.sqrt(total / count))
 
-    def fit_of(self, k: int, level: Level, sigma: float) -> SeriesFit:
-        """How well series k is explained; sigma px: noise of an image coordinate at T₀."""
-        s, model = self.series[k], self.model(k, level)
+    def fit_of(self, k: int, model: ThermalModel, sigma: float) -> SeriesFit:
+        """Assess how well series k is explained; sigma px: noise of a coordinate at T₀."""
+        s = self.series[k]
         averaged = float(np.sqrt(np.median(s.source.per_row)))
         reading = self.fitter.series[k].thermometers[s.history.reference].noise * averaged
         # a constant of each target is taken off: of the thermometer's noise nothing else is
@@ -335,7 +293,7 @@ class _Parts:
         )
 
 
-def fitted_model(
+def fitted_camera(
     fitter: HypothesisFitter,
     fit: Fit,
     series: Sequence[ReducedSeries],
@@ -343,43 +301,47 @@ def fitted_model(
     growth: NoiseGrowth | None,
     moved: Sequence[Moved],
     distortion_sigmas: float | None = None,
-) -> FittedModel:
-    """The model of a fit; series: as they came, unblocked; growth, moved: of effects beyond it;
-    distortion_sigmas: how sure it is what the distortion follows, None where that was given.
+) -> ThermalCamera:
+    """Make the camera of a fit; its events and phases are those of the first series.
+
+    series: as they came, unblocked; growth, moved: of effects beyond the fit; distortion_sigmas:
+    how sure it is what the distortion follows, None where that was given.
     """
     parts = _Parts(fitter, fit, series, listed, growth, moved)
-    starts = [parts.model(k, None) for k in range(len(series))]
-    level = estimate_level(series, starts)
-    gap = missing(fitter, fit, _INTERIOR)
-    names, covariance = parts.covariance(gap, level)
+    models, field = estimate_level(series, [parts.model(k) for k in range(len(series))])
+    verdict, unknowns, parameters = examine_rest(fitter, fit, _INTERIOR)
+    names, covariance = parts.covariance(unknowns, parameters, field)
     sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
-    written = [n for n in names if "@" not in n]
-    kept = [names.index(n) for n in written]
     sigma = parts.image_sigma()
     stated = np.concatenate([s.source.grid.weights[s.source.grid.observed][:, 0] for s in series])
-    fits = tuple(parts.fit_of(k, level, sigma) for k in range(len(series)))
-    gap = replace(gap, left_over=max(f.left_over for f in fits))
-    first = parts.model(0, level)
-    trembles = bool(gap.found) and any(map(detect_tremble, series))
-    told = {} if distortion_sigmas is None else {"distortion_sigmas": round(distortion_sigmas, 1)}
+    fits = tuple(parts.fit_of(k, m, sigma) for k, m in enumerate(models))
+    found = verdict["effect_missing"]
+    verdict["left_over_in_noise"] = round(float(max(f.left_over for f in fits)), 3)
+    verdict["not_examined"] = None if found is not None else f"fewer than {_FEWEST} epochs"
+    if distortion_sigmas is not None:
+        verdict["distortion_sigmas"] = round(float(distortion_sigmas), 1)
+    if found and any(map(detect_tremble, series)):
+        verdict["trembles"] = True
+    first = models[0]
     channels = dict.fromkeys(c for s in series for c in s.source.readings)
     model = replace(
         first,
         effects=tuple(_with_sds(e, sd, series[0]) for e in first.effects),
         image_sigma=sigma,
         sds={n: s for n, s in sd.items() if n.split(".")[0] in ("interior", "rates")},
-        covariance_names=tuple(written),
-        covariance=tuple(tuple(row) for row in covariance[np.ix_(kept, kept)].tolist()),
+        covariance_names=tuple(names),
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
         validity={c: _span(series, c) for c in channels},
         fitted_on=tuple(
             {"series": f.name, "recording": s.source.name, "epochs": f.epochs,
              "rms_px": round(f.rms_px, 5), "thermometer_sd_K": round(f.thermometer_sd, 5)}
             for s, f in zip(series, fits, strict=True)
         ),
-        evidence={"fit": gap.as_mapping() | told | ({"trembles": True} if trembles else {})},
+        evidence={"fit": verdict},
     )  # fmt: skip
     sigma0 = sigma * float(np.sqrt(np.median(stated)))
-    return FittedModel(model, tuple(names), covariance, sigma0, fits, gap)
+    fitted = {"sigma0": sigma0, "band": not model.misses_an_effect, "series": fits}
+    return ThermalCamera(model, {**fitted, "prediction_test": []})
 
 
 def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:

@@ -22,15 +22,17 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from thermocald.analysis.thermal.correction import require_inside
+from thermocald.analysis.thermal.scene_recording import Track, write_scene
 from thermocald.errors import DataError, ImageError
 from thermocald.numbers import with_sd
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, partials
+from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.targets.frame_status import inspect_frame
 from thermocald.photogrammetry.targets.image_file import decode_grey
-from thermocald.result import Result, new_figure
+from thermocald.result import Result, new_figure, with_sds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,25 +57,26 @@ _TUKEY = 4.685
 _ROUNDS = 10
 _WORD_SIGMAS = 4.0
 _MISSED_ALPHA = 1e-3  # of a model that holds
+_KNOWN = 1e6  # degrees of freedom of a variance that is known
+_FEWEST_BEYOND = 3  # frames more than a smooth course has numbers
 _MOVED_CHI2 = 30.7  # three degrees of freedom, one in a million
-_USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
+_LEAST_PX = 0.03  # at the edge: real corners have a common wobble of up to 0.02 px RMS
 _LOCKED_PX = 0.004  # of matching, as a function of the pixel's part moved: common to all features
 
 
 @dataclass(frozen=True, eq=False)
 class SceneMovement:
-    """What a frame shows beside the model's prediction.
+    """The movement that a frame shows beside the model's prediction.
 
     values (4,): turns about the camera's x, y and z axis in rad, change of the principal distance
     mm; covariance (4, 4); locked (4,): the part of the sds that further frames do not lessen;
-    features: how many have it in common, of `tracked`.
+    follow (n,): which of the features have it in common.
     """
 
     values: Array
     covariance: Array
     locked: Array
-    features: int
-    tracked: int
+    follow: NDArray[np.bool_]
 
 
 class SceneTracker:
@@ -137,7 +140,7 @@ def common_movement(
         near = size < 3 * _NEAR_PX
         if near.sum() < _FEWEST:
             return None
-        spread = max(1.4826 * float(np.median(np.abs(r[near]))), 1e-3)
+        spread = max(mad_sd(r[near]), 1e-3)
         weight = np.clip(1 - (size / (_TUKEY * spread)) ** 2, 0.0, None) ** 2
         if (weight > 0).sum() < _FEWEST:
             return None
@@ -149,11 +152,11 @@ def common_movement(
     cells = np.unique(points // (2 * _WINDOW_PX), axis=0, return_inverse=True)[1].ravel()
     score = np.zeros((cells.max() + 1, 4))
     np.add.at(score, cells, np.einsum("nci,n,nc->ni", A, weight, r))
-    used, groups = int((weight > 0).sum()), np.unique(cells[weight > 0]).size
+    groups = np.unique(cells[weight > 0]).size
     covariance = inverse @ (score.T @ score) @ inverse * groups / max(groups - 2, 1)
     covariance += _LOCKED_PX**2 * np.eye(4)
     whole = covariance / np.outer(scale, scale)
-    return SceneMovement(x / scale, whole, _LOCKED_PX / scale, used, len(points))
+    return SceneMovement(x / scale, whole, _LOCKED_PX / scale, weight > 0)
 
 
 def _consensus(A: Array, left: Array, rng: np.random.Generator) -> Array | None:
@@ -172,7 +175,7 @@ def _consensus(A: Array, left: Array, rng: np.random.Generator) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class SceneCourse(Result):
-    """What a series of frames shows beside a thermal model's prediction.
+    """The course of a scene in a series of frames, beside a thermal model's prediction.
 
     names (E); times (E,) s UTC; temperatures (E,) °C; values (E, 4) and covariance (E, 4, 4) as of
     `SceneMovement`, NaN where a frame shows nothing; unsure (E, 4): sds of the prediction itself,
@@ -224,10 +227,9 @@ class SceneCourse(Result):
 
     @cached_property
     def model_misses(self) -> bool:
-        """Whether the principal distance changes beside the prediction, more than that is sure to.
+        """Return whether the principal distance changes by more than the prediction is sure to.
 
-        With the temperature, or with anything else that has a course: noise is what differs from
-        one frame to the next, if that is more than stated.
+        With the temperature, or with anything else that has a course.
         """
         slope, sd = (v[3] for v in self.per_kelvin)
         change = float(np.ptp(self.temperatures[self.seen])) if self.seen.any() else 0.0
@@ -235,17 +237,50 @@ class SceneCourse(Result):
         if abs(slope) > _WORD_SIGMAS * np.hypot(sd, own):
             return True
         rows = np.flatnonzero(self.seen)
-        if len(rows) < 4:
+        least = _LEAST_PX * float(self.locked[3]) / _LOCKED_PX
+        if len(rows) < 4 or float(np.sqrt(np.mean(self.values[rows, 3] ** 2))) < least:
             return False
-        y, variance = self.values[rows, 3], self.covariance[rows, 3, 3]
-        steps = np.diff(y) ** 2 / (variance[1:] + variance[:-1])
-        noise = max(1.0, float(steps.mean()))
+        return self._has_smooth_course(rows) or self._has_course(rows)
+
+    def _has_smooth_course(self, rows: NDArray[np.int64]) -> bool:
+        """Test whether c goes with temperature, its square, time, or differs from the reference's.
+
+        Noise is what these leave. All frames stand together in four numbers, and the effect is not
+        taken for noise: an effect of second order is found that is hidden in each frame.
+        """
+        T, hours = self.temperatures[rows] - self.temperatures[0], self.times[rows] - self.times[0]
+        A = np.column_stack([np.ones(len(T)), T, T**2, hours])
+        A = A / np.maximum(np.abs(A).max(axis=0), 1e-9)
+        y, noise, known = self._beside(rows)
+        weight = np.linalg.inv(noise)
+        N = A.T @ weight @ A
+        rank = int(np.linalg.matrix_rank(N, hermitian=True))
+        free = len(rows) - rank
+        if rank == 0 or free < _FEWEST_BEYOND:
+            return False
+        rest = y - A @ (np.linalg.pinv(N, hermitian=True) @ (A.T @ weight @ y))
+        factor = max(1.0, float(rest @ weight @ rest) / free)
+        weight = np.linalg.inv(factor * noise + known)
+        right = A.T @ weight @ y
+        explained = float(right @ np.linalg.pinv(A.T @ weight @ A, hermitian=True) @ right)
+        return explained / rank > _f_bound(rank, factor, free)
+
+    def _has_course(self, rows: NDArray[np.int64]) -> bool:
+        """Test whether c has a course: noise is what differs from the mean of the frames beside."""
+        y, noise, known = self._beside(rows)
+        v = self.covariance[rows, 3, 3]
+        bends = np.diff(y, 2) ** 2 / (v[2:] + 4.0 * v[1:-1] + v[:-2])
+        factor = max(1.0, float(bends.mean()))
+        whole = float(y @ np.linalg.solve(factor * noise + known, y))
+        return whole / len(rows) > _f_bound(len(rows), factor, len(rows) / 2.0)
+
+    def _beside(self, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+        """Return c beside the prediction (n,), its covariance by noise, and by the prediction."""
+        variance = self.covariance[rows, 3, 3]
         known = self.unsure[rows, 3] * np.sign(self.temperatures[rows] - self.temperatures[0])
-        covariance = noise * np.diag(variance) + np.outer(known, known)
-        covariance += noise * float(np.median(variance))  # of the reference frame, common to all
-        of_noise = 2.0 * len(rows) / 3.0 if noise > 1.0 else 1e6
-        bound = float(f_distribution.ppf(1.0 - _MISSED_ALPHA, len(rows), of_noise))
-        return bool(y @ np.linalg.solve(covariance, y) / len(rows) > bound)
+        # the reference frame's noise is common to all
+        noise = np.diag(variance) + float(np.median(variance))
+        return self.values[rows, 3], noise, np.outer(known, known)
 
     @cached_property
     def movements(self) -> list[tuple[int, Array, Array]]:
@@ -276,8 +311,7 @@ class SceneCourse(Result):
         frames = [
             {
                 "frame": name, "time": time, "temperature": T, "features": int(count),
-                "reason": why, **dict(zip(keys, v, strict=True)),
-                **{f"sd_{k}": s for k, s in zip(keys, sd, strict=True)},
+                "reason": why, **with_sds(keys, v, sd),
             }
             for name, time, T, count, why, v, sd in zip(
                 self.names, self.times.tolist(), self.temperatures.tolist(), self.features,
@@ -292,8 +326,7 @@ class SceneCourse(Result):
             "movements": [
                 {
                     "frame": self.names[row], "time": float(self.times[row]),
-                    **dict(zip(keys[:3], turn.tolist(), strict=True)),
-                    **{f"sd_{k}": v**0.5 for k, v in zip(keys[:3], C.diagonal(), strict=True)},
+                    **with_sds(keys[:3], turn, np.sqrt(C.diagonal())),
                 }
                 for row, turn, C in self.movements
             ],
@@ -344,10 +377,12 @@ def follow_scene(
     frames: Sequence[tuple[Path, float]],
     extrapolate: bool = False,
     advance: Callable[[int], None] = lambda _: None,
+    recording: Path | None = None,
 ) -> SceneCourse:
     """Follow the scene of frames (file, s UTC), the first of which is the reference.
 
-    Raises DataError where there is no temperature, or nothing to follow.
+    recording: a folder to write what does not move to, for `discover`. Raises DataError where there
+    is no temperature, or nothing to follow.
     """
     if len(frames) < 2:
         raise DataError("a scene needs a reference frame and at least one more")
@@ -356,38 +391,42 @@ def follow_scene(
     require_inside(log, times)
     reference = decode_grey(frames[0][0])
     thermal = thermal.for_images(reference.shape[1], reference.shape[0])
-    along = thermal.along(log.times, dict(log.channels), times, extrapolate)
-    noise = thermal.thermometer_sd or _USUAL_THERMOMETER_SD
+    along = thermal.along(log.times, log.channels, times, extrapolate)
     since = thermal.along(
-        log.times, dict(log.channels), times, extrapolate, float(along.temperatures[0]), noise
-    ).sd
+        log.times, log.channels, times, extrapolate, float(along.temperatures[0]),
+        thermal.reading_sd,
+    ).sd  # fmt: skip
     tracker = SceneTracker(reference)
     E = len(frames)
     values, covariance = np.full((E, 4), np.nan), np.full((E, 4, 4), np.nan)
     locked = np.zeros(4)
     features, reasons = np.zeros(E, dtype=np.int64), [""] * E
+    points = tracker.points.astype(float)
+    tracks: list[Track | None] = [(np.arange(len(points)), points), *[None] * (E - 1)]
     for k, (path, _) in enumerate(frames):
         if k == 0:
             reasons[k] = "the reference frame"
             continue
+        found = None
         try:
             image = decode_grey(path)
             status = inspect_frame(image, (reference.shape[1], reference.shape[0]))
-            found = None
             reasons[k] = status.reason
             if status.ok:
                 rows, moved = tracker.follow(image)
-                found = common_movement(
-                    along[0], along[k], tracker.points[rows].astype(float), moved, k
-                )
+                found = common_movement(along[0], along[k], points[rows], moved, k)
                 reasons[k] = "" if found else "too few features have a common movement"
+                if found:
+                    follow = found.follow
+                    tracks[k] = rows[follow], points[rows][follow] + moved[follow]
         except ImageError as error:
             reasons[k] = str(error)
-            found = None
         if found is not None:
             values[k], covariance[k] = found.values, found.covariance
-            features[k], locked = found.features, found.locked
+            features[k], locked = int(found.follow.sum()), found.locked
         advance(1)
+    if recording is not None:
+        write_scene(recording, thermal.model.camera, along[0], log, times, points, tracks)
     interior = InteriorOrientation.from_array(along.values[0])
     unsure = since[:, [2, 1, 0, 0]] / [interior.c, interior.c, np.inf, 1.0]
     return SceneCourse(
@@ -395,6 +434,16 @@ def follow_scene(
         values, covariance, unsure, features, tuple(reasons), locked,
         thermal.model.sensor.pixel_pitch / interior.c,
     )  # fmt: skip
+
+
+def _f_bound(rank: int, factor: float, free: float) -> float:
+    """Bound of one of the two tests of a course, noise being `factor` times the stated variance.
+
+    Stated variances stand, unless that of so many degrees of freedom is of their upper quarter.
+    """
+    if factor < fdtri(free, _KNOWN, 0.75):
+        free = _KNOWN
+    return float(fdtri(rank, free, 1.0 - _MISSED_ALPHA / 2))
 
 
 def _eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:

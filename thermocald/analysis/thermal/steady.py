@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from thermocald.arrays import Array
-    from thermocald.physics.effect import Steady
-    from thermocald.physics.model import ModelEffect, ThermalModel
+    from thermocald.physics.model import ThermalModel
 
 
 _REFUSED_FRACTION = 0.5  # of the fitted range of temperature
@@ -38,53 +37,44 @@ class Validity:
     low: float
     high: float
 
-    def distance(self, T: float) -> tuple[float, bool]:
-        """How many kelvin a temperature lies outside, and whether that is too far to be used."""
+    def beyond(self, T: float) -> float:
+        """Return by how many kelvin a temperature lies outside."""
         beyond = max(self.low - T, T - self.high)
-        return (beyond if beyond > _MARGIN_K else 0.0), self._is_far(T)
+        return beyond if beyond > _MARGIN_K else 0.0
 
-    def beyond(self, T: float, extrapolate: bool) -> float:
-        """How many kelvin a temperature lies outside; warns or refuses."""
-        low, high = self.low, self.high
-        if low - _MARGIN_K <= T <= high + _MARGIN_K:
-            return 0.0
-        beyond = low - T if low > T else T - high
-        far = beyond > _REFUSED_FRACTION * max(high - low, 1.0)
-        if far and not extrapolate and low <= (T - 32.0) / 1.8 <= high:
-            raise UsageError(
-                f"{T:g} looks like fahrenheit: the model was fitted between {low:g} and {high:g} "
-                "°C; convert it"
-            )
-        if far and not extrapolate:
-            raise UsageError(
-                f"{T:g} °C is {beyond:.1f} K outside the {low:g} to {high:g} °C that the model was "
-                "fitted on; ask for extrapolation by name if you mean it"
-            )
-        warnings.warn(
-            f"{T:g} °C is {beyond:.1f} K outside the {low:g} to {high:g} °C that the model was "
-            "fitted on; standard deviations are widened",
-            ExtrapolationWarning,
-            stacklevel=3,
-        )
-        return beyond
+    def is_far(self, T: float) -> bool:
+        """Return whether a temperature is too far outside to be used."""
+        return self.beyond(T) > _REFUSED_FRACTION * max(self.high - self.low, 1.0)
 
-    def outside(self, temperatures: Array, extrapolate: bool) -> Array:
-        """How many kelvin each temperature (E,) lies outside, (E,); warns or refuses."""
-        if not len(temperatures):
-            return np.zeros(0)
+    def check(self, temperatures: Array, extrapolate: bool) -> Array:
+        """Return by how many kelvin each temperature (E,) lies outside; warns.
+
+        Raises UsageError for one that is far outside, unless `extrapolate`.
+        """
         low, high = self.low, self.high
         outside: Array = np.maximum(np.maximum(low - temperatures, temperatures - high), 0.0)
         outside[outside <= _MARGIN_K] = 0.0
-        worst = float(temperatures[int(np.argmax(outside))])
+        if not outside.any():
+            return outside
         # half of a log in fahrenheit may lie inside the range by chance: its middle tells
-        middle = float(np.median(temperatures))
-        if outside.max() > 0:
-            self.beyond(middle if self._is_far(middle) else worst, extrapolate)
+        T = float(np.median(temperatures))
+        if not self.is_far(T):
+            T = float(temperatures[int(np.argmax(outside))])
+        place = (
+            f"{T:g} °C is {self.beyond(T):.1f} K outside the {low:g} to {high:g} °C that the model "
+            "was fitted on"
+        )
+        if self.is_far(T) and not extrapolate:
+            if low <= (T - 32.0) / 1.8 <= high:
+                raise UsageError(
+                    f"{T:g} looks like fahrenheit: the model was fitted between {low:g} and "
+                    f"{high:g} °C; convert it"
+                )
+            raise UsageError(f"{place}; ask for extrapolation by name if you mean it")
+        warnings.warn(
+            f"{place}; standard deviations are widened", ExtrapolationWarning, stacklevel=3
+        )
         return outside
-
-    def _is_far(self, T: float) -> bool:
-        low, high = self.low, self.high
-        return max(low - T, T - high) > _REFUSED_FRACTION * max(high - low, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,24 +137,17 @@ def steady_camera(
             (k, IOP_NAMES.index(k)) for k in kind.linear if k in effect.values and k in IOP_NAMES
         ]
         if steady.knee is not None:
-            knees.append(_knee(effect, steady, own, names))
+            rate, by_rate, by_knee = np.zeros(10), np.zeros_like(J[0]), np.zeros_like(J[0])
+            for key, row in own:
+                rate[row] = float(effect.values[key])
+                if (name := f"{effect.name}.{key}") in names:
+                    by_rate[row, names.index(name)] = 1.0
+                if (name := f"{effect.name}.{steady.knee_name}") in names:
+                    by_knee[row, names.index(name)] = -rate[row]
+            knees.append((steady.knee, rate, by_rate, by_knee))
         for power, factor in enumerate(steady.powers):
             if not factor:
                 continue
             for key, row in own:
                 add(f"{effect.name}.{key}", float(effect.values[key]), row, power, factor)
     return SteadyCamera(model, names, (p[0], p[1], p[2]), (J[0], J[1], J[2]), tuple(knees))
-
-
-def _knee(
-    effect: ModelEffect, steady: Steady, own: list[tuple[str, int]], names: tuple[str, ...]
-) -> tuple[float, Array, Array, Array]:
-    rate, by_rate, by_knee = np.zeros(10), np.zeros((10, len(names))), np.zeros((10, len(names)))
-    for key, row in own:
-        rate[row] = float(effect.values[key])
-        if f"{effect.name}.{key}" in names:
-            by_rate[row, names.index(f"{effect.name}.{key}")] = 1.0
-        if f"{effect.name}.{steady.knee_name}" in names:
-            by_knee[row, names.index(f"{effect.name}.{steady.knee_name}")] = -rate[row]
-    assert steady.knee is not None
-    return steady.knee, rate, by_rate, by_knee

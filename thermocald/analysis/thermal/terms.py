@@ -19,15 +19,6 @@ if TYPE_CHECKING:
     from thermocald.thermal.hypothesis import Block, Fit
     from thermocald.thermal.series import ReducedSeries
 
-__all__ = [
-    "Unknown",
-    "event_worth",
-    "term_of",
-    "unknowns_of_base",
-    "unknowns_of_term",
-    "without_chance_events",
-]
-
 _EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what its search may find by chance
 
 

@@ -16,6 +16,7 @@ is refused, unless extrapolation is asked for by name.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,11 +25,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.thermal.live_camera import LiveCamera
+from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera
 from thermocald.errors import ConfigurationError, UsageError
 from thermocald.figures import BAND
+from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.history import History
@@ -39,12 +41,17 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from matplotlib.figure import Figure
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
     from thermocald.physics.model import ThermalModel
 
+
+USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
 _CHUNK = 20_000  # times in one go
+_STEP = 1e-3  # of a parameter, for its derivative
+_REMEMBERED = 6  # readings that effects of now follow from, and two of each channel
+_NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _TOLD = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
 
@@ -92,7 +99,7 @@ class Along:
 class ThermalCamera(Result):
     """A camera whose interior orientation is known at any temperature and history.
 
-    model: the thermal model; fitted: what `fit` said of it, None for one from a file.
+    model: the thermal model; fitted: what `fit` said of it besides, None for one from a file.
 
     >>> camera = tc.load_camera("camera.yaml")
     >>> bool(camera.at(45.0).interior.c != camera.at(25.0).interior.c)
@@ -118,24 +125,23 @@ class ThermalCamera(Result):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald fit --json` writes; of a camera from a file its model alone."""
-        document: dict[str, Any] = jsonable(dict(self.fitted or self._document()))
+        written = model_document(self.model)
+        said: dict[str, Any] = self.model.evidence.get("fit") or {}
+        document: dict[str, Any] = jsonable(
+            {
+                "format": "thermocald-fit/1",
+                "camera": self.model.camera,
+                "reference_temperature": self.model.T0,
+                **{key: written.get(key) or {} for key in _NUMBERS},
+                **(said if self.fitted else {k: said[k] for k in _TOLD if k in said}),
+                **(self.fitted or {}),
+            }
+        )
         return document
 
     def lines(self) -> list[str]:
         """Return what `thermocald fit` prints."""
-        return model_lines(self.fitted or self._document())
-
-    def _document(self) -> dict[str, Any]:
-        written = model_document(self.model)
-        evidence = self.model.evidence.get("fit") or {}
-        return {
-            "format": "thermocald-fit/1",
-            "camera": self.model.camera,
-            "reference_temperature": self.model.T0,
-            "distortion": self.model.distortion,
-            **{k: written.get(k) or {} for k in ("interior", "rates", "effects", "validity")},
-            **{k: evidence[k] for k in _TOLD if k in evidence},
-        }
+        return model_lines(self.as_dict())
 
     def plot(self) -> Figure:
         """Draw c, x0 and y0 of the steady camera against the temperature, µm from those at T0.
@@ -152,7 +158,7 @@ class ThermalCamera(Result):
             band = 1e3 * BAND * np.array([np.sqrt(s.covariance[k, k]) for s in states])
             axis.plot(T, y)
             axis.fill_between(T, y - band, y + band, alpha=0.3)
-            axis.set_ylabel(f"change of {IOP_NAMES[k]} in µm")
+            axis.set_ylabel(f"change of {parameter_label(IOP_NAMES[k])} in µm")
             axis.grid(alpha=0.3)
         axes[0, 0].set_title(f"{self.model.camera}, from {self.model.T0:g} °C")
         axes[-1, 0].set_xlabel("temperature in °C")
@@ -223,22 +229,23 @@ class ThermalCamera(Result):
         ]
         return float(np.median(known)) if known else None
 
+    @property
+    def reading_sd(self) -> float:
+        """The noise of a reading K, a usual one where no fit has found it."""
+        known = self.thermometer_sd
+        return USUAL_THERMOMETER_SD if known is None else known
+
     @cached_property
     def parameters(self) -> tuple[str, ...]:
         """The parameters with a covariance, as the model file names them."""
         if self.model.covariance is not None:
             return self.model.covariance_names
-        own = {f"{e.name}.{k}": s for e in self.model.effects for k, s in e.sds.items()}
-        return (*self.model.sds, *own)
+        return (*self.model.sds, *(f"{e.name}.{k}" for e in self.model.effects for k in e.sds))
 
     @cached_property
     def covariance(self) -> Array:
-        """Of the parameters: the file's matrix, or its standard deviations without correlation."""
-        if self.model.covariance is not None:
-            return np.array(self.model.covariance)
-        own = {f"{e.name}.{k}": s for e in self.model.effects for k, s in e.sds.items()}
-        known = {**self.model.sds, **own}
-        return np.diag([known[n] ** 2 for n in self.parameters])
+        """The covariance of the parameters: the file's matrix, or its sds without correlation."""
+        return self.model.covariance_of(self.parameters)
 
     def at(
         self,
@@ -254,7 +261,9 @@ class ThermalCamera(Result):
         (unless `extrapolate`), and for what looks like fahrenheit.
         """
         T = float(temperature)
-        beyond = self.validity.beyond(T, extrapolate) if self.validity else 0.0
+        beyond = 0.0
+        if self.validity is not None and self.validity.beyond(T):
+            beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
         plain = channels is None and not self._uses_channels
         values, slope, J = (self._steady if plain else self._with(channels)).at(T)
         covariance = J @ self.covariance @ J.T
@@ -295,13 +304,15 @@ class ThermalCamera(Result):
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
         outside = np.zeros(len(instants))
         if self.validity is not None:
-            outside = self.validity.outside(history.temperature(), extrapolate)
+            outside = self.validity.check(history.temperature(), extrapolate)
         values, covariance = [], []
         steady = None if relative_to is None else self._steady.at(relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
             part = history.at(history.times[first : first + _CHUNK])
-            linear, matrix = self._propagated(part, outside[first : first + _CHUNK], steady)
+            drive, beyond = self.model.drive(part), outside[first : first + _CHUNK]
+            linear = self._linear(part, drive)
             found = self.model.carried(linear)
+            matrix = self._propagated(part, drive, linear, beyond, steady)
             if temperature_sd:
                 rates = np.broadcast_to(self.model.rate_vector[:, None], (len(found), 10, 1))
                 slope = self.model.carried_derivatives(linear, rates)
@@ -318,49 +329,60 @@ class ThermalCamera(Result):
             outside,
         )
 
+    def _linear(self, history: History, drive: Array) -> Array:
+        """Return what rates and effects add up to (E, 10); drive (E,) °C: behind the rates."""
+        model = self.model
+        linear: Array = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
+        for effect in model.effects:
+            if not catalogue.get(effect.name).is_drive:
+                linear = linear + _influence(model, effect.name, history)
+        return linear
+
     def _propagated(
-        self, history: History, outside: Array, steady: Array | None
-    ) -> tuple[Array, Array]:
-        """Return the linear orientation (E, 10), and the covariance of the carried one."""
-        values = self._linear.predict(history).iop
-        J = np.zeros((*values.shape, len(self.parameters)))
+        self,
+        history: History,
+        drive: Array,
+        linear: Array,
+        outside: Array,
+        steady: Array | None = None,
+        driven: Mapping[tuple[str, float], Array] | None = None,
+    ) -> Array:
+        """Return the covariance (E, 10, 10) of the orientations that the linear ones carry.
+
+        driven: {(parameter of a drive, ±1): drive (E,) with it moved}, where that is known.
+        """
+        J = np.zeros((*linear.shape, len(self.parameters)))
         for i, name in enumerate(self.parameters):
-            J[:, :, i] = self._derivative(history, name)
-        J = self.model.carried_derivatives(values, J, self.parameters)
+            group, key = name.split(".", 1)
+            if group == "interior":
+                J[:, IOP_NAMES.index(key), i] = 1.0
+            elif group == "rates":
+                J[:, IOP_NAMES.index(key), i] = drive - self.model.T0
+            elif not catalogue.get(group).is_drive:
+                up, down = (_influence(self._moved(name, s), group, history) for s in (1.0, -1.0))
+                J[:, :, i] = (up - down) / (2.0 * self._step(name))
+            else:
+                if driven is None:
+                    up, down = (self._moved(name, s).drive(history) for s in (1.0, -1.0))
+                else:
+                    up, down = driven[name, 1.0], driven[name, -1.0]
+                slope = (up - down) / (2.0 * self._step(name))
+                J[:, :, i] = slope[:, None] * self.model.rate_vector
+        J = self.model.carried_derivatives(linear, J, self.parameters)
         if steady is not None:
             J -= steady
-        covariance = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
-        beyond = np.abs(self.model.rate_vector) * outside[:, None]
+        covariance: Array = np.einsum("epi,ij,eqj->epq", J, self.covariance, J, optimize=True)
         rows = np.arange(10)
-        covariance[:, rows, rows] += beyond**2
-        return values, covariance
+        covariance[:, rows, rows] += (np.abs(self.model.rate_vector) * outside[:, None]) ** 2
+        return covariance
 
-    def _derivative(self, history: History, name: str) -> Array:
-        """∂ linear IOP / ∂ one parameter, (E, 10)."""
-        group, key = name.split(".", 1)
-        result = np.zeros((len(history.times), 10))
-        if group == "interior":
-            result[:, IOP_NAMES.index(key)] = 1.0
-            return result
-        if group == "rates":
-            result[:, IOP_NAMES.index(key)] = self.model.drive(history) - self.model.T0
-            return result
-        place = next(i for i, e in enumerate(self.model.effects) if e.name == group)
-        value = float(self.model.effects[place].values[key])
-        step = 1e-3 * max(abs(value), 1e-9)
-        sides = []
-        for sign in (1.0, -1.0):
-            effect = self.model.effects[place]
-            moved = replace(effect, values={**effect.values, key: value + sign * step})
-            listed = list(self.model.effects)
-            listed[place] = moved
-            sides.append(replace(self._linear, effects=tuple(listed)).predict(history).iop)
-        return np.asarray((sides[0] - sides[1]) / (2.0 * step))
+    def _step(self, name: str) -> float:
+        """Return the step of a parameter for its derivative."""
+        return _STEP * max(abs(self.model.value(name)), 1e-9)
 
-    @cached_property
-    def _linear(self) -> ThermalModel:
-        """The model without what the distortion does: rates and effects add up."""
-        return replace(self.model, distortion="image")
+    def _moved(self, name: str, sign: float) -> ThermalModel:
+        """Return the model with one parameter moved by a step."""
+        return self.model.with_values({name: self.model.value(name) + sign * self._step(name)})
 
     @cached_property
     def validity(self) -> Validity | None:
@@ -414,3 +436,176 @@ def load_camera(path: Path | str) -> ThermalCamera:
     35.0
     """
     return ThermalCamera.load(Path(path).expanduser())
+
+
+def _influence(model: ThermalModel, name: str, history: History) -> Array:
+    """Return what an effect of a model adds to the interior orientation (E, 10)."""
+    effect = next(e for e in model.effects if e.name == name)
+    return catalogue.get(name).influence(history, effect.values, None).iop
+
+
+class _Drive:
+    """The temperature behind the linear terms: readings through all drives of a model, in order."""
+
+    def __init__(self, model: ThermalModel) -> None:
+        found = [catalogue.get(name).follower(values) for name, values in model.drives]
+        self._stages = [stage for stage in found if stage is not None]
+        self.known = len(self._stages) == len(found)
+
+    def push(self, time: float, value: float) -> Array:
+        """Take a reading °C, and return what drives now, (1,) °C."""
+        for stage in self._stages:
+            value = stage.push(time, value)
+        return np.array([value])
+
+
+class LiveCamera:
+    """A camera that follows its thermometer; made by `ThermalCamera.live`.
+
+    `update` takes a reading and gives the camera, `correct` a frame as the steady camera would have
+    seen it. Its state is that of one run: begin a new one for another. `along` asks the whole
+    history for every time; here effects with a memory keep their state, and a further reading costs
+    the same after an hour as after a minute. Formulas, and effects of others, may depend on all of
+    it: with them it is kept and asked (`keeps_all`).
+
+    >>> live = tc.load_camera("camera.yaml").live(size=(1640, 1232))
+    >>> for k in range(3):
+    ...     now = live.update(10.0 * k, 25.0 + k)
+    >>> now.sensor.width, now.temperature
+    (1640, 27.0)
+    """
+
+    def __init__(self, thermal: ThermalCamera) -> None:
+        self.thermal = thermal
+        model = thermal.model
+        self._drive = _Drive(model)
+        self.keeps_all = not (self._drive.known and _is_of_now(model))
+        self._times: list[float] = []
+        self._rows: list[tuple[float, ...]] = []
+        self._channels: tuple[str, ...] = ()
+        self._now: Camera | None = None
+        self._maps: Maps | None = None
+        drives = {name for name, _ in model.drives}
+        self._moved = {
+            (name, sign): _Drive(thermal._moved(name, sign))
+            for name in thermal.parameters
+            for sign in (1.0, -1.0)
+            if name.split(".")[0] in drives
+        }
+
+    def update(self, time: Any, temperature: float | Mapping[str, float]) -> Camera:
+        """Take a reading and return the camera now, the same as `along` says of the history so far.
+
+        time: s, or datetime64, later than that before; temperature: °C, or {channel: °C}, the
+        first is the reference; NaN where a reading failed: the last one stands. Raises UsageError
+        for a time that is not later, and far outside the temperatures of the fit.
+
+        >>> live = tc.load_camera("camera.yaml").live()
+        >>> live.update(0.0, 25.0).sd["c"] > 0
+        True
+        """
+        thermal, (t, row) = self.thermal, self._checked(time, temperature)
+        outside = np.zeros(1)
+        if thermal.validity is not None:  # before anything is kept: a refusal leaves no trace
+            outside = thermal.validity.check(np.array(row[:1]), extrapolate=False)
+        self._remember(t, row)
+        times = np.array(self._times)
+        readings = dict(zip(self._channels, np.array(self._rows).T, strict=True))
+        if self.keeps_all:
+            self._now = thermal.along(times, readings, [t], extrapolate=True)[0]
+            return self._now
+        drive = self._drive.push(t, row[0])
+        driven = {key: drive.push(t, row[0]) for key, drive in self._moved.items()}
+        begin, model = times[0], thermal.model
+        history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
+        linear = thermal._linear(history, drive)
+        covariance = thermal._propagated(history, drive, linear, outside, driven=driven)
+        values = model.carried(linear)[0]
+        self._now = Camera(
+            model.sensor, row[0], values, covariance[0], float(outside[0]), model.camera
+        )
+        return self._now
+
+    def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:
+        """Return a frame (H, W) or (H, W, 3) as the steady camera had seen it.
+
+        to: °C of that camera, by default the model's T0. The maps of `cv2.remap` are kept, and
+        renewed when an image point has moved by more than 0.05 px. Raises UsageError before the
+        first reading, and for a frame of another size than `live(size=…)` said.
+
+        >>> import numpy as np
+        >>> live = tc.load_camera("camera.yaml").live(size=(1640, 1232))
+        >>> _ = live.update(0.0, 40.0)
+        >>> live.correct(np.zeros((1232, 1640), np.uint8)).shape
+        (1232, 1640)
+        """
+        import cv2
+
+        sensor = self.thermal.model.sensor
+        if frame.shape[:2] != (sensor.height, sensor.width):
+            raise UsageError(
+                f"the frame has {frame.shape[1]}×{frame.shape[0]} px, the camera "
+                f"{sensor.width}×{sensor.height}: say live(size=({frame.shape[1]}, "
+                f"{frame.shape[0]}))"
+            )
+        return cv2.remap(frame, *self.maps(to), cv2.INTER_LINEAR)
+
+    def maps(self, to: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the maps x, y (H, W) px of `cv2.remap` that `correct` uses now.
+
+        They are the same objects until an image point has moved by more than 0.05 px.
+        """
+        if self._now is None:
+            raise UsageError("there is no reading yet: update(time, temperature) comes first")
+        target = self.thermal.model.T0 if to is None else to
+        if self._maps is None or self._maps.to != target:
+            steady = self.thermal.at(target, extrapolate=True)
+            self._maps = Maps(steady.sensor, steady.values, target)
+        return self._maps.of(self._now.values)
+
+    def _checked(
+        self, time: Any, temperature: float | Mapping[str, float]
+    ) -> tuple[float, tuple[float, ...]]:
+        """Return the time s and the readings °C, failed ones as they were before."""
+        t = float(time) if isinstance(time, float | int) else float(seconds(time))
+        given = temperature
+        if isinstance(given, float | int):
+            given = {"temperature": given}
+        names, row = tuple(given), tuple(float(v) for v in given.values())
+        if self._times:
+            if t <= self._times[-1]:
+                raise UsageError(f"time {t} is not later than the last reading, {self._times[-1]}")
+            if names != self._channels:
+                raise UsageError(f"channels {names}: the first reading had {self._channels}")
+            last = self._rows[-1]
+            row = tuple(b if math.isnan(n) else n for b, n in zip(last, row, strict=True))
+        elif any(math.isnan(v) for v in row):
+            raise UsageError("the first reading is NaN: begin with one that was measured")
+        self._channels = names
+        return t, row
+
+    def _remember(self, time: float, row: tuple[float, ...]) -> None:
+        """Keep a reading; where not all are needed the first, the extremes and the last three."""
+        self._times.append(time)
+        self._rows.append(row)
+        last = len(self._times) - 1
+        if not self.keeps_all and last >= _REMEMBERED + 2 * len(row):
+            T = np.array(self._rows)
+            extremes = {*T.argmax(axis=0).tolist(), *T.argmin(axis=0).tolist()}
+            needed = sorted({0, *extremes, last - 2, last - 1, last})
+            self._times = [self._times[i] for i in needed]
+            self._rows = [self._rows[i] for i in needed]
+
+
+def _is_of_now(model: ThermalModel) -> bool:
+    """Return whether the first, the extreme and the last readings tell what the effects do.
+
+    A drive that asks ahead, before another one, changes what it said of the past.
+    """
+    for name, values in model.drives[:-1]:
+        delay = catalogue.get(name).delay
+        if delay and float(values[delay]) < 0:
+            return False
+    kinds = [catalogue.get(e.name) for e in model.effects]
+    signals = [kind for kind in kinds if not kind.is_drive]
+    return all(kind.of_now or not set(kind.linear) & set(IOP_NAMES) for kind in signals)

@@ -6,7 +6,7 @@ Gauss-Newton, the thermometers' errors, one per reading, carried through each ef
 and eliminated. Their size is the readings' own roughness, and that of the image noise what a free
 camera per epoch leaves: neither can take for itself what the model lacks.
 
-What the model leaves is tested against these two (`missing`). Where an effect is missing, the
+What the model leaves is tested against these two (`examine_rest`). Where an effect is missing, the
 covariance is widened by what it may have done to the unknowns, and the result says so.
 """
 
@@ -18,12 +18,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.thermal.level import moved_targets
-from thermocald.analysis.thermal.result import FittedModel, fitted_model
+from thermocald.analysis.thermal.result import fitted_camera
 from thermocald.analysis.thermal.terms import term_of, without_chance_events
 from thermocald.errors import DataError
 from thermocald.physics import catalogue
-from thermocald.thermal.basis import choose_distortion
-from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.fit import HypothesisFitter, choose_distortion
 from thermocald.thermal.movement import add_jumps_to_noise
 from thermocald.thermal.noise import (
     calibrate_thermometers,
@@ -38,11 +37,10 @@ from thermocald.thermal.series import in_blocks
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
     from thermocald.physics.model import Distortion, ModelEffect
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
-
-__all__ = ["fit_thermal_model", "targets_of"]
 
 
 def fit_thermal_model(
@@ -53,8 +51,8 @@ def fit_thermal_model(
     fixed: Sequence[str] = (),
     priors: Mapping[str, tuple[float, float]] | None = None,
     distortion: Distortion | None = None,
-) -> FittedModel:
-    """Fit the base model and some effects to all series together.
+) -> ThermalCamera:
+    """Fit the base model and some effects to all series of a camera together.
 
     listed: effects with start values; with `search` their non-linear parameters are looked for over
     their whole range first (an event always is); fixed: names such as `thermal_lag.tau` that keep
@@ -80,7 +78,7 @@ def fit_thermal_model(
         others = [reweight(s, n) for s, n in zip(others, growth.noise, strict=True)]
     fitter, fit = _fitted(others, listed, search, frozenset(fixed), dict(priors or {}))
     moved = [moved_targets(s, np.array(rows)) for s in others] if rows else []
-    return fitted_model(fitter, fit, others, listed, growth, moved, sure)
+    return fitted_camera(fitter, fit, others, listed, growth, moved, sure)
 
 
 def targets_of(listed: Sequence[ModelEffect]) -> tuple[str, ...]:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import csv
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.store.logger.clock import DeviceClock
-from thermocald.store.logger.moments import parse_moment
+from thermocald.store.logger.clock import DeviceClock, parse_moment
 
 if TYPE_CHECKING:
     import io
@@ -25,8 +24,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 STANDARD_INPUT = Path("-")
-_AT_ONCE = 100_000  # rows: a year of them has to fit into memory
-_CHUNK = 1 << 20
+_CHUNK = 1 << 22  # bytes at once: a year of rows has to fit into memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,24 +103,25 @@ def seconds_of(text: str, clock: DeviceClock) -> float:
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
-    """Lists of whole lines."""
-    if path != STANDARD_INPUT:
-        try:
-            with path.open(encoding="utf-8-sig") as file:
-                while lines := list(islice(file, _AT_ONCE)):
-                    yield lines
-        except (OSError, UnicodeDecodeError) as cause:
-            what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
-            raise DataError(f"{path}: cannot be read: {what}") from cause
-        return
+    """Lists of whole lines: what has come in, of a file some megabytes."""
+    standard = path == STANDARD_INPUT
     rest = b""
-    stream = cast("io.BufferedReader", sys.stdin.buffer)
-    while chunk := stream.read1(_CHUNK):
-        whole, mark, rest = (rest + chunk).rpartition(b"\n")
-        if mark:
-            yield whole.decode("utf-8-sig", errors="replace").splitlines()
-    if rest:
-        yield [rest.decode(errors="replace")]
+    try:
+        with nullcontext(sys.stdin.buffer) if standard else path.open("rb") as file:
+            stream = cast("io.BufferedReader", file)
+            while chunk := stream.read1(_CHUNK):
+                whole, mark, rest = (rest + chunk).rpartition(b"\n")
+                if mark:
+                    yield _text(whole, standard).splitlines()
+            if rest:
+                yield [_text(rest, standard)]
+    except (OSError, UnicodeDecodeError) as cause:
+        what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
+        raise DataError(f"{path}: cannot be read: {what}") from cause
+
+
+def _text(data: bytes, standard: bool) -> str:
+    return data.decode("utf-8-sig", errors="replace" if standard else "strict")
 
 
 def _block(

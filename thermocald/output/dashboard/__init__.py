@@ -10,7 +10,7 @@ import logging
 import stat
 from typing import TYPE_CHECKING
 
-from thermocald.addresses import is_loopback
+from thermocald.addresses import hide, is_loopback
 from thermocald.errors import ConfigurationError, DriverMissing
 
 if TYPE_CHECKING:
@@ -68,4 +68,5 @@ def _read_token(path: Path | None) -> str | None:
         raise ConfigurationError(
             f"{path}: the token has {len(token)} characters; at least {_SHORTEST_TOKEN} are needed"
         )
+    hide(token)
     return token

@@ -13,7 +13,7 @@ import io
 import json
 import math
 import shutil
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ from thermocald.output.dashboard.server import Limits
 from thermocald.output.dashboard.view import View
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 
     from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
@@ -67,21 +67,28 @@ _ONLINE = {
 
 
 class _StatusCollector:
+    """A daemon's status as metrics; an empty one says that none runs."""
+
     def __init__(self, status: Mapping[str, Any]) -> None:
         self._status = status
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         status = self._status
-        yield _single("up", "Whether a daemon answers.", float(bool(status)))
+        single: list[tuple[str, str, float]] = [("up", "Whether a daemon answers.", bool(status))]
+        if status:
+            store = status["store"]
+            single += [
+                ("status_age_s", "Age of the daemon's status, s.", status["age_s"]),
+                ("stalled", "Devices or pipelines that hang.", len(status["stalled"])),
+                ("store_ok", "Whether the store takes everything.", store["state"] == "ok"),
+                ("store_waiting", "Epochs waiting in memory.", store["waiting"]),
+                ("store_lost", "Epochs taken and not kept.", store["lost"]),
+                ("clock_trusted", "Whether UTC is known.", status["clock"]["trusted"]),
+            ]
+        for name, about, value in single:
+            yield GaugeMetricFamily(f"thermocald_{name}", about, value=float(value))
         if not status:
             return
-        yield _single("status_age_s", "Age of the daemon's status, s.", status["age_s"])
-        yield _single("stalled", "Devices or pipelines that hang.", len(status["stalled"]))
-        store = status["store"]
-        yield _single("store_ok", "Whether the store takes everything.", store["state"] == "ok")
-        yield _single("store_waiting", "Epochs waiting in memory.", store["waiting"])
-        yield _single("store_lost", "Epochs taken and not kept.", store["lost"])
-        yield _single("clock_trusted", "Whether UTC is known.", status["clock"]["trusted"])
         up = GaugeMetricFamily("thermocald_device_up", "Open and working.", labels=["kind", "name"])
         for kind in ("cameras", "thermometers", "outputs"):
             for name, device in status[kind].items():
@@ -89,28 +96,22 @@ class _StatusCollector:
         yield up
         for names, inner in ((_CAMERA, ()), (_EPOCH, ("last",)), (_ONLINE, ("last", "online"))):
             for key, about in names.items():
-                yield self._per_camera(key, about, inner)
-
-    def _per_camera(self, key: str, about: str, inner: tuple[str, ...]) -> GaugeMetricFamily:
-        family = GaugeMetricFamily(f"thermocald_{key}", about, labels=["camera", "series"])
-        for name, camera in self._status["cameras"].items():
-            values = camera
-            for part in inner:
-                values = values.get(part) or {}
-            if (value := values.get(key)) is not None:
-                family.add_metric([name, camera["series"]], float(value))
-        return family
+                family = GaugeMetricFamily(f"thermocald_{key}", about, labels=["camera", "series"])
+                for name, camera in status["cameras"].items():
+                    values = camera
+                    for part in inner:
+                        values = values.get(part) or {}
+                    if (value := values.get(key)) is not None:
+                        family.add_metric([name, camera["series"]], float(value))
+                yield family
 
 
-def _single(name: str, about: str, value: float) -> GaugeMetricFamily:
-    return GaugeMetricFamily(f"thermocald_{name}", about, value=float(value))
-
-
-def metrics_text(status: Mapping[str, Any]) -> bytes:
-    """The text format of Prometheus."""
+def _metrics(request: Request) -> Response:
+    """The status in the text format of Prometheus."""
     registry = CollectorRegistry()
-    registry.register(_StatusCollector(status))
-    return generate_latest(registry)
+    registry.register(_StatusCollector(_view(request).status()))
+    content_type = "text/plain; version=0.0.4; charset=utf-8"
+    return Response(generate_latest(registry), media_type=content_type)
 
 
 _STATIC = Path(__file__).parent / "static"
@@ -143,18 +144,13 @@ def build_application(
             Route("/", _page),
             Route("/static/plotly.js", _plotly),
             Route("/static/{name}", _static),
-            Route("/api/status", _status),
             Route("/api/stream", _stream),
-            Route("/api/series", _series),
-            Route("/api/columns", _columns),
-            Route("/api/events", _events),
-            Route("/api/cameras/{camera}/epoch", _epoch),
             Route("/api/cameras/{camera}/frame", _frame),
             Route("/api/series.csv", _csv),
-            Route("/camera.json", _camera_json),
             Route("/camera.yaml", _camera_yaml),
             Route("/healthz", _health),
             Route("/metrics", _metrics),
+            *(Route(path, partial(_json, answer)) for path, answer in _ANSWERS.items()),
         ],
         middleware=[
             Middleware(_Guard, token=token, names=HostNames(host, names)),
@@ -283,10 +279,6 @@ def _plotly(_: Request) -> Response:
     return Response(_plotly_script(), media_type="text/javascript", headers=headers)
 
 
-def _status(request: Request) -> Response:
-    return JSONResponse(_view(request).shown())
-
-
 async def _stream(request: Request) -> Response:
     view = _view(request)
 
@@ -310,26 +302,29 @@ async def _stream(request: Request) -> Response:
     return StreamingResponse(events(), media_type="text/event-stream")
 
 
-def _series(request: Request) -> Response:
-    return JSONResponse(_view(request).series())
-
-
-def _columns(request: Request) -> Response:
-    view = _view(request)
+def _columns(view: View, request: Request) -> dict[str, Any]:
     camera, series = _camera_and_series(request)
     since = _number(request, "last", 1.0, 1e10)
     until = _number(request, "until", 0.0, 1e11)
     points = _number(request, "points", 2.0, 2000.0)
-    return JSONResponse(view.columns(camera, series, since, until, int(points or 1000)))
+    return view.columns(camera, series, since, until, int(points or 1000))
 
 
-def _events(request: Request) -> Response:
-    return JSONResponse(_view(request).events(_number(request, "since", 0.0, 1e11) or 0.0))
+# what is answered as JSON
+_ANSWERS: dict[str, Callable[[View, Request], Any]] = {
+    "/api/status": lambda view, _: view.shown(),
+    "/api/series": lambda view, _: view.series(),
+    "/api/columns": _columns,
+    "/api/events": lambda view, request: view.events(_number(request, "since", 0.0, 1e11) or 0.0),
+    "/api/cameras/{camera}/epoch": lambda view, request: view.last_epoch(
+        request.path_params["camera"]
+    ),
+    "/camera.json": lambda view, request: view.current_camera(request.query_params.get("camera")),
+}
 
 
-def _epoch(request: Request) -> Response:
-    data = _view(request).last_epoch(request.path_params["camera"])
-    return Response(data, media_type="application/json")
+def _json(answer: Callable[[View, Request], Any], request: Request) -> Response:
+    return JSONResponse(answer(_view(request), request))
 
 
 def _frame(request: Request) -> Response:
@@ -337,17 +332,9 @@ def _frame(request: Request) -> Response:
     return Response(data, media_type="image/jpeg")
 
 
-def _camera_json(request: Request) -> Response:
-    return JSONResponse(_view(request).current_camera(_camera_asked(request)))
-
-
 def _camera_yaml(request: Request) -> Response:
-    text = _view(request).camera_info(_camera_asked(request))
+    text = _view(request).camera_info(request.query_params.get("camera"))
     return Response(text, media_type="application/yaml")
-
-
-def _camera_asked(request: Request) -> str | None:
-    return request.query_params.get("camera")
 
 
 def _csv(request: Request) -> Response:
@@ -367,11 +354,6 @@ def _csv(request: Request) -> Response:
 def _health(request: Request) -> Response:
     healthy, why = _view(request).healthy()
     return JSONResponse({"ok": healthy, "why": why}, 200 if healthy else 503)
-
-
-def _metrics(request: Request) -> Response:
-    text = metrics_text(_view(request).status())
-    return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 def _camera_and_series(request: Request) -> tuple[str, str]:

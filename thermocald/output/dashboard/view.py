@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import DataError, StoreError, ThermocaldError
+from thermocald.files import read_json
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -48,12 +48,10 @@ class View:
         path = self._live / "status.json"
         try:
             age_s = time.time() - path.stat().st_mtime
-            document = json.loads(path.read_bytes())
-        except (OSError, ValueError):
+        except OSError:
             return {}
-        if not isinstance(document, dict):
-            return {}
-        return {**document, "age_s": max(0.0, age_s)}
+        document = read_json(path)
+        return document and {**document, "age_s": max(0.0, age_s)}
 
     def shown(self) -> dict[str, Any]:
         """The status; without a daemon only `stopped`, when the last one ended, where known."""
@@ -89,9 +87,12 @@ class View:
         except OSError:
             return 0.0
 
-    def last_epoch(self, camera: str) -> bytes:
-        """The last epoch's row, targets and residuals as JSON; DataError if there is none."""
-        return self._file(camera, "json")
+    def last_epoch(self, camera: str) -> dict[str, Any]:
+        """The last epoch's row, targets and residuals; DataError if there is none."""
+        document = read_json(self._path(camera, "json"))
+        if not document:
+            raise DataError(f"camera {camera!r} has given nothing yet")
+        return document
 
     def current_camera(self, name: str | None) -> dict[str, Any]:
         """The camera of now in OpenCV's terms, with its pose where there is one; name: None for the
@@ -104,7 +105,7 @@ class View:
                     f"say which with ?camera=…; there are: {', '.join(there) or 'none'}"
                 )
             name = there[0]
-        row = json.loads(self.last_epoch(name)).get("row", {})
+        row = self.last_epoch(name).get("row", {})
         if not row.get("opencv"):
             raise DataError(
                 f"camera {name!r}: its last epoch has no result: {row.get('status', 'unknown')}"
@@ -129,15 +130,16 @@ class View:
         if now["temperature"] is not None:
             about += f", {now['temperature']:.2f} degC"
         # imported where they are used: few ask, and the page's process is small
-        from thermocald.photogrammetry.camera_files import FORMATS
-        from thermocald.photogrammetry.camera_files.camera_record import Record
+        from thermocald.photogrammetry.camera_files import encode
 
-        record = Record(CameraModel(sensor, interior), now["camera"], None, about)
-        return FORMATS["ros"].encode(record)[0]
+        return encode(CameraModel(sensor, interior), "ros", None, about, now["camera"])[0]
 
     def last_frame(self, camera: str) -> bytes:
         """The last frame as JPEG; DataError if there is none."""
-        return self._file(camera, "jpg")
+        try:
+            return self._path(camera, "jpg").read_bytes()
+        except OSError as error:
+            raise DataError(f"camera {camera!r} has given nothing yet") from error
 
     def series(self) -> list[dict[str, Any]]:
         """All series of the store, oldest first."""
@@ -216,14 +218,11 @@ class View:
                 raise StoreError("camera and series must both be given")
             store.find_series(camera, series)
 
-    def _file(self, camera: str, suffix: str) -> bytes:
+    def _path(self, camera: str, suffix: str) -> Path:
         # the name is looked up, never joined as it came
         if camera not in self.status().get("cameras", {}):
             raise DataError(f"there is no camera {camera!r}")
-        try:
-            return (self._live / f"{camera}.{suffix}").read_bytes()
-        except OSError as error:
-            raise DataError(f"camera {camera!r} has given nothing yet") from error
+        return self._live / f"{camera}.{suffix}"
 
 
 def _csv_names(series: StoredSeries) -> list[str]:

@@ -5,38 +5,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.errors import ImageError
-from thermocald.figures import Figure, draw_figure, draw_matrix, save
+from thermocald.figures import Figure, draw_figure, save
 from thermocald.files import make_folder
-from thermocald.numbers import parameter_label, plain
-from thermocald.output.study import figures, tables
-from thermocald.output.study.summary import answer_sentences, detail_sentences
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.report import (
-    Answer,
-    Chapter,
-    Drawing,
-    Section,
-    Table,
-    day,
-    of_figure,
-    of_matrix,
-    render_report,
+from thermocald.numbers import plain
+from thermocald.output.study import tables
+from thermocald.output.study.figures import (
+    dependence_figure,
+    file_name,
+    principal_point_figure,
+    study_figures,
 )
+from thermocald.output.study.summary import answer_sentences, detail_sentences
+from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day, render_report
+from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from datetime import datetime
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from thermocald.analysis.study.study import CameraStudy, Study, StudySettings
-    from thermocald.arrays import Array
 
 _CLIP_PX = 96
 _CLIP_LONGEST_PX = 480
@@ -47,69 +42,19 @@ _LEAD = (
 )
 
 
-def render_study(
-    study: Study, title: str = "Thermal study of a camera", made: datetime | None = None
-) -> str:
-    """Return the report as HTML text; made: the time that it bears, by default now."""
+def render_study(study: Study, title: str = "Thermal study of a camera") -> str:
+    """Return the report as HTML text."""
     chapters = [
         Chapter(
             camera.label,
-            _answer(camera, f"c{i}-"),
-            tuple(_sections(camera, study.settings, f"c{i}-")),
+            _answer(camera),
+            tuple(_sections(camera, study.settings)),
             (_device(camera),),
             tuple(_notes(camera)),
         )
-        for i, camera in enumerate(study.cameras)
+        for camera in study.cameras
     ]
-    return render_report(title, chapters, _LEAD, made)
-
-
-def _answer(camera: CameraStudy, prefix: str) -> Answer:
-    sentences = answer_sentences(camera)
-    proof = figures.dependence_figure(camera, "proof", ("c", "x0", "y0"))
-    if proof is None:
-        proof = figures.principal_point_figure(camera, "proof")
-    first = sentences[0] if sentences else "Nothing can be said about change."
-    return Answer(
-        first,
-        of_figure(proof, prefix) if proof is not None else None,
-        tuple(sentences[1:]),
-        _next_steps(camera),
-        _not_covered(),
-    )
-
-
-def _next_steps(camera: CameraStudy) -> tuple[str, ...]:
-    steps = []
-    if any(c.dependences for study in camera.series for c in study.channels):
-        steps.append("Fit a thermal model to correct measurements with: thermocald fit.")
-        steps.append("See what a straight line leaves, and why: thermocald discover.")
-    else:
-        steps.append("Record a temperature with the frames; without one nothing can be corrected.")
-    if len(camera.series) < 2:
-        steps.append("Measure a second series on another day: only that shows what repeats.")
-    return tuple(steps)
-
-
-def _not_covered() -> tuple[str, ...]:
-    return (
-        "Temperatures other than those measured, and changes faster than the epochs.",
-        "Errors of the camera model itself, and focus or lens moved by hand.",
-        "How another specimen of this camera behaves: that is measured with it.",
-    )
-
-
-def _device(camera: CameraStudy) -> str:
-    """The camera, its sensor, and when each series was measured."""
-    sensor = camera.series[0].series.sensor
-    names = ", ".join(dict.fromkeys(study.series.camera for study in camera.series))
-    measured = "; ".join(
-        f"{s.name} {day(s.start_utc)}" for s in (study.series for study in camera.series)
-    )
-    return (
-        f"{names}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm. "
-        f"Measured: {measured}."
-    )
+    return render_report(title, chapters, _LEAD)
 
 
 def save_figures(study: Study, folder: Path) -> list[Path]:
@@ -117,84 +62,71 @@ def save_figures(study: Study, folder: Path) -> list[Path]:
     make_folder(folder)
     paths = []
     for camera in study.cameras:
-        prefix = _file_name(camera.label) + "-" if len(study.cameras) > 1 else ""
-        for figure in _panel_figures(camera):
-            paths += save(draw_figure(figure), folder, prefix + figure.name)
-        for name, (values, names, title, _) in _matrices(camera).items():
-            paths += save(draw_matrix(values, names, title), folder, prefix + name)
+        prefix = file_name(camera.label) + "-" if len(study.cameras) > 1 else ""
+        for name, figure in study_figures(camera).items():
+            paths += save(draw_figure(figure), folder, prefix + name)
     return paths
 
 
-def _panel_figures(camera: CameraStudy) -> list[Figure]:
-    made = (
-        figures.deviation_figure(camera) if figures.has_course(camera) else None,
-        figures.principal_point_figure(camera),
-        figures.movement_figure(camera),
-        figures.significance_figure(camera),
-        figures.dependence_figure(camera),
-        figures.error_figure(camera),
-        figures.point_figure(camera),
+def _answer(camera: CameraStudy) -> Answer:
+    sentences = answer_sentences(camera) or ["Nothing can be said about change."]
+    proof = dependence_figure(camera, ("c", "x0", "y0"))
+    if proof is None and any(len(study.series) > 1 for study in camera.series):
+        proof = principal_point_figure(camera)
+    if any(c.dependences for study in camera.series for c in study.channels):
+        steps = [
+            "Fit a thermal model to correct measurements with: thermocald fit.",
+            "See what a straight line leaves, and why: thermocald discover.",
+        ]
+    else:
+        steps = ["Record a temperature with the frames; without one nothing can be corrected."]
+    if len(camera.series) < 2:
+        steps.append("Measure a second series on another day: only that shows what repeats.")
+    return Answer(
+        sentences[0],
+        None if proof is None else replace(proof, name="proof"),
+        tuple(sentences[1:]),
+        tuple(steps),
+        (
+            "Temperatures other than those measured, and changes faster than the epochs.",
+            "Errors of the camera model itself, and focus or lens moved by hand.",
+            "How another specimen of this camera behaves: that is measured with it.",
+        ),
     )
-    return [figure for figure in made if figure is not None]
 
 
-def _matrices(camera: CameraStudy) -> dict[str, tuple[Array, list[str], str, str]]:
-    """By file name: correlations, what they are of, title, caption."""
-    made = {
-        f"correlation-{_file_name(study.series.name)}": (
-            study.matrix,
-            [parameter_label(n) for n in study.columns],
-            study.series.name,
-            (
-                "Pearson's correlation over the epochs among parameters, σ₀ and temperatures. Red: "
-                "they rise together; blue: one rises as the other falls."
-            ),
-        )
-        for study in camera.series
-        if len(study.series) > 2
-    }
-    free = [k for k in range(10) if camera.sds[k] > 0]
-    if camera.correlations is not None and free:
-        noise = camera.correlations.noise[free][:, free]
-        made["iop-correlations"] = (
-            camera.correlations.median[free][:, free],
-            [parameter_label(IOP_NAMES[k]) for k in free],
-            "Within the adjustments",
-            (
-                "Correlation of the estimated parameters within an epoch's adjustment: median over "
-                f"{camera.correlations.epochs} epochs, of which the noise (sd) is "
-                f"{plain(float(np.max(noise)), digits=2)} at most. High values belong to the "
-                "geometry of the calibration, not to the temperature."
-            ),
-        )
-    return made
+def _device(camera: CameraStudy) -> str:
+    """The camera, its sensor, and when each series was measured."""
+    series = [study.series for study in camera.series]
+    sensor = series[0].sensor
+    names = ", ".join(dict.fromkeys(s.camera for s in series))
+    measured = "; ".join(f"{s.name} {day(s.start_utc)}" for s in series)
+    return (
+        f"{names}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm. "
+        f"Measured: {measured}."
+    )
 
 
-def _sections(camera: CameraStudy, settings: StudySettings, prefix: str) -> list[Section]:
-    drawn = {figure.name: of_figure(figure, prefix) for figure in _panel_figures(camera)}
-    matrices = {
-        name: of_matrix(values, names, f"{prefix}{name}", f"Correlation matrix, {title}", caption)
-        for name, (values, names, title, caption) in _matrices(camera).items()
-    }
-    within = [matrices.pop("iop-correlations")] if "iop-correlations" in matrices else []
+def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
+    drawn = study_figures(camera)
 
     def section(
-        title: str, names: tuple[str, ...], found: Sequence[Table | None],
-        more: list[Drawing] | None = None, text: tuple[str, ...] = (), folded: bool = False,
+        title: str, names: Sequence[str], found: Sequence[Table | None],
+        more: Sequence[Figure] = (), text: Sequence[str] = (), folded: bool = False,
     ) -> Section:  # fmt: skip
-        shown = [drawn[name] for name in names if name in drawn] + (more or [])
+        shown = [drawn[name] for name in names if name in drawn]
         rows = tuple(t for t in found if t is not None and t.rows)
-        return Section(title, text, tuple(shown), rows, folded=folded)
+        return Section(title, tuple(text), (*shown, *more), rows, folded=folded)
 
+    matrices = [name for name in drawn if name.startswith("correlation-")]
     parts = [
         section(
             "How the camera changed", ("deviations", "principal-point", "movement"),
-            [tables.deviation_table(camera)], _clips(camera, prefix),
+            [tables.deviation_table(camera)], _clips(camera),
         ),
         section(
-            "How it depends on the temperature", ("temperature-dependence",),
-            tables.dependence_tables(camera), list(matrices.values()),
-            tuple(detail_sentences(camera)),
+            "How it depends on the temperature", ("temperature-dependence", *matrices),
+            tables.dependence_tables(camera), text=detail_sentences(camera),
         ),
         section(
             "What it means in object space", ("object-space-errors", "errors-by-point"),
@@ -204,7 +136,7 @@ def _sections(camera: CameraStudy, settings: StudySettings, prefix: str) -> list
             "Whether the changes are significant", ("significance",),
             [tables.significance_table(camera, settings)], folded=True,
         ),
-        section("Correlations of the parameters", (), [], within, folded=True),
+        section("Correlations of the parameters", ("iop-correlations",), [], folded=True),
         section(
             "What was measured and assumed", (), [tables.overview_table(camera)],
             text=_assumed(camera, settings), folded=True,
@@ -227,7 +159,7 @@ def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
     return (f"If the lens were {lens}, {change}. Neither was measured.",)
 
 
-def _clips(camera: CameraStudy, prefix: str) -> list[Drawing]:
+def _clips(camera: CameraStudy) -> list[Figure]:
     """First and last image around one target, side by side, for every series that has frames."""
     made = []
     for i, study in enumerate(camera.series):
@@ -239,13 +171,12 @@ def _clips(camera: CameraStudy, prefix: str) -> list[Drawing]:
             for path, epoch in ((clip.first, clip.first_epoch), (clip.last, clip.last_epoch))
         )
         made.append(
-            Drawing(
-                f"{prefix}clips-{i}",
+            Figure(
+                f"clips-{i}",
                 f"Image around target {clip.target}",
                 f"The same {_CLIP_PX} × {_CLIP_PX} px of the first and the last frame; the cross "
                 "is where the target was in the first.",
                 images=images,
-                columns=2,
             )
         )
     return made
@@ -301,13 +232,8 @@ def _notes(camera: CameraStudy) -> list[str]:
         for note, names in holders.items()
     ]
     doubts = [
-        f"{study.series.name} is doubtful: {text}."
+        as_sentence(line)
         for study in camera.series
-        for text in study.series.doubts
+        for line in doubt_lines(study.series.doubts, study.series.name)
     ]
     return doubts + notes + list(camera.notes)
-
-
-def _file_name(label: str) -> str:
-    """A label with nothing in it that a file name cannot hold."""
-    return "".join(c if c.isalnum() or c in "-_." else "-" for c in label).strip(".") or "camera"

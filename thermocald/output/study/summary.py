@@ -19,15 +19,14 @@ from thermocald.numbers import (
     with_sd,
 )
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.result import jsonable
+from thermocald.result import document_of, jsonable
+from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermocald.analysis.statistics.dependence import Dependence
-    from thermocald.analysis.study.deviations import Deviation
     from thermocald.analysis.study.reference import Comparison
-    from thermocald.analysis.study.series_study import ChannelStudy, SeriesStudy, Significance
+    from thermocald.analysis.study.series_study import ChannelStudy, Deviation, SeriesStudy
     from thermocald.analysis.study.study import CameraStudy, Study
 
 
@@ -55,22 +54,19 @@ def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[st
     lines = []
     for camera in study.cameras:
         lines.append(camera.label)
-        lines += [f"  {sentence}" for sentence in summary(camera)]
+        lines += [f"  {s}" for s in (*answer_sentences(camera), *detail_sentences(camera))]
         for one in camera.series:
-            lines += [f"  doubtful, {one.series.name}: {text}" for text in one.series.doubts]
+            lines += [f"  {line}" for line in doubt_lines(one.series.doubts, one.series.name)]
         for one in camera.series:
             lines += [f"  note, {one.series.name}: {note}" for note in one.notes]
         lines += [f"  note: {note}" for note in camera.notes]
     return lines
 
 
-def summary(camera: CameraStudy) -> list[str]:
-    """Return sentences, the rates first; none that the data do not support."""
-    return [*answer_sentences(camera), *detail_sentences(camera)]
-
-
 def answer_sentences(camera: CameraStudy) -> list[str]:
-    """Return what the camera does and what follows from it."""
+    """Return what the camera does and what follows from it, the rates first; nothing that the data
+    do not support.
+    """
     mc = camera.montecarlo
     distance = mc.distance_mm if mc is not None else _DISTANCE_MM
     sentences = [s for study in camera.series if (s := rates(study, distance))]
@@ -259,15 +255,12 @@ def _dependence(study: SeriesStudy) -> str:
     return text + (f", {', '.join(close)} closely (|r| ≥ {_CLOSE})." if close else ".")
 
 
-FORMAT = "thermocald-study/1"
-
-
 def study_document(study: Study) -> dict[str, Any]:
     """Everything the study computed; null where something could not be, `notes` says why."""
     s = study.settings
     document: dict[str, Any] = jsonable(
         {
-            "format": FORMAT,
+            "format": "thermocald-study/1",
             "settings": {k: v for k, v in jsonable(s).items() if k != "jobs"},
             "cameras": [_camera(camera, s.distance_mm) for camera in study.cameras],
             "doubts": [
@@ -300,7 +293,6 @@ def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
 
 def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
     s = study.series
-    focus = study.focus
     return {
         "name": s.name,
         "camera": s.camera,
@@ -314,109 +306,76 @@ def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
         "field_movements": list(s.field_movements),
         "exterior": s.exterior,
         "free": list(s.free),
-        "deviations": {name: jsonable(d) for name, d in study.deviations.items()},
-        "depth_of_field": None
-        if focus is None
-        else {
-            "near_first_mm": focus.first.near,
-            "far_first_mm": focus.first.far,
-            "near_last_mm": focus.last.near,
-            "far_last_mm": focus.last.far,
-            "change_mm": focus.change,
-            "sd_change_mm": focus.sd_change,
-            "confusion_mm": focus.confusion,
-        },
+        "deviations": study.deviations,
+        "depth_of_field": study.focus,
         "image_displacement_px": None
         if study.displacement is None
-        else {"points": study.grid.tolist(), "displacement": study.displacement.tolist()},
-        "significance": {name: _significance(t) for name, t in study.significance.items()},
+        else {"points": study.grid, "displacement": study.displacement},
+        "significance": study.significance,
         "temperature_dependence": {
             channel.thermometer.name: _channel(study, channel, distance_mm)
             for channel in study.channels
         },
-        "correlation_matrix": {"columns": list(study.columns), "r": study.matrix.tolist()},
+        "correlation_matrix": {"columns": study.columns, "r": study.matrix},
         "notes": list(study.notes),
         "doubts": list(s.doubts),
     }
 
 
-def _significance(test: Significance) -> dict[str, Any]:
-    p_holm = {"p_holm": test.p_holm, "p_excess_holm": test.p_excess_holm}
-    drift = None if test.drift is None else {**jsonable(test.drift), **p_holm}
-    return {**jsonable(test), "drift_test": drift}
-
-
 def _channel(study: SeriesStudy, channel: ChannelStudy, distance_mm: float) -> dict[str, Any]:
+    parameters = {}
+    for name, d in channel.dependences.items():
+        parameters[name] = {
+            **document_of(d),
+            "p_naive_holm": channel.p_naive_holm[name],
+            "p_holm": channel.p_holm[name],
+        }
+        if name in ("c", "x0", "y0"):
+            px, mm = rate_in_px_and_mm(study, name, d.slope, distance_mm)
+            sd_px, sd_mm = rate_in_px_and_mm(study, name, d.sd_slope, distance_mm)
+            parameters[name] |= {
+                "slope_px": px, "sd_slope_px": sd_px,
+                "slope_on_plane_mm": mm, "sd_slope_on_plane_mm": sd_mm,
+            }  # fmt: skip
     return {
         "sd_thermometer": channel.thermometer.sd,
         "reason": channel.reason or None,
-        "parameters": {
-            name: {
-                "n": d.n,
-                "r": d.r,
-                "p_naive": d.p_naive,
-                "p_naive_holm": channel.p_naive_holm[name],
-                "n_effective": d.n_effective,
-                "residual_lag_one": d.lag_one,
-                "p": d.p_value,
-                "p_holm": channel.p_holm[name],
-                "slope": d.slope,
-                "sd_slope": d.sd_slope,
-                **_rate_seen(study, name, d, distance_mm),
-                "too_short": d.too_short,
-                "scatter_over_noise": d.misfit,
-            }
-            for name, d in channel.dependences.items()
-        },
+        "parameters": parameters,
     }
-
-
-def _rate_seen(
-    study: SeriesStudy, name: str, d: Dependence, distance_mm: float
-) -> dict[str, float]:
-    """A rate of c, x0 or y0 in px/K, and in mm/K on the object plane."""
-    if name not in ("c", "x0", "y0"):
-        return {}
-    (px, mm), (sd_px, sd_mm) = (
-        rate_in_px_and_mm(study, name, rate, distance_mm) for rate in (d.slope, d.sd_slope)
-    )
-    seen = {"slope_px": px, "sd_slope_px": sd_px}
-    return {**seen, "slope_on_plane_mm": mm, "sd_slope_on_plane_mm": sd_mm}
 
 
 def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
         return None
+    drawn = {
+        "image_point_px": mc.image_points, "expected_mm": mc.expected, "counts": mc.counts,
+        "mean_mm": mc.mean, "largest_mm": mc.largest, "bias_mm": mc.mean_error,
+        "covariance_mm2": mc.covariance,
+    }  # fmt: skip
+    linear = {
+        "mean_mm": first.mean, "expected_largest_mm": first.expected_largest,
+        "covariance_mm2": first.covariance,
+    }  # fmt: skip
+
+    def at(columns: dict[str, Any], k: int) -> dict[str, Any]:
+        return {name: column[k] for name, column in columns.items()}
+
     return {
         "sets": mc.sets,
         "seed": mc.seed,
         "distance_mm": mc.distance_mm,
-        "clusters_mm": list(mc.clusters_mm),
-        "fractions": mc.fractions.tolist(),
+        "clusters_mm": mc.clusters_mm,
+        "fractions": mc.fractions,
         "mean_mm": mc.overall_mean,
         "mean_of_maxima_mm": mc.mean_largest,
         "folded_sets": mc.folded,
         "points": [
-            {
-                "image_point_px": mc.image_points[k].tolist(),
-                "expected_mm": mc.expected[k].tolist(),
-                "counts": mc.counts[k].tolist(),
-                "mean_mm": float(mc.mean[k]),
-                "largest_mm": float(mc.largest[k]),
-                "bias_mm": mc.mean_error[k].tolist(),
-                "covariance_mm2": mc.covariance[k].tolist(),
-                "first_order": {
-                    "mean_mm": float(first.mean[k]),
-                    "expected_largest_mm": float(first.expected_largest[k]),
-                    "covariance_mm2": first.covariance[k].tolist(),
-                },
-            }
-            for k in range(len(mc.image_points))
+            {**at(drawn, k), "first_order": at(linear, k)} for k in range(len(mc.image_points))
         ],
         "first_order": {
-            "fractions": first.fractions.tolist(),
-            "mean_mm": float(first.mean.mean()),
-            "mean_of_maxima_mm": float(first.expected_largest.mean()),
+            "fractions": first.fractions,
+            "mean_mm": first.mean.mean(),
+            "mean_of_maxima_mm": first.expected_largest.mean(),
         },
     }

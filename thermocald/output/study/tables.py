@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,113 +17,97 @@ from thermocald.numbers import (
     rounded,
     with_sd,
 )
+from thermocald.output.study.figures import cluster_names
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.report import Table
 
 if TYPE_CHECKING:
-    from thermocald.analysis.study.deviations import Deviation
     from thermocald.analysis.study.series_study import (
         ChannelStudy,
+        Deviation,
         SeriesStudy,
-        Significance,
         StudySettings,
     )
     from thermocald.analysis.study.study import CameraStudy
+    from thermocald.arrays import Array
 
 _FIXED = {"first": "first epoch", "mean": "mean", "last": "last epoch"}
 
 
 def overview_table(camera: CameraStudy) -> Table:
     """What was measured."""
-    rows = []
-    for study in camera.series:
-        s = study.series
-        lost = sum(s.without_result.values())
-        rows.append(
-            (
-                s.name,
-                s.camera,
-                f"{s.sensor.width} × {s.sensor.height} px of {s.sensor.pixel_pitch * 1000:g} µm",
-                f"{len(s)}" + (f" of {len(s) + lost}" if lost else ""),
-                duration(float(s.time_s[-1] - s.time_s[0])),
-                f"{s.interval_s:.1f} s" if len(s) > 1 else "–",
-                _temperatures(study),
-                _noise(study),
-                ", ".join(parameter_label(name) for name in s.free),
-            )
-        )
-    return Table(
+
+    def temperatures(study: SeriesStudy) -> str:
+        reference = study.series.reference
+        t = study.deviations.get(reference.name) if reference else None
+        return f"{t.first:.1f} to {t.last:.1f} °C, range {t.range:.1f} K" if t else "–"
+
+    def epochs(study: SeriesStudy) -> str:
+        lost, count = sum(study.series.without_result.values()), len(study.series)
+        return f"{count} of {count + lost}" if lost else str(count)
+
+    def sensor(study: SeriesStudy) -> str:
+        one = study.series.sensor
+        return f"{one.width} × {one.height} px of {one.pixel_pitch * 1000:g} µm"
+
+    def noise(study: SeriesStudy) -> str:
+        ratio = f"{study.noise_ratio:.2f}" if np.isfinite(study.noise_ratio) else "–"
+        return f"{np.sqrt(np.mean(np.square(study.series.sigma0))):.2f}; {ratio}"
+
+    return Table.of(
         "Series",
-        (
-            "series",
-            "camera",
-            "sensor",
-            "epochs",
-            "duration",
-            "interval",
-            "temperature",
-            "σ₀; noise / stated",
-            "estimated",
-        ),
-        tuple(rows),
+        camera.series,
+        {
+            "series": lambda s: s.series.name,
+            "camera": lambda s: s.series.camera,
+            "sensor": sensor,
+            "epochs": epochs,
+            "duration": lambda s: duration(float(s.series.time_s[-1] - s.series.time_s[0])),
+            "interval": lambda s: f"{s.series.interval_s:.1f} s" if len(s.series) > 1 else "–",
+            "temperature": temperatures,
+            "σ₀; noise / stated": noise,
+            "estimated": lambda s: ", ".join(parameter_label(name) for name in s.series.free),
+        },
         "Temperature: first to last epoch, and its range. σ₀ is that of the adjustments, against "
         "the stated standard deviations of the image points; noise / stated is the scatter between "
         "neighbouring epochs over the stated standard deviations of the parameters.",
     )
 
 
-def _temperatures(study: SeriesStudy) -> str:
-    s = study.series
-    t = study.deviations.get(s.reference.name) if s.reference else None
-    return f"{t.first:.1f} to {t.last:.1f} °C, range {t.range:.1f} K" if t else "–"
-
-
-def _noise(study: SeriesStudy) -> str:
-    sigma0 = float(np.sqrt(np.mean(np.square(study.series.sigma0))))
-    ratio = f"{study.noise_ratio:.2f}" if np.isfinite(study.noise_ratio) else "–"
-    return f"{sigma0:.2f}; {ratio}"
-
-
 def deviation_table(camera: CameraStudy) -> Table:
     """Last minus first (Table 2)."""
-    names = list(dict.fromkeys(n for study in camera.series for n in study.deviations))
-    rows = []
-    for name in names:
-        for study in camera.series:
-            d = study.deviations.get(name)
-            if d is None:
-                continue
-            unit = UNITS.get(name, "K")
-            # Positions are given in mm, their changes in µm.
-            k, change_unit = (1000.0, "µm") if unit == "mm" else (1.0, unit)
-            level_unit = "°C" if unit == "K" else unit
-            rows.append(
-                (
-                    parameter_label(name),
-                    study.series.name,
-                    rounded(d.first, d.sd_change, level_unit),
-                    rounded(d.last, d.sd_change, level_unit),
-                    with_sd(k * d.change, k * d.sd_change, change_unit),
-                    _in_pixels(name, d, study.series.sensor.pixel_pitch),
-                    plain(k * d.largest, change_unit, 3),
-                    plain(k * d.range, change_unit, 3),
-                    plain(k * d.sd_over_time, change_unit, 3),
-                )
-            )
-    return Table(
+    names = dict.fromkeys(n for study in camera.series for n in study.deviations)
+    rows = [
+        (name, study, study.deviations[name])
+        for name in names
+        for study in camera.series
+        if name in study.deviations
+    ]
+
+    def level(name: str, d: Deviation, value: float) -> str:
+        return rounded(value, d.sd_change, UNITS.get(name, "°C"))
+
+    def change(name: str, value: float, sd: float | None = None) -> str:
+        # Positions are given in mm, their changes in µm.
+        factor, unit = _small_unit(UNITS.get(name, "K"))
+        if sd is None:
+            return plain(factor * value, unit, 3)
+        return with_sd(factor * value, factor * sd, unit)
+
+    return Table.of(
         "Deviations, last minus first epoch",
-        (
-            "parameter",
-            "series",
-            "first",
-            "last",
-            "last − first ± sd",
-            "in px",
-            "largest",
-            "range",
-            "sd over time",
-        ),
-        tuple(rows),
+        rows,
+        {
+            "parameter": lambda r: parameter_label(r[0]),
+            "series": lambda r: r[1].series.name,
+            "first": lambda r: level(r[0], r[2], r[2].first),
+            "last": lambda r: level(r[0], r[2], r[2].last),
+            "last − first ± sd": lambda r: change(r[0], r[2].change, r[2].sd_change),
+            "in px": lambda r: _in_pixels(r[1], r[0], r[2].change, r[2].sd_change),
+            "largest": lambda r: change(r[0], r[2].largest),
+            "range": lambda r: change(r[0], r[2].range),
+            "sd over time": lambda r: change(r[0], r[2].sd_over_time),
+        },
         "The standard deviation alongside a difference is that of the two adjustments (for "
         "temperatures: of the two readings). Largest is the greatest departure from the first "
         "epoch, range the largest minus the smallest value, noise included; sd over "
@@ -132,47 +115,42 @@ def deviation_table(camera: CameraStudy) -> Table:
     )
 
 
-def _in_pixels(name: str, d: Deviation, pitch: float) -> str:
-    return with_sd(d.change / pitch, d.sd_change / pitch) if name in ("c", "x0", "y0") else ""
+def _small_unit(unit: str) -> tuple[float, str]:
+    """The factor to the unit in which changes are told, and that unit."""
+    return (1000.0, "µm") if unit == "mm" else (1.0, unit)
 
 
-def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | None:
+def _in_pixels(study: SeriesStudy, name: str, value: float, sd: float) -> str:
+    """A change of c, x0 or y0 in px, nothing for the others."""
+    pitch = study.series.sensor.pixel_pitch
+    return with_sd(value / pitch, sd / pitch) if name in ("c", "x0", "y0") else ""
+
+
+def significance_table(camera: CameraStudy, settings: StudySettings) -> Table:
     """Success ratios of the F-test and the p-value of the whole series (Tables 4 and 5)."""
-    tested = [study for study in camera.series if study.significance]
-    if not tested:
-        return None
-    rows = []
-    for name in IOP_NAMES:
-        for study in tested:
-            test = study.significance.get(name)
-            if test is not None:
-                rows.append(
-                    (
-                        parameter_label(name),
-                        study.series.name,
-                        percent(test.success_ratio),
-                        plain(test.median_ratio, digits=3),
-                        f"{test.critical:.3f}",
-                        f"{test.degrees_variance}; {test.degrees_sd:.0f}",
-                        f"{test.tests} ({test.left_out})",
-                        *_drift_cells(test),
-                    )
-                )
-    return Table(
+    rows = [
+        (name, study.series.name, study.significance[name], study.significance[name].drift)
+        for name in IOP_NAMES
+        for study in camera.series
+        if name in study.significance
+    ]
+    return Table.of(
         "Is the variation greater than the uncertainty?",
-        (
-            "parameter",
-            "series",
-            "success ratio",
-            "median variance ratio",
-            "limit",
-            "degrees of freedom",
-            "epochs tested (left out)",
-            "p, no drift",
-            "p, within sds",
-            "noise / stated",
-        ),
-        tuple(rows),
+        rows,
+        {
+            "parameter": lambda r: parameter_label(r[0]),
+            "series": lambda r: r[1],
+            "success ratio": lambda r: percent(r[2].success_ratio),
+            "median variance ratio": lambda r: plain(r[2].median_ratio, digits=3),
+            "limit": lambda r: f"{r[2].critical:.3f}",
+            "degrees of freedom": lambda r: f"{r[2].degrees_variance}; {r[2].degrees_sd:.0f}",
+            "epochs tested (left out)": lambda r: f"{r[2].tests} ({r[2].left_out})",
+            "p, no drift": lambda r: p_text(r[2].p_holm) if r[3] else "–",
+            "p, within sds": lambda r: p_text(r[2].p_excess_holm) if r[3] else "–",
+            "noise / stated": lambda r: (
+                with_sd(r[3].noise_ratio, r[3].sd_noise_ratio) if r[3] else "–"
+            ),
+        },
         f"F-test at each epoch: variance of {settings.window} consecutive epochs against the "
         f"mean of their squared standard deviations, one-sided at α = {settings.alpha:g}. "
         f"Neighbouring windows have {settings.window - 1} of {settings.window} epochs in common, "
@@ -186,13 +164,6 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table | 
     )
 
 
-def _drift_cells(test: Significance) -> tuple[str, str, str]:
-    if test.drift is None:
-        return ("–", "–", "–")
-    noise = with_sd(test.drift.noise_ratio, test.drift.sd_noise_ratio)
-    return (p_text(test.p_holm), p_text(test.p_excess_holm), noise)
-
-
 def dependence_tables(camera: CameraStudy) -> list[Table]:
     """Correlation and slope on each thermometer (the reference's section 4.3)."""
     return [
@@ -204,39 +175,25 @@ def dependence_tables(camera: CameraStudy) -> list[Table]:
 
 
 def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
-    rows = []
-    for name, d in channel.dependences.items():
-        k, unit = (1000.0, "µm") if UNITS[name] == "mm" else (1.0, UNITS[name])
-        pitch = study.series.sensor.pixel_pitch
-        in_px = with_sd(d.slope / pitch, d.sd_slope / pitch) if name in ("c", "x0", "y0") else ""
-        rows.append(
-            (
-                parameter_label(name),
-                coefficient(d.r),
-                f"{d.n}",
-                f"{d.n_effective:.0f}",
-                p_text(channel.p_naive_holm[name]),
-                p_text(channel.p_holm[name]),
-                with_sd(k * d.slope, k * d.sd_slope, f"{unit}/K" if unit else "1/K"),
-                in_px,
-                f"{d.misfit:.1f}",
-            )
-        )
+    def slope(name: str, value: float, sd: float) -> str:
+        factor, unit = _small_unit(UNITS[name])
+        return with_sd(factor * value, factor * sd, f"{unit or 1}/K")
+
     t = channel.thermometer
-    return Table(
+    return Table.of(
         f"Dependence on {parameter_label(t.name)}, {study.series.name}",
-        (
-            "parameter",
-            "r",
-            "n",
-            "n effective",
-            "p naive",
-            "p",
-            "slope ± sd",
-            "px/K",
-            "scatter / noise",
-        ),
-        tuple(rows),
+        channel.dependences.items(),
+        {
+            "parameter": lambda r: parameter_label(r[0]),
+            "r": lambda r: coefficient(r[1].r),
+            "n": lambda r: f"{r[1].n}",
+            "n effective": lambda r: f"{r[1].n_effective:.0f}",
+            "p naive": lambda r: p_text(channel.p_naive_holm[r[0]]),
+            "p": lambda r: p_text(channel.p_holm[r[0]]),
+            "slope ± sd": lambda r: slope(r[0], r[1].slope, r[1].sd_slope),
+            "px/K": lambda r: _in_pixels(study, r[0], r[1].slope, r[1].sd_slope),
+            "scatter / noise": lambda r: f"{r[1].misfit:.1f}",
+        },
         f"r: Pearson's correlation. p naive counts every epoch as independent; p holds whatever "
         "the memory of the noise; both are corrected for the number of parameters (Holm). n "
         "effective: independent epochs that the series is worth. The slope counts the "
@@ -250,26 +207,18 @@ def cluster_table(camera: CameraStudy) -> Table | None:
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
         return None
-    cm = [limit / 10 for limit in mc.clusters_mm]
-    names = [f"< {cm[0]:g} cm"]
-    names += [f"{a:g}–{b:g} cm" for a, b in pairwise(cm)]
-    names.append(f"> {cm[-1]:g} cm")
 
-    def row(label: str, fractions: object, mean: float, largest: float) -> tuple[str, ...]:
-        shown = [percent(float(v), 1) for v in np.asarray(fractions, dtype=float)]
+    def row(label: str, fractions: Array, mean: float, largest: float) -> tuple[str, ...]:
+        shown = [percent(float(v), 1) for v in fractions]
         return (label, *shown, f"{mean / 10:.2f} cm", f"{largest / 10:.1f} cm")
 
+    linear = np.maximum(first.fractions, 0.0)
     return Table(
         f"Errors on a plane at {mc.distance_mm / 1000:g} m",
-        ("", *names, "mean", "mean of maxima"),
+        ("", *cluster_names(mc.clusters_mm), "mean", "mean of maxima"),
         (
             row("simulated", mc.fractions, mc.overall_mean, mc.mean_largest),
-            row(
-                "first order",
-                np.maximum(first.fractions, 0.0),
-                float(first.mean.mean()),
-                float(first.expected_largest.mean()),
-            ),
+            row("first order", linear, first.mean.mean(), first.expected_largest.mean()),
             *(
                 row(f"own path, {_FIXED[t.reference]} fixed", t.fractions, t.mean, t.mean_largest)
                 for t in camera.trajectories
@@ -289,36 +238,22 @@ def point_table(camera: CameraStudy) -> Table | None:
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
         return None
-    rows = []
-    for k, point in enumerate(mc.image_points):
-        values, vectors = np.linalg.eigh(mc.covariance[k])
-        major = vectors[:, 1]
-        angle = float(np.degrees(np.arctan2(major[1], major[0]))) % 180
-        rows.append(
-            (
-                f"{point[0]:.0f}, {point[1]:.0f}",
-                f"{mc.mean[k] / 10:.2f}",
-                f"{first.mean[k] / 10:.2f}",
-                f"{mc.largest[k] / 10:.1f}",
-                f"{first.expected_largest[k] / 10:.1f}",
-                f"{np.sqrt(values[1]) / 10:.2f} × {np.sqrt(max(values[0], 0.0)) / 10:.2f}",
-                f"{angle:.0f}°",
-                f"{np.linalg.norm(mc.mean_error[k]):.2f}",
-            )
-        )
-    return Table(
+    values, vectors = np.linalg.eigh(mc.covariance)  # the longer axis is the last
+    axes = np.sqrt(np.maximum(values, 0.0)) / 10
+    direction = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])) % 180
+    return Table.of(
         "Errors by image point",
-        (
-            "image point px",
-            "mean cm",
-            "mean cm, first order",
-            "largest cm",
-            "largest cm, first order",
-            "ellipse sd cm",
-            "direction",
-            "bias mm",
-        ),
-        tuple(rows),
+        range(len(mc.image_points)),
+        {
+            "image point px": lambda k: "{:.0f}, {:.0f}".format(*mc.image_points[k]),
+            "mean cm": lambda k: f"{mc.mean[k] / 10:.2f}",
+            "mean cm, first order": lambda k: f"{first.mean[k] / 10:.2f}",
+            "largest cm": lambda k: f"{mc.largest[k] / 10:.1f}",
+            "largest cm, first order": lambda k: f"{first.expected_largest[k] / 10:.1f}",
+            "ellipse sd cm": lambda k: f"{axes[k, 1]:.2f} × {axes[k, 0]:.2f}",
+            "direction": lambda k: f"{direction[k]:.0f}°",
+            "bias mm": lambda k: f"{np.linalg.norm(mc.mean_error[k]):.2f}",
+        },
         "Direction of the longer axis, from X (right) towards Y (up) as the camera looks. "
         "Bias is what the mean error vector keeps: an effect of second order.",
     )

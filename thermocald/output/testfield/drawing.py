@@ -1,4 +1,4 @@
-"""The drawing of a test field's sheets, in mm: PDF and SVG, all of it vectors.
+"""The drawing of a test field's sheets, in mm: PDF and SVG, all of it vectors; needs matplotlib.
 
 One list of paths serves both formats; circles are Bézier curves of eight segments, exact to
 4·10⁻⁶ of their radius. The sheet's lower left trimmed corner is the origin, x right, y up.
@@ -9,15 +9,19 @@ its angles is allowed. It shows the corner as somebody sees it who looks into it
 
 from __future__ import annotations
 
-import importlib.util
 import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch, Polygon
+from matplotlib.path import Path as Curve
+from matplotlib.transforms import Affine2D
 
-from thermocald.errors import DriverMissing
 from thermocald.files import cannot_write
-from thermocald.output.testfield.layout import STRIP, TRIM, Marker, Sheet, Target
+from thermocald.output.testfield.layout import STRIP, TRIM, Sheet, Target
 from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import marker_cells
 
@@ -28,11 +32,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
+    from thermocald.output.testfield.print import Board
 
 
 _MM_PER_INCH = 25.4
 _POINTS_PER_MM = 72 / _MM_PER_INCH
 _RULER = 100.0
+_LEGEND_HEIGHT = 2.1
 GREY = "0.62"
 """What is read by people only: light enough never to be mistaken for a target."""
 
@@ -41,32 +47,18 @@ class Pen:
     """A figure of one page that is drawn on in mm from the lower left trimmed corner."""
 
     def __init__(self, page: tuple[float, float], light: bool) -> None:
-        from matplotlib.figure import Figure
-        from matplotlib.transforms import Affine2D
-
         self.figure = Figure(figsize=(page[0] / _MM_PER_INCH, page[1] / _MM_PER_INCH))
         self.transform = (
             Affine2D().translate(TRIM, TRIM).scale(1 / _MM_PER_INCH) + self.figure.dpi_scale_trans
         )
         self.colour = "white" if light else "black"
 
-    @staticmethod
-    def stretch(width: float, height: float) -> Any:
-        from matplotlib.transforms import Affine2D
-
-        return Affine2D().scale(width, height)
-
     def fill(self, path: Any, colour: str) -> None:
-        from matplotlib.patches import PathPatch
-
         self.figure.add_artist(
             PathPatch(path, facecolor=colour, edgecolor="none", transform=self.transform)
         )
 
     def line(self, points: Sequence[tuple[float, float]], colour: str, width: float = 0.15) -> None:
-        from matplotlib.patches import PathPatch
-        from matplotlib.path import Path as Curve
-
         self.figure.add_artist(
             PathPatch(
                 Curve(np.asarray(points)), fill=False, edgecolor=colour,
@@ -83,8 +75,6 @@ class Pen:
 
 def rectangle(x: float, y: float, width: float, height: float) -> Any:
     """A rectangle by its lower left corner and its sides, mm."""
-    from matplotlib.path import Path as Curve
-
     x1, y1 = x + width, y + height
     return Curve([(x, y), (x1, y), (x1, y1), (x, y1), (x, y)], closed=True)
 
@@ -176,8 +166,6 @@ STEPS = tuple(" ".join(step.split()) for step in _TEXT.strip().split("\n\n"))
 
 def draw_plan(sheets: Sequence[Sheet]) -> Any:
     """The plan as a matplotlib Figure of the sheets' page size."""
-    from matplotlib.figure import Figure
-
     width, height = sheets[0].design.page
     figure = Figure(figsize=(width / 25.4, height / 25.4))
     portrait = height > width
@@ -197,8 +185,6 @@ def draw_plan(sheets: Sequence[Sheet]) -> Any:
 def _draw_corner(
     figure: Any, box: tuple[float, float, float, float], sheets: Sequence[Sheet], size: float
 ) -> None:
-    from matplotlib.patches import Polygon
-
     axes = figure.add_axes(box)
     axes.set_aspect("equal")
     axes.axis("off")
@@ -244,23 +230,24 @@ _TARGET_NAME = 0.7
 
 def draw(sheet: Sheet) -> Any:
     """The sheet as a matplotlib Figure of the page's size."""
-    from matplotlib.path import Path as Curve
-
     pen = Pen(sheet.design.page, sheet.design.light)
     if sheet.design.light:
-        pen.fill(Curve.unit_rectangle().transformed(pen.stretch(*sheet.size)), "black")
+        pen.fill(rectangle(0.0, 0.0, *sheet.size), "black")
     r = sheet.design.diameter / 2
     for target in sheet.targets:
-        pen.fill(_circle(target.x, target.y, r), pen.colour)
-        for begin, end in _arcs(target):
+        pen.fill(Curve.circle((target.x, target.y), r), pen.colour)
+        arcs = ring_code.segments(*ring_code.parse(target.code)) if target.code else ()
+        for begin, end in arcs:
             pen.fill(_ring_segment(target, r, begin, end), pen.colour)
         below = (outline.RING_OUTER if target.code else 1.0) * r
         _label(pen, target.x, target.y - below, target.name, r)
     for marker in sheet.markers:
+        name, number = marker.code.split(":")
+        cells = marker_cells(name, int(number))
         if sheet.design.light:  # a marker is black on white, whatever the circles are
-            surround = marker.side * (1 + 2 / len(_marker_bits(marker)))
+            surround = marker.side * (1 + 2 / len(cells))
             pen.fill(square(marker.x, marker.y, surround), "white")
-        draw_marker(pen, (marker.x, marker.y), marker.side, _marker_bits(marker))
+        draw_marker(pen, (marker.x, marker.y), marker.side, cells)
         _label(pen, marker.x, marker.y - marker.side / 2, marker.name, r)
     crop_marks(pen, sheet.size)
     rulers(pen, sheet.size)
@@ -287,20 +274,8 @@ def _label(pen: Pen, x: float, below: float, name: str, r: float) -> None:
     pen.text(x, below - 0.35 * r - height, name, height, ha="center", color=GREY)
 
 
-def _circle(x: float, y: float, r: float) -> Any:
-    from matplotlib.path import Path as Curve
-
-    return Curve.circle((x, y), r)
-
-
-def _arcs(target: Target) -> tuple[tuple[float, float], ...]:
-    return ring_code.segments(*ring_code.parse(target.code)) if target.code else ()
-
-
 def _ring_segment(target: Target, r: float, begin: float, end: float) -> Any:
     """An arc of the ring; codes run clockwise as seen, the sheet's y is up: angles are negated."""
-    from matplotlib.path import Path as Curve
-
     arc = Curve.arc(-360 * end, -360 * begin, n=max(2, int(np.ceil(16 * (end - begin)))))
     unit = np.asarray(arc.vertices, dtype=float)
     outer, inner = unit * outline.RING_OUTER * r, unit[::-1] * outline.RING_INNER * r
@@ -316,11 +291,6 @@ def _ring_segment(target: Target, r: float, begin: float, end: float) -> Any:
     return Curve(vertices, codes)
 
 
-def _marker_bits(marker: Marker) -> NDArray[np.bool_]:
-    name, number = marker.code.split(":")[:2]
-    return marker_cells(name, int(number))
-
-
 def _legend(pen: Pen, sheet: Sheet) -> None:
     bar = sheet.scale_bar
     words = f"{sheet.title}, discs {sheet.design.diameter:g} mm"
@@ -333,21 +303,33 @@ def _legend(pen: Pen, sheet: Sheet) -> None:
             for x in (a.x, b.x):
                 pen.line([(x, y - 1.2), (x, y + 1.2)], pen.colour, 0.1)
             pen.line([(a.x, y), (b.x, y)], GREY, 0.1)
-    pen.text(STRIP, STRIP - 4.6, words, 2.1)
+    pen.text(STRIP, STRIP - 4.6, words, _LEGEND_HEIGHT)
 
 
-def pages_of(sheets: Sequence[Sheet]) -> list[Any]:
-    """The sheets as Figures; those of a corner with the plan to put it up as the last one."""
-    require_matplotlib()
+def draw_board(board: Board, page: tuple[float, float]) -> Any:
+    """Draw a board in the middle of a page (mm), with rulers and its name, as a Figure."""
+    pen = Pen(page, light=False)
+    size = (page[0] - 2 * TRIM, page[1] - 2 * TRIM)
+    crop_marks(pen, size)
+    rulers(pen, size)
+    name = board.name.partition(" ")[2]
+    pen.text(STRIP, STRIP - 4.6, f"{name}, {board.measures}", _LEGEND_HEIGHT)
+    dx, dy = board.place(page)
+    for x, y, side in board.squares():
+        pen.fill(rectangle(x + dx, y + dy, side, side), "black")
+    for (x, y), cells in board.markers():
+        draw_marker(pen, (x + dx, y + dy), board.marker, cells)
+    return pen.figure
+
+
+def draw_sheets(sheets: Sequence[Sheet]) -> list[Any]:
+    """Draw sheets as Figures; those of a corner with the plan to put it up as the last one."""
     pages = [draw(sheet) for sheet in sheets]
     return [*pages, draw_plan(sheets)] if len(sheets) == 3 else pages
 
 
 def write_pdf(pages: Sequence[Any], path: Path) -> None:
     """Figures as the pages of one PDF."""
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_pdf import PdfPages
-
     about = {"Title": "thermocald test field", "Creator": "thermocald", "CreationDate": None}
     try:
         with rc_context({"pdf.fonttype": 42}), PdfPages(path, metadata=about) as document:
@@ -359,19 +341,9 @@ def write_pdf(pages: Sequence[Any], path: Path) -> None:
 
 def write_svg(page: Any, path: Path) -> None:
     """One Figure as SVG."""
-    from matplotlib import rc_context
-
     about = {"Title": "thermocald test field", "Creator": "thermocald", "Date": None}
     try:
         with rc_context({"svg.hashsalt": "thermocald"}):
             page.savefig(path, format="svg", metadata=about)
     except OSError as cause:
         raise cannot_write(path, cause) from cause
-
-
-def require_matplotlib() -> None:
-    """DriverMissing, with what mends it, where there is no matplotlib."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise DriverMissing(
-            "drawing a test field needs matplotlib: pip install 'thermocald[report]'"
-        )

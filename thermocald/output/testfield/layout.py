@@ -13,7 +13,7 @@ the walls.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy as np
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.markers import parse_marker
+from thermocald.photogrammetry.targets.markers import dictionary, marker_dictionaries
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -42,6 +42,8 @@ STRIP = 14.0
 _PITCH = 8.5
 """Grid pitch in radii of a disc: the rings' white surround and a plain circle fit in between."""
 _MAX_SIDE = 5000.0
+_MARKER_EVERY = 5
+"""Every so many places of the grid one is a marker's."""
 _MARKER_SIDE = 6.0
 """Side of a marker in radii of a disc; its white surround then still fits into the pitch."""
 # What a print is worth before it has been surveyed (1 sigma): the printer's own raggedness, its
@@ -68,7 +70,7 @@ class Design:
 
     page: size (width, height) mm; diameter of the discs mm; bits of the ring codes (12 or 14, 0 for
     none, None for the fewest that suffice), from the `first_code`-th on; whether plain circles
-    stand in between; a dictionary of markers, each `marker_every`-th place being one of them; light
+    stand in between; a dictionary of markers, every fifth place being one of them; light
     targets on black; 1 sheet or the 3 of a corner; pitch of the grid mm, None for the least.
     """
 
@@ -77,7 +79,6 @@ class Design:
     bits: int | None = None
     plain: bool = True
     dictionary: str | None = None
-    marker_every: int = 5
     light: bool = False
     sheets: int = 1
     first_code: int = 0
@@ -172,45 +173,28 @@ def lay_out(design: Design) -> tuple[Sheet, ...]:
     if design.sheets == 3:
         titles = _TITLES
         sizes = [(width, min(width, height)), (width, height), (width, height)]
-    numbering = _Numbering(design)
-    return tuple(
-        _sheet(design, title, size, numbering) for title, size in zip(titles, sizes, strict=True)
-    )
-
-
-class _Numbering:
-    """The codes, markers and plain names that are still free."""
-
-    def __init__(self, design: Design) -> None:
-        self.codes = _codes(design)
-        self.markers = _marker_ids(design)
-        self.plain = count(1)
-
-
-def _sheet(design: Design, title: str, size: tuple[float, float], numbering: _Numbering) -> Sheet:
-    """One sheet filled with a grid of targets."""
-    x, y = _grid(design, size)
-    pitch = float(x[1] - x[0])
-    r = design.diameter / 2
-    targets, markers = [], []
-    for j in range(len(y)):
-        for i in range(len(x)):
-            place = float(x[i]), float(y[j])
-            if design.dictionary and (i + 2 * j) % design.marker_every == design.marker_every // 2:
-                code = next(numbering.markers)
-                name = "M" + code.rpartition(":")[2]
-                markers.append(Marker(name, *place, _MARKER_SIDE * r, code))
+    codes, markers, plain = _codes(design), _marker_codes(design), count(1)
+    sheets = []
+    for title, size in zip(titles, sizes, strict=True):
+        targets: list[Target] = []
+        marked: list[Marker] = []
+        x, y = (axis.tolist() for axis in _grid(design, size))
+        for (j, v), (i, u) in product(enumerate(y), enumerate(x)):
+            if design.dictionary and (i + 2 * j) % _MARKER_EVERY == _MARKER_EVERY // 2:
+                code = next(markers)
+                side = _MARKER_SIDE * design.diameter / 2
+                marked.append(Marker(f"M{code.rpartition(':')[2]}", u, v, side, code))
             elif design.bits:
-                code = next(numbering.codes)
-                targets.append(Target(f"R{code.rpartition(':')[2]}", *place, code))
+                code = next(codes)
+                targets.append(Target(f"R{code.rpartition(':')[2]}", u, v, code))
             else:
-                targets.append(Target(f"P{next(numbering.plain)}", *place, ""))
-    if design.plain and design.bits:
-        for j in range(len(y) - 1):
-            for i in range(len(x) - 1):
-                middle = float(x[i]) + pitch / 2, float(y[j]) + pitch / 2
-                targets.append(Target(f"P{next(numbering.plain)}", *middle, ""))
-    return Sheet(title, design, size, tuple(targets), tuple(markers))
+                targets.append(Target(f"P{next(plain)}", u, v, ""))
+        if design.plain and design.bits:
+            half = (x[1] - x[0]) / 2
+            for v, u in product(y[:-1], x[:-1]):
+                targets.append(Target(f"P{next(plain)}", u + half, v + half, ""))
+        sheets.append(Sheet(title, design, size, tuple(targets), tuple(marked)))
+    return tuple(sheets)
 
 
 def _grid(design: Design, size: tuple[float, float]) -> tuple[Array, Array]:
@@ -244,8 +228,6 @@ def _check(design: Design) -> None:
         )
     if design.sheets not in (1, 3):
         raise UsageError(f"{design.sheets} sheets: one, or the three of a corner")
-    if design.marker_every < 2:
-        raise UsageError(f"a marker at every {design.marker_every}-th place: at least every second")
     least = _PITCH * design.diameter / 2
     if design.pitch is not None and design.pitch < least - 1e-9:
         raise UsageError(
@@ -266,21 +248,15 @@ def _codes(design: Design) -> Iterator[str]:
         )
 
 
-def _marker_ids(design: Design) -> Iterator[str]:
-    if design.dictionary is None:
-        return
-    import cv2
-
-    number = getattr(cv2.aruco, design.dictionary, None)
-    if number is None or not design.dictionary.startswith("DICT_"):
-        known = [n for n in dir(cv2.aruco) if n.startswith("DICT_")]
-        raise UsageError(f"no marker dictionary {design.dictionary!r}: {', '.join(sorted(known))}")
-    available = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
-    for i in range(available):
-        code = f"{design.dictionary}:{i}"
-        parse_marker(code)
-        yield code
-    raise UsageError(f"the field needs more than the {available} markers of {design.dictionary}")
+def _marker_codes(design: Design) -> Iterator[str]:
+    name = design.dictionary
+    if name is not None:
+        known = marker_dictionaries()
+        if name not in known:
+            raise UsageError(f"no marker dictionary {name!r}: {', '.join(known)}")
+        available = len(dictionary(name).bytesList)
+        yield from (f"{name}:{i}" for i in range(available))
+        raise UsageError(f"the field needs more than the {available} markers of {name}")
 
 
 def _placement(sheets: Sequence[Sheet], k: int) -> tuple[Array, Array]:

@@ -1,30 +1,198 @@
-"""`thermocald testfield print`: a folder with the sheets to print and the test field they are."""
+"""`thermocald testfield print`: a folder with the sheets to print and the test field they are.
+
+Boards of other programs (ChArUco, chessboard, Kalibr's AprilGrid): the field is that of
+`targets.boards`, the same that `testfield import` writes for a board that was bought; the drawing
+follows OpenCV's and Kalibr's.
+"""
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import UsageError
+import numpy as np
+
+from thermocald.errors import DriverMissing, UsageError
 from thermocald.files import cannot_write, new_file
-from thermocald.output.testfield.board import Board, draw_board
-from thermocald.output.testfield.drawing import (
-    pages_of,
-    require_matplotlib,
-    write_pdf,
-    write_svg,
-)
-from thermocald.output.testfield.layout import Design, Sheet, field_of, lay_out
+from thermocald.output.testfield.layout import STRIP, TRIM, Design, Sheet, field_of, lay_out
+from thermocald.photogrammetry.targets import boards
+from thermocald.photogrammetry.targets.markers import marker_cells
 from thermocald.store.recording.testfield_file import write_testfield
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
+    from types import ModuleType
+
+    from numpy.typing import NDArray
 
     from thermocald.photogrammetry.field.testfield import TestField
+
+
+KINDS = ("charuco", "chessboard", "aprilgrid")
+_APRIL_BORDER = 2
+_MARKER_SHARE = 0.75  # of a ChArUco square, where no size is given
+_QUIET = 0.5  # of a square, white about the board
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A board of columns × rows: squares of a ChArUco board, inner corners of a chessboard, tags.
+
+    square mm: side of a square (not of an AprilGrid); marker mm: side of a marker or tag with its
+    black border; spacing: between tags, over their side; dictionary: OpenCV's name, of a ChArUco
+    board; legacy: ChArUco as OpenCV drew it before 4.6.
+    """
+
+    kind: str
+    columns: int
+    rows: int
+    square: float = 0.0
+    marker: float = 0.0
+    spacing: float = 0.3
+    dictionary: str = "DICT_5X5_1000"
+    legacy: bool = False
+
+    @property
+    def _tags(self) -> bool:
+        return self.kind == "aprilgrid"
+
+    def field(self, sigma: float | None = None) -> TestField:
+        """The test field, origin at the board's lower left; sigma: mm, None for a print."""
+        if self.kind == "charuco":
+            return boards.charuco(
+                self.columns, self.rows, self.square, self.marker, self.dictionary,
+                legacy=self.legacy, sigma=sigma,
+            )  # fmt: skip
+        if self.kind == "chessboard":
+            return boards.chessboard(self.columns, self.rows, self.square, sigma=sigma)
+        return boards.aprilgrid(self.columns, self.rows, self.marker, self.spacing, sigma=sigma)
+
+    @property
+    def name(self) -> str:
+        """What it is, in words."""
+        kind, unit = {
+            "charuco": ("a ChArUco board", "squares"),
+            "chessboard": ("a chessboard", "inner corners"),
+            "aprilgrid": ("an AprilGrid", "tags"),
+        }[self.kind]
+        return f"{kind} of {self.columns} × {self.rows} {unit}"
+
+    @property
+    def measures(self) -> str:
+        """Its sizes, in words."""
+        if self.kind == "charuco":
+            return (
+                f"squares {self.square:g} mm, markers {self.marker:g} mm of {self.dictionary}"
+                + (", as OpenCV drew it before 4.6" if self.legacy else "")
+            )
+        if self.kind == "chessboard":
+            return f"squares {self.square:g} mm"
+        return f"tags {self.marker:g} mm, {self._gap:g} mm apart"
+
+    def filled(self, page: tuple[float, float]) -> Board:
+        """With the largest sizes that fit on a page (mm) in place of those that are 0."""
+        side = self.marker if self._tags else self.square
+        if side == 0:
+            unit = replace(self, square=1.0, marker=1.0)._extent()
+            room = _room(page)
+            side = min(room[0] / unit[0], room[1] / unit[1])
+            side = np.floor(side) if side >= 5 else np.floor(10 * side) / 10
+            if side <= 0:
+                raise UsageError(f"{self.name} has no place on {page[0]:g} × {page[1]:g} mm")
+        if self._tags:
+            return replace(self, marker=float(side))
+        marker = self.marker or round(_MARKER_SHARE * side, 1)
+        return replace(self, square=float(side), marker=marker)
+
+    def check_fits(self, page: tuple[float, float]) -> None:
+        """UsageError, with what would fit, where the board is larger than the page (mm)."""
+        (w, h), room = self._extent(), _room(page)
+        if w > room[0] + 1e-6 or h > room[1] + 1e-6:
+            raise UsageError(
+                f"{self.name} ({self.measures}) needs {w:.0f} × {h:.0f} mm with its white margin; "
+                f"{page[0]:g} × {page[1]:g} mm paper has room for {room[0]:.0f} × {room[1]:.0f}: "
+                "take smaller squares, or larger paper"
+            )
+
+    def place(self, page: tuple[float, float]) -> tuple[float, float]:
+        """Where its origin lies so that it is in the middle of a page (mm)."""
+        room, (width, height) = _room(page), self._black()
+        low = -self._gap if self._tags else 0.0
+        return STRIP + (room[0] - width) / 2 - low, STRIP + (room[1] - height) / 2 - low
+
+    @property
+    def _gap(self) -> float:
+        return self.spacing * self.marker
+
+    def _black(self) -> tuple[float, float]:
+        """Width and height of what is black, mm."""
+        if self._tags:
+            step = self.marker + self._gap
+            return self.columns * step + self._gap, self.rows * step + self._gap
+        more = 1 if self.kind == "chessboard" else 0
+        return (self.columns + more) * self.square, (self.rows + more) * self.square
+
+    def _extent(self) -> tuple[float, float]:
+        """Width and height with the white margin, mm."""
+        quiet = 2 * (self._gap if self._tags else _QUIET * self.square)
+        width, height = self._black()
+        return width + quiet, height + quiet
+
+    def squares(self) -> Iterator[tuple[float, float, float]]:
+        """The black squares that are no markers: lower left x, y and side, mm."""
+        s = self.square
+        if self._tags:
+            step = self.marker + self._gap
+            for j, i in product(range(self.rows + 1), range(self.columns + 1)):
+                yield i * step - self._gap, j * step - self._gap, self._gap
+        elif self.kind == "chessboard":
+            for j, i in product(range(self.rows + 1), range(self.columns + 1)):
+                if (i + self.rows - j) % 2 == 0:  # the upper left one is black
+                    yield i * s, j * s, s
+        else:
+            white = {(int(x // s), int(y // s)) for (x, y), _ in self.markers()}
+            for j, i in product(range(self.rows), range(self.columns)):
+                if (i, j) not in white:
+                    yield i * s, j * s, s
+
+    def markers(self) -> list[tuple[tuple[float, float], NDArray[np.bool_]]]:
+        """The markers: centre mm, and cells (n, n), True where black, the first row on top."""
+        field = self.field()
+        found = []
+        rows = [r for r, kind in enumerate(field.kinds) if kind == "marker_corner"]
+        for first in range(0, len(rows), 4):
+            quad = field.points[rows[first : first + 4], :2]
+            name, number, _ = field.codes[rows[first]].split(":")
+            cells = marker_cells(name, int(number), _APRIL_BORDER if self._tags else 1)
+            # corner 0 is where the cells' first one is; turns of 90° bring it there
+            right, up = (quad[0] > quad.mean(axis=0)).tolist()
+            turns = {(False, True): 0, (False, False): 1, (True, False): 2, (True, True): 3}
+            x, y = quad.mean(axis=0).tolist()
+            found.append(((x, y), np.rot90(cells, turns[right, up])))
+        return found
+
+
+def counts_of(option: str, text: str) -> tuple[int, int]:
+    """Return columns and rows of 9x6; UsageError that names the option."""
+    columns, _, rows = text.lower().replace("×", "x").partition("x")
+    if not (columns.isascii() and columns.isdigit() and rows.isascii() and rows.isdigit()):
+        raise UsageError(f"{option} {text}: write COLUMNSxROWS, such as 9x6")
+    if not 0 < int(columns[:6]) <= 1000 or not 0 < int(rows[:6]) <= 1000:
+        raise UsageError(f"{option} {text}: counts up to 1000 are possible")
+    return int(columns), int(rows)
+
+
+def _room(page: tuple[float, float]) -> tuple[float, float]:
+    """What a page (mm) leaves beside the rulers' strips."""
+    return page[0] - 2 * TRIM - STRIP, page[1] - 2 * TRIM - STRIP
+
 
 ONE_PLANE = (
     "one flat sheet calibrates a camera from photographs in several poses (thermocald calibrate); "
@@ -120,8 +288,7 @@ def print_testfield(design: Design, folder: Path, *, replace_printed: bool = Fal
     """
     sheets = lay_out(design)
     field = field_of(sheets)
-    require_matplotlib()
-    files = _publish(pages_of(sheets), len(sheets), field, folder, replace_printed)
+    files = _publish(_drawing().draw_sheets(sheets), len(sheets), field, folder, replace_printed)
     return Printed(folder, files, sheets, field, design.page)
 
 
@@ -133,10 +300,18 @@ def print_board(
     page: width, height mm. UsageError where the board does not fit on it.
     """
     board.check_fits(page)
-    require_matplotlib()
     field = board.field()
-    files = _publish([draw_board(board, page)], 1, field, folder, replace_printed)
+    files = _publish([_drawing().draw_board(board, page)], 1, field, folder, replace_printed)
     return Printed(folder, files, (), field, page, board)
+
+
+def _drawing() -> ModuleType:
+    """The module that draws; DriverMissing, with what mends it, where there is no matplotlib."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise DriverMissing(
+            "drawing a test field needs matplotlib: pip install 'thermocald[report]'"
+        )
+    return importlib.import_module("thermocald.output.testfield.drawing")
 
 
 def _publish(
@@ -155,10 +330,10 @@ def _publish(
         raise cannot_write(folder, cause) from cause
     try:
         names = ["testfield.pdf"]
-        write_pdf(pages, work / "testfield.pdf")
+        _drawing().write_pdf(pages, work / "testfield.pdf")
         for i in range(sheets):
             name = "testfield.svg" if sheets == 1 else f"testfield-{i + 1}.svg"
-            write_svg(pages[i], work / name)
+            _drawing().write_svg(pages[i], work / name)
             names.append(name)
         write_testfield(work / "testfield.csv", field)
         names.append("testfield.csv")

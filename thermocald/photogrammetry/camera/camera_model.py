@@ -217,12 +217,6 @@ def rotation(angles: ArrayLike) -> Array:
     return square
 
 
-def camera_coordinates(eop: ArrayLike, points: ArrayLike) -> Array:
-    """Object points (..., n, 3) → camera frame (..., n, 3) mm; the camera looks along -Z."""
-    e = np.asarray(eop, dtype=float)
-    return _turned(rotation(e[..., :3]), e, np.asarray(points, dtype=float)).swapaxes(-1, -2)
-
-
 def _turned(R: Array, eop: Array, points: Array) -> Array:
     """The camera coordinates as (..., 3, n): what follows writes memory in one run."""
     turned: Array = R.swapaxes(-1, -2) @ (points.swapaxes(-1, -2) - eop[..., 3:6, None])
@@ -296,8 +290,8 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
     return _as_px(sensor, x, y)
 
 
-def _distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """∂(x', y')/∂(x̄, ȳ) as its four elements."""
+def distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return ∂(x', y')/∂(x̄, ȳ) as its four elements; arguments as `distort`."""
     _, _, _, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
     r2 = x * x + y * y
     radial = r2 * (A1 + r2 * (A2 + r2 * A3))
@@ -429,7 +423,7 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
     size = np.full_like(x, np.inf)
     for _ in range(_RAY_ITERATIONS):
         xd, yd = distort(i, x, y)
-        jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)
+        jxx, jxy, jyx, jyy = distortion_jacobian(i, x, y)
         determinant = jxx * jyy - jxy * jyx
         rx, ry = xm - xd, ym - yd
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -439,7 +433,7 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
             size = np.fmax(np.abs(rx), np.abs(ry))
             if bool(np.all(size <= tolerance)):
                 break
-    jxx, jxy, jyx, jyy = _distortion_jacobian(i, x, y)
+    jxx, jxy, jyx, jyy = distortion_jacobian(i, x, y)
     finite = np.isfinite(xm) & np.isfinite(ym)
     with np.errstate(invalid="ignore"):
         # Beyond the fold both eigenvalues may be negative: their product alone does not tell.

@@ -9,7 +9,7 @@ Conventions and what is exact: docs/reference/camera_files.md and `photogrammetr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ import yaml
 
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.files import read_yaml, write_text
+from thermocald.photogrammetry.camera import conversions
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
@@ -24,7 +25,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.camera_files.brown import COLMAP, KALIBR, MRCAL, OPENCV, ROS
-from thermocald.photogrammetry.camera_files.camera_record import OWN, Format, ImportedCamera, Record
+from thermocald.photogrammetry.camera_files.camera_record import OWN, CameraRecord, Format
 from thermocald.photogrammetry.camera_files.photogrammetric import AICON, METASHAPE
 
 if TYPE_CHECKING:
@@ -36,6 +37,24 @@ FORMATS: dict[str, Format] = {
     format_.name: format_ for format_ in (OPENCV, ROS, COLMAP, MRCAL, KALIBR, METASHAPE, AICON, OWN)
 }
 _LARGEST_FILE = 10_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImportedCamera:
+    """A camera as read: our model, how well it reproduces the file's own over the image area."""
+
+    model: CameraModel
+    format: str
+    name: str
+    exact: bool
+    largest_px: float
+    rms_px: float
+    covariance: Array | None = None
+
+    @property
+    def how_read(self) -> str:
+        """How well our model is the file's, in words."""
+        return "exact" if self.exact else f"fitted, largest residual {self.largest_px:.3g} px"
 
 
 def file_name(stem: str, format_name: str) -> str:
@@ -63,12 +82,31 @@ def write(
     An existing file is replaced as a whole or not at all. Raises UsageError for an unknown format,
     GeometryError if the model has no rays for part of its image.
     """
-    if covariance is not None and np.shape(covariance) != (10, 10):
-        raise UsageError(f"a covariance of shape {np.shape(covariance)}, not (10, 10)")
-    record = Record(model, name, covariance, comment)
-    text, statement = _format(format).encode(record)
+    text, statement = encode(model, format, covariance, comment, name)
     write_text(path, text)
     return statement
+
+
+def encode(
+    model: CameraModel,
+    format: str,  # noqa: A002
+    covariance: Array | None = None,
+    comment: str = "",
+    name: str = "camera",
+) -> tuple[str, str]:
+    """Return the text that `write` writes, and its statement."""
+    if covariance is not None and np.shape(covariance) != (10, 10):
+        raise UsageError(f"a covariance of shape {np.shape(covariance)}, not (10, 10)")
+    chosen, sensor = _format(format), model.sensor
+    family = chosen.family(model)
+    found = conversions.convert(
+        sensor, conversions.BROWN, model.interior.as_array(), family, covariance
+    )
+    record = CameraRecord(
+        (sensor.width, sensor.height), family, found.values, name, found.covariance,
+        sensor.pixel_pitch, found.statement, comment,
+    )  # fmt: skip
+    return chosen.encode(record), found.statement
 
 
 def recognised(path: Path) -> str | None:
@@ -91,17 +129,18 @@ def read(
     text = _text(path)
     chosen = _format(format) if format is not None else _recognised(text, path)
     try:
-        found = chosen.decode(text)
-        if not isinstance(found, ImportedCamera):
-            return found.imported(chosen.name, text, pixel_pitch)
-        own = found.model.sensor.pixel_pitch
-        if pixel_pitch is not None and not np.isclose(pixel_pitch, own, rtol=1e-9):
-            raise ConfigurationError(
-                f"pixel pitch {pixel_pitch:g} mm was given, the file says {own:g} mm"
-            )
-        return found
+        record = chosen.decode(text)
+        sensor = record.sensor(text, pixel_pitch)
+        found = conversions.convert(
+            sensor, record.family, record.values, conversions.BROWN, record.covariance
+        )
     except (ConfigurationError, DataError) as cause:
         raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause
+    model = CameraModel(sensor, InteriorOrientation.from_array(found.values))
+    return ImportedCamera(
+        model, chosen.name, record.name, found.exact, found.largest_px, found.rms_px,
+        found.covariance,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +155,7 @@ class Conversion:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the document that `camera convert` writes with `--json`."""
-        camera, sensor, interior = self.camera, self.camera.model.sensor, self.camera.model.interior
+        camera = self.camera
         return {
             "format": "thermocald-camera-conversion/1",
             "source": str(self.source),
@@ -127,10 +166,8 @@ class Conversion:
             "out": str(self.out),
             "out_format": self.to,
             "statement": self.statement,
-            "width": sensor.width,
-            "height": sensor.height,
-            "pixel_pitch": sensor.pixel_pitch,
-            **{name: getattr(interior, name) for name in type(interior).__dataclass_fields__},
+            **asdict(camera.model.sensor),
+            **asdict(camera.model.interior),
         }
 
     def __str__(self) -> str:
@@ -199,21 +236,17 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
         raise ConfigurationError(f"{path}: is not a camera file; it must hold `width: …` and so on")
     camera = document.get("camera", document)
 
-    def number(key: str, required: bool = True) -> float | None:
+    def number(key: str) -> float:
         value = camera.get(key)
-        if value is None and not required:
-            return None
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e5:
             raise ConfigurationError(
                 f"{path}: {key} must be a number above 0 and below 100000, it is {str(value)[:40]}"
             )
         return float(value)
 
-    width, height, pitch = number("width"), number("height"), number("pixel_pitch")
-    assert width is not None
-    assert height is not None
-    assert pitch is not None
-    nominal = number("principal_distance", required=False)
+    sensor = Sensor(int(number("width")), int(number("height")), number("pixel_pitch"))
+    known = camera.get("principal_distance") is not None
+    nominal = number("principal_distance") if known else None
     interior = None
     given = camera.get("interior")
     if given is not None:
@@ -227,12 +260,7 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
             interior = InteriorOrientation(**{k: float(v) for k, v in given.items()})
         except (TypeError, ValueError) as error:
             raise ConfigurationError(f"{path}: interior: {error}") from error
-    return CameraFile(
-        str(camera.get("name", path.stem)),
-        Sensor(int(width), int(height), pitch),
-        nominal,
-        interior,
-    )
+    return CameraFile(str(camera.get("name", path.stem)), sensor, nominal, interior)
 
 
 def write_camera(path: Path, camera: CameraFile, covariance: Array, comment: str) -> None:
@@ -249,13 +277,10 @@ def write_camera(path: Path, camera: CameraFile, covariance: Array, comment: str
         return
     if suffix not in (".yaml", ".yml"):
         raise UsageError(f"{path}: .json and .yaml are written; for another program convert it")
-    values = dict(zip(IOP_NAMES, interior.as_array().tolist(), strict=True))
     document = {
         "name": camera.name,
-        "width": sensor.width,
-        "height": sensor.height,
-        "pixel_pitch": sensor.pixel_pitch,
-        "principal_distance": values["c"],
-        "interior": values,
+        **asdict(sensor),
+        "principal_distance": interior.c,
+        "interior": asdict(interior),
     }
     write_text(path, f"# {comment}\n{yaml.safe_dump(document, sort_keys=False)}")

@@ -24,12 +24,10 @@ import numpy as np
 import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import BrownOpenCV, to_family
+from thermocald.photogrammetry.camera.conversions import Family, opencv
 from thermocald.photogrammetry.camera_files.camera_record import (
-    ForeignCamera,
+    CameraRecord,
     Format,
-    Record,
-    header,
     number,
     numbers,
     yaml_document,
@@ -38,28 +36,26 @@ from thermocald.photogrammetry.camera_files.camera_record import (
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import CameraModel
 
 _OPENCV_COUNTS = (0, 4, 5, 8, 12)
 
 
-def _encode_opencv(record: Record) -> tuple[str, str]:
+def _encode_opencv(record: CameraRecord) -> str:
     import cv2
 
-    family = BrownOpenCV(5)
-    result = to_family(record.model, family, record.covariance)
-    fx, fy, cx, cy = result.values[:4]
+    fx, fy, cx, cy = record.values[:4]
     storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("camera_name", record.name)
-    storage.write("image_width", record.model.sensor.width)
-    storage.write("image_height", record.model.sensor.height)
+    storage.write("image_width", record.size[0])
+    storage.write("image_height", record.size[1])
     storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
-    storage.write("distortion_coefficients", result.values[None, 4:])
-    if result.covariance is not None:
-        storage.write("std_deviation_intrinsics", np.sqrt(np.diag(result.covariance))[None])
-        storage.write("intrinsics_covariance", result.covariance)
-    text = storage.releaseAndGetString()
-    begin, mark, rest = text.partition("---\n")
-    return begin + mark + header(record, result.statement) + rest, result.statement
+    storage.write("distortion_coefficients", record.values[None, 4:])
+    if record.covariance is not None:
+        storage.write("std_deviation_intrinsics", np.sqrt(np.diag(record.covariance))[None])
+        storage.write("intrinsics_covariance", record.covariance)
+    begin, mark, rest = storage.releaseAndGetString().partition("---\n")
+    return begin + mark + record.head() + rest
 
 
 class _OpenCVLoader(yaml.SafeLoader):
@@ -77,12 +73,17 @@ for _kind in ("opencv-matrix", "opencv-nd-matrix"):
     _OpenCVLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", _opencv_matrix)
 
 
+def _size(document: dict[Any, Any]) -> tuple[int, int]:
+    width, height = (int(number(document.get(key), key)) for key in ("image_width", "image_height"))
+    return width, height
+
+
 def _opencv_numbers(document: dict[Any, Any], key: str, counts: tuple[int, ...]) -> Array:
     node = document.get(key)
     return numbers(node.get("data") if isinstance(node, dict) else node, key, counts)
 
 
-def _decode_opencv(text: str) -> ForeignCamera:
+def _decode_opencv(text: str) -> CameraRecord:
     # not with cv2.FileStorage: a damaged file makes it crash the process (OpenCV 5.0.0)
     document = yaml_document(text.partition("\n")[2], _OpenCVLoader)
     if not isinstance(document, dict):
@@ -91,7 +92,6 @@ def _decode_opencv(text: str) -> ForeignCamera:
     d = np.zeros(0)
     if "distortion_coefficients" in document:
         d = _opencv_numbers(document, "distortion_coefficients", (*_OPENCV_COUNTS, 14))
-    size = [int(number(document.get(key), key)) for key in ("image_width", "image_height")]
     if len(d) == 14:
         if np.any(d[12:]):
             raise ConfigurationError("a tilted sensor (tau) has no counterpart in this model")
@@ -104,11 +104,12 @@ def _decode_opencv(text: str) -> ForeignCamera:
         n = len(values)
         covariance = _opencv_numbers(document, "intrinsics_covariance", (n * n,)).reshape(n, n)
     name = str(document.get("camera_name", "camera"))
-    return ForeignCamera((size[0], size[1]), BrownOpenCV(len(d)), values, name, covariance)
+    return CameraRecord(_size(document), opencv(len(d)), values, name, covariance)
 
 
 OPENCV = Format(
-    "opencv", ".yaml", "OpenCV FileStorage YAML", _encode_opencv, _decode_opencv,
+    "opencv", ".yaml", "OpenCV FileStorage YAML", lambda _: opencv(5),
+    _encode_opencv, _decode_opencv,
     lambda text: text.startswith("%YAML") and "camera_matrix" in text,
 )  # fmt: skip
 
@@ -121,24 +122,23 @@ def _ros_matrix(values: Any, rows: int) -> dict[str, Any]:
     return {"rows": rows, "cols": len(flat) // rows, "data": flat}
 
 
-def _encode_ros(record: Record) -> tuple[str, str]:
-    result = to_family(record.model, BrownOpenCV(5))
-    fx, fy, cx, cy = result.values[:4]
+def _encode_ros(record: CameraRecord) -> str:
+    fx, fy, cx, cy = record.values[:4]
     K = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
     document = {
-        "image_width": record.model.sensor.width,
-        "image_height": record.model.sensor.height,
+        "image_width": record.size[0],
+        "image_height": record.size[1],
         "camera_name": record.name,
         "camera_matrix": _ros_matrix(K, 3),
         "distortion_model": "plumb_bob",
-        "distortion_coefficients": _ros_matrix(result.values[4:], 1),
+        "distortion_coefficients": _ros_matrix(record.values[4:], 1),
         "rectification_matrix": _ros_matrix(np.eye(3), 3),
         "projection_matrix": _ros_matrix([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0], 3),
     }
-    return header(record, result.statement) + yaml_text(document), result.statement
+    return record.head() + yaml_text(document)
 
 
-def _decode_ros(text: str) -> ForeignCamera:
+def _decode_ros(text: str) -> CameraRecord:
     document = yaml_document(text)
     if not isinstance(document, dict):
         raise ConfigurationError("no camera_info: the file holds no keys")
@@ -155,36 +155,33 @@ def _decode_ros(text: str) -> ForeignCamera:
     d = numbers(
         data["distortion_coefficients"], "distortion_coefficients.data", (_ROS_COUNTS[model],)
     )
-    size = [int(number(document.get(key), key)) for key in ("image_width", "image_height")]
     values = np.concatenate([K[[0, 4, 2, 5]], d])
     name = str(document.get("camera_name", "camera"))
-    return ForeignCamera((size[0], size[1]), BrownOpenCV(len(d)), values, name)
+    return CameraRecord(_size(document), opencv(len(d)), values, name)
 
 
 ROS = Format(
-    "ros", ".yaml", "ROS camera_info", _encode_ros, _decode_ros,
+    "ros", ".yaml", "ROS camera_info", lambda _: opencv(5), _encode_ros, _decode_ros,
     lambda text: "distortion_model:" in text and "image_width:" in text,
 )  # fmt: skip
 
 
-def _encode_kalibr(record: Record) -> tuple[str, str]:
-    result = to_family(record.model, BrownOpenCV(4))
-    values = [float(v) for v in result.values]
-    sensor = record.model.sensor
+def _encode_kalibr(record: CameraRecord) -> str:
+    values = record.values.tolist()
     document = {
         "cam0": {
             "camera_model": "pinhole",
             "intrinsics": values[:4],
             "distortion_model": "radtan",
             "distortion_coeffs": values[4:],
-            "resolution": [sensor.width, sensor.height],
+            "resolution": list(record.size),
             "rostopic": f"/{record.name}/image_raw",
         }
     }
-    return header(record, result.statement) + yaml_text(document), result.statement
+    return record.head() + yaml_text(document)
 
 
-def _decode_kalibr(text: str) -> ForeignCamera:
+def _decode_kalibr(text: str) -> CameraRecord:
     document = yaml_document(text)
     camera = document.get("cam0") if isinstance(document, dict) else None
     if not isinstance(camera, dict):
@@ -200,11 +197,11 @@ def _decode_kalibr(text: str) -> ForeignCamera:
     f = numbers(camera.get("intrinsics"), "intrinsics", (4,))
     d = numbers(camera.get("distortion_coeffs") or [], "distortion_coeffs", (0, 4))
     size = numbers(camera.get("resolution"), "resolution", (2,))
-    return ForeignCamera((int(size[0]), int(size[1])), BrownOpenCV(len(d)), np.concatenate([f, d]))
+    return CameraRecord((int(size[0]), int(size[1])), opencv(len(d)), np.concatenate([f, d]))
 
 
 KALIBR = Format(
-    "kalibr", ".yaml", "Kalibr camchain", _encode_kalibr, _decode_kalibr,
+    "kalibr", ".yaml", "Kalibr camchain", lambda _: opencv(4), _encode_kalibr, _decode_kalibr,
     lambda text: "cam0:" in text and "camera_model" in text,
 )  # fmt: skip
 
@@ -212,25 +209,27 @@ KALIBR = Format(
 _MRCAL_COUNTS = {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)} | {"LENSMODEL_PINHOLE": 0}
 
 
-def _encode_mrcal(record: Record) -> tuple[str, str]:
-    count = 4 if record.model.interior.A3 == 0 else 5
-    result = to_family(record.model, BrownOpenCV(count))
-    sensor = record.model.sensor
-    values = ", ".join(repr(float(v)) for v in result.values)
-    body = (
+def _four_or_five(model: CameraModel) -> Family:
+    """Without k3 where there is no such term."""
+    return opencv(4 if model.interior.A3 == 0 else 5)
+
+
+def _encode_mrcal(record: CameraRecord) -> str:
+    values = ", ".join(map(repr, record.values.tolist()))
+    width, height = record.size
+    return record.head() + (
         "{\n"
-        f"    'lensmodel':  'LENSMODEL_OPENCV{count}',\n\n"
+        f"    'lensmodel':  'LENSMODEL_OPENCV{len(record.values) - 4}',\n\n"
         "    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
         f"    'intrinsics': [ {values},],\n\n"
         "    # extrinsics are rt_fromref\n"
         "    'extrinsics': [ 0., 0., 0., 0., 0., 0.,],\n\n"
-        f"    'imagersize': [ {sensor.width}, {sensor.height},],\n"
+        f"    'imagersize': [ {width}, {height},],\n"
         "}\n"
     )
-    return header(record, result.statement) + body, result.statement
 
 
-def _decode_mrcal(text: str) -> ForeignCamera:
+def _decode_mrcal(text: str) -> CameraRecord:
     try:
         document = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, MemoryError, RecursionError):
@@ -245,11 +244,11 @@ def _decode_mrcal(text: str) -> ForeignCamera:
     count = _MRCAL_COUNTS[lens]
     values = numbers(document.get("intrinsics"), "intrinsics", (4 + count,))
     size = numbers(document.get("imagersize"), "imagersize", (2,))
-    return ForeignCamera((int(size[0]), int(size[1])), BrownOpenCV(count), values)
+    return CameraRecord((int(size[0]), int(size[1])), opencv(count), values)
 
 
 MRCAL = Format(
-    "mrcal", ".cameramodel", "mrcal cameramodel", _encode_mrcal, _decode_mrcal,
+    "mrcal", ".cameramodel", "mrcal cameramodel", _four_or_five, _encode_mrcal, _decode_mrcal,
     lambda text: "lensmodel" in text and "imagersize" in text,
 )  # fmt: skip
 
@@ -266,24 +265,21 @@ _COLMAP_SLOTS: dict[str, tuple[tuple[int, ...], ...]] = {
 _COLMAP_CENTRE = 0.5
 
 
-def _encode_colmap(record: Record) -> tuple[str, str]:
-    four = record.model.interior.A3 == 0
-    result = to_family(record.model, BrownOpenCV(4 if four else 5))
-    values = result.values.copy()
+def _encode_colmap(record: CameraRecord) -> str:
+    model = "OPENCV" if len(record.values) == 8 else "FULL_OPENCV"
+    values = np.zeros(len(_COLMAP_SLOTS[model]))
+    values[: len(record.values)] = record.values
     values[2:4] += _COLMAP_CENTRE
-    model = "OPENCV" if four else "FULL_OPENCV"
-    padded = [*values, *([0.0] * (len(_COLMAP_SLOTS[model]) - len(values)))]
-    sensor = record.model.sensor
-    fields = ["1", model, str(sensor.width), str(sensor.height), *(repr(float(v)) for v in padded)]
-    head = header(record, result.statement) + "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-    return head + " ".join(fields) + "\n", result.statement
+    fields = ["1", model, *map(repr, record.size), *map(repr, values.tolist())]
+    head = record.head() + "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    return head + " ".join(fields) + "\n"
 
 
 def _colmap_cameras(text: str) -> list[list[str]]:
     return [line.split() for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
 
 
-def _decode_colmap(text: str) -> ForeignCamera:
+def _decode_colmap(text: str) -> CameraRecord:
     cameras = _colmap_cameras(text)
     if len(cameras) != 1:
         raise ConfigurationError(
@@ -302,10 +298,10 @@ def _decode_colmap(text: str) -> ForeignCamera:
         values[list(where)] = value
     values[2:4] -= _COLMAP_CENTRE
     size = int(number(fields[2], "WIDTH")), int(number(fields[3], "HEIGHT"))
-    return ForeignCamera(size, BrownOpenCV(8), values)
+    return CameraRecord(size, opencv(8), values)
 
 
 COLMAP = Format(
-    "colmap", ".txt", "COLMAP cameras.txt", _encode_colmap, _decode_colmap,
+    "colmap", ".txt", "COLMAP cameras.txt", _four_or_five, _encode_colmap, _decode_colmap,
     lambda text: any(len(f) > 4 and f[1].isupper() for f in _colmap_cameras(text)[:1]),
 )  # fmt: skip

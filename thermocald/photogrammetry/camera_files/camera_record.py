@@ -1,5 +1,4 @@
-"""What every camera file works on: the camera to be written, the camera that was read, our own
-JSON.
+"""What every camera file works on: the camera that is written or was read; our own JSON.
 
 Numbers and YAML in the text of a file are read here; what is wrong there is an error that names it.
 """
@@ -16,18 +15,14 @@ import numpy as np
 import yaml
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
-    CameraModel,
-    InteriorOrientation,
-    Sensor,
-)
-from thermocald.photogrammetry.camera.conversions import Family, from_family
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+from thermocald.photogrammetry.camera.conversions import BROWN, Family
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import CameraModel
 
 
 def yaml_document(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
@@ -72,41 +67,12 @@ _PITCH = re.compile(r"pixel_pitch_mm[\"']?\s*[:=]\s*([0-9.eE+-]+)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Record:
-    """A camera to be written: covariance (10, 10) of the interior orientation or None; comment:
-    free text for the file's head.
-    """
+class CameraRecord:
+    """A camera as a program's file holds it, to be written or as read.
 
-    model: CameraModel
-    name: str = "camera"
-    covariance: Array | None = None
-    comment: str = ""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImportedCamera:
-    """A camera as read: our model, how well it reproduces the file's own over the image area."""
-
-    model: CameraModel
-    format: str
-    name: str
-    exact: bool
-    largest_px: float
-    rms_px: float
-    covariance: Array | None = None
-
-    @property
-    def how_read(self) -> str:
-        """How well our model is the file's, in words."""
-        return "exact" if self.exact else f"fitted, largest residual {self.largest_px:.3g} px"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ForeignCamera:
-    """A camera as another program's file holds it.
-
-    size: (width, height) px. values: in the order of the family's parameters. covariance: of the
-    values, or None. pixel_pitch: mm, where the record itself holds it.
+    size: (width, height) px; values: in the order of the family's parameters, covariance theirs or
+    None; pixel_pitch: mm, None where the record itself does not hold it; statement: how exact the
+    values are; comment: free text for the file's head.
     """
 
     size: tuple[int, int]
@@ -115,15 +81,36 @@ class ForeignCamera:
     name: str = "camera"
     covariance: Array | None = None
     pixel_pitch: float | None = None
+    statement: str = ""
+    comment: str = ""
 
-    def imported(self, format_name: str, text: str, pitch: float | None) -> ImportedCamera:
-        """The camera in our model; pitch: mm, as the user gave it, else as the file states it."""
+    def head(self, mark: str = "# ") -> str:
+        """The head of a text file, each line after a mark."""
+        lines = [
+            "written by thermocald",
+            f"conversion: {self.statement}",
+            # other programs do without it, reading the file back into millimetres does not
+            f"pixel_pitch_mm: {self.pixel_pitch!r}",
+            *self.comment.splitlines(),
+        ]
+        return "".join(f"{mark}{line}\n" for line in lines)
+
+    def sensor(self, text: str, given: float | None) -> Sensor:
+        """The sensor; its pitch as the user gave it, else as the file's text states it.
+
+        Raises ConfigurationError where no camera has such values.
+        """
         width, height = self.size
         if not (0 < width <= 100_000 and 0 < height <= 100_000):
             raise ConfigurationError(f"image size {width} × {height} px is impossible")
         if not np.all(np.abs(self.values) < _LARGEST):
             raise ConfigurationError("a camera parameter is not a number, or far out of range")
-        sensor = Sensor(width, height, _pitch(text, self.pixel_pitch if pitch is None else pitch))
+        own = self.pixel_pitch
+        if self.family is BROWN and own and given and not np.isclose(given, own, rtol=1e-9):
+            raise ConfigurationError(
+                f"pixel pitch {given:g} mm was given, the file says {own:g} mm"
+            )
+        sensor = Sensor(width, height, _pitch(text, own if given is None else given))
         # a focal length of zero or less would only fail later, and in other words
         focal = self.values[0] / (sensor.pixel_pitch if self.family.parameters[0] == "c" else 1.0)
         if not 0.05 * max(self.size) < focal < 1000 * max(self.size):
@@ -131,40 +118,22 @@ class ForeignCamera:
                 f"a principal distance of {focal:g} px does not belong to an image of {width} × "
                 f"{height} px"
             )
-        result = from_family(sensor, self.family, self.values, self.covariance)
-        return ImportedCamera(
-            CameraModel(sensor, InteriorOrientation.from_array(result.values)),
-            format_name, self.name, result.exact, result.largest_px, result.rms_px,
-            result.covariance,
-        )  # fmt: skip
+        return sensor
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A file format: its name, usual suffix, what it is for, and its writer and reader of text.
-
-    `encode(record)` gives the file's text and the statement of its residual; `decode(text)` reads
-    it; `recognises(text)` decides from the content alone.
+    """A file format: its name, usual suffix, what it is for; the family in which a camera is
+    written; its writer and reader of text; whether a text is of it, from the content alone.
     """
 
     name: str
     suffix: str
     about: str
-    encode: Callable[[Record], tuple[str, str]]
-    decode: Callable[[str], ForeignCamera | ImportedCamera]
+    family: Callable[[CameraModel], Family]
+    encode: Callable[[CameraRecord], str]
+    decode: Callable[[str], CameraRecord]
     recognises: Callable[[str], bool]
-
-
-def header(record: Record, statement: str, mark: str = "# ") -> str:
-    """The head of a text file: origin, residual, pixel pitch, comment, each line after a mark."""
-    lines = [
-        "written by thermocald",
-        f"conversion: {statement}",
-        # other programs do without it, reading the file back into millimetres does not
-        f"pixel_pitch_mm: {record.model.sensor.pixel_pitch!r}",
-        *record.comment.splitlines(),
-    ]
-    return "".join(f"{mark}{line}\n" for line in lines)
 
 
 def _pitch(text: str, given: float | None) -> float:
@@ -184,29 +153,27 @@ def _pitch(text: str, given: float | None) -> float:
 _VERSION = "thermocald-camera/1"
 
 
-def _encode_own(record: Record) -> tuple[str, str]:
-    sensor, interior = record.model.sensor, record.model.interior
+def _encode_own(record: CameraRecord) -> str:
     values: dict[str, float] = {}
     for k, name in enumerate(IOP_NAMES):
-        values[name] = float(getattr(interior, name))
+        values[name] = float(record.values[k])
         if record.covariance is not None:
             values[f"sd_{name}"] = float(np.sqrt(record.covariance[k, k]))
+    width, height = record.size
     document = {
         "format": _VERSION,
         "name": record.name,
         "comment": record.comment,
-        "sensor": {
-            "width": sensor.width, "height": sensor.height, "pixel_pitch": sensor.pixel_pitch,
-        },
+        "sensor": {"width": width, "height": height, "pixel_pitch": record.pixel_pitch},
         "interior": values,
         "covariance": None
         if record.covariance is None
         else {"parameters": list(IOP_NAMES), "matrix": record.covariance.tolist()},
-    }  # fmt: skip
-    return json.dumps(document, indent=1, allow_nan=False) + "\n", "exact: it is our own model"
+    }
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
-def _decode_own(text: str) -> ImportedCamera:
+def _decode_own(text: str) -> CameraRecord:
     try:
         document = json.loads(text)
     except json.JSONDecodeError as cause:
@@ -217,23 +184,19 @@ def _decode_own(text: str) -> ImportedCamera:
     if not isinstance(head, dict) or not isinstance(values, dict):
         raise ConfigurationError("sensor or interior is missing")
     width, height = (int(number(head.get(side), f"sensor.{side}")) for side in ("width", "height"))
-    own = number(head.get("pixel_pitch"), "sensor.pixel_pitch")
+    pitch = number(head.get("pixel_pitch"), "sensor.pixel_pitch")
     if "c" not in values:
         raise ConfigurationError("interior.c is missing")
-    interior = InteriorOrientation.from_mapping(
-        {name: number(values[name], f"interior.{name}") for name in IOP_NAMES if name in values}
-    )
+    interior = np.array([number(values.get(name, 0.0), f"interior.{name}") for name in IOP_NAMES])
     covariance = None
     if document.get("covariance") is not None:
         matrix = document["covariance"].get("matrix")
         covariance = numbers(matrix, "covariance.matrix", (100,)).reshape(10, 10)
-    return ImportedCamera(
-        CameraModel(Sensor(width, height, own), interior), "json",
-        str(document.get("name", "camera")), True, 0.0, 0.0, covariance,
-    )  # fmt: skip
+    name = str(document.get("name", "camera"))
+    return CameraRecord((width, height), BROWN, interior, name, covariance, pitch)
 
 
 OWN = Format(
-    "json", ".json", "thermocald's own, with covariance", _encode_own, _decode_own,
+    "json", ".json", "thermocald's own, with covariance", lambda _: BROWN, _encode_own, _decode_own,
     lambda text: f'"{_VERSION}"' in text[:200],
 )  # fmt: skip

@@ -23,96 +23,58 @@ one sensor is read too, its covariance included.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import escape
 
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.photogrammetry.camera.conversions import Family, MeasuredPoint, Metashape, to_family
+from thermocald.photogrammetry.camera.conversions import METASHAPE as METASHAPE_FRAME
+from thermocald.photogrammetry.camera.conversions import Family, aicon, measured_point
 from thermocald.photogrammetry.camera_files.camera_record import (
-    ForeignCamera,
+    CameraRecord,
     Format,
-    Record,
-    header,
     number,
     numbers,
 )
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.camera.camera_model import (
-        CameraModel,
-        InteriorOrientation,
-        Sensor,
-    )
+    from thermocald.photogrammetry.camera.camera_model import CameraModel
 
 # In the order of our ten: c x0 y0 A1 A2 A3 B1 B2 C1 C2.
 _AICON_NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
 _AICON_LINES = ("Ck", "Xh", "Yh", "A1", "A2", "R0", "A3", "B1", "B2", "C1", "C2")
 _AICON_SIZES = ("sensor_width_mm", "sensor_height_mm", "pixels_x", "pixels_y")
 _AICON_FIELDS = ("camera", "type", *_AICON_LINES, *_AICON_SIZES)
+_TAGS = METASHAPE_FRAME.parameters
 
 
-@dataclass(frozen=True, slots=True)
-class _Balanced:
-    """The record's model: terms at the ideal point, affinity applied after the distortion."""
-
-    r0: float
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return f"AICON model, R0 {self.r0:g} mm"
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """As ours."""
-        return ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
-
-    def project(self, sensor: Sensor, values: Array, directions: Array) -> Array:
-        """Directions → image points."""
-        c, x0, y0, *_, C1, C2 = values
-        x, y = c * directions[:, 0], -c * directions[:, 1]
-        plain = np.concatenate([values[:8], [0.0, 0.0]])
-        dx, dy = MeasuredPoint(self.r0).correction(plain, x, y)
-        x, y = x + dx, y + dy
-        image = np.column_stack([x0 + (1 + C1) * x + C2 * y, -(y0 + y)])
-        return image / sensor.pixel_pitch + sensor.centre
-
-    def from_brown(self, model: CameraModel) -> Array:
-        """Exact without affinity and shear."""
-        values: Array = MeasuredPoint(self.r0, at_ideal_point=True).from_brown(model)
-        values[8:] = model.interior.C1, model.interior.C2
-        return values
-
-    def to_brown(self, sensor: Sensor, values: Array) -> InteriorOrientation:
-        """The inverse."""
-        plain = np.concatenate([values[:8], [0.0, 0.0]])
-        found = MeasuredPoint(self.r0, at_ideal_point=True).to_brown(sensor, plain)
-        return found.with_values(C1=float(values[8]), C2=float(values[9]))
+def _aicon_family(model: CameraModel) -> Family:
+    """The radial correction vanishes at two thirds of the way to the corner, as is usual."""
+    return aicon(_usual_r0((model.sensor.width, model.sensor.height), model.sensor.pixel_pitch))
 
 
-def _encode_aicon(record: Record) -> tuple[str, str]:
-    sensor = record.model.sensor
-    half_diagonal = 0.5 * float(np.hypot(sensor.width, sensor.height)) * sensor.pixel_pitch
-    # the radial correction vanishes at two thirds of the way to the corner, as is usual
-    r0 = float(f"{2 / 3 * half_diagonal:.4g}")
-    result = to_family(record.model, _Balanced(r0), record.covariance)
-    values = dict(zip(_AICON_NAMES, result.values.tolist(), strict=True))
-    values |= {"Ck": -values["Ck"], "R0": r0}
-    extent = sensor.width * sensor.pixel_pitch, sensor.height * sensor.pixel_pitch
-    numbers = [*(values[n] for n in _AICON_LINES), *extent, sensor.width, sensor.height]
+def _usual_r0(size: tuple[int, int], pitch: float) -> float:
+    half_diagonal = 0.5 * float(np.hypot(*size)) * pitch
+    return float(f"{2 / 3 * half_diagonal:.4g}")
+
+
+def _encode_aicon(record: CameraRecord) -> str:
+    assert record.pixel_pitch is not None
+    values = dict(zip(_AICON_NAMES, record.values.tolist(), strict=True))
+    values |= {"Ck": -values["Ck"], "R0": _usual_r0(record.size, record.pixel_pitch)}
+    extent = [side * record.pixel_pitch for side in record.size]
+    numbers = [*(values[n] for n in _AICON_LINES), *extent, *record.size]
     lines = [" ".join(["1", "1", *map(repr, numbers)]) + " "]
     lines += [f"# fields: {' '.join(_AICON_FIELDS)}", f"# name: {' '.join(record.name.split())}"]
-    if result.covariance is not None:
-        sds = np.sqrt(np.diag(result.covariance)).tolist()
+    if record.covariance is not None:
+        sds = np.sqrt(np.diag(record.covariance)).tolist()
         lines += [f"# sd {n} {sd!r}" for n, sd in zip(_AICON_NAMES, sds, strict=True)]
-    return "\n".join(lines) + "\n" + header(record, result.statement), result.statement
+    return "\n".join(lines) + "\n" + record.head()
 
 
-def _decode_aicon(text: str) -> ForeignCamera:
+def _decode_aicon(text: str) -> CameraRecord:
     fields = _aicon_record(text)
     if fields is None:
         return _typed(text)
@@ -130,7 +92,7 @@ def _decode_aicon(text: str) -> ForeignCamera:
             "R0 is 0: programs differ in the unit of such terms; type the numbers over, one name "
             "and value per line"
         )
-    return _aicon_foreign(found, spread, _Balanced(r0), name)
+    return _aicon_record_of(found, spread, aicon(r0), name)
 
 
 def _aicon_record(text: str) -> list[str] | None:
@@ -145,7 +107,7 @@ def _aicon_record(text: str) -> list[str] | None:
     return words if values[2] < 0 else None
 
 
-def _typed(text: str) -> ForeignCamera:
+def _typed(text: str) -> CameraRecord:
     """One `name value [sd]` per line."""
     found: dict[str, str] = {}
     spread: dict[str, float] = {}
@@ -173,12 +135,12 @@ def _typed(text: str) -> ForeignCamera:
     if missing:
         raise ConfigurationError(f"{', '.join(missing)} missing")
     r0 = number(found.get("R0", 0.0), "R0")
-    return _aicon_foreign(found, spread, MeasuredPoint(r0), name)
+    return _aicon_record_of(found, spread, measured_point(r0), name)
 
 
-def _aicon_foreign(
+def _aicon_record_of(
     found: dict[str, str], spread: dict[str, float], family: Family, name: str
-) -> ForeignCamera:
+) -> CameraRecord:
     values = np.array([number(found.get(key, 0.0), key) for key in _AICON_NAMES])
     values[0] = abs(values[0])
     sizes = [number(found[key], key) for key in _AICON_SIZES]
@@ -191,7 +153,7 @@ def _aicon_foreign(
     if spread:
         covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _AICON_NAMES])
     size = int(sizes[2]), int(sizes[3])
-    return ForeignCamera(size, family, values, name, covariance, sizes[0] / sizes[2])
+    return CameraRecord(size, family, values, name, covariance, sizes[0] / sizes[2])
 
 
 def _is_aicon(text: str) -> bool:
@@ -200,35 +162,36 @@ def _is_aicon(text: str) -> bool:
 
 
 AICON = Format(
-    "aicon", ".ior", "AICON interior orientation", _encode_aicon, _decode_aicon, _is_aicon
+    "aicon",
+    ".ior",
+    "AICON interior orientation",
+    _aicon_family,
+    _encode_aicon,
+    _decode_aicon,
+    _is_aicon,
 )
 
 
-_METASHAPE_FAMILY = Metashape()
-
-
-def _encode_metashape(record: Record) -> tuple[str, str]:
-    result = to_family(record.model, _METASHAPE_FAMILY)
-    sensor = record.model.sensor
+def _encode_metashape(record: CameraRecord) -> str:
     # a comment must not hold a double hyphen
-    words = escape(header(record, result.statement, "  ")).replace("--", "- -")
+    words = escape(record.head("  ")).replace("--", "- -")
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f"<!--\n{words}-->",
         "<calibration>",
         "  <projection>frame</projection>",
-        f"  <width>{sensor.width}</width>",
-        f"  <height>{sensor.height}</height>",
+        f"  <width>{record.size[0]}</width>",
+        f"  <height>{record.size[1]}</height>",
         *(
-            f"  <{tag}>{float(value)!r}</{tag}>"
-            for tag, value in zip(_METASHAPE_FAMILY.parameters, result.values, strict=True)
+            f"  <{tag}>{value!r}</{tag}>"
+            for tag, value in zip(_TAGS, record.values.tolist(), strict=True)
         ),
         "</calibration>",
     ]
-    return "\n".join(lines) + "\n", result.statement
+    return "\n".join(lines) + "\n"
 
 
-def _decode_metashape(text: str) -> ForeignCamera:
+def _decode_metashape(text: str) -> CameraRecord:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ConfigurationError("a calibration needs no DOCTYPE and no entities")
     try:
@@ -251,21 +214,16 @@ def _decode_metashape(text: str) -> ForeignCamera:
         calibration.findtext(side) if resolution is None else resolution.get(side)
         for side in ("width", "height")
     ]
-    values = np.array(
-        [number(calibration.findtext(tag, "0"), f"<{tag}>") for tag in _METASHAPE_FAMILY.parameters]
-    )
+    values = np.array([number(calibration.findtext(tag, "0"), f"<{tag}>") for tag in _TAGS])
     for tag in ("p3", "p4"):
         if number(calibration.findtext(tag, "0"), f"<{tag}>") != 0:
             raise ConfigurationError(f"<{tag}> has no counterpart in this model")
-    return ForeignCamera(
-        (int(number(size[0], "width")), int(number(size[1], "height"))),
-        _METASHAPE_FAMILY, values, covariance=_metashape_covariance(root),
-    )  # fmt: skip
+    width, height = int(number(size[0], "width")), int(number(size[1], "height"))
+    covariance = _metashape_covariance(root)
+    return CameraRecord((width, height), METASHAPE_FRAME, values, covariance=covariance)
 
 
-def _metashape_covariance(
-    root: ET.Element,
-) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] | None:
+def _metashape_covariance(root: ET.Element) -> Array | None:
     """The covariance of a sensor in the order of the family, zero for what was held."""
     node = root.find(".//sensor/covariance")
     if node is None:
@@ -273,12 +231,8 @@ def _metashape_covariance(
     names = (node.findtext("params") or "").split()
     n = len(names)
     C = numbers((node.findtext("coeffs") or "").split(), "covariance", (n * n,)).reshape(n, n)
-    full = np.zeros((len(_METASHAPE_FAMILY.parameters),) * 2)
-    rows = [
-        _METASHAPE_FAMILY.parameters.index(name)
-        for name in names
-        if name in _METASHAPE_FAMILY.parameters
-    ]
+    full = np.zeros((len(_TAGS),) * 2)
+    rows = [_TAGS.index(name) for name in names if name in _TAGS]
     if len(rows) != n:
         raise ConfigurationError("the covariance names parameters that this model does not have")
     full[np.ix_(rows, rows)] = C
@@ -286,6 +240,7 @@ def _metashape_covariance(
 
 
 METASHAPE = Format(
-    "metashape", ".xml", "Agisoft Metashape calibration XML", _encode_metashape, _decode_metashape,
+    "metashape", ".xml", "Agisoft Metashape calibration XML", lambda _: METASHAPE_FRAME,
+    _encode_metashape, _decode_metashape,
     lambda text: "<calibration" in text,
 )  # fmt: skip

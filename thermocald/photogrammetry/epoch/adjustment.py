@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import sqrt
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -69,19 +69,14 @@ class AdjustmentSettings:
     """What is estimated and what is tested.
 
     free: names of IOP to estimate, the others keep their start values; priors: {name: (value, sd)}
-    in the parameter's unit; exterior_free: False holds the EOP too; target_sigmas: whether the
-    sigmas of object coordinates count; snooping_alpha: error probability of a single test, 0
-    switches it off; max_rejected: share of the targets beyond which the epoch fails;
-    scale: covariance with the a-posteriori sigma0, or a priori with 1.
+    in the parameter's unit; snooping_alpha: error probability of a single test, 0 switches it off;
+    max_rejected: share of the targets beyond which the epoch fails.
     """
 
     free: tuple[str, ...] = DEFAULT_FREE
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    exterior_free: bool = True
-    target_sigmas: bool = True
-    snooping_alpha: float = 0.001
+    snooping_alpha: float = 0.0005
     max_rejected: float = 0.35
-    scale: Literal["posterior", "prior"] = "posterior"
     bounds: GeometryBounds = field(default_factory=GeometryBounds)
 
     def __post_init__(self) -> None:
@@ -94,12 +89,12 @@ class AdjustmentSettings:
     @property
     def unknowns(self) -> NDArray[np.int64]:
         """Positions of the unknowns in `PARAMETER_NAMES`."""
-        return _positions(self.free, self.exterior_free)
+        return _positions(self.free)
 
 
 @lru_cache(maxsize=64)
-def _positions(free: tuple[str, ...], exterior_free: bool) -> NDArray[np.int64]:
-    names = {*free, *(EOP_NAMES if exterior_free else ())}
+def _positions(free: tuple[str, ...]) -> NDArray[np.int64]:
+    names = {*free, *EOP_NAMES}
     rows = np.array([i for i, n in enumerate(PARAMETER_NAMES) if n in names], dtype=np.int64)
     rows.flags.writeable = False
     return rows
@@ -120,9 +115,7 @@ class Adjustment:
 
     status: `ok`, or one word for why there is no result, and `reason` in a sentence. covariance
     (16, 16) in the order of `PARAMETER_NAMES`, zero for what was held; residuals (n, 2) px,
-    measured minus adjusted, of all targets in `targets`; redundancy_numbers (n, 2), 0 to 1, of the
-    rejected too (as check points); test_values (n,): chi-square with 2 degrees of freedom;
-    rejected: rows of the test field.
+    measured minus adjusted, of all targets in `targets`; rejected: rows of the test field.
     """
 
     status: str
@@ -135,8 +128,6 @@ class Adjustment:
     redundancy: int
     targets: NDArray[np.int64]
     residuals: Array
-    redundancy_numbers: Array
-    test_values: Array
     rejected: tuple[int, ...]
 
     @property
@@ -162,12 +153,6 @@ class Adjustment:
         variance = np.diag(self.covariance)
         return np.sqrt(np.where(variance > 0, variance, np.nan))
 
-    @property
-    def correlations(self) -> Array:
-        """Correlation coefficients (16, 16), NaN where a parameter was held."""
-        s = self.sd
-        return self.covariance / np.outer(s, s)
-
 
 def failed(
     status: str, reason: str, observations: Observations | None = None, free: tuple[str, ...] = ()
@@ -177,7 +162,7 @@ def failed(
     n = len(targets)
     return Adjustment(
         status, reason, None, None, np.zeros((16, 16)), free, float("nan"), 0, targets,
-        np.full((n, 2), np.nan), np.full((n, 2), np.nan), np.full(n, np.nan), (),
+        np.full((n, 2), np.nan), (),
     )  # fmt: skip
 
 
@@ -216,9 +201,7 @@ def adjust(
         whole = np.zeros((16, 16))
         whole[IOP, IOP] = known
         of_camera = start, whole
-    problem = Problem.build(
-        sensor, testfield, observations, unknowns, s.priors, s.target_sigmas, of_camera
-    )
+    problem = Problem.build(sensor, testfield, observations, unknowns, s.priors, of_camera)
     use = np.ones(n, dtype=bool) if suspects is None else ~suspects
     most = most_rejected(s.max_rejected, 2 * n - len(unknowns))
     try:
@@ -226,7 +209,7 @@ def adjust(
         tests = point_tests(solution, use)
         rejections = Rejections(use)
         for _ in range(_ROUNDS):
-            keep = snoop(tests[0], use, len(unknowns), s.snooping_alpha)
+            keep = snoop(tests, use, len(unknowns), s.snooping_alpha)
             keep = rejections.settle(use, keep)
             if keep is use:
                 break
@@ -245,17 +228,11 @@ def adjust(
         return failed("weak_geometry", str(error), observations, s.free)
     except NoConvergenceError as error:
         return failed("no_convergence", str(error), observations, s.free)
-    return _result(problem, solution, s, use, priors, *tests)
+    return _result(problem, solution, s, use, priors)
 
 
 def _result(
-    problem: Problem,
-    solution: Solution,
-    s: AdjustmentSettings,
-    use: Mask,
-    priors: int,
-    test: Array,
-    redundancy_numbers: Array,
+    problem: Problem, solution: Solution, s: AdjustmentSettings, use: Mask, priors: int
 ) -> Adjustment:
     u, n = problem.unknowns, int(np.count_nonzero(use))
     redundancy = 2 * n + priors - len(u)
@@ -265,7 +242,7 @@ def _result(
         v, points, observed = v[:, use], points[use], observed[use]
         rejected = tuple(problem.observations.targets[~use].tolist())
     sigma0 = sqrt(problem.cost(v, solution.values) / redundancy) if redundancy else 0.0
-    factor = sigma0**2 if s.scale == "posterior" else 1.0
+    factor = sigma0**2
     if redundancy < TRUSTED_REDUNDANCY:
         factor = max(1.0, factor)  # a handful of residuals may be small by luck
     root = np.zeros((16, len(u)))
@@ -284,8 +261,6 @@ def _result(
         redundancy,
         problem.observations.targets,
         solution.residuals.T,
-        redundancy_numbers,
-        test,
         rejected,
     )
     few = redundancy < TRUSTED_REDUNDANCY
@@ -340,9 +315,7 @@ def cold_start(
     first = tuple(name for name in ("c", "A1") if name in s.free)
     suspects = ~fits
     if len(first) < len(s.free):
-        loose = replace(
-            s, free=first, snooping_alpha=0.0, bounds=NO_BOUNDS, scale="posterior", priors={}
-        )
+        loose = replace(s, free=first, snooping_alpha=0.0, bounds=NO_BOUNDS, priors={})
         rough = adjust(
             sensor, testfield, observations, start_interior, start_exterior, loose, suspects
         )
@@ -388,8 +361,7 @@ def pose_only(
     result = adjust(sensor, testfield, observations, interior, exterior, s, ~fits)
     if not result.ok:
         return result
-    other = mirror_pose(sensor, testfield, observations, interior)
-    if other is not None and other < _AMBIGUITY**2:
+    if is_ambiguous(sensor, testfield, observations, interior):
         return failed(
             "ambiguous_pose",
             "the targets lie in one plane and a second, mirrored pose fits nearly as well: show "
@@ -399,18 +371,12 @@ def pose_only(
     return result
 
 
-def mirror_pose(
-    sensor: Sensor,
-    testfield: TestField,
-    observations: Observations,
-    interior: InteriorOrientation,
-) -> float | None:
-    """How much larger the sum of squares of a plane field's second pose is; None without one."""
+def is_ambiguous(
+    sensor: Sensor, testfield: TestField, observations: Observations, interior: InteriorOrientation
+) -> bool:
+    """Return whether a plane field's second, mirrored pose fits nearly as well as the first."""
     points = testfield.points[observations.targets]
     if not plane_fit(points, 0.005)[2]:
-        return None
-    solutions = resection(sensor, interior, points, observations.points)
-    if len(solutions) < 2:
-        return None
-    (best, _), (second, _) = solutions[:2]
-    return (second / max(best, 1e-9)) ** 2
+        return False
+    rms = [rms for rms, _ in resection(sensor, interior, points, observations.points)]
+    return len(rms) > 1 and rms[1] < _AMBIGUITY * max(rms[0], 1e-9)

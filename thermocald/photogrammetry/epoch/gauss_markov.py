@@ -121,7 +121,6 @@ class Problem:
         observations: Observations,
         unknowns: NDArray[np.int64],
         priors: Mapping[str, tuple[float, float]],
-        target_sigmas: bool,
         known: tuple[Array, Array] | None = None,
     ) -> Problem:
         """Collect what the iteration needs.
@@ -139,7 +138,7 @@ class Problem:
             value = known[0][unknowns]
             weight = _weight_of(known[1][np.ix_(unknowns, unknowns)])
         variances = None
-        if target_sigmas and field.sigmas.any():
+        if field.sigmas.any():
             variances = field.sigmas[observations.targets] ** 2
         return cls(
             sensor,

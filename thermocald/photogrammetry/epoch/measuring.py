@@ -34,7 +34,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
     AdjustmentSettings,
     adjust,
     failed,
-    mirror_pose,
+    is_ambiguous,
 )
 from thermocald.photogrammetry.orientation import approximate_orientation
 
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _FEWEST = 4  # control points: three have up to four poses
-_AMBIGUITY = 2.0  # a second pose must fit this much worse to be excluded
 _BESIDE_PX = 5.0  # an image point may lie so far beyond a profile's end
 _GRAZING = np.sin(np.radians(1.0))  # between a ray and a plane: beyond it a pixel is metres
 
@@ -72,25 +71,23 @@ def resect(
         return failed(
             "too_few_targets", f"{n} control points; a pose needs at least {fewest}", observations
         )
-    suspects = None
-    if start is None:
+    suspects, pose = None, start
+    if pose is None:
         points = control.points[observations.targets]
         try:
-            _, start, fits = approximate_orientation(
+            _, pose, fits = approximate_orientation(
                 sensor, points, observations.points, interior=interior
             )
         except GeometryError as error:
             return failed("no_orientation", str(error), observations)
         suspects = ~fits
-    result = adjust(sensor, control, observations, interior, start, s, suspects, covariance)
-    if result.ok and suspects is not None:
-        second = mirror_pose(sensor, control, observations, interior)
-        if second is not None and second < _AMBIGUITY**2:
-            why = (
-                "the control points lie in one plane, and a second, mirrored pose fits nearly as "
-                "well: add one outside of the plane, or state an earlier pose"
-            )
-            return replace(result, status="ambiguous_pose", reason=why)
+    result = adjust(sensor, control, observations, interior, pose, s, suspects, covariance)
+    if result.ok and start is None and is_ambiguous(sensor, control, observations, interior):
+        why = (
+            "the control points lie in one plane, and a second, mirrored pose fits nearly as "
+            "well: add one outside of the plane, or state an earlier pose"
+        )
+        return replace(result, status="ambiguous_pose", reason=why)
     return result
 
 
@@ -131,28 +128,33 @@ class Profile:
     sd_mm: float = 0.0
 
 
-def on_plane(
+def place_on(
     sensor: Sensor,
     values: Array,
     covariance: Array,
     image_points: ArrayLike,
     sigmas: ArrayLike,
-    plane: Plane,
+    surface: Plane | Line | Profile,
     own: Array | None = None,
     member: NDArray[np.int64] | None = None,
 ) -> tuple[Array, Array]:
-    """Return where image points lie on a plane: (n, 3) mm, and their joint covariance (3n, 3n).
+    """Return where image points lie on a surface: (n, 3) mm, and their joint covariance (3n, 3n).
 
     values (16,) or (n, 16), covariance (16, 16): camera and pose, the pose of all is the same;
     image_points (n, 2), sigmas (n, 2) px; own (g, 10, 10): what the cameras of g times have
-    besides, and member (n,): which of them took each point. Raises GeometryError for a point whose
-    ray does not meet the plane before the camera.
+    besides, and member (n,): which of them took each point. On a line it is the place in the plane
+    through it that faces the camera: what an image point is off the line's image is left over, and
+    not in the result; a place has a direction of no variance. Raises GeometryError for a point
+    whose ray does not meet the surface before the camera.
     """
     uv = np.atleast_2d(np.asarray(image_points, dtype=float))
     values = np.broadcast_to(values, (len(uv), 16))
     pose = values[0, EOP]
-    ray = rays(sensor, values[:, IOP], uv[:, None])[:, 0] @ rotation(pose[:3]).T
     centre = pose[3:]
+    if isinstance(surface, Profile):
+        surface = _lines_of(surface, sensor, values, uv)
+    plane = surface if isinstance(surface, Plane) else _facing(surface, centre)
+    ray = rays(sensor, values[:, IOP], uv[:, None])[:, 0] @ rotation(pose[:3]).T
     normal = np.broadcast_to(plane.normal, ray.shape)
     steep = np.sum(ray * normal, axis=1)
     with np.errstate(divide="ignore"):
@@ -187,48 +189,32 @@ def on_plane(
             at = np.flatnonzero(np.repeat(member == k, 3))
             lever = shared[at, IOP]
             total[at[:, None], at] += lever @ Q @ lever.T
+    if isinstance(surface, Line):
+        direction = np.broadcast_to(surface.direction, X.shape)
+        along = direction[:, :, None] * direction[:, None, :]
+        n = len(X)
+        blocks = total.reshape(n, 3, n, 3)
+        total = np.einsum("iab,ibjc,jcd->iajd", along, blocks, along, optimize=True)
+        total = total.reshape(3 * n, 3 * n)
+        X = surface.point + np.einsum("nab,nb->na", along, X - surface.point)
     return X, total
 
 
-def on_line(
-    sensor: Sensor,
-    values: Array,
-    covariance: Array,
-    image_points: ArrayLike,
-    sigmas: ArrayLike,
-    line: Line,
-    own: Array | None = None,
-    member: NDArray[np.int64] | None = None,
-) -> tuple[Array, Array]:
-    """Return where image points lie on a line: (n, 3) mm, and their joint covariance (3n, 3n).
-
-    As `on_plane`, in the plane through the line that faces the camera; what an image point is off
-    the line's image is left over, and not in the result. A place has a direction of no variance.
-    """
-    centre = np.atleast_2d(values)[0, EOP][3:]
-    aside = np.cross(line.direction, centre - line.point)
-    normal = np.cross(aside, line.direction)
+def _facing(line: Line, centre: Array) -> Plane:
+    """Return the plane through a line that faces a camera at a projection centre (3,)."""
+    normal = np.cross(np.cross(line.direction, centre - line.point), line.direction)
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     if not (size > 0).all():
         raise GeometryError("the line passes through the camera: it is seen as a point")
-    plane = Plane(line.point, normal / size, line.sd_mm)
-    X, C = on_plane(sensor, values, covariance, image_points, sigmas, plane, own, member)
-    direction = np.broadcast_to(line.direction, X.shape)
-    along = direction[:, :, None] * direction[:, None, :]
-    n = len(X)
-    C = np.einsum("iab,ibjc,jcd->iajd", along, C.reshape(n, 3, n, 3), along, optimize=True)
-    X = line.point + np.einsum("nab,nb->na", along, X - line.point)
-    return X, C.reshape(3 * n, 3 * n)
+    return Plane(line.point, normal / size, line.sd_mm)
 
 
-def lines_of(profile: Profile, sensor: Sensor, values: Array, image_points: ArrayLike) -> Line:
+def _lines_of(profile: Profile, sensor: Sensor, values: Array, uv: Array) -> Line:
     """Return the line of a profile that each image point lies on: the one whose image is nearest.
 
-    values (16,) or (n, 16). Raises GeometryError for points beside the profile's ends.
+    values (n, 16); uv (n, 2) px. Raises GeometryError for points beside the profile's ends.
     """
-    uv = np.atleast_2d(np.asarray(image_points, dtype=float))
-    six = np.atleast_2d(values)[0, EOP]
-    ends = project(sensor, np.broadcast_to(values, (len(uv), 16))[:, IOP], six, profile.points)
+    ends = project(sensor, values[:, IOP], values[0, EOP], profile.points)
     begin, step = ends[:, :-1], np.diff(ends, axis=1)
     size = np.sum(step**2, axis=2)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -244,24 +230,6 @@ def lines_of(profile: Profile, sensor: Sensor, values: Array, image_points: Arra
     direction = np.diff(profile.points, axis=0)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return Line(profile.points[chosen], direction[chosen], profile.sd_mm)
-
-
-def place_on(
-    sensor: Sensor,
-    values: Array,
-    covariance: Array,
-    image_points: ArrayLike,
-    sigmas: ArrayLike,
-    surface: Plane | Line | Profile,
-    own: Array | None = None,
-    member: NDArray[np.int64] | None = None,
-) -> tuple[Array, Array]:
-    """Return what `on_plane` or `on_line` does, whichever the surface is."""
-    if isinstance(surface, Profile):
-        surface = lines_of(surface, sensor, values, image_points)
-    if isinstance(surface, Line):
-        return on_line(sensor, values, covariance, image_points, sigmas, surface, own, member)
-    return on_plane(sensor, values, covariance, image_points, sigmas, surface, own, member)
 
 
 def _across(normal: Array) -> Array:

@@ -31,6 +31,18 @@ def chi2_2d(alpha: float) -> float:
     return -2.0 * log(alpha) if alpha > 0 else float("inf")
 
 
+def limit_2d(alpha: float, uncertainty: Array) -> Array:
+    """Limit of a point's test at error probability alpha where the noise was found, not known.
+
+    uncertainty: one over the degrees of freedom with which it was found. The quantile of 2 F(2, m),
+    which has a closed form too; a median of n points' tests is worth n degrees of freedom.
+    """
+    if alpha <= 0:
+        return np.full(np.shape(uncertainty), np.inf)
+    known = np.maximum(uncertainty, 1e-9)
+    return np.asarray(np.expm1(-2.0 * known * log(alpha)) / known)
+
+
 def fails_global_test(
     unit: ArrayLike, redundancy: ArrayLike, after_rejection: bool = False
 ) -> NDArray[np.bool_]:
@@ -55,8 +67,8 @@ def most_rejected(fraction: float, redundancy: int) -> float:
     return min(fraction, _MOST_OF_FEW) if redundancy < TRUSTED_REDUNDANCY else fraction
 
 
-def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
-    """Chi-square with 2 degrees of freedom per point (n,), and redundancy numbers (n, 2).
+def point_tests(solution: Solution, use: Mask) -> Array:
+    """Return chi-square with 2 degrees of freedom per point (n,).
 
     A point that takes part has the residual covariance I - h'h, one that does not I + h'h.
     """
@@ -64,7 +76,6 @@ def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
     h = solution.root.T @ solution.whitened[:-1].reshape(u, -1)
     claimed = np.add.reduce(h * h).reshape(2, n)
     q, qxy = 1 - claimed, np.add.reduce(h[:, :n] * h[:, n:])
-    redundancy_numbers = np.maximum(q.T, 0.0)
     if np.count_nonzero(use) == n:
         np.negative(qxy, out=qxy)
     else:
@@ -80,11 +91,11 @@ def point_tests(solution: Solution, use: Mask) -> tuple[Array, Array]:
     squares *= q[::-1]
     qxy *= v[0]
     qxy *= v[1]
-    test = squares[0] + squares[1]
+    test: Array = squares[0] + squares[1]
     test -= qxy
     test -= qxy
     test /= determinant
-    return test, redundancy_numbers
+    return test
 
 
 class Rejections:
@@ -126,7 +137,7 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     few = 2 * n - unknowns < TRUSTED_REDUNDANCY
     if few:
         variance = 1.0  # one gross error reaches every residual: the stated sigmas are the scale
-    limit = chi2_2d(alpha) * max(variance, 1e-12)
+    limit = float(limit_2d(alpha, np.asarray(0.0 if few else 1.0 / n))) * max(variance, 1e-12)
     fits = test <= limit
     if not np.count_nonzero(fits != use):
         return use

@@ -51,32 +51,43 @@ def field_normals(testfield: TestField) -> Array:
 
 
 def target_normals(points: Array) -> Array:
-    """Unit normals (n, 3), of either sign, of targets at points (n, 3) mm; NaN for no plane."""
-    normals = np.full((len(points), 3), np.nan)
+    """Return unit normals (n, 3), of either sign, of targets at (n, 3) mm; NaN for no plane."""
     if len(points) < _PLATE:
-        return normals
+        return np.full((len(points), 3), np.nan)
     near, _ = _neighbours(points)
     reach = np.linalg.norm(points[near[:, :_PLATE]] - points[:, None], axis=2)
     spacing = float(np.median(reach[:, 1]))
     labels = _sheets(points, 0.0)
-    for row, label in enumerate(labels):
-        board = np.flatnonzero(labels == label)
-        local = near[row, :_PLATE]
-        if label >= 0:
-            away = np.linalg.norm(points[board] - points[row], axis=1)
-            local = board[np.argsort(away, kind="stable")[:_LOCAL]]
-        spread = points[local] - points[local].mean(axis=0)
+    normals = sheet_normals(points, labels, _LOCAL)
+    for row in np.flatnonzero(labels < 0):
+        local = points[near[row, :_PLATE]]
+        spread = local - local.mean(axis=0)
         _, size, axes = np.linalg.svd(spread)
-        if label >= 0:
-            # A single row of targets does not say how its board is turned about it.
-            broad = size[1] > 0.1 * size[0]
-            normals[row] = axes[2] if broad else plane_fit(points[board])[1][2]
-        elif (
+        if (
             reach[row, -1] < _COMPACT * reach[row, 1]
             and size[1] > 0.1 * size[0]
             and np.abs(spread @ axes[2]).max() < _LOOSE * spacing
         ):
             normals[row] = axes[2]
+    return normals
+
+
+def sheet_normals(points: Array, labels: NDArray[np.int64], nearest: int) -> Array:
+    """Return unit normals (n, 3), of either sign, of targets by the nearest on the same sheet, so
+    many with the target itself; NaN for those on none (label -1).
+    """
+    normals = np.full((len(points), 3), np.nan)
+    for label in np.unique(labels[labels >= 0]):
+        rows = np.flatnonzero(labels == label)
+        if len(rows) < _PLATE:
+            continue
+        whole = plane_fit(points[rows])[1][2]
+        for row in rows:
+            away = np.linalg.norm(points[rows] - points[row], axis=1)
+            near = points[rows[np.argsort(away, kind="stable")[:nearest]]]
+            _, size, axes = np.linalg.svd(near - near.mean(axis=0))
+            # A single row of targets does not say how its board is turned about it.
+            normals[row] = axes[2] if size[1] > 0.1 * size[0] else whole
     return normals
 
 

@@ -154,19 +154,39 @@ class Observations:
         )
 
     @classmethod
+    def build(
+        cls,
+        rows: NDArray[np.int64],
+        points: Array,
+        covariances: Array,
+        quality: Mapping[str, Array],
+    ) -> Observations:
+        """Build from covariances (n, 2, 2) px², in the order of the test field."""
+        found = cls(
+            rows,
+            points,
+            np.sqrt(np.stack([covariances[:, 0, 0], covariances[:, 1, 1]], axis=-1)),
+            covariances[:, 0, 1],
+            dict(quality),
+        )
+        if (rows[1:] < rows[:-1]).any():
+            return found.select(np.argsort(rows, kind="stable"))
+        return found
+
+    @classmethod
     def none(cls) -> Observations:
-        """No observations, with covariances of none."""
+        """Return no observations, with covariances of none."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
 
     def joined(self, other: Observations) -> Observations:
-        """With those of another measurement of the frame, in the order of the test field.
+        """Join another measurement of the frame; both are in the order of the test field.
 
         No target may be in both, and both have covariances. A quality that one does not have is
         NaN there.
         """
         if len(other) == 0:
             return self
-        if len(self) == 0 and bool((other.targets[1:] > other.targets[:-1]).all()):
+        if len(self) == 0:
             return other
         targets = np.concatenate([self.targets, other.targets])
         order = np.argsort(targets, kind="stable")

@@ -26,22 +26,19 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.field.planes import field_normals
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.linalg import MAD_TO_SD
+from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
-from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.boards import find_chessboards, locate_chess_corners
-from thermocald.photogrammetry.targets.circle import CircleFit, fit_circles
-from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
+from thermocald.photogrammetry.targets.boards import find_chessboards, predict_corners
+from thermocald.photogrammetry.targets.circle import fit_circles
+from thermocald.photogrammetry.targets.corner import Corners, measure_corners
+from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, Word, inspect_frame
 from thermocald.photogrammetry.targets.markers import (
-    MarkerCorners,
     corners_turned_deg,
     is_marker,
     locate_markers,
-    measure_corners,
-    predicted_markers,
 )
-from thermocald.photogrammetry.targets.outline import LocalMap, local_maps
-from thermocald.photogrammetry.targets.ring_code import find_coded
+from thermocald.photogrammetry.targets.outline import LocalMap, facing, local_maps
+from thermocald.photogrammetry.targets.ring_code import find_coded, have_rings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -56,117 +53,36 @@ _WIDE_BLUR_PX = 1.1
 _SETTLED_PX = 0.002
 
 
-def predicted_maps(
-    testfield: TestField, orientation: Orientation, eccentricity: bool = True
+def predict_circles(
+    testfield: TestField,
+    camera: CameraModel,
+    exterior: ExteriorOrientation,
+    normals: Array | None = None,
+    eccentricity: bool = True,
 ) -> tuple[NDArray[np.int64], LocalMap]:
-    """Rows and outlines of the field's circles that face the camera and lie in the image.
+    """Predict the outlines of the field's circles that face the camera and lie in the image.
 
-    A circle whose plane is not known is taken as facing the camera, and has no eccentricity.
+    Returns their rows and maps. normals (n, 3): of the targets, by default those of the planes of
+    the field; a circle whose plane is not known is taken as facing the camera, and has no
+    eccentricity.
     """
     rows = np.nonzero(testfield.circles & np.isfinite(testfield.diameters))[0]
-    X = testfield.points[rows]
-    normals = field_normals(testfield)[rows]
-    view = orientation.exterior.centre - X
-    view = view / np.linalg.norm(view, axis=1, keepdims=True)
-    unknown = ~np.isfinite(normals[:, 0])
-    normals = np.where(unknown[:, None], view, normals)
-    cosine = np.abs(np.sum(view * normals, axis=1))
+    points = testfield.points[rows]
+    given = field_normals(testfield) if normals is None else normals
+    known, cosine = facing(exterior.centre, points, given[rows])
     maps = local_maps(
-        orientation.camera.sensor, orientation.camera.interior.as_array(),
-        orientation.exterior.as_array(), X, normals, testfield.diameters[rows] / 2,
+        camera.sensor, camera.interior.as_array(), exterior.as_array(), points, known,
+        testfield.diameters[rows] / 2,
     )  # fmt: skip
     visible = (
         np.isfinite(maps.second).all(axis=(1, 2))
         & np.isfinite(maps.linear).all(axis=(1, 2))
-        & orientation.camera.sensor.contains(np.nan_to_num(maps.centre, nan=-1e9))
+        & camera.sensor.contains(np.nan_to_num(maps.centre, nan=-1e9))
         & (cosine > _LARGEST_TILT_COSINE)
     )
-    maps = maps if eccentricity else maps.without_eccentricity()
+    if not eccentricity:
+        maps = replace(maps, second=np.zeros_like(maps.second))
     return rows[visible], maps.select(visible)
-
-
-def measure_circles(
-    image: Image,
-    testfield: TestField,
-    orientation: Orientation,
-    corners: Observations,
-    interior: InteriorOrientation | None,
-    eccentricity: bool,
-) -> tuple[Observations, dict[int, str], Orientation]:
-    """Fit every circle in view, improve the orientation with them, and fit once more if needed.
-
-    corners: what was measured before; interior: the camera's, where it is known. Returns the
-    observations, {row: reason} for circles that were not measured, and the orientation.
-    """
-    rows, maps = predicted_maps(testfield, orientation, eccentricity)
-    coded = ring_code.have_rings(testfield, rows)
-    fit = fit_circles(image, maps, coded, _USUAL_BLUR_PX)
-    blur = float(np.median(fit.parameters[:, 5])) if len(rows) else _USUAL_BLUR_PX
-    if blur > _WIDE_BLUR_PX:
-        # The windows were too narrow for this frame.
-        fit = fit_circles(image, maps, coded, blur)
-    good = fit.good
-    if good.sum() + len(corners) < _FEWEST:
-        return Observations.none(), dict(zip(rows.tolist(), fit.reasons, strict=True)), orientation
-    pairs = np.concatenate([corners.targets, rows[good]])
-    better = refine(
-        orientation.camera.sensor, orientation.camera.interior, orientation.exterior,
-        testfield.points[pairs], np.concatenate([corners.points, fit.points[good]]),
-        known=interior is not None,
-    )  # fmt: skip
-    new_rows, new_maps = predicted_maps(testfield, better, eccentricity)
-    same = len(new_rows) == len(rows) and bool(np.all(new_rows == rows))
-    # The outlines' asymmetry decides about the centres, the rest is estimated anyway.
-    settled = (
-        same
-        and bool(good.all())
-        and float(np.abs(new_maps.second - maps.second).max(initial=0.0)) < _SETTLED_PX
-    )
-    if not settled:
-        start = None
-        if same:
-            new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
-            start = fit.parameters if good.all() else None
-        rows, maps = new_rows, new_maps
-        coded = ring_code.have_rings(testfield, rows)
-        fit = fit_circles(image, maps, coded, blur, None, start)
-    return (*_observations(rows, fit, testfield, better), better)
-
-
-def _observations(
-    rows: NDArray[np.int64], fit: CircleFit, testfield: TestField, orientation: Orientation
-) -> tuple[Observations, dict[int, str]]:
-    """The good fits; a circle far from where its target must be is another circle."""
-    reasons = list(fit.reasons)
-    predicted = orientation.camera.project(orientation.exterior, testfield.points[rows])
-    off = np.abs(fit.points - predicted).max(axis=1, initial=0.0)
-    limit = max(_GROSS_PX, _GROSS_SD * min(orientation.scatter, 1.0))
-    for i in np.nonzero(off > limit)[0]:
-        reasons[i] = reasons[i] or "not where the target must be"
-    good = np.array([not reason for reason in reasons], dtype=bool)
-    observations = circle_observations(rows, fit, good)
-    return observations, {int(r): why for r, why in zip(rows, reasons, strict=True) if why}
-
-
-def circle_observations(
-    rows: NDArray[np.int64], fit: CircleFit, good: NDArray[np.bool_]
-) -> Observations:
-    """Some of the fits (mask) as observations of the test field's rows (n,)."""
-    c, p = fit.covariances[good], fit.parameters[good]
-    return Observations(
-        rows[good].astype(np.int64),
-        p[:, :2],
-        np.sqrt(np.stack([c[:, 0, 0], c[:, 1, 1]], axis=-1)),
-        c[:, 0, 1],
-        {
-            "blur": p[:, 5],
-            "contrast": p[:, 7],
-            "grey": p[:, 6],
-            "noise": np.sqrt(fit.noise.variance(p[:, 6])).astype(float),
-            "saturation": fit.saturation[good],
-            "misfit": fit.misfit[good],
-        },
-    )
 
 
 _FEWEST = 4
@@ -205,14 +121,18 @@ class Prior:
 class Measurement:
     """What a frame gave: observations (none where the status is not ok), {row: reason} for targets
     of the field that are in view and not measured, the approximate orientation (None where the
-    targets did not carry one), and where the marker corners are.
+    targets did not carry one), and where the marker corners are. Where targets are tracked,
+    `searched` says why the whole frame was searched, empty where only windows were read, and
+    renewed how many targets got new weights.
     """
 
     observations: Observations
     status: FrameStatus = OK
     missed: dict[int, str] = field(default_factory=dict)
     orientation: Orientation | None = None
-    markers: MarkerCorners | None = None
+    markers: Corners | None = None
+    searched: str = ""
+    renewed: int = 0
 
 
 def measure(
@@ -234,158 +154,194 @@ def measure(
     status = inspect_frame(image, size)
     if not status.ok:
         return Measurement(Observations.none(), status)
-    sensor = prior.sensor or Sensor(image.shape[1], image.shape[0], 1.0)
-    missed: dict[int, str] = {}
-    markers = locate_markers(image, testfield, missed)
-    if turned := corners_turned_deg(markers, testfield):
-        return Measurement(
-            Observations.none(), FrameStatus("other_field", _TURNED.format(turned)), missed
+    return _Frame(image, testfield, prior, eccentricity).measure()
+
+
+class _Frame:
+    """One frame while it is measured; `missed` grows and shrinks."""
+
+    def __init__(
+        self, image: Image, testfield: TestField, prior: Prior, eccentricity: bool
+    ) -> None:
+        self._image, self._field, self._prior = image, testfield, prior
+        self._eccentricity = eccentricity
+        self._sensor = prior.sensor or Sensor(image.shape[1], image.shape[0], 1.0)
+        self._missed: dict[int, str] = {}
+        self._markers = locate_markers(image, testfield, self._missed)
+
+    def measure(self) -> Measurement:
+        """Measure markers and squares, then the circles."""
+        if turned := corners_turned_deg(self._markers, self._field):
+            return self._result("other_field", _TURNED.format(turned))
+        corners = measure_corners(self._image, self._markers, self._missed)
+        if "chess_corner" in self._field.kinds:
+            corners = corners.joined(find_chessboards(self._image, self._field, self._missed))
+        corners = corners.joined(self._second_look(corners))
+        if not self._field.circles.any():
+            return self._finished(corners)
+        prior = self._prior
+        if prior.interior is not None and prior.exterior is not None:
+            camera = CameraModel(self._sensor, prior.interior)
+            known = Orientation(camera, prior.exterior, np.zeros((0, 2)))
+            found, missed, orientation = self._circles(known, corners, known=False)
+            if len(found) >= max(_FEWEST, 0.5 * (len(found) + len(missed))):
+                self._missed.update(missed)
+                return self._finished(corners.joined(found), orientation)
+        return self._by_codes(corners)
+
+    def _second_look(self, corners: Observations) -> Observations:
+        """Measure corners that detection does not give where the orientation from the others has
+        them: those of markers and chessboards that it placed wrongly, and of the squares of ChArUco
+        boards.
+        """
+        again = {row for row, why in self._missed.items() if why in _WORTH_A_SECOND_LOOK}
+        if len(corners) < max(_FEW_CORNERS, len(again)):
+            again = set()
+        rows = [
+            row
+            for row, (kind, code) in enumerate(
+                zip(self._field.kinds, self._field.codes, strict=True)
+            )
+            if (kind == "chess_corner" and not code)
+            or (row in again and (kind == "chess_corner" or is_marker(code)))
+        ]
+        if len(corners) < _FEWEST or not rows:
+            return Observations.none()
+        try:
+            known = self._orient(corners.targets, corners.points)
+        except GeometryError:
+            return Observations.none()
+        places = predict_corners(self._field, rows, known, self._markers)
+        found = measure_corners(self._image, places, self._missed)
+        for row in found.targets.tolist():
+            self._missed.pop(row, None)
+        return found
+
+    def _orient(self, rows: NDArray[np.int64], points: Array) -> Orientation:
+        prior = self._prior
+        return orient(
+            self._sensor, self._field.points[rows], points, prior.principal_distance,
+            prior.interior,
+        )  # fmt: skip
+
+    def _by_codes(self, corners: Observations) -> Measurement:
+        """Find the circles by their codes and the corners."""
+        rows, maps, foreign = find_coded(
+            self._image, self._field, _FEWEST, needed=len(corners) < _FEWEST
         )
-    corners = measure_corners(image, markers, missed)
-    if "chess_corner" in testfield.kinds:
-        plain = find_chessboards(image, testfield, missed)
-        corners = corners.joined(plain) if len(plain) else corners
-    corners = _by_orientation(image, testfield, prior, sensor, corners, markers, missed)
-    found = _measure(image, testfield, prior, sensor, corners, missed, eccentricity)
-    return replace(found, markers=markers)
-
-
-def _by_orientation(
-    image: Image,
-    testfield: TestField,
-    prior: Prior,
-    sensor: Sensor,
-    corners: Observations,
-    markers: MarkerCorners,
-    missed: dict[int, str],
-) -> Observations:
-    """Corners that detection does not give, where the orientation from the others has them: those
-    of markers and chessboards that it placed wrongly, and of the squares of ChArUco boards.
-    """
-    again = [row for row, why in missed.items() if why in _WORTH_A_SECOND_LOOK]
-    again = again if len(corners) >= max(_FEW_CORNERS, len(again)) else []
-    squares = [
-        row
-        for row, (kind, code) in enumerate(zip(testfield.kinds, testfield.codes, strict=True))
-        if kind == "chess_corner" and (not code or row in again)
-    ]
-    again = [row for row in again if is_marker(testfield.codes[row])]
-    if len(corners) < _FEWEST or not (again or squares):
-        return corners
-    try:
-        known = orient(
-            sensor, testfield.points[corners.targets], corners.points, prior.principal_distance,
-            prior.interior,
-        )  # fmt: skip
-    except GeometryError:
-        return corners
-    places = [locate_chess_corners(testfield, squares, known)] if squares else []
-    if again:
-        points = known.camera.project(known.exterior, testfield.points)
-        inside = sensor.contains(np.nan_to_num(points, nan=-1e9), 3.0)
-        rows = [row for row in again if inside[row]]
-        places.append(predicted_markers(testfield, rows, points, markers))
-    for place in places:
-        if len(place):
-            found = measure_corners(image, place, missed)
-            for row in found.targets.tolist():
-                missed.pop(row, None)
-            corners = corners.joined(found) if len(found) else corners
-    return corners
-
-
-def _measure(
-    image: Image,
-    testfield: TestField,
-    prior: Prior,
-    sensor: Sensor,
-    corners: Observations,
-    missed: dict[int, str],
-    eccentricity: bool,
-) -> Measurement:
-    """The circles, once the marker corners are known."""
-    if not testfield.circles.any():
-        return _finish(testfield, corners, missed, None, foreign=False)
-
-    if prior.interior is not None and prior.exterior is not None:
-        known = Orientation(CameraModel(sensor, prior.interior), prior.exterior, np.zeros((0, 2)))
-        found = measure_circles(image, testfield, known, corners, None, eccentricity)
-        if len(found[0]) >= max(_FEWEST, 0.5 * (len(found[0]) + len(found[1]))):
-            missed.update(found[1])
-            return _finish(testfield, corners.joined(found[0]), missed, found[2], False)
-
-    rows, points, maps, foreign = find_coded(
-        image, testfield, _FEWEST, needed=len(corners) < _FEWEST
-    )
-    pair_rows = np.concatenate([corners.targets, rows])
-    pair_points = np.concatenate([corners.points, points])
-    if len(pair_rows) < _FEWEST:
-        return _few(image, testfield, corners, rows, maps, missed, foreign)
-    try:
-        orientation = orient(
-            sensor, testfield.points[pair_rows], pair_points, prior.principal_distance,
-            prior.interior,
-        )  # fmt: skip
-    except GeometryError as error:
-        return Measurement(
-            Observations.none(),
-            FrameStatus(
+        pairs = np.concatenate([corners.targets, rows])
+        if len(pairs) < _FEWEST:  # too few for an orientation: those that there are, as ellipses
+            fit = fit_circles(self._image, maps, have_rings(self._field, rows))
+            self._missed.update(fit.missed(rows))
+            circles = fit.observations(rows, fit.good)
+            return self._finished(corners.joined(circles), foreign=foreign)
+        try:
+            orientation = self._orient(pairs, np.concatenate([corners.points, maps.centre]))
+        except GeometryError as error:
+            return self._result(
                 "other_field",
-                f"{len(pair_rows)} codes of the test field are seen, but not where it has them "
+                f"{len(pairs)} codes of the test field are seen, but not where it has them "
                 f"({error})",
-            ),
-            missed,
+            )
+        measured, missed, orientation = self._circles(
+            orientation, corners, known=self._prior.interior is not None
         )
-    measured, lost, orientation = measure_circles(
-        image, testfield, orientation, corners, prior.interior, eccentricity
-    )
-    missed.update(lost)
-    return _finish(testfield, corners.joined(measured), missed, orientation, foreign)
+        self._missed.update(missed)
+        return self._finished(corners.joined(measured), orientation, foreign)
 
+    def _circles(
+        self, orientation: Orientation, corners: Observations, known: bool
+    ) -> tuple[Observations, dict[int, str], Orientation]:
+        """Fit every circle in view, improve the orientation with them, and fit once more if needed.
 
-def _few(
-    image: Image,
-    testfield: TestField,
-    corners: Observations,
-    rows: NDArray[np.int64],
-    maps: LocalMap,
-    missed: dict[int, str],
-    foreign: bool,
-) -> Measurement:
-    """Too few codes for an orientation: those that there are, as ellipses."""
-    coded = ring_code.have_rings(testfield, rows)
-    fit = fit_circles(image, maps, coded)
-    good = fit.good
-    missed.update({int(r): why for r, why in zip(rows, fit.reasons, strict=True) if why})
-    circles = circle_observations(rows, fit, good)
-    return _finish(testfield, corners.joined(circles), missed, None, foreign)
-
-
-def _finish(
-    testfield: TestField,
-    observations: Observations,
-    missed: dict[int, str],
-    orientation: Orientation | None,
-    foreign: bool,
-) -> Measurement:
-    n = len(observations)
-    status = OK
-    coded = any(testfield.codes)
-    if n < _FEWEST and foreign:
-        status = FrameStatus(
-            "other_field", "the ring codes in the frame are not those of this test field"
+        corners: what was measured before; known: whether the interior orientation is. Returns the
+        observations, {row: reason} for circles that were not measured, and the orientation.
+        """
+        image, field = self._image, self._field
+        rows, maps = predict_circles(
+            field, orientation.camera, orientation.exterior, None, self._eccentricity
         )
-    elif n == 0 and not coded:
-        status = FrameStatus(
-            "nothing_found",
-            "the test field has no coded target and the camera's orientation is not known: plain "
-            "circles alone cannot be separated",
+        coded = have_rings(field, rows)
+        fit = fit_circles(image, maps, coded, _USUAL_BLUR_PX)
+        blur = float(np.median(fit.parameters[:, 5])) if len(rows) else _USUAL_BLUR_PX
+        if blur > _WIDE_BLUR_PX:
+            # The windows were too narrow for this frame.
+            fit = fit_circles(image, maps, coded, blur)
+        good = fit.good
+        if good.sum() + len(corners) < _FEWEST:
+            return (
+                Observations.none(),
+                dict(zip(rows.tolist(), fit.reasons, strict=True)),
+                orientation,
+            )
+        pairs = np.concatenate([corners.targets, rows[good]])
+        better = refine(
+            self._sensor, orientation.camera.interior, orientation.exterior, field.points[pairs],
+            np.concatenate([corners.points, fit.points[good]]), known=known,
+        )  # fmt: skip
+        new_rows, new_maps = predict_circles(
+            field, better.camera, better.exterior, None, self._eccentricity
         )
-    elif n == 0:
-        status = FrameStatus("nothing_found", _why_nothing(missed))
-    elif n < _FEWEST:
-        status = FrameStatus("too_few", f"only {n} targets are found in the frame")
-    return Measurement(observations, status, missed, orientation)
+        same = np.array_equal(new_rows, rows)
+        # The outlines' asymmetry decides about the centres, the rest is estimated anyway.
+        settled = (
+            same
+            and good.all()
+            and np.abs(new_maps.second - maps.second).max(initial=0.0) < _SETTLED_PX
+        )
+        if not settled:
+            start = None
+            if same:
+                new_maps = new_maps.at(np.where(good[:, None], fit.points, new_maps.centre))
+                start = fit.parameters if good.all() else None
+            rows = new_rows
+            fit = fit_circles(image, new_maps, have_rings(field, rows), blur, None, start)
+        # A circle far from where its target must be is another circle.
+        predicted = better.camera.project(better.exterior, field.points[rows])
+        off = np.abs(fit.points - predicted).max(axis=1, initial=0.0)
+        limit = max(_GROSS_PX, _GROSS_SD * min(better.scatter, 1.0))
+        fit.reasons[fit.good & (off > limit)] = "not where the target must be"
+        return fit.observations(rows, fit.good), fit.missed(rows), better
+
+    def _finished(
+        self,
+        observations: Observations,
+        orientation: Orientation | None = None,
+        foreign: bool = False,
+    ) -> Measurement:
+        """Return the result; foreign: whether codes of another field were seen."""
+        n = len(observations)
+        if n < _FEWEST and foreign:
+            return self._result(
+                "other_field", "the ring codes in the frame are not those of this test field",
+                observations, orientation,
+            )  # fmt: skip
+        if n == 0 and not any(self._field.codes):
+            return self._result(
+                "nothing_found",
+                "the test field has no coded target and the camera's orientation is not known: "
+                "plain circles alone cannot be separated",
+                observations, orientation,
+            )  # fmt: skip
+        if n == 0:
+            why = _why_nothing(self._missed)
+            return self._result("nothing_found", why, observations, orientation)
+        if n < _FEWEST:
+            why = f"only {n} targets are found in the frame"
+            return self._result("too_few", why, observations, orientation)
+        return self._result("ok", "", observations, orientation)
+
+    def _result(
+        self,
+        word: Word,
+        reason: str,
+        observations: Observations | None = None,
+        orientation: Orientation | None = None,
+    ) -> Measurement:
+        return Measurement(
+            observations or Observations.none(), FrameStatus(word, reason), self._missed,
+            orientation, self._markers,
+        )  # fmt: skip
 
 
 def _why_nothing(missed: dict[int, str]) -> str:
@@ -445,7 +401,7 @@ def blur_trend(points: Array, blur: Array, sensor: Sensor) -> tuple[Array, Array
         A, b = design[good], blur[good]
         solution = np.linalg.lstsq(A, b, rcond=None)[0]
         residual = blur - design @ solution
-        sd = MAD_TO_SD * float(np.median(np.abs(residual[good])))
+        sd = float(mad_sd(residual[good]))
         variance = float(np.sum(residual[good] ** 2)) / max(int(good.sum()) - 4, 1)
         good = np.isfinite(blur) & (np.abs(residual) <= _BLUR_CUT * max(sd, 1e-6))
     normal = design[good].T @ design[good]

@@ -11,14 +11,15 @@ Luhmann et al. (2014), section 5.4.5.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
 
-from thermocald.errors import ConfigurationError, GeometryError, ImageError
+from thermocald.errors import ConfigurationError, ImageError
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import Measurement
 from thermocald.photogrammetry.targets.frame_status import OK, FrameStatus, inspect_frame
@@ -36,10 +37,12 @@ MATCHING_SD = "matching_px"
 
 _HALF = 12  # px of a patch to either side of its point
 _SEARCH_PX = 30  # a point is looked for so far from where it should be
+_TRACKED_PX = 8  # and first so far from where the last frame had it
 _SYMMETRIC = (5, 8, 12)  # px, the windows in which a centre of symmetry is sought
 _SYMMETRY = 0.75  # correlation of a window with itself turned by 180°
 _FARTHEST_CLICK = 2.5  # its standard deviations
-_MARGIN = 8  # px about what a spline is asked for
+_AWAY_PX = 5  # a fit ends so near to where the search has found its patch
+_REACH = _HALF + _AWAY_PX + 6  # px to either side of a start that a fit looks at
 _ALIKE = 0.75  # correlation of a patch with the frame
 _FEWEST = 3
 _ITERATIONS = 15
@@ -48,31 +51,22 @@ _INTERPOLATED_PX = 0.01  # what a spline through pixels makes of edges that are 
 _LEAST_CONTRAST = 3.0  # DN, root mean square
 
 
-@dataclass(frozen=True, eq=False)
-class _Patch:
-    """A point's patch: row of the field, its place px and its definition's covariance (2, 2) px²,
-    grey values (m, m), and why it cannot be used.
-    """
-
-    row: int
-    point: Array
-    defined: Array
-    grey: Array
-    symmetric: bool
-
-
 class Templates:
     """Measures control points (rows of `field`) in frames, from a reference frame and clicks."""
 
     def __init__(self, reference: NDArray[Any], field: TestField, clicks: Observations) -> None:
         self._shape, self._field = reference.shape, field
-        self.patches = [
-            _patch(reference, int(row), point, sigma)
-            for row, point, sigma in zip(clicks.targets, clicks.points, clicks.sigmas, strict=True)
-            if _inside(reference, point)
-        ]
-        self._shift = np.zeros(2)
-        self._sought = _SEARCH_PX
+        height, width = reference.shape
+        margin = _HALF + 2
+        low, high = (margin, margin), (width - margin, height - margin)
+        inside = ((clicks.points >= low) & (clicks.points < high)).all(axis=1)
+        self._rows = clicks.targets[inside]
+        pairs = zip(clicks.points[inside], clicks.sigmas[inside], strict=True)
+        meant = [_meant(reference, point, sigma) for point, sigma in pairs]
+        self._points = np.array([point for point, _ in meant]).reshape(-1, 2)
+        self._defined = np.array([C for _, C in meant]).reshape(-1, 2, 2)
+        self._matching = Matching(reference, self._points)
+        self.reset()
 
     @classmethod
     def read(cls, path: Path, field: TestField, clicks: Observations) -> Self:
@@ -81,9 +75,9 @@ class Templates:
             made = cls(decode_grey(path), field, clicks)
         except ImageError as error:
             raise ConfigurationError(f"control_reference {path}: {error}") from error
-        if len(made.patches) < _FEWEST:
+        if len(made._rows) < _FEWEST:
             raise ConfigurationError(
-                f"control_reference {path}: {len(made.patches)} control points have x, y within "
+                f"control_reference {path}: {len(made._rows)} control points have x, y within "
                 f"the frame; at least {_FEWEST} are needed"
             )
         return made
@@ -91,106 +85,230 @@ class Templates:
     @property
     def reference(self) -> Observations:
         """The points in the reference frame, as measured."""
-        at = np.array([p.point for p in self.patches]).reshape(-1, 2)
-        C = np.array([p.defined for p in self.patches]).reshape(-1, 2, 2)
-        rows = np.array([p.row for p in self.patches], dtype=np.int64)
-        return _observations(rows, at, C, np.zeros(len(rows)))
+        none = np.zeros(len(self._rows))
+        return Observations.build(self._rows, self._points, self._defined, {MATCHING_SD: none})
 
     def reset(self) -> None:
         """Forget where the points were in the last frame."""
-        self._shift, self._sought = np.zeros(2), _SEARCH_PX
+        self._shift, self._reach = np.zeros(2), _SEARCH_PX
 
     def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement:
         """Measure a frame; raises ImageError where it cannot be decoded."""
         if isinstance(image, EncodedImage):
-            image = image.whole()
+            image = image.whole()  # it is given back: a gauge waits a minute for the next
         status = inspect_frame(image, (self._shape[1], self._shape[0]))
         if not status.ok:
             return Measurement(Observations.none(), status)
-        missed: dict[int, str] = {}
-        found = []
-        for patch in self.patches:
-            try:
-                found.append((patch, *self._matched(image, patch)))
-            except GeometryError as error:
-                missed[patch.row] = str(error)
-        if len(found) < _FEWEST and self._shift.any():
+        found = self._search(image)
+        if len(found.observations) < _FEWEST and self._shift.any():
             self.reset()
-            return self.measure(image)
-        if found:
-            self._shift = np.median([at - p.point for p, at, _ in found], axis=0)
-        at = np.array([a for _, a, _ in found]).reshape(-1, 2)
-        own = np.array([C for _, _, C in found]).reshape(-1, 2, 2)
-        whole = own + np.array([p.defined for p, _, _ in found]).reshape(-1, 2, 2)
-        rows = np.array([p.row for p, _, _ in found], dtype=np.int64)
-        seen = _observations(rows, at, whole, np.sqrt(np.trace(own, axis1=1, axis2=2) / 2))
+            found = self._search(image)
+        return found
+
+    def _search(self, image: NDArray[Any]) -> Measurement:
+        """Match all patches: near where the last frame had them, then farther away."""
+        start = self._points + self._shift
+        matched = self._matching.search(image, start, self._reach)
+        if self._reach < _SEARCH_PX and (lost := np.flatnonzero(~matched.ok)).size:
+            matched.take(lost, self._matching.search(image, start, _SEARCH_PX, lost))
+        ok = matched.ok
+        if ok.any():
+            self._shift = np.median((matched.points - self._points)[ok], axis=0)
+        own = matched.covariance[ok]
+        spread = np.sqrt(np.trace(own, axis1=1, axis2=2) / 2)
+        seen = Observations.build(
+            self._rows[ok], matched.points[ok], own + self._defined[ok], {MATCHING_SD: spread}
+        )
+        missed = {int(self._rows[i]): matched.reasons[i] for i in np.flatnonzero(~ok)}
         if len(seen) < _FEWEST:
             names = ", ".join(self._field.names[row] for row in missed)
-            status = FrameStatus("too_few", f"not recognised: {names}")
-            return Measurement(seen, status, missed)
+            return Measurement(seen, FrameStatus("too_few", f"not recognised: {names}"), missed)
+        self._reach = _TRACKED_PX
         return Measurement(seen, OK, missed)
 
-    def _matched(self, image: NDArray[Any], patch: _Patch) -> tuple[Array, Array]:
-        """Where a patch is in an image, and its covariance px²; GeometryError where it is not."""
-        place = _searched(image, patch.grey, patch.point + self._shift, self._sought)
-        return match(image, patch.grey, place)
+
+@dataclass(eq=False)
+class Matched:
+    """Where patches are: points (n, 2) px, covariance (n, 2, 2) px², and why one is nowhere."""
+
+    points: Array
+    covariance: Array
+    reasons: list[str]
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(n,)."""
+        return np.array([not why for why in self.reasons], dtype=bool)
+
+    def take(self, rows: NDArray[np.int64], others: Matched) -> None:
+        """Replace rows (k,) by k others."""
+        self.points[rows], self.covariance[rows] = others.points, others.covariance
+        for row, why in zip(rows, others.reasons, strict=True):
+            self.reasons[row] = why
 
 
-def match(image: NDArray[Any], patch: Array, start: Array) -> tuple[Array, Array]:
-    """Fit a patch (m, m) to an image from a start: its centre (2,) px and covariance (2, 2) px².
+class Matching:
+    """Fits the patches about points (n, 2) px of a reference frame to images, all at a time.
 
-    The covariance is that of the residuals, enlarged by their correlation between neighbours.
-    Raises GeometryError where it does not converge, or is unlike.
+    What does not change from frame to frame is kept: how a patch reacts to shift, affinity,
+    brightness and contrast.
     """
-    half = patch.shape[0] // 2
-    v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
-    weight = np.exp(-0.5 * (u**2 + v**2) / (half / 1.8) ** 2)
-    gy, gx = np.gradient(patch.astype(float))
-    p = np.array([*start, 1.0, 0.0, 0.0, 1.0])
-    J = np.stack([gx, gy, gx * u, gx * v, gy * u, gy * v, patch, np.ones_like(u)], axis=-1)
-    J, root = J.reshape(-1, 8), np.sqrt(weight).ravel()
-    N = np.linalg.pinv((J * weight.reshape(-1, 1)).T @ J, rcond=1e-9, hermitian=True)
-    gain, r = 1.0, np.zeros(patch.shape)
-    for _ in range(_ITERATIONS):
-        sampled = _sampled(image, p, u, v)
-        flat = sampled.ravel()
-        # brightness and contrast first, then how the frame's patch lies against the template
-        B = np.stack([patch.ravel(), np.ones(flat.size)], axis=1) * root[:, None]
-        (gain, level), *_ = np.linalg.lstsq(B, flat * root, rcond=None)
-        if gain <= 0:
-            raise GeometryError("not recognised")
-        r = (sampled - level) / gain - patch
-        step = N @ (J.T @ (weight * r).ravel())
-        # inverse compositional: the step is the template's, and is undone in the frame
-        A, S = p[2:].reshape(2, 2), np.eye(2) + step[2:6].reshape(2, 2)
-        A = A @ np.linalg.inv(S)
-        p = np.concatenate([p[:2] - A @ step[:2], A.ravel()])
-        if np.abs(p[:2] - start).max() > half or not 0.5 < np.linalg.det(A) < 2.0:
-            raise GeometryError("the match runs away")
-        if np.abs(step[:2]).max() < _CONVERGED_PX:
-            break
-    else:
-        raise GeometryError("the match does not converge")
-    if _correlation(_sampled(image, p, u, v), patch, weight) < _ALIKE:
-        raise GeometryError("not recognised")
-    freedom = weight.sum() ** 2 / (weight**2).sum() - 8
-    variance = float((weight * r**2).sum() / weight.sum()) * (1 + 8 / max(freedom, 1.0))
-    M = (J * (weight**2).reshape(-1, 1)).T @ J
-    A = p[2:].reshape(2, 2)
-    covariance = A @ (N @ M @ N)[:2, :2] @ A.T * variance * _correlated(r)
-    return p[:2], covariance + _INTERPOLATED_PX**2 * np.eye(2)
+
+    def __init__(self, reference: NDArray[Any], points: Array) -> None:
+        v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
+        spline = Spline.through(reference, points, _HALF + 8)
+        unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(points), 1))
+        self.grey = spline.at(np.hstack([points, unturned]), u, v, np.arange(len(points)))
+        self._grid = u.ravel(), v.ravel()
+        self._weight = np.exp(-0.5 * (u**2 + v**2) / (_HALF / 1.8) ** 2)
+        gy, gx = np.gradient(self.grey, axis=(1, 2)) if len(self.grey) else (self.grey, self.grey)
+        flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, self.grey, np.ones_like(self.grey)]
+        J = np.stack(flat, axis=-1).reshape(len(self.grey), -1, 8)
+        weighted = J * self._weight.reshape(-1, 1)
+        N = np.linalg.pinv(weighted.mT @ J, rcond=1e-9, hermitian=True)
+        self._step = N @ weighted.mT
+        self._sandwich = (self._step @ self._step.mT)[:, :2, :2]
+
+    def search(
+        self, image: NDArray[Any], start: Array, reach: int, rows: NDArray[np.int64] | None = None
+    ) -> Matched:
+        """Search patches (rows of them) within `reach` px of start (n, 2), and fit them."""
+        rows = np.arange(len(self.grey)) if rows is None else rows
+        places, reasons = start[rows], [""] * len(rows)
+        for k, row in enumerate(rows):
+            place = _searched(image, self.grey[row], places[k], reach)
+            if place is None:
+                reasons[k] = "outside the frame, or in the dark"
+            else:
+                places[k] = place
+        seen = np.array([k for k, why in enumerate(reasons) if not why], dtype=np.int64)
+        covariance = np.zeros((len(rows), 2, 2))
+        matched = Matched(places, covariance, reasons)
+        matched.take(seen, self.match(image, places[seen], rows[seen]))
+        return matched
+
+    def match(self, image: NDArray[Any], start: Array, rows: NDArray[np.int64]) -> Matched:
+        """Fit patches (rows of them) to an image from their starts (n, 2) px.
+
+        The covariance is that of the residuals, enlarged by their correlation between neighbours. A
+        patch whose fit does not converge, or that is unlike, has a reason.
+        """
+        n, (u, v) = len(rows), self._grid
+        grey, weight = self.grey[rows].reshape(n, -1), self._weight.ravel() / self._weight.sum()
+        spline = Spline.through(image, start, _REACH)
+        p = np.hstack([start, np.tile([1.0, 0.0, 0.0, 1.0], (n, 1))])
+        r, alike, reasons = np.zeros(grey.shape), np.zeros(n), ["the match does not converge"] * n
+        mean = grey @ weight
+        variance = ((grey - mean[:, None]) ** 2) @ weight
+        todo = np.arange(n)
+        for _ in range(_ITERATIONS):
+            if not todo.size:
+                break
+            sampled, template = spline.at(p[todo], u, v, todo), grey[todo]
+            # brightness and contrast first, then how the frame's patch lies against the template
+            common = (sampled * (template - mean[todo, None])) @ weight
+            gain = np.where(common > 0, common / np.maximum(variance[todo], 1e-12), 1.0)
+            middle = sampled @ weight
+            level = middle - gain * mean[todo]
+            spread = ((sampled - middle[:, None]) ** 2) @ weight * variance[todo]
+            alike[todo] = common / np.sqrt(np.maximum(spread, 1e-12))
+            r[todo] = (sampled - level[:, None]) / gain[:, None] - template
+            step = (self._step[rows[todo]] @ r[todo][:, :, None])[:, :, 0]
+            # inverse compositional: the step is the template's, and is undone in the frame
+            a, b, c, d = step[:, 2:6].T + np.array([[1.0], [0.0], [0.0], [1.0]])
+            inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
+            A = p[todo, 2:].reshape(-1, 2, 2) @ inverse.transpose(2, 0, 1)
+            p[todo, :2] -= (A @ step[:, :2, None])[:, :, 0]
+            p[todo, 2:] = A.reshape(-1, 4)
+            size = np.linalg.det(A)
+            away = np.abs(p[todo, :2] - start[todo]).max(axis=1) > _AWAY_PX
+            away |= ~((size > 0.5) & (size < 2.0))
+            done = np.abs(step[:, :2]).max(axis=1) < _CONVERGED_PX
+            for k, is_away, is_dark in zip(todo, away, common <= 0, strict=True):
+                reasons[k] = "the match runs away" if is_away else reasons[k]
+                reasons[k] = "not recognised" if is_dark else reasons[k]
+            for k in todo[done & ~away & (common > 0)]:
+                reasons[k] = ""
+            todo = todo[~(done | away | (common <= 0))]
+        for k in np.flatnonzero(alike < _ALIKE):
+            reasons[k] = reasons[k] or "not recognised"
+        own = self._weight
+        freedom = own.sum() ** 2 / (own**2).sum() - 8
+        scale = (r**2 @ weight) * (1 + 8 / max(freedom, 1.0))
+        scale *= _correlated(r.reshape(n, *own.shape))
+        A = p[:, 2:].reshape(-1, 2, 2)
+        covariance = A @ self._sandwich[rows] @ A.mT * scale[:, None, None]
+        return Matched(p[:, :2].copy(), covariance + _INTERPOLATED_PX**2 * np.eye(2), reasons)
 
 
-def symmetry_centre(
-    image: NDArray[Any], click: Array, farthest: float
-) -> tuple[Array, Array] | None:
-    """Return the point near a click about which the image is symmetric, and its covariance px²."""
-    best = None
-    for half in _SYMMETRIC:
-        found = _centre(image, click, half, farthest)
-        if found is not None and (best is None or found[2] > best[2]):
-            best = found
-    return None if best is None else best[:2]
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """Cubic splines through windows of an image: coefficients (n, m, m), first pixels (n, 2).
+
+    OpenCV's remap interpolates on 1/32 px only, and SciPy's package takes a daemon 20 MB.
+
+    Source: Unser, M., Aldroubi, A., Eden, M. (1993): B-spline signal processing, IEEE Transactions
+    on Signal Processing 41(2).
+    """
+
+    coefficients: Array
+    first: NDArray[np.int64]
+
+    @classmethod
+    def through(cls, image: NDArray[Any], middle: Array, reach: int) -> Self:
+        """Interpolate `reach` px to each side of places (n, 2); the image's edge goes on."""
+        first = np.round(middle).astype(np.int64) - reach
+        along = np.arange(2 * reach + 1)
+        x = np.clip(first[:, :1] + along, 0, image.shape[1] - 1)
+        y = np.clip(first[:, 1:] + along, 0, image.shape[0] - 1)
+        inverse = _spline_inverse(len(along))
+        return cls(inverse @ image[y[:, :, None], x[:, None, :]] @ inverse.T, first)
+
+    def at(self, p: Array, u: Array, v: Array, rows: NDArray[np.int64]) -> Array:
+        """Values (k, …) of windows (rows of them) at x = p0 + p2 u + p3 v, y = p1 + p4 u + p5 v.
+
+        p (k, 6).
+        """
+        size = self.coefficients.shape[1]
+        a = (p - np.pad(self.first[rows], [(0, 0), (0, 4)]))[(..., *[None] * u.ndim)]
+        x, y = a[:, 0] + a[:, 2] * u + a[:, 3] * v, a[:, 1] + a[:, 4] * u + a[:, 5] * v
+        (column, wx), (line, wy) = _basis(x, size), _basis(y, size)
+        window = rows[(..., *[None] * u.ndim)] * size**2
+        at, flat = window + line * size + column, self.coefficients.ravel()
+        values = np.zeros(at.shape)
+        for i in range(4):
+            row = sum(wx[j] * flat[i * size + j :].take(at) for j in range(4))
+            values += wy[i] * row
+        return values
+
+
+@lru_cache(maxsize=16)
+def _spline_inverse(size: int) -> Array:
+    """Matrix from samples to coefficients of a cubic spline that is mirrored at its ends."""
+    M = (4.0 * np.eye(size) + np.eye(size, k=1) + np.eye(size, k=-1)) / 6.0
+    M[0, 1] = M[-1, -2] = 2.0 / 6.0
+    return np.asarray(np.linalg.inv(M), dtype=float)
+
+
+def _basis(x: Array, size: int) -> tuple[NDArray[np.int64], list[Array]]:
+    """The first of the four coefficients at positions, and their weights."""
+    whole = np.clip(np.floor(x), 1, size - 3)
+    t = np.clip(x - whole, 0.0, 1.0)
+    s = 1.0 - t
+    t2, s2 = t * t, s * s  # a power takes ten times as long
+    t3, s3 = t2 * t / 6, s2 * s / 6
+    weights = [s3, 2 / 3 - t2 + 3 * t3, 2 / 3 - s2 + 3 * s3, t3]
+    return whole.astype(np.int64) - 1, weights
+
+
+def _meant(image: NDArray[Any], click: Array, sigma: Array) -> tuple[Array, Array]:
+    """The point that a click means, and its covariance px²: that about which the image is
+    symmetric, where there is one, else the click itself.
+    """
+    farthest = _FARTHEST_CLICK * float(sigma.max())
+    centres = [_centre(image, click, half, farthest) for half in _SYMMETRIC]
+    found = [centre for centre in centres if centre is not None]
+    return max(found, key=lambda centre: centre[2])[:2] if found else (click, np.diag(sigma**2))
 
 
 def _centre(
@@ -201,11 +319,18 @@ def _centre(
     # a click is a pixel or two off: the best start first
     offsets = np.arange(-np.floor(farthest), farthest + 0.5)
     starts = [click + np.array([dx, dy]) for dy in offsets for dx in offsets]
-    windows = [_sampled(image, np.array([*at, 1, 0, 0, 1]), u, v) for at in starts]
-    alike = [_correlation(w, w[::-1, ::-1], weight) for w in windows]
+    spline = Spline.through(image, click[None], half + 2 * math.ceil(farthest) + 4)
+
+    def window(*at: float) -> Array:
+        p = np.array([[*at, 1.0, 0.0, 0.0, 1.0]])
+        values: Array = spline.at(p, u, v, np.zeros(1, dtype=np.int64))[0]
+        return values
+
+    windows = [window(*at) for at in starts]
+    alike = [float(_correlation(w, w[::-1, ::-1], weight)) for w in windows]
     p = starts[int(np.argmax(alike))].copy()
     for _ in range(_ITERATIONS):
-        w = _sampled(image, np.array([*p, 1, 0, 0, 1]), u, v)
+        w = window(*p)
         gy, gx = (np.asarray(g) for g in np.gradient(w))
         J = np.stack([gx - gx[::-1, ::-1], gy - gy[::-1, ::-1]], axis=-1).reshape(-1, 2)
         r = w - w[::-1, ::-1]
@@ -218,8 +343,8 @@ def _centre(
             return None
         if np.abs(step).max() < _CONVERGED_PX:
             break
-    w = _sampled(image, np.array([*p, 1, 0, 0, 1]), u, v)
-    symmetric = _correlation(w, w[::-1, ::-1], weight)
+    w = window(*p)
+    symmetric = float(_correlation(w, w[::-1, ::-1], weight))
     if symmetric < _SYMMETRY:
         return None
     inverse = np.linalg.inv(N)
@@ -229,68 +354,38 @@ def _centre(
     return p, inverse @ M @ inverse * variance * _correlated(r), symmetric
 
 
-def _patch(image: NDArray[Any], row: int, click: Array, sigma: Array) -> _Patch:
-    found = symmetry_centre(image, click, _FARTHEST_CLICK * float(sigma.max()))
-    point, defined = (click, np.diag(sigma**2)) if found is None else found
-    v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
-    grey = _sampled(image, np.array([*point, 1, 0, 0, 1]), u, v)
-    return _Patch(row, np.array(point), defined, grey, found is not None)
-
-
-def _inside(image: NDArray[Any], point: Array) -> bool:
-    height, width = image.shape
-    margin = _HALF + 2
-    x, y = point
-    return bool(margin <= x < width - margin and margin <= y < height - margin)
-
-
-def _searched(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Array:
-    """The pixel where a patch correlates best; GeometryError outside the image."""
+def _searched(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Array | None:
+    """The pixel where a patch correlates best; None outside the image."""
     half = patch.shape[0] // 2
     x, y = (round(float(c)) for c in near)
     left, top = max(x - reach - half, 0), max(y - reach - half, 0)
+    if x < 0 or y < 0:
+        return None
     window = image[top : y + reach + half + 1, left : x + reach + half + 1].astype(np.float32)
-    if x < 0 or y < 0 or min(window.shape) <= 2 * half or window.std() < _LEAST_CONTRAST:
-        raise GeometryError("outside the frame, or in the dark")
+    if min(window.shape) <= 2 * half or cv2.meanStdDev(window)[1][0, 0] < _LEAST_CONTRAST:
+        return None
     score = cv2.matchTemplate(window, patch.astype(np.float32), cv2.TM_CCOEFF_NORMED)
     row, column = np.unravel_index(int(np.argmax(score)), score.shape)
     return np.array([left + column + half, top + row + half], dtype=float)
 
 
-def _sampled(image: NDArray[Any], p: Array, u: Array, v: Array) -> Array:
-    """Grey values at x = p0 + p2 u + p3 v, y = p1 + p4 u + p5 v, by cubic splines.
+def _correlation(a: Array, b: Array, weight: Array) -> Array:
+    """Weighted correlation along the last axes, as many as weights (…) have; 0 without contrast."""
+    axes = tuple(range(-weight.ndim, 0))
+    da, db = (x - (weight * x).sum(axis=axes, keepdims=True) / weight.sum() for x in (a, b))
+    both, ours, theirs = ((weight * x).sum(axis=axes) for x in (da * db, da**2, db**2))
+    scale = np.sqrt(ours * theirs)
+    found: Array = np.where(scale > 0, both / np.where(scale > 0, scale, 1.0), 0.0)
+    return found
 
-    OpenCV's remap would do so on 1/32 px only.
+
+def _correlated(r: Array) -> Array:
+    """How much larger a mean's variance is than of independent residuals (…, m, m), by their
+    neighbours.
     """
-    x, y = p[0] + p[2] * u + p[3] * v, p[1] + p[4] * u + p[5] * v
-    height, width = image.shape
-    left, top = max(int(x.min()) - _MARGIN, 0), max(int(y.min()) - _MARGIN, 0)
-    right, bottom = min(int(x.max()) + _MARGIN, width), min(int(y.max()) + _MARGIN, height)
-    if right - left < _MARGIN or bottom - top < _MARGIN:
-        raise GeometryError("outside the frame")
-    part = image[top:bottom, left:right].astype(float)
-    values: Array = map_coordinates(part, [y - top, x - left], order=3, mode="nearest")
-    return values
-
-
-def _correlation(a: Array, b: Array, weight: Array) -> float:
-    total = weight.sum()
-    da, db = (x - (weight * x).sum() / total for x in (a, b))
-    scale = np.sqrt((weight * da**2).sum() * (weight * db**2).sum())
-    return float((weight * da * db).sum() / scale) if scale > 0 else 0.0
-
-
-def _correlated(r: Array) -> float:
-    """How much larger a mean's variance is than of independent residuals, by their neighbours."""
-    square = float((r**2).mean())
-    if not square > 0:
-        return 1.0
-    along = [float((r[:, 1:] * r[:, :-1]).mean()), float((r[1:] * r[:-1]).mean())]
-    rho = np.clip(np.array(along) / square, 0.0, 0.9)
-    return float(np.prod((1 + rho) / (1 - rho)))
-
-
-def _observations(rows: NDArray[np.int64], at: Array, C: Array, own: Array) -> Observations:
-    order = np.argsort(rows)
-    sigmas = np.sqrt(np.stack([C[:, 0, 0], C[:, 1, 1]], axis=1))[order]
-    return Observations(rows[order], at[order], sigmas, C[order, 0, 1], {MATCHING_SD: own[order]})
+    square = np.maximum(np.square(r).mean(axis=(-2, -1)), 1e-300)
+    along = (r[..., 1:] * r[..., :-1]).mean(axis=(-2, -1)) / square
+    down = (r[..., 1:, :] * r[..., :-1, :]).mean(axis=(-2, -1)) / square
+    rho = np.clip([along, down], 0.0, 0.9)
+    found: Array = np.prod((1 + rho) / (1 - rho), axis=0)
+    return found

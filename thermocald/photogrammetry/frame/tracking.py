@@ -24,31 +24,25 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.frame.measurement import Measurement, Prior, measure, predicted_maps
-from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.circle import blurred_disc, fit_circles
+from thermocald.photogrammetry.frame.measurement import (
+    Measurement,
+    Prior,
+    measure,
+    predict_circles,
+)
+from thermocald.photogrammetry.linalg import scaled_solve
+from thermocald.photogrammetry.targets.circle import CircleFit, blurred_disc, fit_circles
 from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
+from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.frame_status import OK, NoiseModel, inspect_frame
 from thermocald.photogrammetry.targets.image_file import EncodedImage
-from thermocald.photogrammetry.targets.markers import MarkerCorners, measure_corners
 from thermocald.photogrammetry.targets.outline import LocalMap, window_reach, windows
+from thermocald.photogrammetry.targets.ring_code import have_rings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image, Single
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearStep:
-    """What fixed weights say of a frame: parameters (n, 10) as `blurred_disc`; moved (n,) px since
-    the weights were made; covariances (n, 2, 2) px² and misfit (n,) with the noise as it was then.
-    """
-
-    parameters: Array
-    moved: Array
-    covariances: Array
-    misfit: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,12 +56,16 @@ class _Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradientWeights:
-    """Weights for n targets, made from their parameters (n, 10).
+    """Weights for n targets, made from their parameters (n, 10) and the frame's noise.
 
-    inverse (n, 10, 10): of the normal matrices; freedom (n,): pixels beyond the parameters.
+    maps, coded (n,): the targets' outlines, and which have a code ring; inverse (n, 10, 10): of the
+    normal matrices; freedom (n,): pixels beyond the parameters.
     """
 
+    maps: LocalMap
+    coded: NDArray[np.bool_]
     parameters: Array
+    noise: NoiseModel
     parts: tuple[_Part, ...]
     inverse: Array
     freedom: Array
@@ -81,7 +79,7 @@ class GradientWeights:
         parameters: Array,
         noise: NoiseModel,
     ) -> Self:
-        """From fitted parameters (n, 10); of the image only the size counts."""
+        """Build from fitted parameters (n, 10); of the image only the size counts."""
         parts = []
         inverse = np.zeros((len(parameters), 10, 10))
         freedom = np.ones(len(parameters))
@@ -94,15 +92,16 @@ class GradientWeights:
             weight = (w.weight / noise.variance(value)).astype(np.float32)
             jw = np.ascontiguousarray((j * weight).transpose(1, 0, 2))
             N = (jw @ j.transpose(1, 2, 0)).astype(float)
-            scale = np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
-            scaled = N / (scale[:, :, None] * scale[:, None, :]) + 1e-10 * np.eye(10)
-            inverse[w.rows] = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+            inverse[w.rows] = scaled_solve(N, np.eye(10)[None], 1e-10)
             freedom[w.rows] = np.maximum(w.weight.sum(axis=1) - 10, 1)
-            parts.append(_Part(w.rows, w.pixel.astype(np.int64), value, weight, jw))
-        return cls(parameters, tuple(parts), inverse, freedom)
+            parts.append(_Part(w.rows, w.pixel, value, weight, jw))
+        return cls(maps, coded, parameters, noise, tuple(parts), inverse, freedom)
 
-    def apply(self, image: Image) -> LinearStep:
-        """The step from the weights' own epoch to this image, which must be of the same size."""
+    def apply(self, image: Image) -> CircleFit:
+        """Step from the weights' own epoch to this image, which must be of the same size.
+
+        Covariances and misfit are with the noise as it was then.
+        """
         n = len(self.parameters)
         rhs, square = np.zeros((n, 10)), np.zeros(n)
         flat = image.ravel()
@@ -120,11 +119,13 @@ class GradientWeights:
         gain = contrast / np.where(np.abs(contrast + delta[:, 7]) > 0.1 * np.abs(contrast),
                                    contrast + delta[:, 7], np.inf)  # fmt: skip
         delta[:, :6] *= gain[:, None]
-        return LinearStep(
+        return CircleFit(
             self.parameters + delta,
-            np.abs(delta[:, :2]).max(axis=1, initial=0.0),
             self.inverse[:, :2, :2] * (gain**2)[:, None, None],
             np.sqrt(np.maximum(square, 0.0) / self.freedom),
+            np.zeros(n),
+            np.full(n, "", dtype=object),
+            self.noise,
         )
 
 
@@ -142,24 +143,11 @@ _MARGIN_PX = 3.0  # around the windows: how far the camera may move until all of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrackedMeasurement(Measurement):
-    """A measurement, and how it came about: `searched` says why the whole frame was searched,
-    empty where only windows were read; renewed: how many targets got new weights.
-    """
-
-    searched: str = ""
-    renewed: int = 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Circles:
-    """The circles that are tracked: rows of the field, outlines, weights, and who is seen."""
+    """The circles that are tracked: rows of the field, their weights, and which are seen."""
 
     rows: NDArray[np.int64]
-    maps: LocalMap
-    coded: NDArray[np.bool_]
     weights: GradientWeights
-    noise: NoiseModel
     seen: NDArray[np.bool_]
 
 
@@ -169,7 +157,7 @@ class _State:
     dtype: np.dtype[Any]
     seen: int
     circles: _Circles | None
-    markers: MarkerCorners | None
+    markers: Corners | None
     boxes: NDArray[np.int64]  # what is looked at in the next frame
 
 
@@ -185,36 +173,32 @@ class Tracker:
         """Forget what was tracked: the next frame is searched."""
         self._state = None
 
-    def measure(self, image: NDArray[Any] | EncodedImage) -> TrackedMeasurement:
+    def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement:
         """Measure a frame (H, W), grey, 8 or 16 bit.
 
         Never raises for what a camera delivers, but ImageError where `image` is encoded and cannot
         be decoded.
         """
-        if isinstance(image, EncodedImage):
-            return self._measure_parts(image) or self.measure(image.whole())
         state = self._state
+        if isinstance(image, EncodedImage):
+            if state is not None and state.dtype == np.uint8:
+                parts = image.around(state.boxes, state.shape)
+                found = None if parts is None else self._track(parts, state, _MARGIN_PX)
+                if found is not None:
+                    return found
+            image = image.whole()
         if state is None:
             return self._search(image, "nothing is tracked yet")
         if image.shape != state.shape:
-            size = (state.shape[1], state.shape[0])
-            status = inspect_frame(image, size)
-            return TrackedMeasurement(Observations.none(), status)
+            status = inspect_frame(image, (state.shape[1], state.shape[0]))
+            return Measurement(Observations.none(), status)
         if image.dtype != state.dtype:
             return self._search(image, f"the frame is {image.dtype}, it was {state.dtype}")
         return self._track(image, state) or self._search(
             image, f"too many of {state.seen} targets were lost"
         )
 
-    def _measure_parts(self, image: EncodedImage) -> TrackedMeasurement | None:
-        """Track in those parts of a frame that are looked at; None where that is not enough."""
-        state = self._state
-        if state is None or state.dtype != np.uint8:
-            return None
-        parts = image.around(state.boxes, state.shape)
-        return None if parts is None else self._track(parts, state, _MARGIN_PX)
-
-    def _search(self, image: NDArray[Any], why: str) -> TrackedMeasurement:
+    def _search(self, image: NDArray[Any], why: str) -> Measurement:
         found = measure(image, self._testfield, self._prior)
         # A frame that shows nothing says nothing about where the targets are: keep what is known.
         if found.status.ok:
@@ -223,18 +207,18 @@ class Tracker:
                 image.shape, image.dtype, len(found.observations), circles, markers,
                 _boxes(circles, markers),
             )  # fmt: skip
-        return TrackedMeasurement(
-            found.observations, found.status, found.missed, found.orientation, found.markers, why
-        )
+        return replace(found, searched=why)
 
     def _begin(self, image: Image, found: Measurement) -> _Circles | None:
-        """Outlines and weights for every circle in view, measured or not."""
+        """Predict and weigh every circle in view, measured or not."""
         if found.orientation is None:
             return None
-        rows, maps = predicted_maps(self._testfield, found.orientation)
+        rows, maps = predict_circles(
+            self._testfield, found.orientation.camera, found.orientation.exterior
+        )
         if len(rows) == 0:
             return None
-        coded = ring_code.have_rings(self._testfield, rows)
+        coded = have_rings(self._testfield, rows)
         seen = np.isin(rows, found.observations.targets)
         at = np.searchsorted(found.observations.targets, rows[seen])
         centre = maps.centre.copy()
@@ -248,44 +232,40 @@ class Tracker:
         # A target that is hidden now keeps typical values for the time when it comes back.
         p = np.where(seen[:, None], fit.parameters, np.median(fit.parameters[seen], axis=0))
         p[~seen, :2] = maps.centre[~seen]
-        weights = GradientWeights.build(image, maps, coded, p, fit.noise)
-        return _Circles(rows, maps, coded, weights, fit.noise, seen)
+        return _Circles(rows, GradientWeights.build(image, maps, coded, p, fit.noise), seen)
 
-    def _track(
-        self, image: Image, state: _State, farthest: float = np.inf
-    ) -> TrackedMeasurement | None:
+    def _track(self, image: Image, state: _State, farthest: float = np.inf) -> Measurement | None:
         """Measure in windows; None where too many targets are lost or moved by more than
         `farthest` px.
         """
         missed: dict[int, str] = {}
-        corners, circles, renewed = Observations.none(), state.circles, 0
-        found = Observations.none()
+        found, circles, renewed = Observations.none(), state.circles, 0
         markers = state.markers
         if markers is not None:
-            corners = measure_corners(image, markers, missed)
-            markers = markers.moved(corners)
+            found = measure_corners(image, markers, missed)
+            markers = markers.moved(found)
         if circles is not None:
             tracked = _track_circles(image, circles, missed, farthest)
             if tracked is None:
                 return None
-            found, circles, renewed = tracked
-        both = corners.joined(found)
-        if len(both) < max(_FEWEST, (1 - _LOST_SHARE) * state.seen):
+            found, circles, renewed = found.joined(tracked[0]), *tracked[1:]
+        if len(found) < max(_FEWEST, (1 - _LOST_SHARE) * state.seen):
             return None
         boxes = _boxes(circles, markers) if renewed or markers is not None else state.boxes
-        self._state = replace(state, seen=len(both), circles=circles, markers=markers, boxes=boxes)
-        return TrackedMeasurement(both, OK, missed, None, markers, "", renewed)
+        self._state = replace(state, seen=len(found), circles=circles, markers=markers, boxes=boxes)
+        return Measurement(found, OK, missed, None, markers, "", renewed)
 
 
-def _boxes(circles: _Circles | None, markers: MarkerCorners | None) -> NDArray[np.int64]:
+def _boxes(circles: _Circles | None, markers: Corners | None) -> NDArray[np.int64]:
     """What is looked at in the next frame (n, 4) px: left, top, right and bottom (exclusive)."""
     centres, halves = [np.zeros((0, 2))], [np.zeros((0, 2))]
     if circles is not None:
         p = circles.weights.parameters
         centres.append(p[:, :2])
-        halves.append(circles.maps.half_extent + window_reach(float(np.median(p[:, 5]))))
+        reach = window_reach(float(np.median(p[:, 5])))
+        halves.append(circles.weights.maps.half_extent + reach)
     if markers is not None:
-        centres.append(markers.corners)
+        centres.append(markers.places)
         halves.append(np.full((len(markers), 2), CORNER_REACH_PX))
     centre, half = np.concatenate(centres), np.concatenate(halves) + _MARGIN_PX + 1.0
     low, high = np.floor(centre - half), np.ceil(centre + half) + 1.0
@@ -295,16 +275,16 @@ def _boxes(circles: _Circles | None, markers: MarkerCorners | None) -> NDArray[n
 def _track_circles(
     image: Image, state: _Circles, missed: dict[int, str], farthest: float
 ) -> tuple[Observations, _Circles, int] | None:
-    """Observations, the new state, and how many weights were renewed; None where all is lost, or
-    where targets that have to be fitted again moved by more than `farthest` px.
+    """Return observations, the new state, and how many weights were renewed; None where all is
+    lost, or where targets that have to be fitted again moved by more than `farthest` px.
     """
-    step = state.weights.apply(image)
-    old, p, seen = state.weights.parameters, step.parameters, state.seen
-    covariances, misfit = step.covariances, step.misfit
+    weights, seen = state.weights, state.seen
+    fit = weights.apply(image)
+    old, p, misfit = weights.parameters, fit.parameters, fit.misfit
     top = float(np.iinfo(image.dtype).max)
     level = max(float(_median(misfit[seen])) if seen.any() else 1.0, 1.0)
     disturbed = (
-        (step.moved > RENEWED_AT_PX)
+        (np.abs(p[:, :2] - old[:, :2]).max(axis=1, initial=0.0) > RENEWED_AT_PX)
         | (misfit > _MISFIT * level)
         | (np.abs(p[:, 5] - old[:, 5]) > _LARGEST_BLUR_CHANGE * old[:, 5])
         | (np.abs(p[:, 6:8] - old[:, 6:8]).max(axis=1) > _LARGEST_LIGHT_CHANGE * np.abs(old[:, 7]))
@@ -313,8 +293,9 @@ def _track_circles(
     )
     again = disturbed | ~seen
     calm = ~again
-    reasons = np.full(len(p), "", dtype=object)
-    saturation = np.zeros(len(p))
+    # The noise may have changed since the weights were made; the calm targets tell by how much.
+    factor = float(_median(misfit[calm])) ** 2 if calm.any() else 1.0
+    np.multiply(fit.covariances, factor, out=fit.covariances)
     # Where the calm ones went, the others went too.
     shift = _median(p[calm, :2] - old[calm, :2]) if calm.any() else np.zeros(2)
     if again.any():
@@ -322,42 +303,25 @@ def _track_circles(
             return None
         which = np.nonzero(again)[0]
         blur = float(np.median(old[:, 5]))
-        fit = fit_circles(
-            image, state.maps.select(which).at(old[which, :2] + shift), state.coded[which], blur,
-            state.noise, iterations=_ITERATIONS,
+        others = fit_circles(
+            image, weights.maps.select(which).at(old[which, :2] + shift), weights.coded[which],
+            blur, weights.noise, iterations=_ITERATIONS,
         )  # fmt: skip
-        p[which], covariances[which], misfit[which] = fit.parameters, fit.covariances, fit.misfit
-        reasons[which] = fit.reasons
-        saturation[which] = fit.saturation
-    good = reasons == ""
+        fit.put(which, others)
+    good = fit.good
     if good.sum() < (1 - _LOST_SHARE) * seen.sum():
         return None
-    weights, renewed = state.weights, 0
-    if np.sum(again & good) > _RENEW_SHARE * good.sum():
+    renewed = int(np.sum(again & good))
+    if renewed > _RENEW_SHARE * good.sum():
         base = np.where(good[:, None], p, old)
         base[~good, :2] += shift
-        weights = GradientWeights.build(image, state.maps, state.coded, base, state.noise)
-        renewed = int(np.sum(again & good))
-    # The noise may have changed since the weights were made; the calm targets tell by how much.
-    factor = float(_median(misfit[calm])) ** 2 if calm.any() else 1.0
-    scale = np.where(again, 1.0, factor)
-    c = (covariances * scale[:, None, None])[good]
-    observations = Observations(
-        state.rows[good].astype(np.int64),
-        p[good, :2],
-        np.sqrt(np.stack([c[:, 0, 0], c[:, 1, 1]], axis=-1)),
-        c[:, 0, 1],
-        {
-            "blur": p[good, 5],
-            "contrast": p[good, 7],
-            "grey": p[good, 6],
-            "noise": np.sqrt(factor * state.noise.variance(p[good, 6])).astype(float),
-            "saturation": saturation[good],
-            "misfit": misfit[good],
-        },
-    )
-    missed.update({int(state.rows[i]): str(reasons[i]) for i in np.flatnonzero(~good)})
-    return observations, replace(state, weights=weights, seen=good), renewed
+        weights = GradientWeights.build(image, weights.maps, weights.coded, base, weights.noise)
+    else:
+        renewed = 0
+    if not good.all():
+        missed.update(fit.missed(state.rows))
+    fit = replace(fit, noise=fit.noise.scaled(factor))
+    return fit.observations(state.rows, good), _Circles(state.rows, weights, good), renewed
 
 
 def _median(values: Array) -> Array:

@@ -13,8 +13,8 @@ Wrobel, B. (2016): Photogrammetric Computer Vision, section 4.6.4 (test of a poi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -26,9 +26,15 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.network import bundle as nb
-from thermocald.photogrammetry.network.bundle import Bundle, ImageRays, covariance
-from thermocald.photogrammetry.network.datum import Datum, Distance, bring_to_datum
+from thermocald.photogrammetry.network.bundle import (
+    MEDIAN_CHI2,
+    Bundle,
+    BundleAdjustment,
+    ImageRays,
+    inner_constraints,
+    point_tests,
+)
+from thermocald.photogrammetry.network.datum import Distance, bring_to_datum
 from thermocald.photogrammetry.network.start import approximate
 
 if TYPE_CHECKING:
@@ -54,6 +60,8 @@ class Station:
 class Rejection:
     """An image point that was left out: residual in px, and its test value over the limit."""
 
+    JSON: ClassVar = {"residual": "residual_px"}
+
     photo: str
     target: str
     residual: float
@@ -66,8 +74,8 @@ class Network:
 
     names: m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,) rad,
     the largest angle of intersection of each target; interior with covariance (10, 10), zero for
-    what was held; free: names of what was not; residuals: one (n, 2) px per station; unused:
-    targets and photographs left out, with reasons.
+    what was held; free: names of what was not; unused: targets and photographs left out, with
+    reasons.
     """
 
     names: tuple[str, ...]
@@ -81,7 +89,6 @@ class Network:
     stations: tuple[Station, ...]
     sigma0: float
     redundancy: int
-    residuals: tuple[Array, ...]
     rejected: tuple[Rejection, ...]
     unused: dict[str, str]
     datum: str
@@ -101,12 +108,10 @@ class Network:
     @property
     def relative_accuracy(self) -> float:
         """Mean standard deviation of a coordinate over the extent, without the scale's own."""
-        shape = np.diag(self.covariance).mean() - self._scale_share()
-        return float(np.sqrt(max(shape, 0.0)) / self.extent)
-
-    def _scale_share(self) -> float:
         centred = self.points - self.points.mean(axis=0)
-        return self.sd_scale**2 * float(np.mean(centred**2))
+        of_scale = self.sd_scale**2 * float(np.mean(centred**2))
+        shape = np.diag(self.covariance).mean() - of_scale
+        return float(np.sqrt(max(shape, 0.0)) / self.extent)
 
 
 MIN_PHOTOS = 3
@@ -160,7 +165,7 @@ def refuse_narrow(angles: Array) -> None:
         _refuse([reason])
 
 
-def refuse_weak(network: Network, weakest: tuple[float, tuple[str, ...]]) -> None:
+def refuse_weak(network: Network, weakest: tuple[str, ...]) -> None:
     """Refuse a result whose geometry or residuals say that it is not worth its digits."""
     reasons = []
     if len(network.stations) < MIN_PHOTOS:
@@ -173,7 +178,7 @@ def refuse_weak(network: Network, weakest: tuple[float, tuple[str, ...]]) -> Non
     if "c" in network.free and sd_c > MAX_RELATIVE_SD_C * c:
         reasons.append(
             f"the principal distance is uncertain by {100 * sd_c / c:.1f} % (weakest: "
-            f"{', '.join(weakest[1])}): photograph obliquely, turn the camera, bring depth into "
+            f"{', '.join(weakest)}): photograph obliquely, turn the camera, bring depth into "
             "the field, or give a calibrated camera and hold it"
         )
     if network.relative_accuracy > MAX_RELATIVE_SD:
@@ -224,44 +229,40 @@ MIN_PHOTO_RAYS = 6
 """Rays that a photograph needs to be oriented and to say something besides."""
 
 _FAMILY_ERROR = 0.05
-_MEDIAN_CHI2 = 1.386  # of two degrees of freedom
 _COARSE = 10.0  # times the limit: no accident, left out at once
-_CONTROLLED = 1e-3  # cofactor of a residual below which nothing else controls it
 _ROUNDS = 30
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cleaned:
-    """What is left after snooping: the bundle and rays of the photographs and targets in use, with
-    their rows before; of all rays which were rejected, their tests over the limit, and residuals
-    in px.
-    """
-
-    bundle: Bundle
-    rays: ImageRays
-    photos: Index
-    targets: Index
-    rejected: NDArray[np.bool_]
-    tests: Array
-    residuals: Array
-
-
-def snoop(sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index) -> Cleaned:
+def snoop(
+    sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index
+) -> tuple[Bundle, NDArray[np.bool_], Array]:
     """Adjust, and leave out gross errors, some per round, until none is left.
 
-    A target or a photograph that too few rays are left of goes with them.
+    A target or a photograph that too few rays are left of goes with them. Returns the bundle, which
+    rays were rejected, and their tests over the limit.
     """
-    bundle, _ = nb.solve(sensor, bundle, rays, free, robust=True)
+    whole = BundleAdjustment(sensor, rays, free)
+    bundle = whole.solve(bundle, robust=True)
     limit = -2.0 * np.log(_FAMILY_ERROR / len(rays))  # chi² with 2 degrees of freedom
-    v2 = np.sum(nb.residuals(sensor, bundle, rays) ** 2, axis=1)
-    rejected = v2 > _COARSE * limit * max(float(np.median(v2)) / _MEDIAN_CHI2, 1e-12)
+    v2 = np.sum(whole.residuals(bundle) ** 2, axis=1)
+    rejected = v2 > _COARSE * limit * max(float(np.median(v2)) / MEDIAN_CHI2, 1e-12)
     tests = np.zeros(len(rays))
     for _round in range(_ROUNDS):
         _drop_uncontrolled(rejected, rays)
         part, used, photos, targets = _in_use(bundle, rays, ~rejected)
-        part, _ = nb.solve(sensor, part, used, free)
-        bundle = _written_back(bundle, part, photos, targets)
-        tests = _point_tests(sensor, bundle, rays, rejected, part, used, free) / limit
+        adjustment = BundleAdjustment(sensor, used, free)
+        part = adjustment.solve(part)
+        rotations, centres, points = (
+            a.copy() for a in (bundle.rotations, bundle.centres, bundle.points)
+        )
+        rotations[photos], centres[photos] = part.rotations, part.centres
+        points[targets] = part.points
+        bundle = Bundle(part.interior, rotations, centres, points)
+        v = whole.residuals(bundle)
+        explained = adjustment.explained(part, adjustment.cofactors(part))
+        tests = np.sum(v * v, axis=1)
+        tests[~rejected] = point_tests(v[~rejected], np.eye(2) - explained)
+        tests /= limit * max(float(np.median(tests[~rejected])) / MEDIAN_CHI2, 1e-12)
         candidates = ~rejected & (tests > 1)
         if not candidates.any():
             break
@@ -271,8 +272,7 @@ def snoop(sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index) -> Clean
         rejected |= (
             candidates & (tests >= worst[rays.target]) & (tests > 0.3 * tests[candidates].max())
         )
-    sizes = np.linalg.norm(nb.residuals(sensor, bundle, rays.in_pixels()), axis=1)
-    return Cleaned(part, used, photos, targets, rejected, tests, sizes)
+    return bundle, rejected, tests
 
 
 def _drop_uncontrolled(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
@@ -299,42 +299,11 @@ def _in_use(
     """The part of a network that good rays belong to, renumbered, and its rows before."""
     photos, photo = np.unique(rays.photo[good], return_inverse=True)
     targets, target = np.unique(rays.target[good], return_inverse=True)
-    used = nb.ImageRays(photo, target, rays.points[good], rays.whitening[good])
-    part = nb.Bundle(
+    used = ImageRays(photo, target, rays.points[good], rays.whitening[good])
+    part = Bundle(
         bundle.interior, bundle.rotations[photos], bundle.centres[photos], bundle.points[targets]
     )
     return part, used, photos, targets
-
-
-def _written_back(bundle: Bundle, part: Bundle, photos: Index, targets: Index) -> Bundle:
-    rotations, centres, points = (
-        a.copy() for a in (bundle.rotations, bundle.centres, bundle.points)
-    )
-    rotations[photos], centres[photos], points[targets] = part.rotations, part.centres, part.points
-    return nb.Bundle(part.interior, rotations, centres, points)
-
-
-def _point_tests(
-    sensor: Sensor,
-    bundle: Bundle,
-    rays: ImageRays,
-    rejected: NDArray[np.bool_],
-    part: Bundle,
-    used: ImageRays,
-    free: Index,
-) -> Array:
-    """Test values vᵀ Qvv⁻¹ v / sigma0² of all rays, (n,); plain vᵀ v for those left out."""
-    cofactors = covariance(sensor, part, used, free, np.ones(len(used))).residual_cofactors
-    v = nb.residuals(sensor, bundle, rays)
-    tests = np.sum(v * v, axis=1)
-    values, vectors = np.linalg.eigh(cofactors)
-    along = np.einsum("nji,nj->ni", vectors, v[~rejected])
-    controlled = values > _CONTROLLED
-    shares = np.where(controlled, along**2 / np.where(controlled, values, 1), 0)
-    tests[~rejected] = np.sum(shares, axis=1)
-    scale2 = max(float(np.median(tests[~rejected])) / _MEDIAN_CHI2, 1e-12)
-    scaled: Array = tests / scale2
-    return scaled
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -364,7 +333,13 @@ def adjust_network(
     determined; start: an earlier result for the same photographs, whose orientation is begun with.
     Raises GeometryError where the network cannot carry it, with the reasons.
     """
-    rays, left_out = _collect(photos, len(names), names)
+    rays = ImageRays.collect([p.observations for p in photos])
+    seen = np.bincount(rays.target, minlength=len(names))
+    left_out = {
+        names[int(t)]: "fewer than three photographs show it"
+        for t in np.flatnonzero((seen > 0) & (seen < MIN_RAYS))
+    }
+    rays = rays.select(seen[rays.target] >= MIN_RAYS)
     refuse_before(len(photos), rays, distances, names)
     free_rows = np.array([IOP_NAMES.index(name) for name in free], dtype=int)
     bundle, kept, used = (
@@ -375,63 +350,69 @@ def adjust_network(
     for i in sorted(set(range(len(photos))) - set(kept)):
         left_out[photos[i].name] = "could not be oriented: too few targets in common with others"
 
-    clean = snoop(sensor, bundle, used, free_rows)
-    for i in sorted(set(range(len(kept))) - set(clean.photos.tolist())):
+    whole, rejected, tests = snoop(sensor, bundle, used, free_rows)
+    bundle, final, in_use, targets = _in_use(whole, used, ~rejected)
+    for i in sorted(set(range(len(kept))) - set(in_use.tolist())):
         left_out[photos[kept[i]].name] = (
             "contradicts the others: another focus, or a field that moved"
         )
-    for t in np.setdiff1d(rays.target, clean.targets):
+    for t in np.setdiff1d(rays.target, targets):
         left_out[names[int(t)]] = "fewer than three photographs agree on it"
-    bundle, final = clean.bundle, clean.rays
-    kept_photos = [photos[kept[int(i)]] for i in clean.photos]
-    kept_names = tuple(names[int(t)] for t in clean.targets)
+    kept_names = tuple(names[int(t)] for t in targets)
 
-    refuse_narrow(_intersection_angles(bundle, final))
-    v = nb.residuals(sensor, bundle, final)
-    unknowns = len(free_rows) + 6 * len(kept_photos) + 3 * len(kept_names) - 7
+    angles = _intersection_angles(bundle, final)
+    refuse_narrow(angles)
+    adjustment = BundleAdjustment(sensor, final, free_rows)
+    unknowns = len(free_rows) + 6 * len(in_use) + 3 * len(kept_names) - 7
     redundancy = 2 * len(final) - unknowns
-    sigma0 = float(np.sqrt(np.sum(v * v) / max(redundancy, 1)))
-    cofactors = covariance(sensor, bundle, final, free_rows, np.ones(len(final)))
+    variance = float(np.sum(adjustment.residuals(bundle) ** 2)) / max(redundancy, 1)
+    found = adjustment.cofactors(bundle)
+    of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows)
     placed = bring_to_datum(
         bundle,
-        cofactors.points * sigma0**2,
+        of_points * variance,
         distances,
         {name: i for i, name in enumerate(kept_names)},
-        None if nominal is None else np.asarray(nominal, dtype=float)[clean.targets],
+        None if nominal is None else np.asarray(nominal, dtype=float)[targets],
     )
+    to_datum = placed.scale * placed.turn
+    stations = []
+    for i, row in enumerate(in_use):
+        x, y, z = np.sqrt(np.diag(to_datum @ of_centres[i] @ to_datum.T) * variance).tolist()
+        exterior = ExteriorOrientation.from_rotation(
+            placed.bundle.rotations[i], placed.bundle.centres[i]
+        )
+        n = int(np.count_nonzero(final.photo == i))
+        stations.append(Station(photos[kept[int(row)]].name, exterior, n, (x, y, z)))
+    sizes = np.linalg.norm(
+        BundleAdjustment(sensor, used.in_pixels(), free_rows).residuals(whole), axis=1
+    )
+    rejections = [
+        Rejection(
+            photos[kept[used.photo[i]]].name, names[used.target[i]],
+            float(sizes[i]), float(tests[i]),
+        )
+        for i in np.flatnonzero(rejected)
+    ]  # fmt: skip
     network = Network(
         names=kept_names,
         points=placed.bundle.points,
         covariance=placed.covariance,
         n_rays=np.bincount(final.target, minlength=len(kept_names)),
-        angles=_intersection_angles(placed.bundle, final),
+        angles=angles,
         camera=CameraModel(sensor, InteriorOrientation.from_array(bundle.interior)),
-        interior_covariance=cofactors.interior * sigma0**2,
+        interior_covariance=of_interior * variance,
         free=tuple(free),
-        stations=_stations(kept_photos, placed, cofactors.centres * sigma0**2, final),
-        sigma0=sigma0,
+        stations=tuple(stations),
+        sigma0=float(np.sqrt(variance)),
         redundancy=redundancy,
-        residuals=_residuals_px(sensor, bundle, final),
-        rejected=_rejections([photos[i].name for i in kept], names, used, clean),
+        rejected=tuple(sorted(rejections, key=lambda r: (r.photo, r.target))),
         unused=left_out,
         datum=placed.statement,
         sd_scale=placed.sd_scale,
     )
-    refuse_weak(network, cofactors.weakest)
+    refuse_weak(network, found.weakest)
     return network
-
-
-def _collect(
-    photos: Sequence[Photo], m: int, names: Sequence[str]
-) -> tuple[ImageRays, dict[str, str]]:
-    """All rays of targets that enough photographs show, and what was left out."""
-    rays = nb.ImageRays.collect([p.observations for p in photos])
-    seen = np.bincount(rays.target, minlength=m)
-    left_out = {
-        names[int(t)]: "fewer than three photographs show it"
-        for t in np.flatnonzero((seen > 0) & (seen < MIN_RAYS))
-    }
-    return rays.select(seen[rays.target] >= MIN_RAYS), left_out
 
 
 def _resume(
@@ -446,50 +427,13 @@ def _resume(
     index = {name: i for i, name in enumerate(names)}
     points[[index[name] for name in start.names]] = start.points
     used = rays.select((number[rays.photo] >= 0) & np.isfinite(points[rays.target, 0]))
-    return (
-        nb.Bundle(
-            start.camera.interior.as_array(),
-            np.array([s.exterior.rotation for s in start.stations]),
-            np.array([s.exterior.centre for s in start.stations]),
-            np.nan_to_num(points),
-        ),
-        kept,
-        nb.ImageRays(number[used.photo], used.target, used.points, used.whitening),
+    bundle = Bundle(
+        start.camera.interior.as_array(),
+        np.array([s.exterior.rotation for s in start.stations]),
+        np.array([s.exterior.centre for s in start.stations]),
+        np.nan_to_num(points),
     )
-
-
-def _rejections(
-    photos: Sequence[str], names: Sequence[str], rays: ImageRays, clean: Cleaned
-) -> tuple[Rejection, ...]:
-    """The rejected image points, by photograph and target."""
-    found = [
-        Rejection(
-            photos[int(rays.photo[row])], names[int(rays.target[row])],
-            float(clean.residuals[row]), float(clean.tests[row]),
-        )
-        for row in np.flatnonzero(clean.rejected)
-    ]  # fmt: skip
-    return tuple(sorted(found, key=lambda r: (r.photo, r.target)))
-
-
-def _stations(
-    photos: Sequence[Photo], placed: Datum, cofactors: Array, rays: ImageRays
-) -> tuple[Station, ...]:
-    """The stations in their datum; cofactors (k, 3, 3) mm² of the centres before."""
-    stations = []
-    for i, photo in enumerate(photos):
-        C = placed.scale**2 * placed.turn @ cofactors[i] @ placed.turn.T
-        x, y, z = np.sqrt(np.diag(C)).tolist()
-        bundle = placed.bundle
-        exterior = ExteriorOrientation.from_rotation(bundle.rotations[i], bundle.centres[i])
-        stations.append(Station(photo.name, exterior, int((rays.photo == i).sum()), (x, y, z)))
-    return tuple(stations)
-
-
-def _residuals_px(sensor: Sensor, bundle: Bundle, rays: ImageRays) -> tuple[Array, ...]:
-    """Residuals per photograph, (n, 2) px each."""
-    v = nb.residuals(sensor, bundle, rays.in_pixels())
-    return tuple(v[rays.photo == i] for i in range(len(bundle.centres)))
+    return bundle, kept, replace(used, photo=number[used.photo])
 
 
 def _intersection_angles(bundle: Bundle, rays: ImageRays) -> Array:

@@ -29,7 +29,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
     project,
 )
-from thermocald.photogrammetry.linalg import unit_diagonal
+from thermocald.photogrammetry.linalg import scaled_inverse, unit_diagonal
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,100 +43,16 @@ if TYPE_CHECKING:
 _N_IOP = len(IOP_NAMES)
 # Eigenvalues of the scaled matrix below this are rounding errors of its elements.
 _SINGULAR = 1e-13
-SINGULAR = (
+_SEPARATE_NOTHING = (
     "the normal matrix is singular: these photographs do not separate the parameters; take some "
     "from other directions or hold parameters fixed"
 )
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma alongside others with one
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Covariance:
-    """Cofactors (sigma0 = 1) of a bundle with inner constraints over the targets.
-
-    interior (10, 10), zero for what is held; centres (k, 3, 3) mm²; points (3m, 3m) mm²;
-    residual_cofactors (n, 2, 2): those of the whitened residuals, the identity less the adjusted
-    points' share; weakest: the smallest eigenvalue of the scaled reduced matrix and the parameters
-    that it belongs to.
-    """
-
-    interior: Array
-    centres: Array
-    points: Array
-    residual_cofactors: Array
-    weakest: tuple[float, tuple[str, ...]]
-
-
-def covariance(
-    sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index, weights: Array
-) -> Covariance:
-    """The cofactors at the solution; `weights` 0 or 1. GeometryError if it is undetermined."""
-    linearised = linearise(sensor, bundle, rays, weights)
-    normals = normal_equations(bundle, rays, free, linearised)
-    S, _, inverses = reduce_targets(normals, 0.0)
-    f, k, m = len(free), len(bundle.centres), len(bundle.points)
-    null_c, null_p = null_space(bundle.centres, bundle.points, f)
-    scaled, scales, projector = regularise(S, null_c)
-    values, vectors = np.linalg.eigh(scaled)
-    labels = [IOP_NAMES[i] for i in free] + ["a camera's pose"] * (6 * k)
-    share = vectors[:, 0] ** 2
-    strongest = np.argsort(-share)[:3]
-    weakest = (float(values[0]), tuple(dict.fromkeys(labels[i] for i in strongest)))
-    if values[0] < _SINGULAR:
-        raise GeometryError(
-            f"the photographs do not determine {', '.join(weakest[1])}: take them from more "
-            "directions, turn the camera by 90° for some, and bring depth into the field"
-        )
-    Qc = (vectors / values) @ vectors.T - projector
-    Qc = Qc * scales[:, None] * scales
-    W = -np.einsum("mij,umj->umi", inverses, normals.B.reshape(-1, m, 3)).reshape(-1, 3 * m)
-    Qcp = Qc @ W
-    Qp = W.T @ Qcp
-    blocks = np.einsum("mimj->mij", Qp.reshape(m, 3, m, 3))  # a view
-    blocks += inverses
-    cofactors = np.eye(2) - adjusted_cofactors(linearised, rays, free, Qc, Qcp, blocks)
-
-    K = np.linalg.solve(null_p.T @ null_p, null_p.T)
-    KQ = K @ Qp
-    inner = Qp - null_p @ KQ - KQ.T @ null_p.T + null_p @ (KQ @ K.T) @ null_p.T
-    KQc = K @ Qcp.T
-    cameras = Qc - null_c @ KQc - KQc.T @ null_c.T + null_c @ (KQ @ K.T) @ null_c.T
-    interior = np.zeros((_N_IOP, _N_IOP))
-    interior[np.ix_(free, free)] = cameras[:f, :f]
-    poses = cameras[f:, f:].reshape(k, 6, k, 6)
-    centres = np.array([poses[i, 3:, i, 3:] for i in range(k)])
-    return Covariance(interior, centres, inner, cofactors, weakest)
-
-
-def adjusted_cofactors(
-    linearised: tuple[Array, Array, Array, Array],
-    rays: ImageRays,
-    free: Index,
-    Qc: Array,
-    Qcp: Array,
-    targets: Array,
-) -> Array:
-    """The cofactors (n, 2, 2) of the adjusted, whitened image points; independent of the gauge.
-
-    Qc (u, u), Qcp (u, 3m), targets (m, 3, 3): cofactors of cameras, between both, of each target.
-    """
-    _, by_interior, by_pose, by_point = linearised
-    J = np.concatenate([by_interior[:, :, free], by_pose], axis=2)
-    f = len(free)
-    pose = f + 6 * rays.photo[:, None] + np.arange(6)
-    columns = np.concatenate([np.broadcast_to(np.arange(f), (len(rays), f)), pose], axis=1)
-    rows = 3 * rays.target[:, None] + np.arange(3)
-    cameras = Qc[columns[:, :, None], columns[:, None, :]]
-    mixed = Qcp[columns[:, :, None], rows[:, None, :]]
-    points = targets[rays.target]
-    half = J @ mixed @ np.swapaxes(by_point, 1, 2)
-    total: Array = (
-        J @ cameras @ np.swapaxes(J, 1, 2)
-        + half
-        + np.swapaxes(half, 1, 2)
-        + by_point @ points @ np.swapaxes(by_point, 1, 2)
-    )
-    return total
+BEHIND = 1e6
+"""The whitened residual of a target behind its camera."""
+_CONTROLLED = 1e-3  # cofactor of a residual below which nothing else controls it
+MEDIAN_CHI2 = 1.386
+"""Of two degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,11 +111,19 @@ class Bundle:
 
     def exteriors(self) -> Array:
         """The exterior orientations (k, 6) in the order of `EOP_NAMES`."""
-        rows = [
-            ExteriorOrientation.from_rotation(R, X).as_array()
-            for R, X in zip(self.rotations, self.centres, strict=True)
-        ]
-        return np.array(rows)
+        pairs = zip(self.rotations, self.centres, strict=True)
+        return np.array([ExteriorOrientation.from_rotation(R, X).as_array() for R, X in pairs])
+
+    def moved(self, cameras: Array, targets: Array, free: Index) -> Bundle:
+        """The bundle after a step of cameras (u,) and targets (m, 3)."""
+        interior, pose = self.interior.copy(), cameras[len(free) :].reshape(-1, 6)
+        interior[free] += cameras[: len(free)]
+        return Bundle(
+            interior,
+            _turn(pose[:, :3]) @ self.rotations,
+            self.centres + pose[:, 3:],
+            self.points + targets,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -225,7 +149,18 @@ class KnownTargets:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NormalEquations:
+class _Linearised:
+    """Whitened residuals (n, 2), and their partials by camera and pose (n, 2, f + 6) and by the
+    target (n, 2, 3), 0 where that is held.
+    """
+
+    residuals: Array
+    by_camera: Array
+    by_target: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _NormalEquations:
     """Normal equations: cameras (interior first, then six per photo) and targets."""
 
     A: Array  # (u, u)
@@ -234,93 +169,282 @@ class NormalEquations:
     a: Array  # (u,)
     d: Array  # (m, 3)
 
+    def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
+        """The matrix and right-hand side reduced by the targets, and their blocks' inverses."""
+        trace = np.trace(self.D, axis1=1, axis2=2)[:, None, None]
+        # a target without any weight left stays where it is
+        regular = self.D + (damping * trace + np.where(trace == 0, 1.0, 0.0)) * np.eye(3)
+        inverses = np.linalg.inv(regular)
+        B3 = self.B.reshape(len(self.B), len(inverses), 3)
+        BD = np.einsum("umi,mij->umj", B3, inverses).reshape(self.B.shape)
+        return self.A - BD @ self.B.T, self.a - BD @ self.d.ravel(), inverses
 
-def residuals(sensor: Sensor, bundle: Bundle, rays: ImageRays) -> Array:
-    """Whitened residuals (n, 2), measured minus computed; huge for a target behind its camera."""
-    eop = bundle.exteriors()[rays.photo]
-    computed = project(sensor, bundle.interior, eop, bundle.points[rays.target][:, None, :])[:, 0]
-    v = np.einsum("nij,nj->ni", rays.whitening, rays.points - computed)
-    result: Array = np.where(np.isfinite(v), v, 1e6)
-    return result
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Cofactors:
+    """Cofactors (sigma0 = 1) of a bundle, of a free one in an arbitrary datum.
 
-def linearise(
-    sensor: Sensor,
-    bundle: Bundle,
-    rays: ImageRays,
-    weights: Array,
-    known: KnownTargets | None = None,
-) -> tuple[Array, Array, Array, Array]:
-    """Whitened residuals (n, 2), partials by interior (n, 2, 10), pose (…, 6), target (…, 3).
-
-    The partials by a target that is held are 0.
+    cameras (u, u), interior first; mixed (u, 3m): between cameras and targets; follow (u, 3m): how
+    the targets follow the cameras; own (m, 3, 3): of the targets where the cameras stand; weakest:
+    the parameters that a free network determines worst.
     """
-    eop = bundle.exteriors()[rays.photo]
-    points = bundle.points[rays.target]
-    computed, by_parameter, by_point = partials(sensor, bundle.interior, eop, points[:, None, :])
-    in_front = np.isfinite(computed[:, 0, 0])
-    root = np.sqrt(np.where(in_front, weights, 0.0))[:, None, None] * rays.whitening
-    by_point = np.nan_to_num(by_point[:, 0])
-    # q = Rᵀ d, turned about the object's axes: the derivative by w is that by the point times d × e
-    d = points - bundle.centres[rays.photo]
-    cross = np.zeros((len(rays), 3, 3))
-    cross[:, 1, 0], cross[:, 2, 0] = d[:, 2], -d[:, 1]
-    cross[:, 0, 1], cross[:, 2, 1] = -d[:, 2], d[:, 0]
-    cross[:, 0, 2], cross[:, 1, 2] = d[:, 1], -d[:, 0]
-    by_pose = np.concatenate([by_point @ cross, -by_point], axis=2)
-    v = (root @ np.nan_to_num(rays.points - computed[:, 0])[..., None])[..., 0]
-    by_interior = np.nan_to_num(by_parameter[:, 0, :, :_N_IOP])
-    if known is not None:
-        by_point = by_point * known.uncertain[rays.target, None, None]
-    return v, root @ by_interior, root @ by_pose, root @ by_point
+
+    cameras: Array
+    mixed: Array
+    follow: Array
+    own: Array
+    weakest: tuple[str, ...] = ()
+
+    def each_target(self) -> Array:
+        """The cofactors (m, 3, 3) of each target."""
+        follow, mixed = (a.reshape(len(a), -1, 3) for a in (self.follow, self.mixed))
+        result: Array = self.own + np.einsum("umi,umj->mij", follow, mixed)
+        return result
 
 
-def normal_equations(
-    bundle: Bundle,
-    rays: ImageRays,
-    free: Index,
-    linearised: tuple[Array, Array, Array, Array],
-    known: KnownTargets | None = None,
-) -> NormalEquations:
-    """The normal equations of a bundle in blocks: camera and poses, targets, and between them.
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleAdjustment:
+    """Image points of one camera, adjusted by interior orientation, poses and targets.
 
-    free: columns of the interior orientation that are estimated; linearised: of `linearise`.
+    free: which of `IOP_NAMES` are unknown (indices); known: what is known of the targets, None for
+    a free network, in which position, orientation and scale are free.
     """
-    v, by_interior, by_pose, by_point = linearised
-    by_interior = by_interior[:, :, free]
-    k, m, f = len(bundle.centres), len(bundle.points), len(free)
-    u = f + 6 * k
-    A, a = np.zeros((u, u)), np.zeros(u)
-    flat = by_interior.reshape(2 * len(rays), f)
-    A[:f, :f] = flat.T @ flat
-    a[:f] = flat.T @ v.ravel()
-    pose = np.zeros((k, 6, 6))
-    np.add.at(pose, rays.photo, np.swapaxes(by_pose, 1, 2) @ by_pose)
-    mixed = np.zeros((k, f, 6))
-    np.add.at(mixed, rays.photo, np.swapaxes(by_interior, 1, 2) @ by_pose)
-    right = np.zeros((k, 6))
-    np.add.at(right, rays.photo, np.einsum("nai,na->ni", by_pose, v))
-    for i in range(k):
-        rows = slice(f + 6 * i, f + 6 * i + 6)
-        A[rows, rows], A[:f, rows], A[rows, :f], a[rows] = pose[i], mixed[i], mixed[i].T, right[i]
 
-    B_interior = np.zeros((m, f, 3))
-    np.add.at(B_interior, rays.target, np.swapaxes(by_interior, 1, 2) @ by_point)
-    B_pose = np.zeros((k, m, 6, 3))
-    np.add.at(B_pose, (rays.photo, rays.target), np.swapaxes(by_pose, 1, 2) @ by_point)
-    B = np.concatenate(
-        [
-            B_interior.transpose(1, 0, 2).reshape(f, 3 * m),
-            B_pose.transpose(0, 2, 1, 3).reshape(6 * k, 3 * m),
-        ]
-    )
-    D, d = np.zeros((m, 3, 3)), np.zeros((m, 3))
-    np.add.at(D, rays.target, np.swapaxes(by_point, 1, 2) @ by_point)
-    np.add.at(d, rays.target, np.einsum("nai,na->ni", by_point, v))
-    if known is not None:
-        D += known.weights[:, :, None] * np.eye(3)
-        d += known.weights * (known.points - bundle.points)
-    return NormalEquations(A, B, D, a, d)
+    sensor: Sensor
+    rays: ImageRays
+    free: Index
+    known: KnownTargets | None = None
+
+    def residuals(self, bundle: Bundle) -> Array:
+        """Return whitened residuals (n, 2), measured minus computed; `BEHIND` for a target behind
+        its camera.
+        """
+        eop = bundle.exteriors()[self.rays.photo]
+        points = bundle.points[self.rays.target][:, None, :]
+        computed = project(self.sensor, bundle.interior, eop, points)[:, 0]
+        v = np.einsum("nij,nj->ni", self.rays.whitening, self.rays.points - computed)
+        result: Array = np.where(np.isfinite(v), v, BEHIND)
+        return result
+
+    def solve(self, bundle: Bundle, *, robust: bool = False, iterations: int = 30) -> Bundle:
+        """Adjust a bundle to the image points.
+
+        A free network by damped steps (Levenberg-Marquardt); with known targets by whole or shorter
+        ones (Gauss-Newton), which follow the narrow valley of a weak geometry to its end. `robust`
+        renews weights in each iteration (Cauchy, scaled by the median residual).
+        Raises GeometryError where it cannot converge.
+        """
+        gauge = self.known is None
+        w = np.ones(len(self.rays))
+        damping = 1e-6 if gauge else 0.0
+        v = self.residuals(bundle)
+        for _ in range(iterations):
+            if robust:
+                w = _cauchy(v)
+            cost = self._cost(bundle, v, w)
+            normals = self._normal_equations(bundle, self._linearised(bundle, w))
+            fraction = 1.0
+            for _attempt in range(12):
+                step = self._step(bundle, normals, damping)
+                if step is not None:
+                    trial = bundle.moved(fraction * step[0], fraction * step[1], self.free)
+                    if trial.interior[0] > 0:
+                        v_new = self.residuals(trial)
+                        new = self._cost(trial, v_new, w)
+                        if new <= cost * (1 + 1e-12):
+                            break
+                elif not gauge:
+                    raise GeometryError(_SEPARATE_NOTHING)
+                if gauge:
+                    damping = max(damping * 10, 1e-9)
+                else:
+                    fraction /= 2
+            else:
+                # no step lowers the sum: it is the minimum to within rounding, or hopeless
+                if step is not None and step[2] < 1e-4:
+                    return bundle
+                raise GeometryError(
+                    "the bundle adjustment does not converge: take more photographs, from more "
+                    "sides, or give approximate camera data"
+                )
+            bundle, v = trial, v_new
+            if gauge:
+                damping = max(damping / 10, 1e-12)
+            if step[2] < 1e-8 or (robust and cost - new < 1e-6 * cost):
+                break
+        else:
+            if not gauge:
+                raise GeometryError(f"the adjustment did not converge in {iterations} iterations")
+        # orthonormal to the last bit
+        U, _, Vt = np.linalg.svd(bundle.rotations)
+        return replace(bundle, rotations=U @ Vt)
+
+    def cofactors(self, bundle: Bundle) -> Cofactors:
+        """Return the cofactors at the solution; GeometryError where it is undetermined."""
+        linearised = self._linearised(bundle, np.ones(len(self.rays)))
+        normals = self._normal_equations(bundle, linearised)
+        S, _, inverses = normals.reduced()
+        weakest: tuple[str, ...] = ()
+        if self.known is None:
+            null, _ = null_space(bundle.centres, bundle.points, len(self.free))
+            scaled, scales, projector = _regularise(S, null)
+            values, vectors = np.linalg.eigh(scaled)
+            labels = [IOP_NAMES[i] for i in self.free] + ["a camera's pose"] * len(S)
+            strongest = np.argsort(-(vectors[:, 0] ** 2))[:3]
+            weakest = tuple(dict.fromkeys(labels[i] for i in strongest))
+            if values[0] < _SINGULAR:
+                raise GeometryError(
+                    f"the photographs do not determine {', '.join(weakest)}: take them from more "
+                    "directions, turn the camera by 90° for some, and bring depth into the field"
+                )
+            Q = ((vectors / values) @ vectors.T - projector) * scales[:, None] * scales
+        else:
+            try:
+                np.linalg.cholesky(unit_diagonal(S)[0])
+                Q = scaled_inverse(S)
+            except np.linalg.LinAlgError:
+                raise GeometryError(_SEPARATE_NOTHING) from None
+        B3 = normals.B.reshape(len(Q), -1, 3)
+        follow = -np.einsum("mij,umj->umi", inverses, B3).reshape(len(Q), -1)
+        return Cofactors(Q, Q @ follow, follow, inverses, weakest)
+
+    def explained(self, bundle: Bundle, found: Cofactors) -> Array:
+        """Return the cofactors (n, 2, 2) of the adjusted, whitened image points; independent of the
+        gauge. The rays may be others than those of the adjustment.
+        """
+        linearised = self._linearised(bundle, np.ones(len(self.rays)))
+        J, by_target = linearised.by_camera, linearised.by_target
+        f = len(self.free)
+        pose = f + 6 * self.rays.photo[:, None] + np.arange(6)
+        interior = np.broadcast_to(np.arange(f), (len(self.rays), f))
+        columns = np.concatenate([interior, pose], axis=1)[:, :, None]
+        rows = 3 * self.rays.target[:, None] + np.arange(3)
+        half = J @ found.mixed[columns, rows[:, None, :]] @ np.swapaxes(by_target, 1, 2)
+        total: Array = (
+            J @ found.cameras[columns, np.swapaxes(columns, 1, 2)] @ np.swapaxes(J, 1, 2)
+            + half
+            + np.swapaxes(half, 1, 2)
+            + by_target @ found.each_target()[self.rays.target] @ np.swapaxes(by_target, 1, 2)
+        )
+        return total
+
+    def _cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
+        prior = 0.0 if self.known is None else self.known.cost(bundle)
+        return float(weights @ np.sum(v * v, axis=1)) + prior
+
+    def _linearised(self, bundle: Bundle, weights: Array) -> _Linearised:
+        rays = self.rays
+        eop = bundle.exteriors()[rays.photo]
+        points = bundle.points[rays.target]
+        computed, by_parameter, by_point = partials(
+            self.sensor, bundle.interior, eop, points[:, None, :]
+        )
+        in_front = np.isfinite(computed[:, 0, 0])
+        root = np.sqrt(np.where(in_front, weights, 0.0))[:, None, None] * rays.whitening
+        by_point = np.nan_to_num(by_point[:, 0])
+        # q = Rᵀ d, turned about the object's axes: by w it is that by the point times d × e
+        d = points - bundle.centres[rays.photo]
+        cross = np.zeros((len(rays), 3, 3))
+        cross[:, 1, 0], cross[:, 2, 0] = d[:, 2], -d[:, 1]
+        cross[:, 0, 1], cross[:, 2, 1] = -d[:, 2], d[:, 0]
+        cross[:, 0, 2], cross[:, 1, 2] = d[:, 1], -d[:, 0]
+        by_interior = np.nan_to_num(by_parameter[:, 0, :, :_N_IOP])[:, :, self.free]
+        by_camera = np.concatenate([by_interior, by_point @ cross, -by_point], axis=2)
+        v = (root @ np.nan_to_num(rays.points - computed[:, 0])[..., None])[..., 0]
+        if self.known is not None:
+            by_point = by_point * self.known.uncertain[rays.target, None, None]
+        return _Linearised(v, root @ by_camera, root @ by_point)
+
+    def _normal_equations(self, bundle: Bundle, linearised: _Linearised) -> _NormalEquations:
+        """The normal equations in blocks: camera and poses, targets, and between them."""
+        v, by_point = linearised.residuals, linearised.by_target
+        rays, f = self.rays, len(self.free)
+        by_interior, by_pose = np.split(linearised.by_camera, [f], axis=2)
+        k, m = len(bundle.centres), len(bundle.points)
+        u = f + 6 * k
+        A, a = np.zeros((u, u)), np.zeros(u)
+        flat = by_interior.reshape(2 * len(rays), f)
+        A[:f, :f] = flat.T @ flat
+        a[:f] = flat.T @ v.ravel()
+        pose, mixed, right = np.zeros((k, 6, 6)), np.zeros((k, f, 6)), np.zeros((k, 6))
+        np.add.at(pose, rays.photo, np.swapaxes(by_pose, 1, 2) @ by_pose)
+        np.add.at(mixed, rays.photo, np.swapaxes(by_interior, 1, 2) @ by_pose)
+        np.add.at(right, rays.photo, np.einsum("nai,na->ni", by_pose, v))
+        for i in range(k):
+            rows = slice(f + 6 * i, f + 6 * i + 6)
+            A[rows, rows], A[:f, rows], A[rows, :f] = pose[i], mixed[i], mixed[i].T
+        a[f:] = right.ravel()
+        B_interior, B_pose = np.zeros((m, f, 3)), np.zeros((k, m, 6, 3))
+        np.add.at(B_interior, rays.target, np.swapaxes(by_interior, 1, 2) @ by_point)
+        np.add.at(B_pose, (rays.photo, rays.target), np.swapaxes(by_pose, 1, 2) @ by_point)
+        B = np.concatenate(
+            [
+                B_interior.transpose(1, 0, 2).reshape(f, 3 * m),
+                B_pose.transpose(0, 2, 1, 3).reshape(6 * k, 3 * m),
+            ]
+        )
+        D, d = np.zeros((m, 3, 3)), np.zeros((m, 3))
+        np.add.at(D, rays.target, np.swapaxes(by_point, 1, 2) @ by_point)
+        np.add.at(d, rays.target, np.einsum("nai,na->ni", by_point, v))
+        if self.known is not None:
+            D += self.known.weights[:, :, None] * np.eye(3)
+            d += self.known.weights * (self.known.points - bundle.points)
+        return _NormalEquations(A, B, D, a, d)
+
+    def _step(
+        self, bundle: Bundle, normals: _NormalEquations, damping: float
+    ) -> tuple[Array, Array, float] | None:
+        """The damped step of cameras (u,) and targets (m, 3), and its size stepᵀ N step; None if
+        the matrix is not positive definite.
+        """
+        S, s, inverses = normals.reduced(damping)
+        if self.known is None:
+            null, _ = null_space(bundle.centres, bundle.points, len(self.free))
+            scaled, scales, _ = _regularise(S, null)
+        else:
+            scaled, scales = unit_diagonal(S)
+        scaled = scaled + damping * np.eye(len(scaled))
+        try:
+            np.linalg.cholesky(scaled)
+        except np.linalg.LinAlgError:
+            return None
+        dc = scales * np.linalg.solve(scaled, scales * s)
+        dp = np.einsum("mij,mj->mi", inverses, normals.d - (dc @ normals.B).reshape(-1, 3))
+        # the predicted decrease of the sum of squares, in its own unit
+        return dc, dp, float(dc @ normals.a + dp.ravel() @ normals.d.ravel())
+
+
+def inner_constraints(bundle: Bundle, found: Cofactors, free: Index) -> tuple[Array, Array, Array]:
+    """Return the cofactors of a free network with inner constraints over the targets: of the
+    interior orientation (10, 10), zero for what is held, the centres (k, 3, 3) mm² and the targets
+    (3m, 3m) mm².
+    """
+    f, k, m = len(free), len(bundle.centres), len(bundle.points)
+    Qp = found.follow.T @ found.mixed
+    blocks = np.einsum("mimj->mij", Qp.reshape(m, 3, m, 3))  # a view
+    blocks += found.own
+    null_c, null_p = null_space(bundle.centres, bundle.points, f)
+    K = np.linalg.solve(null_p.T @ null_p, null_p.T)
+    KQ = K @ Qp
+    inner = Qp - null_p @ KQ - KQ.T @ null_p.T + null_p @ (KQ @ K.T) @ null_p.T
+    KQc = K @ found.mixed.T
+    cameras = found.cameras - null_c @ KQc - KQc.T @ null_c.T + null_c @ (KQ @ K.T) @ null_c.T
+    interior = np.zeros((_N_IOP, _N_IOP))
+    interior[np.ix_(free, free)] = cameras[:f, :f]
+    poses = cameras[f:, f:].reshape(k, 6, k, 6)
+    return interior, np.einsum("kikj->kij", poses[:, 3:, :, 3:]), inner
+
+
+def point_tests(v: Array, cofactors: Array) -> Array:
+    """Return vᵀ Qvv⁻¹ v (n,) of whitened residuals (n, 2) with cofactors (n, 2, 2): chi² with two
+    degrees of freedom; what nothing else controls is left out of it.
+    """
+    values, vectors = np.linalg.eigh(cofactors)
+    along = np.einsum("nji,nj->ni", vectors, v)
+    controlled = values > _CONTROLLED
+    shares = np.where(controlled, along**2 / np.where(controlled, values, 1), 0)
+    tests: Array = np.sum(shares, axis=1)
+    return tests
 
 
 def null_space(centres: Array, points: Array, n_interior: int) -> tuple[Array, Array]:
@@ -345,20 +469,7 @@ def null_space(centres: Array, points: Array, n_interior: int) -> tuple[Array, A
     return padded, motion(points).reshape(-1, 7)
 
 
-def reduce_targets(normals: NormalEquations, damping: float) -> tuple[Array, Array, Array]:
-    """The reduced matrix and right-hand side, and the inverses of the targets' blocks."""
-    eye = np.eye(3)
-    trace = np.trace(normals.D, axis1=1, axis2=2)[:, None, None]
-    # a target without any weight left stays where it is
-    regular = normals.D + (damping * trace + np.where(trace == 0, 1.0, 0.0)) * eye
-    inverses = np.linalg.inv(regular)
-    m = len(inverses)
-    B3 = normals.B.reshape(len(normals.B), m, 3)
-    BD = np.einsum("umi,mij->umj", B3, inverses).reshape(normals.B.shape)
-    return normals.A - BD @ normals.B.T, normals.a - BD @ normals.d.ravel(), inverses
-
-
-def regularise(S: Array, null: Array) -> tuple[Array, Array, Array]:
+def _regularise(S: Array, null: Array) -> tuple[Array, Array, Array]:
     """S scaled to a unit diagonal plus the projector on its null space; scales; projector."""
     scales = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
     basis, _ = np.linalg.qr(null / scales[:, None])
@@ -381,130 +492,9 @@ def _turn(w: Array) -> Array:
     return turned
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Step:
-    """A step of cameras (u,) and targets (m, 3), and its size: stepᵀ N step."""
-
-    cameras: Array
-    targets: Array
-    size: float
-
-    def taken(self, bundle: Bundle, free: Index, fraction: float) -> Bundle:
-        """The bundle after a fraction of the step."""
-        dc, f = fraction * self.cameras, len(free)
-        interior, pose = bundle.interior.copy(), dc[f:].reshape(-1, 6)
-        interior[free] += dc[:f]
-        return Bundle(
-            interior,
-            _turn(pose[:, :3]) @ bundle.rotations,
-            bundle.centres + pose[:, 3:],
-            bundle.points + fraction * self.targets,
-        )
-
-
-def _step(
-    bundle: Bundle, normals: NormalEquations, free: Index, damping: float, gauge: bool
-) -> _Step | None:
-    """The damped step; None if the matrix is not positive definite.
-
-    gauge: whether position, orientation and scale are free.
-    """
-    S, s, inverses = reduce_targets(normals, damping)
-    if gauge:
-        null, _ = null_space(bundle.centres, bundle.points, len(free))
-        scaled, scales, _ = regularise(S, null)
-    else:
-        scaled, scales = unit_diagonal(S)
-    scaled = scaled + damping * np.eye(len(scaled))
-    try:
-        np.linalg.cholesky(scaled)
-    except np.linalg.LinAlgError:
-        return None
-    dc = scales * np.linalg.solve(scaled, scales * s)
-    dp = np.einsum("mij,mj->mi", inverses, normals.d - (dc @ normals.B).reshape(-1, 3))
-    # the predicted decrease of the sum of squares, in its own unit
-    return _Step(dc, dp, float(dc @ normals.a + dp.ravel() @ normals.d.ravel()))
-
-
-def solve(
-    sensor: Sensor,
-    bundle: Bundle,
-    rays: ImageRays,
-    free: Index,
-    *,
-    weights: Array | None = None,
-    robust: bool = False,
-    iterations: int = 30,
-    known: KnownTargets | None = None,
-) -> tuple[Bundle, Array]:
-    """Adjust the bundle to the rays.
-
-    A free network by damped steps (Levenberg-Marquardt); with known targets by whole or shorter
-    ones (Gauss-Newton), which follow the narrow valley of a weak geometry to its end.
-    free: which of `IOP_NAMES` are unknown (indices); weights (n,) factors of the rays' weights, 0
-    leaves one out; `robust` renews them in each iteration (Cauchy, scaled by the median residual);
-    known: what is known of the targets, None for a free network.
-    Returns the bundle and the final weights. Raises GeometryError where it cannot converge.
-    """
-
-    def cost_of(bundle: Bundle, v: Array) -> float:
-        prior = 0.0 if known is None else known.cost(bundle)
-        return float(w @ np.sum(v * v, axis=1)) + prior
-
-    gauge = known is None
-    w = np.ones(len(rays)) if weights is None else weights
-    damping = 1e-6 if gauge else 0.0
-    v = residuals(sensor, bundle, rays)
-    for _ in range(iterations):
-        if robust:
-            w = _cauchy(v) * (1.0 if weights is None else weights > 0)
-        cost = cost_of(bundle, v)
-        linearised = linearise(sensor, bundle, rays, w, known)
-        normals = normal_equations(bundle, rays, free, linearised, known)
-        fraction = 1.0
-        for _attempt in range(12):
-            step = _step(bundle, normals, free, damping, gauge)
-            if step is not None:
-                trial = step.taken(bundle, free, fraction)
-                if trial.interior[0] > 0:
-                    v_new = residuals(sensor, trial, rays)
-                    new = cost_of(trial, v_new)
-                    if new <= cost * (1 + 1e-12):
-                        break
-            elif not gauge:
-                raise GeometryError(SINGULAR)
-            if gauge:
-                damping = max(damping * 10, 1e-9)
-            else:
-                fraction /= 2
-        else:
-            # no step lowers the sum: it is the minimum to within rounding, or hopeless
-            if step is not None and step.size < 1e-4:
-                return bundle, w
-            raise GeometryError(
-                "the bundle adjustment does not converge: take more photographs, from more sides, "
-                "or give approximate camera data"
-            )
-        bundle, v = trial, v_new
-        if gauge:
-            damping = max(damping / 10, 1e-12)
-        if step.size < 1e-8 or (robust and cost - new < 1e-6 * cost):
-            break
-    else:
-        if not gauge:
-            raise GeometryError(f"the adjustment did not converge in {iterations} iterations")
-    return _normalised(bundle), w
-
-
 def _cauchy(v: Array) -> Array:
     """Weights (n,) from whitened residuals (n, 2): 1 for the good, falling with the square."""
     size2 = np.sum(v * v, axis=1)
-    scale2 = max(float(np.median(size2)) / 1.386, 1e-12)  # the median of chi² with 2 degrees
+    scale2 = max(float(np.median(size2)) / MEDIAN_CHI2, 1e-12)
     weights: Array = 1.0 / (1.0 + size2 / (9.0 * scale2))
     return weights
-
-
-def _normalised(bundle: Bundle) -> Bundle:
-    """With rotations that are orthonormal to the last bit."""
-    U, _, Vt = np.linalg.svd(bundle.rotations)
-    return replace(bundle, rotations=U @ Vt)

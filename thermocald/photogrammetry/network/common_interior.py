@@ -11,7 +11,7 @@ Brown, D. C. (1976): The bundle adjustment - progress and prospects.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,18 +28,14 @@ from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
 from thermocald.photogrammetry.epoch.snooping import chi2_2d
 from thermocald.photogrammetry.field.planes import plane_fit
-from thermocald.photogrammetry.linalg import diagonal_scale, scaled_inverse
 from thermocald.photogrammetry.network.bundle import (
-    SINGULAR,
+    BEHIND,
+    MEDIAN_CHI2,
     Bundle,
+    BundleAdjustment,
     ImageRays,
     KnownTargets,
-    adjusted_cofactors,
-    linearise,
-    normal_equations,
-    reduce_targets,
-    residuals,
-    solve,
+    point_tests,
 )
 
 if TYPE_CHECKING:
@@ -50,8 +46,6 @@ if TYPE_CHECKING:
 
 _ITERATIONS = 60
 _ROUNDS = 10
-_BEHIND = 1e6  # of `residuals`
-_UNTESTABLE = 1e-6  # of its variance: a ray whose residual the unknowns take up
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 
 
@@ -98,7 +92,7 @@ def adjust_common_interior(
     free = np.array(free_columns(s.free), dtype=np.int64)
     seen = np.unique(np.concatenate([o.targets for o in photographs]))
     rays = ImageRays.collect(photographs)
-    rays = ImageRays(rays.photo, np.searchsorted(seen, rays.target), rays.points, rays.whitening)
+    rays = replace(rays, target=np.searchsorted(seen, rays.target))
     known = KnownTargets.build(testfield.points[seen], testfield.sigmas[seen])
     bundle = Bundle(
         interior.as_array(),
@@ -109,16 +103,18 @@ def adjust_common_interior(
     used = np.ones(len(rays), dtype=bool)
     if fitting is not None and s.snooping_alpha > 0:
         used = np.concatenate(list(fitting))
+    every = BundleAdjustment(sensor, rays, free, known)
     for _ in range(_ROUNDS):
-        if np.abs(residuals(sensor, bundle, rays)[used]).max(initial=0.0) >= _BEHIND:
+        if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
             raise GeometryError("targets came to lie behind the camera during the iteration")
-        weights = used.astype(float)
-        bundle, _ = solve(
-            sensor, bundle, rays, free, weights=weights, iterations=_ITERATIONS, known=known
-        )
-        Q, shares = _cofactors(sensor, bundle, rays, free, weights, known)
-        v = residuals(sensor, bundle, rays)
-        kept = snoop_rays(ray_tests(v, shares, used), rays.target, used, s.snooping_alpha)
+        part = BundleAdjustment(sensor, rays.select(used), free, known)
+        bundle = part.solve(bundle, iterations=_ITERATIONS)
+        found = part.cofactors(bundle)
+        v = every.residuals(bundle)
+        # what took part pulls the result towards itself, what did not is off from it as well
+        signs = np.where(used, -1.0, 1.0)[:, None, None]
+        tests = point_tests(v, np.eye(2) + signs * every.explained(bundle, found))
+        kept = snoop_rays(tests, rays.target, used, s.snooping_alpha)
         if np.array_equal(kept, used):
             break
         used = kept
@@ -130,7 +126,7 @@ def adjust_common_interior(
             f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
         )
     variance = (float(np.sum(v[used] ** 2)) + known.cost(bundle)) / redundancy
-    Q *= variance if s.scale == "posterior" else 1.0
+    Q = found.cameras * variance
     covariance = np.zeros((16, 16))
     covariance[np.ix_(free, free)] = Q[: len(free), : len(free)]
     eops = bundle.exteriors()
@@ -143,37 +139,9 @@ def adjust_common_interior(
         float(np.sqrt(variance)),
         redundancy,
         tuple(np.split(used, ends)),
-        tuple(np.split(residuals(sensor, bundle, rays.in_pixels()), ends)),
+        tuple(np.split(replace(every, rays=rays.in_pixels()).residuals(bundle), ends)),
         tuple(_weaknesses(sensor, bundle.interior, eops, known, rays.select(used), covariance, s)),
     )
-
-
-def _cofactors(
-    sensor: Sensor,
-    bundle: Bundle,
-    rays: ImageRays,
-    free: Index,
-    weights: Array,
-    known: KnownTargets,
-) -> tuple[Array, Array]:
-    """The cofactors (u, u) of camera and poses, and those (n, 2, 2) of all adjusted image points.
-
-    Raises GeometryError where the photographs do not carry it.
-    """
-    used = linearise(sensor, bundle, rays, weights, known)
-    normals = normal_equations(bundle, rays, free, used, known)
-    S, _, inverses = reduce_targets(normals, 0.0)
-    scale = diagonal_scale(S)
-    try:
-        np.linalg.cholesky(S * np.outer(scale, scale))
-        Q = scaled_inverse(S)
-    except np.linalg.LinAlgError:
-        raise GeometryError(SINGULAR) from None
-    W = -np.einsum("mij,umj->umi", inverses, normals.B.reshape(len(Q), -1, 3))
-    mixed = np.einsum("uv,vmi->umi", Q, W)
-    targets = inverses + np.einsum("umi,umj->mij", W, mixed)
-    every = linearise(sensor, bundle, rays, np.ones(len(rays)), known)
-    return Q, adjusted_cofactors(every, rays, free, Q, mixed.reshape(len(Q), -1), targets)
 
 
 def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:
@@ -189,22 +157,11 @@ def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:
     return result
 
 
-def ray_tests(v: Array, shares: Array, used: Mask) -> Array:
-    """Chi-square (2) of whitened residuals (n, 2), of which the unknowns explain the cofactors
-    `shares` (n, 2, 2).
-    """
-    V = np.eye(2) + np.where(used, -1.0, 1.0)[:, None, None] * shares
-    testable = np.linalg.det(V) > _UNTESTABLE
-    V[~testable] = np.eye(2)
-    test = np.einsum("ni,nij,nj->n", v, np.linalg.inv(V), v)
-    return np.where(testable, test, 0.0)
-
-
 def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
     """Which image points stay; of the rays of one target only the worst goes at a time."""
     if alpha <= 0:
         return used
-    limit = chi2_2d(alpha) * max(float(np.median(tests[used])) / (2 * np.log(2)), 1e-12)
+    limit = chi2_2d(alpha) * max(float(np.median(tests[used])) / MEDIAN_CHI2, 1e-12)
     worst = np.zeros(1 + int(target.max(initial=0)))
     np.maximum.at(worst, target[used], tests[used])
     kept: Mask = (tests <= limit) | (used & (tests < worst[target]))

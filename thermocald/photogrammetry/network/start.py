@@ -12,6 +12,7 @@ point problem (both as implemented in OpenCV).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ import numpy as np
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
-from thermocald.photogrammetry.network.bundle import Bundle, ImageRays, residuals, solve
+from thermocald.photogrammetry.network.bundle import Bundle, BundleAdjustment, ImageRays
 from thermocald.photogrammetry.orientation import majority_pose
 
 if TYPE_CHECKING:
@@ -45,9 +46,8 @@ class _Start:
 
     def __init__(self, sensor: Sensor, interior: Array, rays: ImageRays, n_targets: int) -> None:
         self.sensor, self.interior, self.rays = sensor, interior, rays
-        direction = camera_rays(sensor, interior, rays.points) @ _FLIP
-        self.normalised: Array = direction[:, :2] / direction[:, 2:]
-        self.directions = direction
+        self.directions = camera_rays(sensor, interior, rays.points) @ _FLIP
+        self.normalised: Array = self.directions[:, :2] / self.directions[:, 2:]
         self.threshold = _INLIER_PX * sensor.pixel_pitch / float(interior[0])
         self.poses: dict[int, tuple[Array, Array]] = {}  # OpenCV: x_camera = R x + t
         self.points = np.full((n_targets, 3), np.nan)
@@ -96,19 +96,18 @@ class _Start:
         number[photos] = np.arange(len(photos))
         keep = (number[self.rays.photo] >= 0) & np.isfinite(self.points[self.rays.target, 0])
         used = self.rays.select(keep)
-        used = ImageRays(number[used.photo], used.target, used.points, used.whitening)
+        used = replace(used, photo=number[used.photo])
         R = np.array([self.poses[p][0] for p in photos])
         t = np.array([self.poses[p][1] for p in photos])
         centres = -np.einsum("nji,nj->ni", R, t)
         points = np.where(np.isfinite(self.points), self.points, 0.0)
         return Bundle(self.interior, np.swapaxes(R, 1, 2) @ _FLIP, centres, points), photos, used
 
-    def refine(self, iterations: int = 4) -> None:
-        """A few robust iterations over what is there, the interior orientation held."""
+    def refine(self) -> None:
+        """Do a few robust iterations over what is there, the interior orientation held."""
         bundle, photos, used = self.bundle()
-        bundle, _ = solve(
-            self.sensor, bundle, used, np.array([], dtype=int), robust=True, iterations=iterations
-        )
+        held = BundleAdjustment(self.sensor, used, np.array([], dtype=int))
+        bundle = held.solve(bundle, robust=True, iterations=4)
         R = _FLIP @ np.swapaxes(bundle.rotations, 1, 2)
         for i, photo in enumerate(photos):
             self.poses[photo] = (R[i], -R[i] @ bundle.centres[i])
@@ -131,6 +130,56 @@ class _Start:
             if len(self.poses) <= 8 or len(self.poses) % 4 == 0:
                 self.refine()
         self.intersect()
+
+    def begin_with_pair(self, pair: tuple[int, int]) -> None:
+        """Orient two photographs to each other; GeometryError where the pair is of no use."""
+        import cv2
+
+        a, b = (self.rows(p) for p in pair)
+        _, ia, ib = np.intersect1d(self.rays.target[a], self.rays.target[b], return_indices=True)
+        first, second = self.normalised[a[ia]], self.normalised[b[ib]]
+        cv2.setRNGSeed(1)
+        E, mask = cv2.findEssentialMat(
+            first, second, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=0.9999,
+            threshold=self.threshold,
+        )  # fmt: skip
+        n = 0
+        if E is not None and E.shape == (3, 3):
+            n, R, t, _ = cv2.recoverPose(E, first, second, focal=1.0, pp=(0.0, 0.0), mask=mask)
+        # a pair that disagrees in half of its targets is not a pair, whatever its parallax promised
+        if n < max(_MIN_PAIR, len(ia) // 2):
+            raise GeometryError("the two photographs do not fit together")
+        self.poses = {
+            pair[0]: (np.eye(3), np.zeros(3)),
+            pair[1]: (np.asarray(R, dtype=float), np.asarray(t, dtype=float).ravel()),
+        }
+        self.points[:] = np.nan
+        self.intersect()
+        if np.isfinite(self.points[:, 0]).sum() < _MIN_PAIR:
+            raise GeometryError("the two photographs have too few targets in common")
+
+    def begin_with_nominal(self, nominal: Array) -> None:
+        """Resect every photograph on nominal coordinates (m, 3) mm, NaN where unknown."""
+        self.points[:] = nominal
+        for photo in np.unique(self.rays.photo):
+            self.resect(int(photo))
+        if len(self.poses) < 2:
+            raise GeometryError("fewer than two photographs show enough of the nominal field")
+        # from here on the photographs speak, and targets without nominal coordinates join
+        self.points[:] = np.nan
+        self.intersect()
+
+    def network(self, free: Index) -> tuple[Bundle, list[int], ImageRays]:
+        """Add the other photographs and adjust roughly; GeometryError where that fails."""
+        self.refine()
+        self.extend()
+        bundle, photos, used = self.bundle()
+        for stage in ([0], [0, 1, 2, 3], range(len(bundle.interior))):
+            some = free[np.isin(free, stage)]
+            bundle = BundleAdjustment(self.sensor, used, some).solve(
+                bundle, robust=True, iterations=15
+            )
+        return bundle, photos, used
 
 
 def _pairs(rays: ImageRays, normalised: Array) -> list[tuple[int, int]]:
@@ -164,58 +213,6 @@ def _pairs(rays: ImageRays, normalised: Array) -> list[tuple[int, int]]:
     return [(a, b) for _, a, b in sorted(scored, key=lambda row: -row[0])]
 
 
-def _from_pair(start: _Start, pair: tuple[int, int]) -> bool:
-    """Begin with a pair, then add all photographs that can be; False if the pair is of no use."""
-    import cv2
-
-    a, b = (start.rows(p) for p in pair)
-    _, ia, ib = np.intersect1d(start.rays.target[a], start.rays.target[b], return_indices=True)
-    first, second = start.normalised[a[ia]], start.normalised[b[ib]]
-    cv2.setRNGSeed(1)
-    E, mask = cv2.findEssentialMat(
-        first, second, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=0.9999,
-        threshold=start.threshold,
-    )  # fmt: skip
-    if E is None or E.shape != (3, 3):
-        return False
-    n, R, t, _ = cv2.recoverPose(E, first, second, focal=1.0, pp=(0.0, 0.0), mask=mask)
-    # a pair that disagrees in half of its targets is not a pair, whatever its parallax promised
-    if n < max(_MIN_PAIR, len(ia) // 2):
-        return False
-    start.poses = {
-        pair[0]: (np.eye(3), np.zeros(3)),
-        pair[1]: (np.asarray(R, dtype=float), np.asarray(t, dtype=float).ravel()),
-    }
-    start.points[:] = np.nan
-    start.intersect()
-    if np.isfinite(start.points[:, 0]).sum() < _MIN_PAIR:
-        return False
-    return _refined(start)
-
-
-def _refined(start: _Start) -> bool:
-    """Refine what there is and add the other photographs; False where that fails."""
-    try:
-        start.refine()
-        start.extend()
-    except GeometryError:
-        return False
-    return True
-
-
-def _from_nominal(start: _Start, nominal: Array) -> bool:
-    """Resect every photograph on nominal coordinates (m, 3) mm (NaN: unknown), then intersect."""
-    start.points[:] = nominal
-    for photo in np.unique(start.rays.photo):
-        start.resect(int(photo))
-    if len(start.poses) < 2:
-        return False
-    # from here on the photographs speak, and targets without nominal coordinates join
-    start.points[:] = np.nan
-    start.intersect()
-    return _refined(start)
-
-
 def approximate(
     sensor: Sensor,
     rays: ImageRays,
@@ -243,11 +240,15 @@ def approximate(
         ways += list(_pairs(rays, start.normalised)[:_PAIRS])
         good = 0
         for way in ways:
-            found = _begin(start, way, nominal, free)
-            if found is None:
+            try:
+                if way is not None:
+                    start.begin_with_pair(way)
+                else:
+                    start.begin_with_nominal(np.asarray(nominal, dtype=float))
+                bundle, photos, used = start.network(free)
+            except GeometryError:
                 continue
-            bundle, photos, used = found
-            off = residuals(sensor, bundle, used.in_pixels())
+            off = BundleAdjustment(sensor, used.in_pixels(), free).residuals(bundle)
             median = float(np.median(np.linalg.norm(off, axis=1)))
             # five percent more or fewer image points decide nothing
             missing = round(20 * (1 - len(used) / len(rays)))
@@ -264,23 +265,3 @@ def approximate(
             "targets from clearly different places, and three are needed"
         )
     return best[2:]
-
-
-def _begin(
-    start: _Start, pair: tuple[int, int] | None, nominal: Array | None, free: Index
-) -> tuple[Bundle, list[int], ImageRays] | None:
-    """A network begun with a pair (None: on the nominal coordinates), roughly adjusted, or None."""
-    if pair is not None:
-        done = _from_pair(start, pair)
-    else:
-        done = nominal is not None and _from_nominal(start, np.asarray(nominal, dtype=float))
-    if not done:
-        return None
-    bundle, photos, used = start.bundle()
-    try:
-        for stage in ([0], [0, 1, 2, 3], range(len(bundle.interior))):
-            some = free[np.isin(free, stage)]
-            bundle, _ = solve(start.sensor, bundle, used, some, robust=True, iterations=15)
-    except GeometryError:
-        return None
-    return bundle, photos, used

@@ -37,7 +37,6 @@ from thermocald.photogrammetry.series.covariances import (
     of_correlated,
     of_priors,
     of_slow_targets,
-    offset_cofactors,
     stillness,
     typical_sensitivity,
 )
@@ -48,8 +47,13 @@ from thermocald.photogrammetry.series.estimator import (
     Estimate,
     SeriesEstimator,
 )
-from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, estimate_movement
-from thermocald.photogrammetry.series.movement import STILL, Movement, together
+from thermocald.photogrammetry.series.mount import (
+    FEWEST_EPOCHS,
+    STILL,
+    Movement,
+    estimate_movement,
+    together,
+)
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise, sums_of_squares
 from thermocald.photogrammetry.series.result import (
     Exterior,
@@ -222,20 +226,18 @@ def result(found: Adjusted) -> SeriesAdjustment:
     if series.shown_share(estimate) < NOISE_SHOWN:
         unit, sigma0 = np.maximum(unit, pooled), np.maximum(sigma0, np.sqrt(pooled))
     sigma0[~positive] = np.nan
-    cofactors = all_cofactors(system)
-    relative, level, trend = cofactors.relative, cofactors.level, cofactors.trend
+    relative, level, trend = all_cofactors(system)
     excess, own, sound = np.zeros(16), system.design.own, system.good
     block = (slice(None), own[:, None], own)
-    if s.scale == "posterior":
-        few = series.has_offsets and len(use) < FEW_EPOCHS
-        # what errors of image points have in common in few epochs the offsets take up
-        least = np.maximum(unit, 1.0) if few else unit
-        # What priors contribute is known as well as they are, not as the epoch.
-        bound = of_priors(system)
-        relative[block] -= bound
-        relative *= epoch_variance(least, redundancy, pooled)[:, None, None]
-        relative[block] += pooled * bound
-        level *= pooled
+    few = series.has_offsets and len(use) < FEW_EPOCHS
+    # what errors of image points have in common in few epochs the offsets take up
+    least = np.maximum(unit, 1.0) if few else unit
+    # What priors contribute is known as well as they are, not as the epoch.
+    bound = of_priors(system)
+    relative[block] -= bound
+    relative *= epoch_variance(least, redundancy, pooled)[:, None, None]
+    relative[block] += pooled * bound
+    level *= pooled
     trend *= pooled
     movement = series.movement
     if s.exterior == "series" and len(use) >= FEWEST_EPOCHS:
@@ -246,11 +248,13 @@ def result(found: Adjusted) -> SeriesAdjustment:
             relative[block] += of_common(system, movement.covariance)
         G = typical_sensitivity(system)
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
-    slow = np.zeros((16, 16))
+    slow, pairs = np.zeros((16, 16)), None
     if s.target_noise and len(use) >= ENOUGH_FOR_NOISE:
         pairs = series.pairs(estimate, use)
         if len(pairs):
             relative += of_correlated(system, pairs)
+        else:
+            pairs = None
         slow = of_slow_targets(
             system, slow_errors(estimate.residuals, use), series.testfield.groups
         )
@@ -276,11 +280,11 @@ def result(found: Adjusted) -> SeriesAdjustment:
     return SeriesAdjustment(
         s, values, relative, level, sigma0, redundancy, use, observed & ~use,
         estimate.residuals, estimate.offsets if series.has_offsets else estimate.offsets * np.nan,
-        _sds(offset_cofactors(system) * pooled), tuple(status), tuple(reasons), still,
+        tuple(status), tuple(reasons), still,
         np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
         _sds(by_perspective(system) * pooled), float(np.sqrt(series.field_variance)),
         _outer_noise(series, estimate),
-        _noise_ratio(sigma0, sound), movement, found.choice,
+        _noise_ratio(sigma0, sound), movement, found.choice, slow, pairs,
     )  # fmt: skip
 
 

@@ -5,7 +5,6 @@ Two kinds are kept apart: what differs between epochs, and the level, which all 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,20 +18,14 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.system import SeriesSystem
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
-
-@dataclass(frozen=True, eq=False)
-class SeriesCofactors:
-    """relative (E, 16, 16): to the series; level (16, 16): of what all epochs have in common; trend
-    (16, 16): of what the common unknowns do to a straight line from the first to the last epoch.
-    """
-
-    relative: Array
-    level: Array
-    trend: Array
+_MOST_TAKEN_OFF = 0.6  # of the variance of a combination of parameters
 
 
-def all_cofactors(system: SeriesSystem) -> SeriesCofactors:
-    """The cofactors of all parameters.
+def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
+    """Return the cofactors of all parameters.
+
+    Those (E, 16, 16) relative to the series; of what all epochs have in common (16, 16); and of
+    what the common unknowns do to a straight line from the first to the last epoch (16, 16).
 
     An epoch's parameters depend on the common unknowns by -G; what of G is the same in all
     epochs cancels in differences within the series, the rest is the epoch's own.
@@ -64,7 +57,7 @@ def all_cofactors(system: SeriesSystem) -> SeriesCofactors:
         level = all_level @ all_level.T
     relative = among_all(Q, own)
     relative[~system.good] = 0.0
-    return SeriesCofactors(relative, level, trend)
+    return relative, level, trend
 
 
 def of_slow_targets(system: SeriesSystem, errors: Array, group: Index) -> Array:
@@ -105,13 +98,15 @@ def of_correlated(system: SeriesSystem, pairs: CorrelatedPairs) -> Array:
     design = system.design
     extra = pairs.normal_matrices(system.used(), design.at.A[..., design.own])
     own = system.Q @ extra @ system.Q
-    # Covariances from epochs that do not see the same targets may be indefinite together: drawn
-    # in so that they take at most three fifths off the variance of any combination.
-    root = np.linalg.inv(np.linalg.cholesky(system.Q))
-    least = np.linalg.eigvalsh(root @ own @ np.swapaxes(root, 1, 2))[:, 0]
-    drawn = np.where(system.good, np.minimum(1.0, 0.6 / np.maximum(-least, 1e-9)), 0.0)
-    drawn[least >= 0] = 1.0
-    return among_all(drawn[:, None, None] * own, design.own)
+    # Covariances from epochs that do not see the same targets may be indefinite together: at most
+    # three fifths are taken off the variance of any combination.
+    root = np.linalg.cholesky(system.Q)
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ own @ np.swapaxes(inverse, 1, 2))
+    back = root @ vectors
+    own = (back * np.maximum(values, -_MOST_TAKEN_OFF)[:, None, :]) @ np.swapaxes(back, 1, 2)
+    own[~system.good] = 0.0
+    return among_all(own, design.own)
 
 
 def of_priors(system: SeriesSystem) -> Array:
@@ -153,12 +148,15 @@ def of_common(system: SeriesSystem, covariance: Array) -> Array:
     return part
 
 
-def offset_cofactors(system: SeriesSystem) -> Array:
-    """Cofactors (T, 2) px² of the offsets in x and y; NaN without offsets."""
-    design = system.design
-    if design.offset_prior is None:
-        return np.full((len(design.at.A), 2), np.nan)
-    return np.diag(system.Q_common)[len(design.common) :].reshape(2, -1).T
+def pose_equations(N: Array, b: Array, own: Index, Q: Array) -> tuple[Array, Array]:
+    """Return normal equations (E, 6, 6), (E, 6) of the pose, an epoch's own parameters reduced.
+
+    N (E, 16, 16), b (E, 16); Q (E, p, p): cofactors of the own parameters, the pose held.
+    """
+    C = N[:, own[:, None], EOP_COLUMNS]
+    QC = Q @ C
+    reduced = N[:, EOP, EOP] - np.swapaxes(C, 1, 2) @ QC
+    return reduced, b[:, EOP] - np.einsum("epi,ep->ei", QC, b[:, own])
 
 
 def stillness(system: SeriesSystem, residuals: Array) -> Array:
@@ -166,12 +164,8 @@ def stillness(system: SeriesSystem, residuals: Array) -> Array:
 
     Rao's score test: the gradient by its six parameters, with the epoch's own ones reduced.
     """
-    design = system.design
     b = system.gradient(residuals)
-    C = system.N[:, design.own[:, None], EOP_COLUMNS]
-    QC = system.Q @ C
-    V = system.N[:, EOP, EOP] - np.swapaxes(C, 1, 2) @ QC
-    g = b[:, EOP] - np.einsum("epi,ep->ei", QC, b[:, design.own])
+    V, g = pose_equations(system.N, b, system.design.own, system.Q)
     inverse, good = cofactors(V)
     score = np.einsum("ei,eij,ej->e", g, inverse, g)
     return np.where(good & system.good, score, np.nan)

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
 from thermocald.photogrammetry.epoch.snooping import Rejections
-from thermocald.photogrammetry.series.movement import STILL, Movement
+from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     Partials,
@@ -31,6 +31,7 @@ from thermocald.photogrammetry.series.snooping import (
 )
 from thermocald.photogrammetry.series.system import Design, SeriesSystem, State, offset_weights
 from thermocald.photogrammetry.series.target_noise import (
+    MEDIAN_WORTH,
     CorrelatedPairs,
     correlated_pairs,
     noise_ratios,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.result import SeriesSettings
 
-ENOUGH_FOR_NOISE = 20
+ENOUGH_FOR_NOISE = 10
 """Epochs that show the noise of single targets."""
 
 FEW_EPOCHS = 10
@@ -50,6 +51,7 @@ FEW_EPOCHS = 10
 NOISE_SHOWN = 0.5
 """Share of the redundancy below which residuals show the priors, not the noise: of one epoch."""
 
+_GUESSED = 10.0  # degrees of freedom with which stated noise tells that of a single target
 _MANY = 10.0  # observations for each common unknown: their priors hardly matter any more
 _ITERATIONS = 15
 _SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
@@ -60,7 +62,6 @@ _FIELD_ROUNDS = 4  # of the field's own variance component
 _SAME_FIELD = 0.1  # of it
 _LEAST_TOLD = 0.1  # of an offset by the image points, to count
 _FEWEST_OFFSETS = 8
-_MEDIAN_WORTH = 0.37  # of a degree of freedom in a mean
 _BEYOND_CHANCE = 3.1  # standard deviations
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
 
@@ -86,7 +87,8 @@ class SeriesEstimator:
     variance of unit weight that the priors start with; windows: runs of consecutive epochs, where
     the series is a sample of a longer one; typical: variance of unit weight for epochs too poor to
     tell their own, None: that of these epochs; field_variance: by what the stated covariance of the
-    field's coordinates is multiplied.
+    field's coordinates is multiplied; freedom (T,): degrees of freedom with which each target's
+    noise is known, None: it is as stated.
     """
 
     sensor: Sensor
@@ -101,6 +103,7 @@ class SeriesEstimator:
     windows: tuple[slice, ...] = ()
     typical: float | None = None
     field_variance: float = 1.0
+    freedom: Array | None = None
 
     def adjusted(self, start: State, use: Mask) -> tuple[SeriesEstimator, Estimate, Mask]:
         """Solve, find the gross errors and the targets' own noise; the series with that noise."""
@@ -119,7 +122,7 @@ class SeriesEstimator:
             if s.target_noise and len(use) >= ENOUGH_FOR_NOISE and first_look:
                 series = series.with_target_noise(estimate, use)
                 estimate = series.solve(estimate, use, 1.0)
-                estimate, use = series.snoop(estimate, use, use)
+                estimate, use = series.snoop(estimate, use, offered)
             for _ in range(_FIELD_ROUNDS):
                 variance = series.estimate_field_variance(estimate)
                 if variance is None or abs(variance / series.field_variance - 1.0) < _SAME_FIELD:
@@ -152,7 +155,7 @@ class SeriesEstimator:
         squares = (wx * x * x + wy * y * y + 2.0 * wxy * x * y) / self.variance(estimate)
         ratio = float(np.median(squares[shown] / told[shown])) / (2.0 * np.log(2.0))
         ratio *= self.field_variance
-        chance = 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / (_MEDIAN_WORTH * 2.0 * told[shown].sum()))
+        chance = 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / (MEDIAN_WORTH * 2.0 * told[shown].sum()))
         return ratio if ratio > chance or self.field_variance > 1.0 else None
 
     def _screened(self, start: State, use: Mask) -> Mask:
@@ -213,18 +216,25 @@ class SeriesEstimator:
 
     def with_target_noise(self, estimate: Estimate, use: Mask) -> SeriesEstimator:
         """The series with every target's weights from the scatter of its own residuals."""
-        ratios = noise_ratios(
+        ratios, freedom = noise_ratios(
             estimate.residuals, self.grid.weights, use, self.redundancy_share(use)
         )
         weights = self.grid.weights.copy(order="K")
         weights[..., :2] /= ratios
         weights[..., 2] /= np.sqrt(ratios.prod(axis=1))
-        return replace(self, grid=ObservationGrid(self.grid.points, weights))
+        return replace(self, grid=ObservationGrid(self.grid.points, weights), freedom=freedom)
 
     def pairs(self, estimate: Estimate, use: Mask) -> CorrelatedPairs:
         return correlated_pairs(
             estimate.residuals, use, self.testfield.groups, self.redundancy_share(use)
         )
+
+    @property
+    def _noise_freedom(self) -> Array | None:
+        """Degrees of freedom (T,) with which the noise of each target is known; None: as stated."""
+        if self.freedom is None and self.s.target_noise:
+            return np.full(len(self.testfield), _GUESSED)
+        return self.freedom
 
     def redundancy_share(self, use: Mask) -> float:
         """Redundancy over observations: what the parameters have left of the residuals."""
@@ -246,7 +256,9 @@ class SeriesEstimator:
             alpha = self.s.snooping_alpha
             if self.shown_share(estimate) < NOISE_SHOWN:
                 alpha **= 2  # errors of the field look like gross ones: only those beyond doubt
-            keep = snoop_series(tests, offered, use, self.s.unknowns, alpha, typical)
+            keep = snoop_series(
+                tests, offered, use, self.s.carried, alpha, typical, self._noise_freedom
+            )
             keep = rejections.settle(use, keep)
             previous, variance = variance, self.variance(estimate)
             settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
@@ -269,8 +281,9 @@ class SeriesEstimator:
             if typical is None:  # of all epochs, at the first look
                 typical = typical_variance(tests, use)
             keep = snoop_series(
-                tests, offered[part], use[part], self.s.unknowns, self.s.snooping_alpha, typical
-            )
+                tests, offered[part], use[part], self.s.carried, self.s.snooping_alpha, typical,
+                self._noise_freedom,
+            )  # fmt: skip
             keep = rejections.settle(use[part], keep, part)
             changed = (keep != use[part]).any(axis=1)
             part = rows = rows[changed]

@@ -20,8 +20,11 @@ import numpy as np
 
 from thermocald.photogrammetry.field.planes import FEWEST_ON_A_SHEET
 from thermocald.photogrammetry.linalg import inverse_of_determined
+from thermocald.photogrammetry.series.normals import ObservationGrid
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
@@ -36,12 +39,17 @@ LEAST_PX = 0.02
 """Movements below are not worth a word."""
 OTHERS = 8.0
 """Times what most of the others do."""
+MOST_TARGETS = 0.2
+"""Share of the targets: so many do not wander by themselves."""
+FEW_TARGETS = 100
+"""Of which some that wander may hide each other."""
 
 _ORDERS = 14
 _PASSES = 3
 _MOST = 80.0  # per cent of the targets, which stay below what a single one does
 _SEEN = 0.3  # of the epochs: of what wanders fast, many are taken for gross errors
-_MOST_TARGETS = 0.2  # of the targets: so many do not wander by themselves
+_ON_TRIAL = 4  # so many
+_LEAST_FREE = 0.05  # redundancy of a coordinate
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +141,22 @@ def without(s: FieldSeries, rows: Rows) -> FieldSeries:
     return replace(s, weights=weights)
 
 
+def taken_off(
+    grid: ObservationGrid, moved: Sequence[FieldMovement], rows: slice = slice(None)
+) -> ObservationGrid:
+    """Return observations as if the field had stood still: boards back, wandering targets out.
+
+    rows: the grid's epochs among those that told of the movements.
+    """
+    points, wandering = grid.points.copy(order="K"), np.zeros(grid.observed.shape, dtype=bool)
+    for m in moved:
+        if m.kind == "wander":
+            wandering[:, m.rows] = True
+        else:
+            points[:, m.rows] -= m.trajectory[rows, None, None] * m.image
+    return ObservationGrid(points, grid.weights).reject(wandering)
+
+
 def put_back(s: FieldSeries, movement: FieldMovement) -> FieldSeries:
     """The series as if something had not moved."""
     residuals = s.residuals.copy()
@@ -141,36 +165,106 @@ def put_back(s: FieldSeries, movement: FieldMovement) -> FieldSeries:
 
 
 def wandering_targets(s: FieldSeries) -> list[FieldMovement]:
-    """Single targets whose slow residuals are far beyond those of the others on their board."""
+    """Single targets whose slow residuals are far beyond those of the others on their board.
+
+    A few among few targets bend the cameras until none stands out: such are left out together.
+    """
     if len(s.times) < FEWEST_EPOCHS:
         return []
     found: list[FieldMovement] = []
-    every = int(s.used.any(axis=0).sum())
-    for _ in range(max(int(_MOST_TARGETS * every), 1)):
+    most = MOST_TARGETS * int(s.used.any(axis=0).sum())
+    for _ in range(max(int(most), 1)):
         free = with_free_cameras(s)
-        w = free.w
-        slow = cosines(free.times)
-        v = np.nan_to_num(free.residuals) * np.sqrt(w)
-        power = np.sum(np.einsum("je,etk->jtk", slow, v) ** 2, axis=(0, 2))
-        count = np.sum(w[..., 0] > 0, axis=0)
-        there = count >= max(FEWEST_EPOCHS, _SEEN * len(free.times))
+        there, power = _often_seen(free), _slow_power(free)
         if not there.any():
             break
-        power = np.where(there, power, 0.0)
-        usual = np.full(len(power), float(np.percentile(power[there], _MOST)))
-        for board in np.unique(s.boards[there & (s.boards >= 0)]):
-            usual[s.boards == board] = np.percentile(power[there & (s.boards == board)], _MOST)
-        power = np.where(power > np.maximum(OTHERS * usual, GAIN), power, 0.0)
-        row = int(np.argmax(power))
-        smooth = slow.T @ np.einsum("je,ek->jk", slow, np.nan_to_num(free.residuals[:, row]))
-        size = float(np.sqrt(np.mean(np.sum(smooth**2, axis=1)) / 2))
-        if not power[row] or size < LEAST_PX:
+        power = np.where(power > _usual_limits(free, power, there), power, 0.0)
+        rows = [int(np.argmax(power))]
+        if not power[rows[0]] or _size_px(_slow_movement(free, rows[0])) < LEAST_PX:
+            rows = _find_masked(s, min(_ON_TRIAL, int(most) - len(found)))
+            free = with_free_cameras(without(s, np.array(rows, dtype=int)))
+        if not rows:
             break
-        found.append(_wanderer(free, row, smooth, float(power[row])))
-        s = without(s, found[-1].rows)
-        if len(found) > _MOST_TARGETS * every:
+        found += [_wanderer(s, free, row) for row in rows]
+        s = without(s, np.array(rows))
+        if len(found) > most:
             return []
     return found
+
+
+def _find_masked(s: FieldSeries, most: int) -> list[int]:
+    """Find targets, `most` at most, that stand out only where all of them are left out."""
+    rows, found = list[int](), list[int]()
+    if s.used.any(axis=0).sum() > FEW_TARGETS:
+        return found
+    free = with_free_cameras(s)
+    own = _own_power(free, s.w, bent=True)
+    for _ in range(most):
+        rows.append(int(np.argmax(np.where(_often_seen(free), own, 0.0))))
+        free = with_free_cameras(without(s, np.array(rows)))
+        there = _often_seen(free)
+        if there.sum() < _FEWEST_OTHERS:
+            break
+        own = _own_power(free, free.w, bent=True)
+        limits = _usual_limits(free, own, there)[rows]
+        stand_out = _own_power(free, s.w, bent=False)[rows] > limits
+        if stand_out.all() and all(_size_px(_slow_movement(free, r)) >= LEAST_PX for r in rows):
+            found = list(rows)
+    return found
+
+
+def _often_seen(s: FieldSeries) -> NDArray[np.bool_]:
+    """Which targets (T,) are seen in so many epochs that they may show a wander."""
+    out: NDArray[np.bool_] = s.used.sum(axis=0) >= max(FEWEST_EPOCHS, _SEEN * len(s.times))
+    return out
+
+
+def _slow_power(s: FieldSeries) -> Array:
+    """χ² (T,) of the slow residuals of each target."""
+    v = np.nan_to_num(s.residuals) * np.sqrt(s.w)
+    out: Array = np.sum(np.einsum("je,etk->jtk", cosines(s.times), v) ** 2, axis=(0, 2))
+    return out
+
+
+def _own_power(s: FieldSeries, w: Array, bent: bool) -> Array:
+    """χ² (T,) that each target's slow movement explains by itself.
+
+    w (E, T, 2): weights; bent: whether the target itself bends the camera with the others, or they
+    alone give it.
+    """
+    flat = s.A.reshape(-1, s.A.shape[-1])
+    N = weighted_products(s.w.mean(axis=0).reshape(1, -1), flat, flat)[0]
+    held = 1e-9 * np.trace(N) + 1e-12
+    root = np.sqrt(w.mean(axis=0))
+    J = s.A * root[..., None]
+    of_camera = J @ np.linalg.inv(N + held * np.eye(len(N))) @ J.swapaxes(1, 2)
+    values, vectors = np.linalg.eigh(np.eye(2) + (-of_camera if bent else of_camera))
+    seen = np.isfinite(s.residuals)
+    level = np.nan_to_num(s.residuals).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    v = np.where(seen, s.residuals - level, 0.0) * root
+    slow = np.einsum("je,etk,tkl->jtl", cosines(s.times), v, vectors)
+    out: Array = np.sum(slow**2 / np.maximum(values, _LEAST_FREE), axis=(0, 2))
+    return out
+
+
+def _usual_limits(s: FieldSeries, power: Array, there: NDArray[np.bool_]) -> Array:
+    """What each target's χ² (T,) has to exceed for a wander, from the others of its board."""
+    limits = np.full(len(power), float(np.percentile(power[there], _MOST)))
+    for board in np.unique(s.boards[there & (s.boards >= 0)]):
+        limits[s.boards == board] = np.percentile(power[there & (s.boards == board)], _MOST)
+    out: Array = np.where(there | ~s.used.any(axis=0), np.maximum(OTHERS * limits, GAIN), np.inf)
+    return out
+
+
+def _slow_movement(s: FieldSeries, row: int) -> Array:
+    """The slow part of a target's residuals (E, 2) px."""
+    slow = cosines(s.times)
+    out: Array = slow.T @ np.einsum("je,ek->jk", slow, np.nan_to_num(s.residuals[:, row]))
+    return out
+
+
+def _size_px(smooth: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(smooth**2, axis=1)) / 2))
 
 
 def with_free_cameras(s: FieldSeries) -> FieldSeries:
@@ -207,17 +301,21 @@ def cosines(times: Array) -> Array:
     return out
 
 
-def _wanderer(s: FieldSeries, row: int, smooth: Array, gain: float) -> FieldMovement:
+def _wanderer(s: FieldSeries, free: FieldSeries, row: int) -> FieldMovement:
+    """Describe a target that wanders; s: the series with it, free: with free cameras."""
+    smooth = _slow_movement(free, row)
     inverse = np.linalg.pinv(s.B[row])
     moved = smooth @ inverse.T
     size = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
     w = s.w[:, row]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
     sd = sigma * float(np.sqrt(np.mean(np.sum(inverse**2, axis=0)))) / np.sqrt(len(s.times))
-    rms = float(np.sqrt(np.mean(np.sum(smooth**2, axis=1)) / 2))
+    slow = np.einsum(
+        "je,ek->jk", cosines(s.times), np.nan_to_num(free.residuals[:, row]) * np.sqrt(w)
+    )
     return FieldMovement(
         "wander", np.array([row]), (s.names[row],), 0, 0.0, 0.0, np.zeros(len(s.times)),
-        np.zeros((1, 2)), size, float(sd), rms, gain,
+        np.zeros((1, 2)), size, float(sd), _size_px(smooth), float(np.sum(slow**2)),
     )  # fmt: skip
 
 

@@ -1,125 +1,386 @@
-"""Adjustment of a series of any length, in blocks of epochs and constant memory.
+"""Adjustment of a series of any length, in blocks of epochs, or of epochs as they come.
 
 A sample of the epochs, runs of neighbours from the first to the last, is adjusted as a whole series
-(`adjustment`). The blocks then follow one after the other with what it says (`known`). Each gives
-its epochs' own parameters, and adds to the normal equations of what is common (`CommonSums`). What
-these change of the common unknowns is put on the epochs by its mean where single epochs differ by
-less than a twentieth of their standard deviation; else there is another pass.
+(`adjustment`). It says how the camera stands, how far its mount moves, what single targets are
+measured to and where they are off. Any other epoch is then adjusted with that known
+(`KnownSeries`), in blocks, or one by one. A block gives its epochs' own parameters, and adds to the
+sums of what all have in common (`CommonSums`): its normal equations with its own parameters
+reduced. At the epochs' own solution the reduced right-hand side is the plain gradient, which is
+summed epoch by epoch. The matrix is that of the mean weights of all epochs that see the same
+targets; it differs from the sum by the square of how much their weights vary, and costs one
+reduction per kind of epoch. What these sums change of the common unknowns is put on the epochs by
+its mean where single epochs differ by less than a twentieth of their standard deviation; else there
+is another pass.
 
 A block needs nothing of the others, so that blocks may be adjusted on several processes. The result
-is one row per epoch on disk, and a sample in full.
+is one row per epoch, and a sample in full.
 
 Source: Helmert blocking, Wolf, H. (1978): The Helmert block method.
 """
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.parallel import in_order
-from thermocald.photogrammetry.linalg import root_of
-from thermocald.photogrammetry.series.adjustment import Adjusted, adjusted, result
-from thermocald.photogrammetry.series.blocks import (
-    ColumnSpool,
+from thermocald.photogrammetry.camera.camera_model import EOP
+from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
+from thermocald.photogrammetry.series.adjustment import Adjusted, adjusted, epoch_variance, result
+from thermocald.photogrammetry.series.covariances import (
+    line_weights,
+    of_correlated,
+    of_priors,
+    stillness,
+)
+from thermocald.photogrammetry.series.normals import (
     ObservationBlocks,
+    ObservationGrid,
+    among_all,
     gathered,
-    give_back,
+    normal_matrices,
+    planes,
     spread_windows,
+    sums_of_squares,
 )
-from thermocald.photogrammetry.series.covariances import line_weights, of_slow_targets, stillness
-from thermocald.photogrammetry.series.estimator import ENOUGH_FOR_NOISE
-from thermocald.photogrammetry.series.known import (
-    AdjustedBlock,
-    CommonSums,
-    KnownSeries,
-    Solved,
-    level_of,
+from thermocald.photogrammetry.series.result import (
+    EpochRows,
+    SeriesAdjustment,
+    SeriesSettings,
+    enough_targets,
+    judge,
 )
-from thermocald.photogrammetry.series.normals import ObservationGrid, normal_matrices
-from thermocald.photogrammetry.series.target_noise import slow_errors
+from thermocald.photogrammetry.series.system import Design, SeriesSystem, State
 
 if TYPE_CHECKING:
-    from thermocald.arrays import Array, Index
+    from collections.abc import Callable
+
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
         Sensor,
     )
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.photogrammetry.series.result import SeriesAdjustment, SeriesSettings
+    from thermocald.photogrammetry.series.estimator import Estimate, SeriesEstimator
+    from thermocald.photogrammetry.series.mount import Movement
+    from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
+
+    Kind = tuple[Index, SeriesSystem, Array]
+
+
+_FEW = 0.02  # share of a block's epochs that is worth a matrix of its own
+_MOST = 12  # kinds of epochs in a block
+_MOST_PATTERNS = 300  # of targets seen, over the series; the epochs of others count together
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """Consecutive epochs of a long series from epoch `first` on, as adjusted.
-
-    values, variance (n, 16): NaN and 0 where there is no result; status, reasons: of each epoch;
-    sigma0, redundancy, stillness (n,): NaN where there is none; observed, rejected (n,): how many
-    targets; sums: what the block adds to those of the series.
+class Shared:
+    """What is known of the common unknowns: offsets (T, 2) px, pose (6,), their cofactors (q + 2T,
+    q + 2T), the mean G (p, q + 2T) by which own parameters follow an error of theirs; used: how
+    many observations they use up.
     """
 
-    first: int
-    values: Array
-    variance: Array
+    offsets: Array
+    pose: Array
+    cofactors: Array
+    mean: Array
+    used: float
+
+    def level(self, design: Design) -> Array:
+        """Return the cofactors (16, 16) of what the common unknowns do to all epochs alike."""
+        whole = np.zeros((16, design.width))
+        whole[design.common, np.arange(len(design.common))] = 1.0
+        whole[design.own] -= self.mean
+        level: Array = whole @ self.cofactors @ whole.T
+        return level
+
+
+@dataclass(eq=False)
+class CommonSums:
+    """The sums over the blocks so far.
+
+    design: the unknowns; gradient (q + 2T,); ends: the first and the last epoch; patterns: of the
+    epochs that see the same targets how many there are, sums of their numbers and of these squared,
+    of the gradients (p,) of their own parameters, and of their weights (T, 3), one after the other.
+    """
+
+    design: Design
+    gradient: Array = field(init=False)
+    ends: tuple[int, int] | None = None
+    patterns: dict[bytes, Array] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.gradient = np.zeros(self.design.width)
+
+    def add(self, first: int, system: SeriesSystem, left: Array, right: Array) -> None:
+        """Add a block that begins at epoch `first`.
+
+        system: of the block, its common unknowns held; left (E, T, 2) px: residuals; right (E, p):
+        gradient of the own parameters, which is 0 at their solution.
+        """
+        good = np.flatnonzero(system.good)
+        if not len(good) or not self.design.width:
+            return
+        t = (first + good).astype(np.float64)
+        self.ends = int(t[0]), int(t[-1])
+        w = system.used(good)
+        self.gradient += self.design.gradient(w, left[good])
+        seen, of = np.unique(np.packbits(system.use[good], axis=1), axis=0, return_inverse=True)
+        for k, bits in enumerate(seen):
+            at = np.flatnonzero(of.ravel() == k)
+            counts = [len(at), t[at].sum(), t[at] @ t[at]]
+            pull, weights = right[good[at]].sum(axis=0), w[at].sum(axis=0)
+            self._count(bits.tobytes(), np.concatenate([counts, pull, weights.ravel()]))
+
+    def merge(self, later: CommonSums) -> None:
+        """Add the sums over later blocks."""
+        if later.ends is None:
+            return
+        self.ends = (self.ends or later.ends)[0], later.ends[1]
+        self.gradient += later.gradient
+        for bits, part in later.patterns.items():
+            self._count(bits, part)
+
+    def _count(self, bits: bytes, part: Array) -> None:
+        """Add epochs that see the same targets; those of rare patterns together."""
+        if bits not in self.patterns and len(self.patterns) >= _MOST_PATTERNS:
+            bits = b""
+        self.patterns[bits] = self.patterns.get(bits, 0.0) + part
+
+    def solved(self, known: Shared) -> tuple[Shared, Array, Array, float]:
+        """Return what is known of the common unknowns with these sums, and what that changes.
+
+        By how much own parameters (p,) change in the mean; by how much (p, q + 2T) the common
+        unknowns tilt a straight line from the first to the last epoch; by how many of their
+        standard deviations single kinds of epochs change otherwise.
+        """
+        design, p = self.design, len(self.design.own)
+        q, width, prior = len(design.common), design.width, design.prior_matrix()
+        sums = np.array(list(self.patterns.values())).reshape(-1, 3 + p + 3 * len(design.at.A))
+        count, times, squares = sums[:, :3].T
+        right, weights = sums[:, 3 : 3 + p], sums[:, 3 + p :].reshape(len(sums), -1, 3)
+        kinds = _typical(design, weights / count[:, None, None])
+        gradient = self.gradient + design.common_pull(known.pose, known.offsets)
+        mean, tilt = np.zeros((2, p, width))
+        for part, C in kinds.couplings():
+            G = kinds.Q[part] @ C
+            gradient -= np.einsum("kpi,kp->i", G, right[part])
+            mean += np.tensordot(count[part], G, axes=1)
+            tilt += np.tensordot(times[part], G, axes=1)
+        n = max(count.sum(), 1.0)
+        mean /= n
+        cofactors = inverse_of_determined(prior + kinds.common_normals(count))
+        change = cofactors @ gradient
+        offsets = known.offsets
+        if design.offset_prior is not None:
+            offsets = offsets + change[q:].reshape(2, -1).T
+        rest = 0.0
+        for part, C in kinds.couplings():
+            sd = np.sqrt(np.diagonal(kinds.Q[part], axis1=1, axis2=2))
+            other = (kinds.Q[part] @ C - mean) @ change
+            rest = max(rest, float(np.max(np.abs(other) / sd)))
+        middle = times.sum() / n
+        spread = squares.sum() - n * middle**2
+        line = np.zeros((p, width))
+        if spread > 0 and self.ends is not None:
+            line = (tilt - middle * n * mean) / spread * (self.ends[1] - self.ends[0])
+        pose = known.pose + change[:q] if q else known.pose
+        used = float(width - np.einsum("ij,ji->", cofactors, prior))
+        return Shared(offsets, pose, cofactors, mean, used), -mean @ change, line, rest
+
+
+def _typical(design: Design, weights: Array) -> SeriesSystem:
+    """Return the system of epochs with weights (K, T, 3), without the priors of what is common."""
+    return SeriesSystem.formed(design.without_common_priors(), weights, weights[..., 0] > 0)
+
+
+def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
+    """Sort the epochs of a block: the frequent ones by what they see, the others together.
+
+    design: of the series; system: of the block, its common unknowns held.
+    """
+    good = np.flatnonzero(system.good)
+    if not len(good):
+        return []
+    seen = np.packbits(system.use[good], axis=1)
+    _, of, count = np.unique(seen, axis=0, return_inverse=True, return_counts=True)
+    of = of.ravel()
+    often = np.argsort(-count, kind="stable")[:_MOST]
+    often = often[count[often] >= max(_FEW * len(good), 2)]
+    groups = [good[of == label] for label in often]
+    rest = good[~np.isin(of, often)]
+    if len(rest):
+        groups.append(rest)
+    out = []
+    for rows in groups:
+        one = _typical(design, system.used(rows).mean(axis=0, keepdims=True))
+        if one.good[0]:
+            G = np.zeros((len(design.own), design.width))
+            for _, C in one.couplings():
+                G = one.Q[0] @ C[0]
+            out.append((rows, one, G))
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedBlock:
+    """Epochs adjusted with what is known of their series.
+
+    use (E, T): which points took part; covariance (E, 16, 16): without what all epochs have in
+    common; status, reasons: of each epoch; unit, redundancy, sigma0 (E,): variance of unit weight
+    by the weights in use, its degrees of freedom, and the noise against the stated sigmas.
+    """
+
+    estimate: Estimate
+    use: Mask
+    covariance: Array
     status: list[str]
     reasons: list[str]
-    sigma0: Array
+    unit: Array
     redundancy: Array
-    stillness: Array
-    observed: Index
-    rejected: Index
-    sums: CommonSums
+    sigma0: Array
+
+    def sums(self, first: int, design: Design) -> CommonSums:
+        """Return what the block, which begins at epoch `first`, adds to the sums of its series."""
+        sums, estimate = CommonSums(design), self.estimate
+        right = estimate.system.own_gradient(estimate.residuals, estimate)
+        sums.add(first, estimate.system, estimate.residuals, right)
+        return sums
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
-    """What adjusts the blocks of a series of so many epochs: known, and slow (16, 16), covariance
-    of a straight line over the series from slow errors of targets.
+class KnownSeries:
+    """What epochs adjusted together say of their series.
+
+    estimator: as it adjusts further epochs, the common unknowns held; design: the unknowns of the
+    series; shared: the common ones; excess (16,): variance by which epochs scatter beyond theirs;
+    ratios (T, 3): by what weights are multiplied; middle (16,): where epochs start; pairs,
+    movement: errors that targets share, and the mount's; slow (16, 16): covariance of a straight
+    line over the series from slow errors of targets.
     """
 
-    known: KnownSeries
-    epochs: int
+    estimator: SeriesEstimator
+    design: Design
+    shared: Shared
+    excess: Array
+    ratios: Array
+    middle: Array
+    pairs: CorrelatedPairs | None
+    movement: Movement
     slow: Array
 
-    def adjusted(self, first: int, grid: ObservationGrid) -> Block:
-        """The block of epochs from `first` on."""
-        known = self.known
-        block = known.adjusted(grid, self.epochs)
-        estimate, use, system = block.estimate, block.use, block.estimate.system
-        sums = CommonSums(known.design)
-        sums.add(first, system, estimate.residuals, block.right)
-        relative = known.covariance(block, known.shared.mean)
-        # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
-        if self.slow.any():
-            line = (first + np.arange(len(grid))) / max(self.epochs - 1, 1) - 0.5
-            relative += (line * system.good)[:, None, None] ** 2 * self.slow
-        status, reasons = known.judged(block, relative)
-        ok = np.array([word == "ok" for word in status], dtype=bool)
-        return Block(
-            first, np.where(ok[:, None], estimate.values, np.nan),
-            np.where(ok[:, None], np.diagonal(relative, axis1=1, axis2=2), 0.0), status, reasons,
-            np.where(ok, block.sigma0, np.nan), block.redundancy, self._stillness(block),
-            use.sum(axis=1), (grid.observed & ~use).sum(axis=1), sums,
+    @classmethod
+    def of(cls, found: Adjusted, sample: SeriesAdjustment) -> KnownSeries:
+        """Collect what adjusted epochs say of a series."""
+        series, estimate = found.series, found.estimate
+        system, unit = estimate.system, series.variance(estimate)
+        at = system.design.at
+        design = series.design(at, unit)
+        sums = CommonSums(design)
+        sums.add(0, system, estimate.residuals, np.zeros((len(found.use), len(design.own))))
+        shared = Shared(
+            estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
+            system.common_share(),
+        )  # fmt: skip
+        shared = replace(shared, mean=sums.solved(shared)[0].mean)
+        good = sample.ok
+        middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
+        T = series.grid.points.shape[1]
+        none = ObservationGrid(planes(2, 0, T), planes(3, 0, T))
+        held = replace(
+            series, grid=none, stated=none.weights, held=at, unit=unit, windows=(), typical=unit
+        )
+        return cls(
+            held, design, shared, sample.excess_sd**2, _ratios(series), middle,
+            sample.pairs, sample.movement, sample.slow,
         )  # fmt: skip
 
-    def _stillness(self, block: AdjustedBlock) -> Array:
-        """Chi-square (n,) of each epoch's pose being the series', NaN where epochs have poses."""
-        if self.known.s.exterior != "series":
-            return np.full(len(block.grid), np.nan)
-        system = block.estimate.system
-        N = normal_matrices(system.used(), system.design.at.A)
-        score = stillness(replace(system, N=N), block.estimate.residuals)
-        still: Array = score / np.where(block.redundancy > 0, block.unit, 1.0)
-        return still
+    @property
+    def s(self) -> SeriesSettings:
+        """How the series is adjusted."""
+        return self.estimator.s
+
+    @property
+    def unit(self) -> float:
+        """Variance of unit weight."""
+        return self.estimator.unit
+
+    def adjusted(
+        self, grid: ObservationGrid, epochs: int, line: Array | None = None
+    ) -> AdjustedBlock:
+        """Adjust epochs.
+
+        epochs: how many there are, which the common unknowns rest on; line (E,): where in the
+        series each is, from -0.5 for the first of all to 0.5 for the last.
+        """
+        s, shared = self.s, self.shared
+        weighted = ObservationGrid(grid.points, grid.weights * self.ratios)
+        values = np.tile(self.middle, (len(grid), 1))
+        if len(self.design.common):
+            values[:, EOP] = shared.pose
+        held, estimate, use = replace(self.estimator, grid=weighted, stated=grid.weights).adjusted(
+            State(values, shared.offsets, shared.pose),
+            grid.observed & enough_targets(grid, s)[:, None],
+        )
+        system = estimate.system
+        vPv, redundancy = held.sums(estimate)
+        redundancy = redundancy - shared.used / epochs
+        positive = redundancy > 0
+        unit = vPv / np.where(positive, redundancy, 1.0)
+        stated = sums_of_squares(grid.weights, estimate.residuals, system.use)
+        covariance = self._covariance(system, epoch_variance(unit, redundancy, self.unit))
+        if line is not None and self.slow.any():
+            # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
+            covariance += (line * system.good)[:, None, None] ** 2 * self.slow
+        status, reasons = judge(
+            held.sensor, held.testfield, grid, s, estimate.values, use, system.good, covariance,
+            unit / self.unit, redundancy,
+        )  # fmt: skip
+        return AdjustedBlock(
+            estimate, use, covariance, status, reasons, unit, redundancy,
+            np.sqrt(stated / np.where(positive, redundancy, np.nan)),
+        )  # fmt: skip
+
+    def _covariance(self, system: SeriesSystem, unit: Array) -> Array:
+        """Return covariances (E, 16, 16) of epochs without what all epochs have in common.
+
+        unit (E,): variance of unit weight that scales each.
+        """
+        s, own = self.s, self.design.own
+        mine, kinds = system.Q.copy(), _kinds_of(self.design, system)
+        for rows, _, G in kinds:
+            away = G - self.shared.mean
+            mine[rows] += away @ self.shared.cofactors @ away.T
+        # What priors contribute is known as well as they are, not as the epoch.
+        bound = of_priors(system) if system.design.own_prior.any() else 0.0
+        mine -= bound
+        mine *= unit[:, None, None]
+        mine += self.unit * bound
+        for rows, one, G in kinds:
+            if s.exterior == "series" and self.movement.covariance.any():
+                swayed = G[:, :6]
+                mine[rows] += swayed @ self.movement.covariance @ swayed.T
+            if self.pairs is not None:
+                mine[rows] += of_correlated(one, self.pairs)[0][np.ix_(own, own)]
+        mine += np.diag(self.excess[own])
+        mine[~system.good] = 0.0
+        return among_all(mine, own)
 
 
-def adjusted_block(blocks: Blocks, block: tuple[int, ObservationGrid]) -> Block:
-    """A block from its first epoch and its observations, for `parallel.in_order`."""
-    return blocks.adjusted(*block)
+def _ratios(series: SeriesEstimator) -> Array:
+    """Return by what the weights of each target (T, 3) are multiplied, from its own noise."""
+    seen = series.stated[..., 0] > 0
+    ratios = np.ones((seen.shape[1], 3))
+    for k in (0, 1):
+        ratio = series.grid.weights[..., k] / np.where(seen, series.stated[..., k], 1.0)
+        ratio = np.where(seen, ratio, 0.0).max(axis=0, initial=0.0)
+        ratios[:, k] = np.where(ratio > 0, ratio, 1.0)
+    ratios[:, 2] = np.sqrt(ratios[:, 0] * ratios[:, 1])
+    return ratios
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,61 +392,12 @@ class LongAdjustment:
     passes: how often the observations were read.
     """
 
-    rows: RowWriter
+    rows: EpochRows
     level_sd: Array
     trend_sd: Array
     sample: SeriesAdjustment
     sampled: Index
     passes: int
-
-
-class RowWriter:
-    """The rows of a long series.
-
-    values, sd (E, 16): NaN where an epoch has no result or a parameter was held, on disk (`release`
-    takes what was used of them out of memory); sigma0, redundancy, stillness (E,); observed,
-    rejected (E,): how many targets; ok (E,): epochs with a result; status, reasons: E words and
-    sentences, "" where it has one.
-    """
-
-    def __init__(self, epochs: int) -> None:
-        self._spools = ColumnSpool(epochs, 16), ColumnSpool(epochs, 16)
-        self.values, self.sd = (spool.array for spool in self._spools)
-        self.sigma0, self.redundancy, self.stillness = np.full((3, epochs), np.nan)
-        self.observed, self.rejected = np.zeros((2, epochs), dtype=np.int32)
-        self.ok = np.zeros(epochs, dtype=bool)
-        self.status, self.reasons = [""] * epochs, [""] * epochs
-
-    def put(self, block: Block) -> None:
-        """The epochs of a block."""
-        here = slice(block.first, block.first + len(block.values))
-        self.values[here] = block.values
-        self.sd[here] = np.sqrt(np.where(block.variance > 0, block.variance, np.nan))
-        self.ok[here] = [word == "ok" for word in block.status]
-        # each text once, however many epochs have it
-        self.status[here] = map(sys.intern, block.status)
-        self.reasons[here] = map(sys.intern, block.reasons)
-        self.sigma0[here], self.redundancy[here] = block.sigma0, block.redundancy
-        self.stillness[here] = block.stillness
-        self.observed[here], self.rejected[here] = block.observed, block.rejected
-
-    def shift(self, columns: Index, change: Array) -> None:
-        """Add a change (k,) to some parameters of all epochs."""
-        for column, size in zip(columns, change, strict=True):
-            self.values[:, column] += size
-            self.release()
-
-    def widen(self, columns: Index, variance: Array) -> None:
-        """Add variances (k,) to some parameters of all epochs with a result."""
-        for column, size in zip(columns, variance, strict=True):
-            old = np.nan_to_num(self.sd[:, column])
-            self.sd[:, column] = np.where(self.ok, np.sqrt(old**2 + size), np.nan)
-            self.release()
-
-    def release(self) -> None:
-        """Take the values on disk out of memory."""
-        for spool in self._spools:
-            spool.release()
 
 
 _TOGETHER_POINTS = 1_300_000  # a day of 150 targets: 200 MB
@@ -195,7 +407,7 @@ _SAME = 0.05  # standard deviations that the last pass may leave an epoch withou
 
 
 def together_at_most(targets: int) -> int:
-    """How many epochs of so many targets are adjusted at once."""
+    """Return how many epochs of so many targets are adjusted at once."""
     wanted = _TOGETHER_POINTS // max(targets, 1)
     return min(max(wanted, _FEWEST_TOGETHER), _MOST_TOGETHER)
 
@@ -209,75 +421,96 @@ def adjust_long_series(
     settings: SeriesSettings,
     together: int | None = None,
     jobs: int = 1,
+    advance: Callable[[int], None] | None = None,
 ) -> LongAdjustment:
     """Adjust a series of any length, from start values good to a few per cent.
 
     together: epochs of the sample, by default as many as a day of 150 targets has; jobs: processes
-    that adjust blocks, with the same bits for any number. Never raises for data: an epoch without a
-    result has a status and a reason.
+    that adjust blocks, with the same bits for any number; advance: receives how many epochs the
+    first pass has done. Never raises for data: an epoch without a result has a status and a reason.
     """
-    windows = spread_windows(len(source), together or together_at_most(len(testfield)))
-    sample = gathered(source, windows)
-    lengths = [w.stop - w.start for w in windows]
-    ends = np.cumsum(lengths)
-    inside = tuple(slice(int(e) - n, int(e)) for e, n in zip(ends, lengths, strict=True))
+    epochs = len(source)
+    windows = spread_windows(epochs, together or together_at_most(len(testfield)))
     start = np.concatenate([interior.as_array(), exterior.as_array()])
-    found = adjusted(sensor, testfield, sample, start, settings, inside if len(inside) > 1 else ())
-    rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
-    whole = result(found)
-    blocks, out = _known(found, whole, len(source)), RowWriter(len(source))
-    for turn in range(1, _PASSES + 1):
-        solved = _walk(blocks, source, out, jobs).solved(blocks.known.shared)
-        if solved.rest <= _SAME or turn == _PASSES:
+    known, sample = _adjust_sample(sensor, testfield, source, windows, start, settings)
+    rows = EpochRows.empty(epochs)
+    for passes in range(1, _PASSES + 1):
+        sums = CommonSums(known.design)
+        for first, block, part in in_order(_adjust_block, (known, epochs), source.blocks(), jobs):
+            rows.put(first, block)
+            sums.merge(part)
+            if advance is not None and passes == 1:
+                advance(len(block.values))
+        shared, own, line, rest = sums.solved(known.shared)
+        if rest <= _SAME or passes == _PASSES:
             break
-        blocks = replace(blocks, known=replace(blocks.known, shared=solved.shared))
-    give_back()
-    return _finished(blocks, solved, out, whole, rows, turn)
+        known = replace(known, shared=shared)
+    level, trend = _carry(known, replace(known, shared=shared), own, line, rows)
+    sampled = np.concatenate([np.arange(w.start, w.stop) for w in windows])
+    return LongAdjustment(rows, level, trend, sample, sampled, passes)
 
 
-def _known(found: Adjusted, sample: SeriesAdjustment, epochs: int) -> Blocks:
-    """What a sample of a series of so many epochs says."""
-    series, estimate, slow = found.series, found.estimate, np.zeros((16, 16))
-    if series.s.target_noise and len(found.use) >= ENOUGH_FOR_NOISE:
-        errors = slow_errors(estimate.residuals, found.use)
-        slow = of_slow_targets(estimate.system, errors, series.testfield.groups)
-    return Blocks(KnownSeries.of(found, sample)[0], epochs, slow)
+def _adjust_sample(
+    sensor: Sensor, testfield: TestField, source: ObservationBlocks, windows: tuple[slice, ...],
+    start: Array, settings: SeriesSettings,
+) -> tuple[KnownSeries, SeriesAdjustment]:  # fmt: skip
+    """Adjust the epochs of some windows together: what they say of the others, and the result."""
+    ends = np.cumsum([0, *(w.stop - w.start for w in windows)]).tolist()
+    inside = tuple(slice(a, b) for a, b in pairwise(ends)) if len(windows) > 1 else ()
+    grid = gathered(source, windows)
+    found = adjusted(sensor, testfield, grid, start, settings, inside)
+    sample = result(found)
+    return KnownSeries.of(found, sample), sample
 
 
-def _walk(blocks: Blocks, source: ObservationBlocks, out: RowWriter, jobs: int) -> CommonSums:
-    """One pass: every block's epochs into `out`, and the sums."""
-    sums = CommonSums(blocks.known.design)
-    for block in in_order(adjusted_block, blocks, source.blocks(), jobs):
-        out.put(block)
-        sums.merge(block.sums)
-        out.release()
-    return sums
-
-
-def _finished(
-    blocks: Blocks, solved: Solved, out: RowWriter, sample: SeriesAdjustment,
-    sampled: Index, passes: int,
-) -> LongAdjustment:  # fmt: skip
-    """The last change of the common unknowns on all epochs, and what is of the whole series."""
-    known, shared, design = blocks.known, solved.shared, blocks.known.design
-    own, common = design.own, design.common
-    level = level_of(shared, design, shared.mean) * known.unit
-    total = np.zeros(16)
-    total[own] += solved.own
-    total[common] += (shared.pose - known.shared.pose)[: len(common)]
-    moved = np.flatnonzero(total)
-    out.shift(moved, total[moved])
-    out.widen(common, np.diag(level)[common])
-    trend = np.zeros((16, 16))
-    if len(shared.cofactors):
-        tilt = solved.line @ root_of(shared.cofactors)
-        trend[own[:, None], own] = tilt @ tilt.T * known.unit
-    trend += blocks.slow
-    if known.movement.covariance.any() and len(common):
-        G = shared.mean[:, :6]
-        swayed = G @ known.movement.tilt(line_weights(out.ok)) @ G.T
-        trend[own[:, None], own] += swayed
-    return LongAdjustment(
-        out, np.sqrt(np.clip(np.diag(level), 0.0, None)), np.sqrt(np.diag(trend)), sample,
-        sampled, passes,
+def _adjust_block(
+    state: tuple[KnownSeries, int], item: tuple[int, ObservationGrid]
+) -> tuple[int, EpochRows, CommonSums]:
+    """Adjust the block of epochs from `first` on: its rows, and what it adds to the sums."""
+    (known, epochs), (first, grid) = state, item
+    line = (first + np.arange(len(grid))) / max(epochs - 1, 1) - 0.5
+    block = known.adjusted(grid, epochs, line)
+    ok = np.array([word == "ok" for word in block.status], dtype=bool)
+    estimate, still = block.estimate, np.full(len(grid), np.nan)
+    if known.s.exterior == "series":
+        system = estimate.system
+        N = normal_matrices(system.used(), system.design.at.A)
+        score = stillness(replace(system, N=N), estimate.residuals)
+        still = score / np.where(block.redundancy > 0, block.unit, 1.0)
+    variance = np.where(ok[:, None], np.diagonal(block.covariance, axis1=1, axis2=2), 0.0)
+    rows = EpochRows(
+        np.where(ok[:, None], estimate.values, np.nan),
+        np.sqrt(np.where(variance > 0, variance, np.nan)), ok,
+        np.where(ok, block.sigma0, np.nan), block.redundancy, still,
+        (grid.observed | block.use).sum(axis=1), (grid.observed & ~block.use).sum(axis=1),
+        block.status, block.reasons,
     )  # fmt: skip
+    return first, rows, block.sums(first, known.design)
+
+
+def _carry(
+    known: KnownSeries, later: KnownSeries, own: Array, line: Array, rows: EpochRows
+) -> tuple[Array, Array]:
+    """Put the last change of the common unknowns on all epochs, in place.
+
+    later: with the common unknowns from all sums; own, line: as of `CommonSums.solved`. Returns the
+    standard deviations (16,) of what all epochs have in common, and of a straight line.
+    """
+    shared, design = later.shared, known.design
+    level = np.diag(shared.level(design)) * known.unit
+    total = np.zeros(16)
+    total[design.own] += own
+    total[design.common] += (shared.pose - known.shared.pose)[: len(design.common)]
+    for column in np.flatnonzero(total):
+        rows.values[:, column] += total[column]
+    for column in design.common:
+        old = np.nan_to_num(rows.sd[:, column])
+        rows.sd[:, column] = np.where(rows.ok, np.sqrt(old**2 + level[column]), np.nan)
+    trend, block = known.slow.copy(), np.ix_(design.own, design.own)
+    if len(shared.cofactors):
+        tilt = line @ root_of(shared.cofactors)
+        trend[block] += tilt @ tilt.T * known.unit
+    if known.movement.covariance.any() and len(design.common):
+        G = shared.mean[:, :6]
+        trend[block] += G @ known.movement.tilt(line_weights(rows.ok)) @ G.T
+    return np.sqrt(np.clip(level, 0.0, None)), np.sqrt(np.diag(trend))

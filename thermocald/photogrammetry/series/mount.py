@@ -15,7 +15,11 @@ In the trajectory there may be jumps: the mount was knocked, or a lens slipped. 
 perspective attributes to the interior orientation is left to the camera; every other one counts as
 a movement of the mount.
 
-Source: variance components as Patterson and Thompson (1971), Biometrika 58, 545-554.
+How long the memory is, and whether a component is there at all, is averaged over as plausible.
+
+Sources: variance components as Patterson and Thompson (1971), Biometrika 58, 545-554; Whittle
+(1953), Estimation and information in stationary time series; the maximisation by multiplicative
+updates as Févotte and Idier (2011), Neural Computation 23, 2421-2456.
 """
 
 from __future__ import annotations
@@ -26,11 +30,272 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
-from thermocald.photogrammetry.linalg import mad_sd, stacked_inverses, symmetric_power
-from thermocald.photogrammetry.series.movement import STILL, Movement, components
+from thermocald.photogrammetry.linalg import (
+    mad_sd,
+    stacked_inverses,
+    symmetric_power,
+    unit_diagonal,
+)
+from thermocald.photogrammetry.series.covariances import pose_equations
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from thermocald.arrays import Array, Index, Mask
+
+
+_PHI = np.array([0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98])
+_LONG_PHI = np.append(_PHI, [0.99, 0.995, 0.998])  # where no drift can be mistaken for it
+_UPDATES = 150
+_WHITE_COST = 8.0  # log-likelihood that a tremble must gain, in the best of six directions
+_SLOW_COST = 2.0  # that a memory must gain with it
+_NEGLIGIBLE = 0.02  # of the noise's variance
+_MOST_FREQUENCIES = 2000
+_LEAK_DEGREE = 6
+_LEAST_PER_DEGREE = 20  # fast frequencies: fewer would lose much of the mount itself
+_END = 15  # epochs at each end that tell the slope there
+
+
+def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
+    """Return the components of every column of a trajectory.
+
+    Variances (k,) of the white part and of that with memory about the mean; the memory of the
+    latter in epochs, 0 without it. trajectory (E, k) in units of its noise; period: the shortest of
+    the drift in epochs, 0 for none. A component that the likelihood does not ask for is 0.
+    """
+    levelled = _without_leak(_level_at_its_ends(trajectory), period) if period else trajectory
+    power = _cosines(levelled) ** 2
+    n = len(trajectory)
+    omega = np.pi * np.arange(1, n) / n
+    if len(power) > _MOST_FREQUENCIES:  # the high ones are pooled, they look alike
+        power, omega, count = _pooled(power, omega)
+    else:
+        count = np.ones(len(power))
+    one = np.ones_like(omega)
+    drift = _drift(omega, period)
+    memories = _PHI if period else _LONG_PHI
+    evidence = np.empty((len(memories), 3, power.shape[1]))  # still, white, with memory
+    _, evidence[:, 0] = _fit(power, count, np.stack([drift]))
+    (_, trembling), likelihood = _fit(power, count, np.stack([drift, one]))
+    evidence[:, 1] = likelihood - _WHITE_COST
+    swaying = []
+    for k, phi in enumerate(memories):
+        sway = (1 - phi**2) / (1 - 2 * phi * np.cos(omega) + phi**2)
+        sizes, likelihood = _fit(power, count, np.stack([drift, one, sway]))
+        evidence[k, 2] = likelihood - _WHITE_COST - _SLOW_COST
+        swaying.append(sizes)
+    evidence -= evidence.max(axis=(0, 1))
+    plausible = np.exp(evidence)
+    each = plausible.sum(axis=1)  # of a memory, by direction; the mount has one memory for all
+    together = np.log(each).sum(axis=1)
+    of_memory = np.exp(together - together.max())
+    of_memory /= of_memory.sum()
+    plausible *= of_memory[:, None, None] / each[:, None]
+    white = plausible[:, 1].sum(axis=0) * trembling
+    white += sum(p * sizes[1] for p, sizes in zip(plausible[:, 2], swaying, strict=True))
+    by_memory = np.array([p * sizes[2] for p, sizes in zip(plausible[:, 2], swaying, strict=True)])
+    by_memory *= np.array([1.0 - mean_variance(phi, n) for phi in memories])[:, None]
+    if not period:  # without a drift of the camera, whatever wanders is the mount
+        missing = (count @ power) / n - 1.0 - white - by_memory.sum(axis=0)
+        by_memory[-1] = np.maximum(by_memory[-1] + missing, 0.0)
+    negligible = white + by_memory.sum(axis=0) < _NEGLIGIBLE
+    white[negligible], by_memory[:, negligible] = 0.0, 0.0
+    slow = by_memory.sum(axis=0)
+    total = float(slow.sum())
+    memory = float(by_memory.sum(axis=1) @ (-1.0 / np.log(memories))) / total if total else 0.0
+    return white, slow, memory
+
+
+def _drift(omega: Array, period: float) -> Array:
+    """Spectrum of a camera that warms up: an integrated random walk without fast movements.
+
+    period: the shortest in epochs, 0 for a random walk without a bound.
+    """
+    x = 2.0 - 2.0 * np.cos(omega)
+    if not period:
+        walk: Array = (x[0] / x) ** 2
+        return walk
+    fast = 2.0 - 2.0 * np.cos(2.0 * np.pi / period)
+    shape: Array = 1.0 / (x * (1.0 + (x / fast) ** 2)) ** 2
+    shape /= shape.max()
+    return shape
+
+
+def _level_at_its_ends(trajectory: Array) -> Array:
+    """The trajectory (E, k) less the parabola with its slopes at both ends.
+
+    Its mirror image then continues it smoothly, and a drift stays at the low frequencies.
+    """
+    n = len(trajectory)
+    m = max(min(_END, n // 2), 4)
+    t = np.arange(m) - 0.5 * (m - 1)
+    V = np.vander(t, 3)
+    slopes = np.linalg.pinv(V)
+    first = 2 * (slopes[0] @ trajectory[:m]) * t[0] + slopes[1] @ trajectory[:m]
+    last = 2 * (slopes[0] @ trajectory[-m:]) * t[-1] + slopes[1] @ trajectory[-m:]
+    u = np.arange(n)[:, None]
+    level: Array = trajectory - first * u - (last - first) * u**2 / (2 * (n - 1))
+    return level
+
+
+def _without_leak(trajectory: Array, period: float) -> Array:
+    """The trajectory (E, k) less the polynomial that explains most of its fast part.
+
+    A strong drift that does not end flat has high frequencies of its own, those of a polynomial;
+    besides a millipixel of noise they would be taken for movements of the mount.
+    """
+    n = len(trajectory)
+    low = int(2 * n / period)
+    if n - 1 - low < _LEAST_PER_DEGREE * _LEAK_DEGREE:
+        return trajectory
+    u = np.linspace(-1.0, 1.0, n)
+    basis = np.stack([u**k for k in range(1, _LEAK_DEGREE + 1)], axis=1)
+    fast, _, _, _ = np.linalg.lstsq(_cosines(basis)[low:], _cosines(trajectory)[low:], rcond=None)
+    clean: Array = trajectory - basis @ fast
+    return clean
+
+
+def _cosines(trajectory: Array) -> Array:
+    """Coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
+    n = len(trajectory)
+    even = np.concatenate([trajectory, trajectory[::-1]])
+    spectrum = np.fft.rfft(even, axis=0)[1:n]
+    turn = np.exp(-0.5j * np.pi * np.arange(1, n) / n)[:, None]
+    coefficients: Array = (spectrum * turn).real / np.sqrt(2 * n)
+    return coefficients
+
+
+def _pooled(power: Array, omega: Array) -> tuple[Array, Array, Array]:
+    """The low frequencies one by one, the others in equal groups, and how many each stands for."""
+    half = _MOST_FREQUENCIES // 2
+    groups = np.array_split(np.arange(half, len(power)), half)
+    return (
+        np.concatenate([power[:half], np.stack([power[g].mean(axis=0) for g in groups])]),
+        np.concatenate([omega[:half], [omega[g].mean() for g in groups]]),
+        np.concatenate([np.ones(half), [len(g) for g in groups]]),
+    )
+
+
+def _fit(power: Array, count: Array, shapes: Array) -> tuple[Array, Array]:
+    """Fit the sizes (components, k) of spectra (components, m) alongside white noise of variance 1.
+
+    Returns them and the likelihood (k,).
+    """
+    weight = count[:, None]
+    # Spectra are steep: start where each alone would give the power of its own frequencies.
+    share = shapes * weight[:, 0] / np.maximum((shapes * weight[:, 0]).sum(axis=1), 1e-300)[:, None]
+    peak = (shapes * share).sum(axis=1)[:, None]
+    sizes = (share @ power) / np.maximum(peak, 1e-300) / len(shapes)
+    for _ in range(_UPDATES):
+        model = 1.0 + shapes.T @ sizes
+        up = shapes @ (weight * power / model**2)
+        down = shapes @ (weight / model)
+        sizes = sizes * np.sqrt(up / np.maximum(down, 1e-300))
+    model = 1.0 + shapes.T @ sizes
+    likelihood = -0.5 * (weight * (np.log(model) + power / model)).sum(axis=0)
+    return sizes, likelihood
+
+
+def mean_variance(phi: float, n: int) -> float:
+    """Variance of the mean of n values with unit variance and correlation φ^|i-j|."""
+    if n <= 1 or phi >= 1:
+        return 1.0
+    sum_ = (1 + phi) / (1 - phi) - 2 * phi * (1 - phi**n) / (n * (1 - phi) ** 2)
+    return float(min(sum_ / n, 1.0))
+
+
+_HIDDEN = 0.3  # of the noise's variance: too little to estimate it epoch by epoch
+_FLAT = 1e-6  # of the noise: directions without movement
+
+
+@dataclass(frozen=True, eq=False)
+class Movement:
+    """How far a mount moves about its mean pose over a series.
+
+    white, slow (6, 6): covariance of the exterior orientation, rad and mm, of a movement without
+    and with memory, about the mean over the series; memory: epochs after which the latter has lost
+    63 % of its correlation; noise (6, 6): covariance of the pose of one epoch with its interior
+    orientation held; jumps: the epochs from which on it stood elsewhere.
+    """
+
+    white: Array
+    slow: Array
+    memory: float
+    noise: Array
+    jumps: tuple[int, ...] = ()
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (6, 6) of an epoch's movement."""
+        return self.white + self.slow
+
+    @property
+    def still(self) -> bool:
+        """Whether no movement was found that one epoch's noise would not hide."""
+        whiten = self._whitening()
+        inside = np.linalg.eigvalsh(whiten @ self.covariance @ whiten.T)
+        return bool(inside[-1] < _HIDDEN)
+
+    def _whitening(self) -> Array:
+        """T with T · noise · Tᵀ = 1."""
+        scaled, scale = unit_diagonal(self.noise)
+        whitening: Array = symmetric_power(scaled, -0.5, 1e-12) * scale
+        return whitening
+
+    def precision(self) -> Array:
+        """Inverse covariance (6, 6); directions without movement are held to 1e-3 of the noise."""
+        T = self._whitening()
+        inside = T @ self.covariance @ T.T
+        return T.T @ symmetric_power(inside, -1.0, _FLAT) @ T
+
+    def image_px(self, A: Array) -> float:
+        """Movement of the image, px, by partials (T, 2, 16): RMS over targets, per coordinate."""
+        return _rms_px(A, self.covariance)
+
+    def noise_px(self, A: Array) -> float:
+        """The same of what an epoch's noise is mistaken for."""
+        return _rms_px(A, self.noise)
+
+    def slow_fraction(self, A: Array) -> float:
+        """Fraction of the movement's variance in the image that has a memory."""
+        return (_rms_px(A, self.slow) / max(self.image_px(A), 1e-12)) ** 2
+
+    def tilt(self, weights: Array) -> Array:
+        """Covariance (6, 6) of Σ w m over the epochs, weights (E,): of a line, say."""
+        white: Array = self.white * float(weights @ weights)
+        if not self.slow.any():
+            return white
+        # w'Rw for R = φ^|i-j| in one pass
+        phi, carried, total = float(np.exp(-1.0 / self.memory)), 0.0, 0.0
+        for first in range(0, len(weights), 1 << 16):
+            for w in weights[first : first + (1 << 16)].tolist():
+                total += w * (w + 2.0 * carried)
+                carried = phi * (carried + w)
+        about_mean = 1.0 - mean_variance(phi, int(np.count_nonzero(weights)))
+        return white + self.slow * (total / max(about_mean, 1e-6))
+
+
+STILL = Movement(np.zeros((6, 6)), np.zeros((6, 6)), 0.0, np.eye(6))
+"""A mount that does not move."""
+
+
+def together(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
+    """The mean of the movements of parts of a series, which start at some epochs.
+
+    The memory is the longest; jumps count as those of the series.
+    """
+    return Movement(
+        np.mean([m.white for m in movements], axis=0),
+        np.mean([m.slow for m in movements], axis=0),
+        max(m.memory for m in movements),
+        np.mean([m.noise for m in movements], axis=0),
+        tuple(start + row for m, start in zip(movements, starts, strict=True) for row in m.jumps),
+    )
+
+
+def _rms_px(A: Array, covariance: Array) -> float:
+    E = A[..., EOP]
+    return float(np.sqrt(np.einsum("tki,ij,tkj->tk", E, covariance, E).mean()))
 
 
 _LARGE = 8.0  # robust standard deviations of the change between neighbours
@@ -39,14 +304,6 @@ _SIDE = 8  # epochs before and after that tell where the pose stood
 _MOST = 8
 _SURE = 4.0  # standard deviations by which the perspective must exclude a movement
 _UNSEEN = 3.0
-
-
-@dataclass(frozen=True, eq=False)
-class Perspective:
-    """Normal equations M (E, k, k), g (E, k) of the pose with the interior orientation free."""
-
-    M: Array
-    g: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +334,11 @@ class Jumps:
         return out
 
 
-def jumps(trajectory: Array, perspective: Perspective) -> Jumps:
-    """The jumps of a trajectory (E, k), in units of its noise, that are the mount's."""
+def jumps(trajectory: Array, M: Array, g: Array) -> Jumps:
+    """Return the jumps of a trajectory (E, k), in units of its noise, that are the mount's.
+
+    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free.
+    """
     rows: list[int] = []
     steps: list[Array] = []
     variances: list[Array] = []
@@ -98,7 +358,7 @@ def jumps(trajectory: Array, perspective: Perspective) -> Jumps:
         if abs(step[column]) < _LASTING * abs(change[worst, column]):
             continue
         left[row:] -= step
-        if not _is_the_cameras(row, step, perspective):
+        if not _is_the_cameras(row, step, M, g):
             rows.append(row)
             steps.append(step)
             variances.append(factor * mad_sd(change, axis=0) ** 2 / 2)
@@ -115,12 +375,12 @@ def _step(trajectory: Array, row: int) -> tuple[Array, float]:
     return estimator @ part, float(estimator @ estimator)
 
 
-def _is_the_cameras(row: int, step: Array, perspective: Perspective) -> bool:
+def _is_the_cameras(row: int, step: Array, M: Array, g: Array) -> bool:
     """Whether the perspective excludes that the pose made a step."""
 
     def half(part: slice) -> tuple[float, float]:
-        information = float(np.einsum("i,eij,j->", step, perspective.M[part], step))
-        return float((perspective.g[part] @ step).sum()) / max(information, 1e-300), information
+        information = float(np.einsum("i,eij,j->", step, M[part], step))
+        return float((g[part] @ step).sum()) / max(information, 1e-300), information
 
     (before, known_before), (after, known_after) = half(slice(None, row)), half(slice(row, None))
     if min(known_before, known_after) <= 0:
@@ -194,7 +454,10 @@ def estimate_movement(
         noise += inverse.T @ correlated @ inverse
     whiten = symmetric_power(noise, -0.5, 1e-3)
     trajectory = _filled(trajectory @ whiten, weak)
-    found = jumps(trajectory, _perspective(N, b, own, root, whiten))
+    back = np.linalg.inv(root) @ np.linalg.inv(whiten)
+    # what the perspective alone says of the pose, the interior orientation eliminated
+    M, g = pose_equations(N, b, own, stacked_inverses(N[:, own[:, None], own])[0])
+    found = jumps(trajectory, back.T @ M @ back, g @ back)
     trajectory = found.removed(trajectory)
     period = min(period, len(trajectory) / _PERIODS)
     if period:
@@ -206,27 +469,16 @@ def estimate_movement(
     limit = _SPIKE * mad_sd(rough - np.median(rough, axis=0), axis=0)
     rough = np.clip(rough, -limit, limit)
     directions = _directions(rough, whiten @ _visible(N, own, root) @ whiten)
-    parts = components((smooth + rough) @ directions, period)
-    back = np.linalg.inv(root) @ np.linalg.inv(whiten)
+    white, slow, memory = components((smooth + rough) @ directions, period)
     axes = back @ directions
-    slow = (axes * parts.slow) @ axes.T + back @ found.covariance(len(trajectory)) @ back.T
-    memory = max(parts.memory, len(trajectory) / 2.0) if found.rows else parts.memory
+    if found.rows:
+        memory = max(memory, len(trajectory) / 2.0)
     return Movement(
-        (axes * parts.white) @ axes.T, slow, memory, back @ back.T,
+        (axes * white) @ axes.T,
+        (axes * slow) @ axes.T + back @ found.covariance(len(trajectory)) @ back.T,
+        memory, back @ back.T,
         tuple(int(rows[k]) for k in found.rows),
     )  # fmt: skip
-
-
-def _perspective(N: Array, b: Array, own: Index, root: Array, whiten: Array) -> Perspective:
-    """What the perspective alone says of the pose, the interior orientation eliminated."""
-    M, g = N[:, EOP, EOP], b[:, EOP]
-    if len(own):
-        Q, _ = stacked_inverses(N[:, own[:, None], own])
-        QC = Q @ N[:, own[:, None], EOP_COLUMNS]
-        M = M - np.swapaxes(N[:, own[:, None], EOP_COLUMNS], 1, 2) @ QC
-        g = g - np.einsum("epi,ep->ei", QC, b[:, own])
-    back = np.linalg.inv(root) @ np.linalg.inv(whiten)
-    return Perspective(np.swapaxes(back, 0, 1) @ M @ back, g @ back)
 
 
 def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, Mask]:
@@ -259,18 +511,14 @@ def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, 
 
 
 def _visible(N: Array, own: Index, root: Array) -> Array:
-    """How much of a movement (6, 6) an epoch sees by its perspective, 0 to 1, in units of `root`.
-
-    The rest looks like a change of the interior orientation.
+    """Return how much of a movement (6, 6) an epoch sees by its perspective, 0 to 1, in units of
+    `root`; the rest looks like a change of the interior orientation.
     """
-    usual = N.mean(axis=0)
-    seen = usual[EOP, EOP].copy()
-    if len(own):
-        coupling = usual[own[:, None], EOP_COLUMNS]
-        Q, _ = stacked_inverses(usual[own[:, None], own][None])
-        seen -= coupling.T @ Q[0] @ coupling
+    usual = N.mean(axis=0, keepdims=True)
+    Q, _ = stacked_inverses(usual[:, own[:, None], own])
+    seen, _ = pose_equations(usual, usual[:, 0], own, Q)
     inverse = np.linalg.inv(root)
-    visible: Array = inverse.T @ seen @ inverse
+    visible: Array = inverse.T @ seen[0] @ inverse
     return visible
 
 

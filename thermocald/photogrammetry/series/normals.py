@@ -1,4 +1,4 @@
-"""Normal equations of many epochs at one common linearisation point.
+"""Observations of many epochs, and their normal equations at one common linearisation point.
 
 A static camera sees the same field in every epoch, so the partial derivatives are one array for the
 whole series and each epoch differs only in its weights and residuals. All normal matrices are then
@@ -15,7 +15,7 @@ Ackermann (1976), Observations and Least Squares, chapter 10.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -23,11 +23,11 @@ from thermocald.photogrammetry.camera.camera_model import EOP, IOP, Sensor, part
 from thermocald.photogrammetry.linalg import stacked_inverses
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
@@ -100,6 +100,16 @@ class ObservationGrid:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def blocks(
+        self, windows: Sequence[slice] | None = None, size: int = 1000
+    ) -> Iterator[tuple[int, ObservationGrid]]:
+        """Yield grids of at most `size` consecutive epochs, each with its first epoch (from 0).
+
+        windows: only the epochs of these slices, ascending.
+        """
+        for rows in runs(len(self), size, windows):
+            yield rows.start, ObservationGrid(self.points[rows], self.weights[rows])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process, one component after the other there as well."""
@@ -185,13 +195,22 @@ def planes(components: int, epochs: int, targets: int) -> Array:
     return np.moveaxis(np.empty((components, epochs, targets)), 0, -1)
 
 
+def runs(count: int, size: int, windows: Sequence[slice] | None = None) -> Iterator[slice]:
+    """Yield the rows of `count` epochs, at most `size` at a time.
+
+    windows: only the rows of these slices, ascending; each begins a run.
+    """
+    for window in windows or (slice(0, count),):
+        for first in range(window.start, window.stop, size):
+            yield slice(first, min(first + size, window.stop))
+
+
 def chunks(epochs: int, targets: int) -> Iterator[slice]:
-    """The epochs in parts whose points stay in the processor's cache.
+    """Yield the epochs in parts whose points stay in the processor's cache.
 
     The arrays of a long series would also have to be fetched from the system, page by page.
     """
-    size = max(_CHUNK_POINTS // max(targets, 1), 1)
-    return (slice(start, start + size) for start in range(0, epochs, size))
+    return runs(epochs, max(_CHUNK_POINTS // max(targets, 1), 1))
 
 
 def same_rows(*arrays: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -292,3 +311,91 @@ def among_all(Q: Array, own: NDArray[np.int64]) -> Array:
             )
             whole[:, a, b] = Q[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     return whole
+
+
+class ObservationBlocks(Protocol):
+    """The observations of consecutive epochs, on all targets of the field."""
+
+    def __len__(self) -> int: ...
+
+    def blocks(
+        self, windows: Sequence[slice] | None = None
+    ) -> Iterator[tuple[int, ObservationGrid]]:
+        """Yield grids of consecutive epochs with the first epoch (from 0) of each.
+
+        windows: only the epochs of these slices, ascending.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class WithoutTargets:
+    """The same as if some targets (rows of the field) had never been observed."""
+
+    source: ObservationBlocks
+    targets: Index
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def blocks(
+        self, windows: Sequence[slice] | None = None
+    ) -> Iterator[tuple[int, ObservationGrid]]:
+        """Yield the blocks without the targets."""
+        for first, grid in self.source.blocks(windows):
+            mask = np.zeros(grid.observed.shape, dtype=bool)
+            mask[:, self.targets] = True
+            yield first, grid.reject(mask)
+
+
+def spread_windows(epochs: int, most: int, count: int = 12) -> tuple[slice, ...]:
+    """Return up to `count` runs of consecutive epochs, `most` epochs in all, from first to last.
+
+    All epochs in one where they are not more than that.
+    """
+    if epochs <= most:
+        return (slice(0, epochs),)
+    length = max(most // count, 1)
+    starts = np.linspace(0, epochs - length, count).round().astype(int)
+    return tuple(slice(int(start), int(start) + length) for start in starts)
+
+
+def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> ObservationGrid:
+    """Return the epochs of some windows on one grid."""
+    if isinstance(source, ObservationGrid) and list(windows) == [slice(0, len(source))]:
+        return source
+    whole = ObservationGrid(planes(2, 0, 0), planes(3, 0, 0))
+    done = 0
+    for _, grid in source.blocks(windows):
+        if not done:
+            size = sum(w.stop - w.start for w in windows), grid.points.shape[1]
+            whole = ObservationGrid(planes(2, *size), planes(3, *size))
+        rows = slice(done, done + len(grid))
+        whole.points[rows], whole.weights[rows] = grid.points, grid.weights
+        done += len(grid)
+    return whole
+
+
+def recut(
+    blocks: Iterable[tuple[int, ObservationGrid]], length: int
+) -> Iterator[tuple[int, ObservationGrid]]:
+    """Yield the same epochs `length` at a time, so that blocks do not depend on the reader."""
+    points: list[Array] = []
+    weights: list[Array] = []
+    begin = held = 0
+    for first, grid in blocks:
+        if not held:
+            begin = first
+        points.append(grid.points)
+        weights.append(grid.weights)
+        held += len(grid)
+        if held < length:
+            continue
+        p, w = np.concatenate(points), np.concatenate(weights)
+        whole = held // length * length
+        for k in range(0, whole, length):
+            yield begin + k, ObservationGrid(p[k : k + length], w[k : k + length])
+        begin, held = begin + whole, held - whole
+        points, weights = [p[whole:]], [w[whole:]]
+    if held:
+        yield begin, ObservationGrid(np.concatenate(points), np.concatenate(weights))

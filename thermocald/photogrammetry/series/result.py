@@ -8,39 +8,34 @@ result has its reason in a sentence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import sys
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import (
-    EOP,
     EOP_COLUMNS,
-    IOP,
-    PARAMETER_NAMES,
     PRINCIPAL_POINT,
-    ExteriorOrientation,
-    InteriorOrientation,
     Sensor,
     free_columns,
 )
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, Adjustment, AdjustmentSettings
-from thermocald.photogrammetry.epoch.geometry import GeometryBounds, weaknesses
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.epoch.geometry import weaknesses
 from thermocald.photogrammetry.epoch.snooping import (
     TRUSTED_REDUNDANCY,
     fails_global_test,
     most_rejected,
 )
-from thermocald.photogrammetry.series.movement import STILL, Movement
+from thermocald.photogrammetry.series.mount import STILL, Movement
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.normals import ObservationGrid
+    from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
 
 Exterior = Literal["per_epoch", "series", "mount", "auto"]
@@ -51,41 +46,28 @@ EXTERIOR_CHOICES: tuple[str, ...] = get_args(Exterior)
 
 
 @dataclass(frozen=True, slots=True)
-class SeriesSettings:
-    """What is estimated per epoch and what once.
+class SeriesSettings(AdjustmentSettings):
+    """What is estimated per epoch and what once, beside the settings of single epochs.
 
     exterior: `per_epoch`: every epoch its own orientation; `series`: one for all epochs; `mount`:
     one for all and a movement of each epoch, whose variance is estimated; `auto`: what the data
-    choose of the three; free: IOP per epoch, the others are held;
-    target_offsets: a constant offset per target, with the test field's sigmas as prior;
-    target_noise: the measuring noise, also its correlations within a marker and what neighbouring
-    epochs scatter beyond it, from the series' own scatter where it is long enough; drift_period:
-    the shortest of the camera's drift in epochs (`mount.drift_period`), 0 for a series too short
-    for one; priors, snooping_alpha, max_rejected, scale, bounds as in `AdjustmentSettings`.
+    choose of the three; target_offsets: a constant offset per target, with the test field's sigmas
+    as prior; target_noise: the measuring noise, also its correlations within a marker and what
+    neighbouring epochs scatter beyond it, from the series' own scatter where it is long enough;
+    drift_period: the shortest of the camera's drift in epochs (`mount.drift_period`), 0 for a
+    series too short for one.
     """
 
     exterior: Exterior = "series"
-    free: tuple[str, ...] = DEFAULT_FREE
     target_offsets: bool = True
     target_noise: bool = True
     drift_period: float = 24.0
-    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    snooping_alpha: float = 0.002
-    max_rejected: float = 0.35
-    scale: Literal["posterior", "prior"] = "posterior"
-    bounds: GeometryBounds = field(default_factory=GeometryBounds)
 
     @classmethod
     def of(cls, settings: AdjustmentSettings, exterior: str) -> SeriesSettings:
-        """The series' settings that go with those of single epochs."""
-        return cls(
-            exterior=cast("Exterior", exterior),
-            free=settings.free,
-            scale=settings.scale,
-            bounds=settings.bounds,
-            max_rejected=settings.max_rejected,
-            priors=settings.priors,
-        )
+        """Return the series' settings that go with those of single epochs."""
+        given = {each.name: getattr(settings, each.name) for each in fields(AdjustmentSettings)}
+        return cls(**given, exterior=cast("Exterior", exterior))
 
     @property
     def per_epoch(self) -> Index:
@@ -96,7 +78,7 @@ class SeriesSettings:
         return np.array(own, dtype=np.int64)
 
     @property
-    def unknowns(self) -> int:
+    def carried(self) -> int:
         """How many unknowns an epoch has to carry: a movement of the mount costs hardly any."""
         interior = free_columns(self.free)
         return len(interior) + (6 if self.exterior == "per_epoch" else 0)
@@ -108,13 +90,54 @@ class SeriesSettings:
 
 
 @dataclass(frozen=True, eq=False)
+class EpochRows:
+    """Epochs of a series as adjusted, one by one.
+
+    values, sd (E, 16): NaN where an epoch has no result or a parameter was held; ok (E,): epochs
+    with a result; sigma0, redundancy, stillness (E,): NaN where there is none; observed, rejected
+    (E,): how many targets, in `observed` the rejected too; status, reasons: E words and sentences.
+    """
+
+    values: Array
+    sd: Array
+    ok: Mask
+    sigma0: Array
+    redundancy: Array
+    stillness: Array
+    observed: Index
+    rejected: Index
+    status: list[str]
+    reasons: list[str]
+
+    @classmethod
+    def empty(cls, epochs: int) -> EpochRows:
+        """Return rows to be put in."""
+        values, sd = np.empty((2, epochs, 16))
+        sigma0, redundancy, stillness = np.empty((3, epochs))
+        observed, rejected = np.empty((2, epochs), dtype=np.int64)
+        return cls(
+            values, sd, np.zeros(epochs, dtype=bool), sigma0, redundancy, stillness, observed,
+            rejected, [""] * epochs, [""] * epochs,
+        )  # fmt: skip
+
+    def put(self, first: int, part: EpochRows) -> None:
+        """Put consecutive epochs in, from epoch `first` on."""
+        here = slice(first, first + len(part.values))
+        for column in fields(self):
+            values = getattr(part, column.name)
+            if isinstance(values, list):  # each text once, however many epochs have it
+                values = map(sys.intern, values)
+            getattr(self, column.name)[here] = values
+
+
+@dataclass(frozen=True, eq=False)
 class SeriesAdjustment:
     """The adjusted series; rows are epochs, parameters in the order of `PARAMETER_NAMES`.
 
     values (E, 16), NaN where an epoch has no result; covariance (E, 16, 16): relative to the
     series; level_covariance (16, 16): common to all epochs; sigma0 (E,); redundancy (E,);
-    observed, rejected (E, T); residuals (E, T, 2) px; offsets, offset_sds (T, 2) px, NaN where
-    none was estimated; status, reasons: per epoch; stillness (E,): chi-square with 6 degrees of
+    observed, rejected (E, T); residuals (E, T, 2) px; offsets (T, 2) px, NaN where none was
+    estimated; status, reasons: per epoch; stillness (E,): chi-square with 6 degrees of
     freedom of the epoch's own EOP against the series', NaN where the EOP are per epoch; excess_sd
     (16,): by how much neighbouring epochs scatter beyond their noise because the set-up trembles
     or the light flickers; contained in the covariance, 0 where it is not significant; trend_sd
@@ -125,7 +148,8 @@ class SeriesAdjustment:
     coordinates over those stated, 1 where no more are shown; outer_noise: noise of the outermost
     target over that in the image's middle, and its standard deviation; noise_ratio: the noise found
     over the one stated; movement: of the mount; choice: how the exterior orientation was estimated
-    and why.
+    and why; slow (16, 16): covariance of a straight line from slow errors of targets; pairs: of
+    coordinates that err together.
     """
 
     settings: SeriesSettings
@@ -138,7 +162,6 @@ class SeriesAdjustment:
     rejected: Mask
     residuals: Array
     offsets: Array
-    offset_sds: Array
     status: tuple[str, ...]
     reasons: tuple[str, ...]
     stillness: Array
@@ -150,6 +173,8 @@ class SeriesAdjustment:
     noise_ratio: float = 1.0
     movement: Movement = STILL
     choice: str = ""
+    slow: Array = field(default_factory=lambda: np.zeros((16, 16)))
+    pairs: CorrelatedPairs | None = None
 
     @property
     def exterior(self) -> Exterior:
@@ -176,6 +201,16 @@ class SeriesAdjustment:
         """(E,): epochs with a result."""
         return np.array([s == "ok" for s in self.status], dtype=bool)
 
+    @property
+    def rows(self) -> EpochRows:
+        """The epochs one by one."""
+        ok, rejected = self.ok, self.rejected.sum(axis=1)
+        return EpochRows(
+            self.values, self.sd, ok, np.where(ok, self.sigma0, np.nan), self.redundancy,
+            self.stillness, self.observed.sum(axis=1) + rejected, rejected, list(self.status),
+            list(self.reasons),
+        )  # fmt: skip
+
     def spread(self, targets: Index, n: int) -> SeriesAdjustment:
         """The same with its columns of targets put where they stand in a larger test field."""
         if len(targets) == n:
@@ -194,31 +229,6 @@ class SeriesAdjustment:
             rejected=wide(self.rejected, 1, False),
             residuals=wide(self.residuals, 1, np.nan),
             offsets=wide(self.offsets, 0, np.nan),
-            offset_sds=wide(self.offset_sds, 0, np.nan),
-        )
-
-    def epoch(self, row: int) -> Adjustment:
-        """One epoch as an `Adjustment`, for the store and the exports."""
-        ok = self.status[row] == "ok"
-        targets = np.flatnonzero(self.observed[row] | self.rejected[row])
-        covariance = self.covariance[row].copy()
-        common = np.ix_(self.settings.common, self.settings.common)
-        covariance[common] += self.level_covariance[common]
-        n = len(targets)
-        return Adjustment(
-            self.status[row],
-            self.reasons[row],
-            InteriorOrientation.from_array(self.values[row, IOP]) if ok else None,
-            ExteriorOrientation.from_array(self.values[row, EOP]) if ok else None,
-            covariance if ok else np.zeros((16, 16)),
-            tuple(PARAMETER_NAMES[i] for i in self.settings.per_epoch if i < EOP.start),
-            float(self.sigma0[row]),
-            int(self.redundancy[row]) if ok else 0,
-            targets,
-            self.residuals[row, targets],
-            np.full((n, 2), np.nan),
-            np.full(n, np.nan),
-            tuple(int(t) for t in np.flatnonzero(self.rejected[row])),
         )
 
 
@@ -227,7 +237,7 @@ _FEW = 0.6  # share of a series' targets below which an epoch's geometry is look
 
 def enough_targets(grid: ObservationGrid, s: SeriesSettings) -> Mask:
     """(E,): epochs with enough targets for their own parameters."""
-    count = 2 * grid.observed.sum(axis=1) - s.unknowns
+    count = 2 * grid.observed.sum(axis=1) - s.carried
     enough: Mask = count >= s.bounds.minimum_redundancy
     return enough
 
@@ -260,13 +270,13 @@ def judge(
                 status[row] = word
                 reasons[row] = sentence.format(n=offered[row], bad=offered[row] - used[row])
 
-    few = 2 * offered - s.unknowns < TRUSTED_REDUNDANCY
+    few = 2 * offered - s.carried < TRUSTED_REDUNDANCY
     most = np.where(few, most_rejected(s.max_rejected, 0), s.max_rejected)
     say(offered == 0, "no_observations", "no target was measured")
     say(
         ~enough_targets(grid, s),
         "too_few_targets",
-        f"{{n}} targets for {s.unknowns} unknowns of the epoch leave too little "
+        f"{{n}} targets for {s.carried} unknowns of the epoch leave too little "
         "redundancy: show more targets or hold parameters fixed",
     )
     say(

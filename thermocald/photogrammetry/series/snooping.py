@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, chi2_2d
+from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, limit_2d
 from thermocald.photogrammetry.series.normals import chunks, products
 from thermocald.photogrammetry.series.system import SeriesSystem, alike
 
@@ -86,15 +86,24 @@ def typical_variance(tests: Array, used: Mask) -> float:
 
 
 def snoop_series(
-    tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float, typical: float
+    tests: Array,
+    offered: Mask,
+    used: Mask,
+    unknowns: int,
+    alpha: float,
+    typical: float,
+    freedom: Array | None,
 ) -> Mask:
     """Which image points (E, T) stay, epoch by epoch, as `epoch.snooping.snoop` does.
 
-    typical: variance of unit weight of the series, for epochs too poor to tell their own.
+    typical: variance of unit weight of the series, for epochs too poor to tell their own; freedom
+    (T,): degrees of freedom with which each target's noise is known, None: it is as stated.
     """
     keep = np.empty_like(used)
     for part in chunks(*used.shape):
-        keep[part] = _staying(tests[part], offered[part], used[part], unknowns, alpha, typical)
+        keep[part] = _staying(
+            tests[part], offered[part], used[part], unknowns, alpha, typical, freedom
+        )
     return keep
 
 
@@ -110,11 +119,21 @@ def _variances(tests: Array, used: Mask) -> Array:
 
 
 def _staying(
-    tests: Array, offered: Mask, used: Mask, unknowns: int, alpha: float, typical: float
+    tests: Array,
+    offered: Mask,
+    used: Mask,
+    unknowns: int,
+    alpha: float,
+    typical: float,
+    freedom: Array | None,
 ) -> Mask:
-    few = 2 * used.sum(axis=1) - unknowns < TRUSTED_REDUNDANCY
+    n = used.sum(axis=1)
+    few = 2 * n - unknowns < TRUSTED_REDUNDANCY
     variance = np.where(few, typical, _variances(tests, used))
-    limit = (chi2_2d(alpha) * np.maximum(variance, 1e-12))[:, None]
+    uncertain = np.where(few, 0.0, 1.0 / np.maximum(n, 1))[:, None]
+    if freedom is not None:
+        uncertain = uncertain + 1.0 / freedom
+    limit = np.maximum(variance, 1e-12)[:, None] * limit_2d(alpha, uncertain)
     worst = np.where(used, tests, 0.0).max(axis=1, initial=0.0)[:, None]
     small = tests <= limit
     near = np.where(few, 1.0, 0.5)[:, None]

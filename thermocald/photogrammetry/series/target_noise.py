@@ -4,8 +4,9 @@ A-priori sigmas seldom know that a near, bright marker is measured better than a
 two corners of a marker share an edge and err together (corners from fitted edges correlate at -0.7
 along the edge they share). Over a series of a static camera both can be seen.
 
-Source: variance components as Förstner (1979); the covariance of least squares under
-correlated noise, Q (Aᵀ P C P A) Q, as Koch (1999), section 3.2.
+Source: variance components as Förstner (1979); how far single variances are to be believed: Smyth
+(2004), Linear models and empirical Bayes methods, Stat. Appl. Genet. Mol. Biol. 3(1), section 3;
+the covariance of least squares under correlated noise, Q (Aᵀ P C P A) Q, as Koch (1999), 3.2.
 """
 
 from __future__ import annotations
@@ -21,7 +22,13 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
 
-_PRIOR_FREEDOM = 8.0  # weight of the series' noise in a target's own
+MEDIAN_WORTH = 0.37
+"""Degrees of freedom of a mean that a median of squares is worth, for each square."""
+
+_MEDIANS_FROM = 10.0  # degrees of freedom of a target's median; one of fewer is luck
+_CUT = 2.5  # standard deviations: beyond it a residual counts as this one
+_LEFT_OF_CUT = 0.9776  # of the mean square of a normal distribution cut there
+_ALIKE = 1e4  # degrees of freedom of targets that are all measured alike
 _MEDIAN_CHI2_1 = 0.4549
 _SIGNIFICANT = 4.0  # correlations of n pairs below 4/√n are noise: 6e-5 two-sided
 _FEWEST_PAIRS = 40
@@ -32,23 +39,46 @@ _LOG_CHI2 = np.pi**2 / 6  # variance of the logarithm of chi-square with two deg
 _CLIP = 60.0  # times the median square: beyond it is not scatter but a jump
 
 
-def noise_ratios(residuals: Array, weights: Array, used: Mask, redundancy_share: float) -> Array:
-    """Variance (T, 2) of each target's coordinates in units of its a-priori variance.
+def noise_ratios(
+    residuals: Array, weights: Array, used: Mask, redundancy_share: float
+) -> tuple[Array, Array]:
+    """Variance (T, 2) of each target's coordinates in units of its a-priori variance, and the
+    degrees of freedom (T,) with which it is known.
 
     residuals (E, T, 2) px; weights (E, T, 3) px⁻²; used (E, T); redundancy_share: redundancy over
-    observations. Robust: medians of squares, drawn to the series' own as far as few epochs leave a
-    target's uncertain.
+    observations. Robust: medians of squares, of a few epochs their means, which jumps do not
+    reach; drawn to what the targets have in common: strongly where their variances differ no more
+    than so many epochs leave them uncertain (Smyth, 2004).
     """
-    squares = np.where(used[..., None], residuals**2 * weights[..., :2], np.nan)
+    squares = np.where(used[..., None], residuals**2 * weights[..., :2], np.nan) / redundancy_share
+    n = used.sum(axis=0)[:, None].astype(np.float64)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # targets that take no part
-        ratio = np.nanmedian(squares, axis=0) / _MEDIAN_CHI2_1 / redundancy_share
-    n = used.sum(axis=0)[:, None]
-    pooled = float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else 1.0
-    ratio = np.where(np.isfinite(ratio), ratio, pooled)
-    # A median of n squares is worth about 0.37 n degrees of freedom of a mean.
-    drawn: Array = (0.37 * n * ratio + _PRIOR_FREEDOM * pooled) / (0.37 * n + _PRIOR_FREEDOM)
-    return np.maximum(drawn, 1e-12)
+        middle = np.nanmedian(squares, axis=0) / _MEDIAN_CHI2_1
+        usual = float(np.nanmedian(middle)) if np.isfinite(middle).any() else 1.0
+        worth = MEDIAN_WORTH * n
+        cut = (worth * middle + _MEDIANS_FROM * usual) / (worth + _MEDIANS_FROM)
+        mean = np.nanmean(np.minimum(squares, _CUT**2 * cut), axis=0) / _LEFT_OF_CUT
+    few = worth < _MEDIANS_FROM
+    ratio, worth = np.where(few, mean, middle), np.where(few, n, worth)
+    of_usual = np.where(few, (1.0 - 2.0 / (9.0 * np.maximum(n, 1.0))) ** 3, 1.0)  # Wilson, Hilferty
+    shown = np.isfinite(ratio) & (ratio > 0)
+    if not shown.any():
+        return np.ones(ratio.shape), np.full(len(worth), _ALIKE)
+    freedom = np.broadcast_to(worth, ratio.shape)[shown]
+    common = float(np.median((ratio / of_usual)[shown]))
+    # the freedom of a prior that lets the logarithms scatter by as much: trigamma(prior/2) = it
+    between = float(np.var(np.log(ratio[shown]))) - float(np.mean(_log_variance(freedom)))
+    prior = (1.0 + np.sqrt(1.0 + 2.0 * between)) / between if between > 0 else _ALIKE
+    prior = min(prior, _ALIKE)
+    drawn: Array = (worth * np.where(shown, ratio, common) + prior * common) / (worth + prior)
+    return np.maximum(drawn, 1e-12), worth[:, 0] + prior
+
+
+def _log_variance(freedom: Array) -> Array:
+    """Variance of the logarithm of a chi-square: trigamma of half its degrees of freedom."""
+    variance: Array = 2.0 / freedom + 2.0 / freedom**2
+    return variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +226,7 @@ def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool = T
     normed = residual**2 / left / variances[inner]
     n = len(normed)
     if kinks:
-        ratio, worth = np.median(normed, axis=0) / _MEDIAN_CHI2_1, 0.37 * left
+        ratio, worth = np.median(normed, axis=0) / _MEDIAN_CHI2_1, MEDIAN_WORTH * left
     else:
         # Epochs in which a passer-by hides half of the targets scatter more than others, and count.
         ratio, worth = np.minimum(normed, _CLIP * np.median(normed, axis=0)).mean(axis=0), left

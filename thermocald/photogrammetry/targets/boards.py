@@ -22,10 +22,14 @@ import numpy as np
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.targets import ring_code
+from thermocald.photogrammetry.targets.corner import Corners, measure_corners
 from thermocald.photogrammetry.targets.markers import (
-    MarkerCorners,
+    LARGE_PIXELS,
+    SMALLEST_SIDE_PX,
     corner_shift,
-    measure_corners,
+    halved,
+    marker_rows,
+    parse_marker,
     to_8_bit,
 )
 from thermocald.photogrammetry.targets.markers import dictionary as markers_of
@@ -47,18 +51,20 @@ def board_of(
     points: Array,
     kinds: Sequence[str],
     codes: Sequence[str],
-    sigma: float | None = None,
+    sigma: float | Array | None = None,
+    diameter: float = np.nan,
 ) -> TestField:
-    """A board from targets at points (n, 3) mm; sigma: mm, of each coordinate, None for a print."""
+    """Build a board of targets at points (n, 3) mm; sigma: mm, of each coordinate, None for a
+    print; diameter: of discs, mm.
+    """
     if not 4 <= len(names) <= _MOST_TARGETS:
         raise TestFieldError(f"a board of {len(names)} targets: 4 to {_MOST_TARGETS} are possible")
     if sigma is None:
         local = points - points.mean(axis=0)
-        sigmas = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local)
-        sigmas[:, 2] = _SIGMA_FLAT
-    else:
-        sigmas = np.full(points.shape, sigma)
-    return TestField.build(names, points, sigmas, np.nan, kinds, codes)
+        spread = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local)
+        spread[:, 2] = _SIGMA_FLAT
+        sigma = spread
+    return TestField.build(names, points, sigma, diameter, kinds, codes)
 
 
 def aprilgrid(
@@ -68,7 +74,6 @@ def aprilgrid(
     spacing: float,
     *,
     first: int = 0,
-    dictionary: str = "DICT_APRILTAG_36h11",
     sigma: float | None = None,
 ) -> TestField:
     """Kalibr's AprilGrid: size mm of a tag with its black border, spacing as a ratio of it.
@@ -92,7 +97,7 @@ def aprilgrid(
             for k, (x, y) in enumerate(square + np.array([i * step, j * step])):
                 names.append(f"{number}.{k}")
                 points.append((x, y, 0.0))
-                codes.append(f"{dictionary}:{number}:{k}")
+                codes.append(f"DICT_APRILTAG_36h11:{number}:{k}")
     kinds = ["marker_corner"] * len(names)
     return board_of(names, np.array(points), kinds, codes, sigma)
 
@@ -104,25 +109,22 @@ def charuco(
     marker: float,
     dictionary: str,
     *,
-    first: int = 0,
     legacy: bool = False,
     sigma: float | None = None,
 ) -> TestField:
     """A ChArUco board of columns × rows squares as OpenCV and calib.io draw it.
 
-    square, marker: sides mm; first: number of the first marker; legacy: the pattern of OpenCV
-    before 4.6, whose upper left square is another where the number of rows is even. Targets are the
-    corners of squares (C0, C1 …, OpenCV's numbers) and of markers (M0.0 …).
+    square, marker: sides mm; legacy: the pattern of OpenCV before 4.6, whose upper left square is
+    another where the number of rows is even. Targets are the corners of squares (C0, C1 …, OpenCV's
+    numbers) and of markers (M0.0 …).
     """
-    import cv2
-
     if not (2 <= columns <= 100 and 2 <= rows <= 100 and 0 < marker < square):
         raise TestFieldError(
             f"a ChArUco board of {columns} × {rows} squares of {square:g} mm with markers of "
             f"{marker:g} mm: 2 to 100 squares, and markers smaller than squares"
         )
     known = markers_of(dictionary)
-    numbers = np.arange(first, first + columns * rows // 2, dtype=np.int32)
+    numbers = np.arange(columns * rows // 2, dtype=np.int32)
     if numbers[-1] >= len(known.bytesList):
         raise TestFieldError(
             f"{dictionary} has {len(known.bytesList)} markers, the board needs up to {numbers[-1]}"
@@ -180,17 +182,14 @@ def numbered_rings(
     for number in numbers:
         if not 1 <= number <= len(codes):
             raise TestFieldError(f"target {number}: there are {len(codes)} codes of {bits} bits")
-    field = board_of(
+    return board_of(
         [str(n) for n in numbers], points, ["circle"] * len(numbers),
-        [ring_code.write(bits, codes[n - 1]) for n in numbers],
+        [ring_code.write(bits, codes[n - 1]) for n in numbers], sigmas, diameter,
     )  # fmt: skip
-    spread = field.sigmas if sigmas is None else sigmas
-    return TestField.build(field.names, points, spread, diameter, field.kinds, field.codes)
 
 
 _CODE = re.compile(r"CHESS:(\d{1,3})x(\d{1,3}):(\d{1,5})")
 _QUIET_SHARE = 0.45  # of the distance between corners, where no marker stands nearer
-_LARGE_PIXELS = 3_000_000
 
 
 def is_chess(code: str) -> bool:
@@ -230,31 +229,28 @@ def find_chessboards(
             columns, rows, number = parse_chess(code)
             boards.setdefault((columns, rows), {})[number] = row
     missed = {} if missed is None else missed
-    found = _nothing()
+    found = Observations.none()
     grey = to_8_bit(image)
     for (columns, rows), row_of in boards.items():
         grid = _find(grey, columns, rows)
         if grid is None:
             missed.update(dict.fromkeys(row_of.values(), "not found"))
             continue
-        numbers = np.arange(columns * rows)
-        known = np.array([n in row_of for n in numbers.tolist()], dtype=bool)
-        along, across = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
-        at = grid.reshape(-1, 2)[known]
-        before, after = (v.reshape(-1, 2)[known] for v in (across, along))
-        size = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1))
-        places = np.array([row_of[n] for n in numbers[known].tolist()], dtype=np.int64)
-        corners = MarkerCorners(places, at, at + before, at + after, _QUIET_SHARE * size)
-        found = measure_corners(image, corners, missed)
+        numbers = sorted(row_of)
+        at, across, along = (
+            v.reshape(-1, 2)[numbers] for v in (grid, *np.gradient(grid, axis=(0, 1)))
+        )
+        size = np.minimum(np.linalg.norm(across, axis=1), np.linalg.norm(along, axis=1))
+        places = np.array([row_of[n] for n in numbers], dtype=np.int64)
+        corners = Corners(places, at, at + across, at + along, _QUIET_SHARE * size)
+        found = found.joined(measure_corners(image, corners, missed))
     return found
 
 
 def _find(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     """The inner corners (rows, columns, 2) px of one board, right-handed, from its black corner."""
-    scale = 2 if grey.size > _LARGE_PIXELS else 1
-    small = grey
-    if scale > 1:
-        small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+    scale = 2 if grey.size > LARGE_PIXELS else 1
+    small = halved(grey) if scale > 1 else grey
     size = (columns, rows)
     done, corners = cv2.findChessboardCornersSB(small, size, flags=0)
     if not done:  # oblique or soft boards: by the quadrangles
@@ -282,54 +278,62 @@ def _begins_black(grey: NDArray[np.uint8], grid: Array) -> bool:
     return mean(diagonal) < mean(beside)
 
 
-def locate_chess_corners(
-    testfield: TestField, corners: Sequence[int], orientation: Orientation
-) -> MarkerCorners:
-    """Where corners of squares (rows of the field) must be, given an orientation, and two edges."""
-    rows = np.array(corners, dtype=np.int64)
-    first, second, quiet = _edges(testfield, rows)
-    points = testfield.points[rows]
+def predict_corners(
+    testfield: TestField, rows: Sequence[int], orientation: Orientation, found: Corners
+) -> Corners:
+    """Predict where corners (rows of the field) are by an orientation, those in the image.
+
+    found: the markers that were detected, for the width of their border. A marker's corner of which
+    a neighbour is not in the field, or that is seen small, is left out.
+    """
+    at = np.array(rows, dtype=np.int64)
+    chess = np.array([testfield.kinds[row] == "chess_corner" for row in at], dtype=bool)
+    sides = np.full((2, len(at), 3), np.nan)
+    side = np.linalg.norm(found.before - found.places, axis=1)
+    border = float(np.median(found.quiet / np.maximum(side, 1e-9))) if len(found) else 0.1
+    quiet = np.full(len(at), border)  # over the shorter side
+    sides[:, chess], quiet[chess] = _squares(testfield, at[chess])
+    points = testfield.points[at]
+    row_of = {(n, *key): row for n, m in marker_rows(testfield).items() for key, row in m.items()}
+    for i in np.flatnonzero(~chess):
+        name, marker, k = parse_marker(testfield.codes[at[i]])
+        keys = [(name, marker, ((k or 0) + step) % 4) for step in (-1, 1)]
+        if all(key in row_of for key in keys):
+            sides[:, i] = testfield.points[[row_of[key] for key in keys]] - points[i]
     project = orientation.camera.project
-    at = project(orientation.exterior, points)
-    before, after = (project(orientation.exterior, points + v) for v in (first, second))
-    size = np.minimum(*(np.linalg.norm(end - at, axis=1) for end in (before, after)))
-    cell = size * quiet / np.maximum(np.linalg.norm(first, axis=1), 1e-9)
-    inside = orientation.camera.sensor.contains(np.nan_to_num(at, nan=-1e9), 3.0)
-    inside &= np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
-    return MarkerCorners(rows[inside], at[inside], before[inside], after[inside], cell[inside])
+    places, before, after = (
+        project(orientation.exterior, p) for p in (points, points + sides[0], points + sides[1])
+    )
+    size = np.minimum(*(np.linalg.norm(end - places, axis=1) for end in (before, after)))
+    inside = orientation.camera.sensor.contains(np.nan_to_num(places, nan=-1e9), 3.0)
+    inside &= np.isfinite(size) & (chess | (size >= SMALLEST_SIDE_PX))
+    return Corners(
+        at[inside], places[inside], before[inside], after[inside], (quiet * size)[inside]
+    )
 
 
-def _edges(testfield: TestField, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """For each corner two directions (n, 3) mm along its edges, to neighbours, and how far (n,) mm
-    from the edges nothing but squares is.
+def _squares(testfield: TestField, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+    """For each corner two directions (2, n, 3) mm along its edges, to neighbours, and how far (n,)
+    from the edges nothing but squares is, over the first of them.
     """
     points = testfield.points[rows]
     kinds = np.array(testfield.kinds)
     corners = testfield.points[kinds == "chess_corner"]
     markers = testfield.points[kinds == "marker_corner"]
-    first, second = np.zeros_like(points), np.zeros_like(points)
-    quiet = np.zeros(len(points))
+    sides = np.zeros((2, *points.shape))
+    quiet = np.full(len(points), _QUIET_SHARE)
     for i, point in enumerate(points):
         offset = corners - point
         distance = np.linalg.norm(offset, axis=1)
         order = np.argsort(distance, kind="stable")[1:9]
-        first[i] = offset[order[0]] if len(order) else (1.0, 0, 0)
+        sides[0, i] = offset[order[0]] if len(order) else (1.0, 0, 0)
+        length = max(float(np.linalg.norm(sides[0, i])), 1e-9)
         for other in order.tolist():
-            cosine = offset[other] @ first[i] / (distance[other] * np.linalg.norm(first[i]))
-            if abs(cosine) < 0.3:
-                second[i] = offset[other]
+            if abs(offset[other] @ sides[0, i] / (distance[other] * length)) < 0.3:
+                sides[1, i] = offset[other]
                 break
-        quiet[i] = _QUIET_SHARE * float(np.linalg.norm(first[i]))
         if len(markers):
             # a marker's corner lies on the diagonal of its square
             nearest = float(np.linalg.norm(markers - point, axis=1).min())
-            quiet[i] = min(quiet[i], nearest / np.sqrt(2))
-    return first, second, quiet
-
-
-def _nothing() -> Observations:
-    none = np.zeros(0)
-    return Observations(
-        np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), none,
-        dict.fromkeys(("blur", "contrast", "grey", "noise", "saturation"), none),
-    )  # fmt: skip
+            quiet[i] = min(quiet[i], nearest / np.sqrt(2) / length)
+    return sides, quiet

@@ -33,10 +33,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.arrays import Array, Image, Single, scratch
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.frame_status import NoiseModel, estimate_noise
 from thermocald.photogrammetry.targets.outline import LocalMap, Windows, inverse_2x2, windows
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 
@@ -60,6 +64,14 @@ def normal_cdf(z: Single) -> Single:
     value += _ONE
     value *= _HALF
     return value
+
+
+def first_reasons(tests: Sequence[tuple[NDArray[np.bool_], str]]) -> NDArray[Any]:
+    """Return the word (n,) of the first test that says no (n,), empty where none does."""
+    reasons = np.full(len(tests[0][0]), "", dtype=object)
+    for bad, word in reversed(tests):
+        reasons[bad] = word
+    return reasons
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,14 +231,14 @@ _STEP_LIMITS = np.array([1.0, 1.0, 0.15, 0.15, 0.15, 0.5, np.inf, np.inf, 0.02, 
 class CircleFit:
     """n circles as fitted: parameters (n, 10) as `blurred_disc`, covariances (n, 2, 2) px² of the
     centres, misfit (n,) residual sd over the frame's noise, saturation (n,) share of the pixels
-    used; reasons: n words, empty where the fit is good; noise: of the frame.
+    used; reasons (n,): words, empty where the fit is good; noise: of the frame.
     """
 
     parameters: Array
     covariances: Array
     misfit: Array
     saturation: Array
-    reasons: tuple[str, ...]
+    reasons: NDArray[Any]
     noise: NoiseModel
 
     @property
@@ -237,7 +249,30 @@ class CircleFit:
     @property
     def good(self) -> NDArray[np.bool_]:
         """Which fits are good (n,)."""
-        return np.array([not reason for reason in self.reasons], dtype=bool)
+        return np.asarray(self.reasons == "", dtype=bool)
+
+    def missed(self, rows: NDArray[np.int64]) -> dict[int, str]:
+        """Return {row: reason} of the fits that are no good, of the test field's rows (n,)."""
+        bad = ~self.good
+        return dict(zip(rows[bad].tolist(), self.reasons[bad], strict=True))
+
+    def put(self, which: NDArray[np.int64], others: CircleFit) -> None:
+        """Replace some fits by others, in place."""
+        for name in ("parameters", "covariances", "misfit", "saturation", "reasons"):
+            getattr(self, name)[which] = getattr(others, name)
+
+    def observations(self, rows: NDArray[np.int64], keep: NDArray[np.bool_]) -> Observations:
+        """Return some of the fits (mask) as observations of the test field's rows (n,)."""
+        p = self.parameters[keep]
+        quality = {
+            "blur": p[:, 5],
+            "contrast": p[:, 7],
+            "grey": p[:, 6],
+            "noise": np.sqrt(self.noise.variance(p[:, 6])).astype(float),
+            "saturation": self.saturation[keep],
+            "misfit": self.misfit[keep],
+        }
+        return Observations.build(rows[keep], p[:, :2], self.covariances[keep], quality)
 
 
 def fit_circles(
@@ -295,8 +330,10 @@ def fit_circles(
         noise, variance, normal = noise.scaled(level), variance / level, normal / level
     # A target that is noisier than the frame by more than chance has its own noise.
     own = np.where(variance > 1 + 4 * np.sqrt(2 / np.maximum(pixels, 1)), variance, 1.0)
-    covariances = _centre_covariance(normal) * np.maximum(own, 1.0)[:, None, None]
-    fit = CircleFit(parameters, covariances, np.sqrt(variance), saturation, ("",) * n, noise)
+    cofactors = scaled_solve(normal, np.eye(10)[None, :, :2], 1e-12)[:, :2]
+    covariances = cofactors * np.maximum(own, 1.0)[:, None, None]
+    none = np.full(n, "", dtype=object)
+    fit = CircleFit(parameters, covariances, np.sqrt(variance), saturation, none, noise)
     return replace(fit, reasons=_reasons(fit, maps, cut, pixels, last_step))
 
 
@@ -357,7 +394,8 @@ def _step(
     residual = w.grey - value
     by_target = jw.transpose(1, 0, 2)
     N = (by_target @ j.transpose(1, 2, 0)).astype(float)
-    delta = _limited(N, (by_target @ residual[..., None])[..., 0])
+    rhs = (by_target @ residual[..., None])[..., 0]
+    delta = np.clip(scaled_solve(N, rhs, 1e-9), -_STEP_LIMITS, _STEP_LIMITS)
     p += delta
     p[:, 5] = np.clip(p[:, 5], 0.2, 6.0)
     p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
@@ -373,33 +411,9 @@ def _step(
     return _Fit(p, value + change, residual - change, N, step, stands, flat)
 
 
-def _limited(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
-    delta: Array = np.clip(_solve(N, rhs), -_STEP_LIMITS, _STEP_LIMITS)
-    return delta
-
-
-def _solve(N: Array, rhs: NDArray[np.floating[Any]]) -> Array:
-    scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
-    scaled = N * scale[:, :, None]
-    scaled *= scale[:, None, :]
-    np.einsum("nii->ni", scaled)[:] += 1e-9
-    solution: Array = np.linalg.solve(scaled, (rhs * scale)[..., None])[..., 0] * scale
-    return solution
-
-
-def _centre_covariance(N: Array) -> Array:
-    """Of the first two unknowns, from normal matrices (n, p, p)."""
-    scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", N), 1e-12))
-    scaled = N * scale[:, :, None] * scale[:, None, :] + 1e-12 * np.eye(N.shape[-1])
-    first_two = np.eye(N.shape[-1])[None, :, :2]  # NumPy 1 takes (p, 2) for vectors
-    columns = np.linalg.solve(scaled, first_two)
-    part: Array = columns[:, :2] * scale[:, :2, None] * scale[:, None, :2]
-    return part
-
-
 def _reasons(
     fit: CircleFit, maps: LocalMap, cut: NDArray[np.bool_], pixels: Array, step: Array
-) -> tuple[str, ...]:
+) -> NDArray[Any]:
     minor = maps.semi_axes[:, 1]
     p = fit.parameters
     move = np.hypot(*(p[:, :2] - maps.centre).T)
@@ -423,7 +437,4 @@ def _reasons(
         ),
         (covered, "covered in part or disturbed"),
     )
-    reasons = np.full(len(p), "", dtype=object)
-    for bad, word in reversed(tests):
-        reasons[bad] = word
-    return tuple(reasons.tolist())
+    return first_reasons(tests)

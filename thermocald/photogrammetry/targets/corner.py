@@ -17,12 +17,14 @@ vertex detection, IJCV 10(2), 101–124.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.targets.circle import normal_cdf
+from thermocald.photogrammetry.field.testfield import Observations
+from thermocald.photogrammetry.linalg import scaled_solve
+from thermocald.photogrammetry.targets.circle import first_reasons, normal_cdf
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,55 +47,59 @@ _SLOWEST_CORRELATION = 0.93  # the series is not good enough for edges that meet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CornerFit:
-    """Corners as fitted: points (n, 2) px, covariances (n, 2, 2) px², blur (n,) px, contrast and
-    background (n,) DN, residual_sd (n,) DN, saturation (n,) share of the pixels that were used;
-    reasons: n words, empty where the fit is good.
+class Corners:
+    """Where corners are about: rows (n,) of the test field, places (n, 2) px and their neighbours
+    along the outline, before and after (n, 2) px; quiet (n,) px: width of the marker's border and
+    of the quiet zone about it, beyond which nothing is looked at.
     """
 
-    points: Array
-    covariances: Array
-    blur: Array
-    contrast: Array
-    background: Array
-    residual_sd: Array
-    saturation: Array
-    reasons: tuple[str, ...]
+    rows: NDArray[np.int64]
+    places: Array
+    before: Array
+    after: Array
+    quiet: Array
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def part(self, some: slice) -> Corners:
+        """Return some of the corners."""
+        return Corners(*(getattr(self, f.name)[some] for f in fields(self)))
+
+    def moved(self, found: Observations) -> Corners:
+        """Move places and neighbours by what `found` says of these corners."""
+        at = {int(row): i for i, row in enumerate(found.targets)}
+        shift = np.array(
+            [
+                found.points[at[row]] - place if row in at else (np.nan, np.nan)
+                for row, place in zip(self.rows.tolist(), self.places, strict=True)
+            ]
+        ).reshape(-1, 2)
+        if np.isfinite(shift).any():
+            shift = np.where(np.isfinite(shift), shift, np.nanmedian(shift, axis=0))
+        else:
+            shift = np.zeros_like(shift)
+        return Corners(
+            self.rows, self.places + shift, self.before + shift, self.after + shift, self.quiet
+        )
 
 
-def fit_corners(
-    image: Image,
-    corners: Array,
-    before: Array,
-    after: Array,
-    cell: Array,
-) -> CornerFit:
-    """Fit corners (n, 2) px whose neighbours along the outline are `before` and `after` (n, 2) px.
+def measure_corners(
+    image: Image, corners: Corners, missed: dict[int, str] | None = None
+) -> Observations:
+    """Measure corners in an image (H, W), grey, 8 or 16 bit.
 
-    cell (n,) px: width of the marker's border and of the quiet zone about it; nothing beyond is
-    looked at.
+    Returns them with standard deviation and covariance, and as quality `blur` px, `contrast`,
+    `grey` (background), `noise` DN, `saturation` (share of pixels). `missed` receives
+    {row: reason} for those that cannot be measured.
     """
-    if len(corners) == 0:
-        none = np.zeros(0)
-        return CornerFit(np.zeros((0, 2)), np.zeros((0, 2, 2)), *(none,) * 5, ())
-    parts = []
+    found = Observations.none()
     for i in range(0, len(corners), _CHUNK):
-        s = slice(i, i + _CHUNK)
-        parts.append(_fit(image, corners[s], before[s], after[s], cell[s]))
-
-    def joined(name: str) -> Array:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    return CornerFit(
-        joined("points"),
-        joined("covariances"),
-        joined("blur"),
-        joined("contrast"),
-        joined("background"),
-        joined("residual_sd"),
-        joined("saturation"),
-        tuple(reason for part in parts for reason in part.reasons),
-    )
+        some, reasons = _fit(image, corners.part(slice(i, i + _CHUNK)))
+        if missed is not None:
+            missed.update(reasons)
+        found = found.joined(some)
+    return found
 
 
 def _unit(v: Array) -> Array:
@@ -169,10 +175,11 @@ def _is_saddle(grey: Array, d1: Array, d2: Array, near: NDArray[np.bool_]) -> ND
     return found & (clear & near & (d1 < 0) & (d2 < 0)).any(axis=1)
 
 
-def _fit(image: Image, corners: Array, before: Array, after: Array, cell: Array) -> CornerFit:
-    n = len(corners)
+def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
+    """Fit corners together; {row: reason} for those whose fit is no good."""
+    corners, n = found.places, len(found)
     height, width = image.shape
-    sides = np.stack([before - corners, after - corners])
+    sides = np.stack([found.before - corners, found.after - corners])
     side = np.linalg.norm(sides, axis=-1).min(axis=0)
     along = np.minimum(0.45 * side, REACH_PX)
     half = int(np.ceil(along.max()))
@@ -193,7 +200,7 @@ def _fit(image: Image, corners: Array, before: Array, after: Array, cell: Array)
     d1, d2 = (m[:, 0, None] * dx + m[:, 1, None] * dy for m in normals)
     depth = np.minimum(d1, d2)
     # A margin of two px keeps the blurred bits and neighbours out, but an edge needs two px itself.
-    margin = np.maximum(cell - 2.0, 2.0)[:, None]
+    margin = np.maximum(found.quiet - 2.0, 2.0)[:, None]
     saddle = _is_saddle(grey, d1, d2, inside & (np.hypot(dx, dy) <= along[:, None]))
     # the square opposite to a marker of an AprilGrid is a third as large as the marker
     along = np.where(saddle, np.minimum(along, _SADDLE_REACH * side), along)
@@ -261,37 +268,35 @@ def _fit(image: Image, corners: Array, before: Array, after: Array, cell: Array)
 
     jw = j * weight[..., None]
     normal_matrix = np.swapaxes(jw, 1, 2) @ j
-    scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal_matrix), 1e-12))
-    conditioned = normal_matrix / (scale[:, :, None] * scale[:, None, :])
-    inverse = np.linalg.inv(conditioned + 1e-12 * np.eye(7))
-    inverse = inverse / (scale[:, :, None] * scale[:, None, :])
+    cofactors = scaled_solve(normal_matrix, np.eye(7)[None, :, :2], 1e-12)[:, :2]
     variance = chi / np.maximum(m - 7, 1)
-    covariances = inverse[:, :2, :2] * variance[:, None, None]
-    top = np.iinfo(image.dtype).max
-    saturation = np.sum(use & (grey >= top), axis=1) / np.maximum(m, 1)
-
-    move = np.hypot(*(p[:, :2] - corners).T)
-    converged = np.abs(step[:, :2]).max(axis=1, initial=0.0) < 0.02
-    angle = np.abs(np.cos(p[:, 2] - p[:, 3]))
     residual_sd = np.sqrt(variance)
-    reasons = []
-    for i in range(n):
-        if cut_off[i]:
-            reasons.append("cut off by the image's edge")
-        elif m[i] < 20:
-            reasons.append("too small")
-        elif not np.isfinite(p[i]).all() or not converged[i]:
-            reasons.append("the fit does not converge")
-        elif move[i] > _LARGEST_MOVE_PX + _LARGEST_MOVE_SHARE * side[i]:
-            reasons.append("no corner where the marker has one")
-        elif angle[i] > 0.95:
-            reasons.append("too oblique")
-        elif abs(p[i, 6]) < 5 * residual_sd[i]:
-            reasons.append("too little contrast")
-        else:
-            reasons.append("")
-    # The fitted width holds the pixel's own.
-    blur = np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0))
-    return CornerFit(
-        p[:, :2], covariances, blur, p[:, 6], p[:, 5], residual_sd, saturation, tuple(reasons)
+    tests = (
+        (cut_off, "cut off by the image's edge"),
+        (m < 20, "too small"),
+        (
+            ~np.isfinite(p).all(axis=1) | ~(np.abs(step[:, :2]).max(axis=1) < 0.02),
+            "the fit does not converge",
+        ),
+        (
+            np.hypot(*(p[:, :2] - corners).T) > _LARGEST_MOVE_PX + _LARGEST_MOVE_SHARE * side,
+            "no corner where the marker has one",
+        ),
+        (np.abs(np.cos(p[:, 2] - p[:, 3])) > 0.95, "too oblique"),
+        (np.abs(p[:, 6]) < 5 * residual_sd, "too little contrast"),
     )
+    reasons = first_reasons(tests)
+    good = reasons == ""
+    quality = {
+        # The fitted width holds the pixel's own.
+        "blur": np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0)),
+        "contrast": p[:, 6],
+        "grey": p[:, 5],
+        "noise": residual_sd,
+        "saturation": np.sum(use & (grey >= np.iinfo(image.dtype).max), axis=1) / np.maximum(m, 1),
+    }
+    observations = Observations.build(
+        found.rows[good], p[good, :2], (cofactors * variance[:, None, None])[good],
+        {name: values[good] for name, values in quality.items()},
+    )  # fmt: skip
+    return observations, dict(zip(found.rows[~good].tolist(), reasons[~good], strict=True))

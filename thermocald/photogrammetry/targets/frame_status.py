@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import cv2
 import numpy as np
 
-from thermocald.photogrammetry.linalg import MAD_TO_SD
+from thermocald.photogrammetry.linalg import mad_sd
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -60,7 +60,7 @@ def estimate_noise(
     freedom = np.sqrt(max(len(residuals) - unknowns, 1) / max(len(residuals), 1))
     thin = max(len(residuals) // _ENOUGH, 1)
     grey, residuals = grey[::thin].astype(float), residuals[::thin].astype(float) / freedom
-    sd = MAD_TO_SD * float(np.median(np.abs(residuals))) if len(residuals) else 0.0
+    sd = float(mad_sd(residuals)) if len(residuals) else 0.0
     sd = max(sd, np.sqrt(_QUANTISATION))
     good = np.abs(residuals) < 2 * _CUT * sd
     g, r2 = grey[good], residuals[good] ** 2

@@ -1,4 +1,4 @@
-"""Image files: their size from the header, their grey values, and parts of a JPEG alone.
+"""Image files: their size from the header, their grey values, parts of a JPEG alone, metadata.
 
 Source: PNG (ISO/IEC 15948), 11.2.2 IHDR; JPEG (ITU T.81), B.2.2 frame header; TIFF 6.0, section 2.
 
@@ -12,12 +12,17 @@ Source: ITU-T Recommendation T.81, B.2 (markers and headers) and A.2 (order of t
 
 JPEGs are decoded by libjpeg-turbo through simplejpeg, to the luminance alone: two thirds of the
 time of OpenCV, which decodes all others and those that simplejpeg refuses. The pixels are the same.
+
+EXIF and comments are written, and carried to another file: CIPA DC-008 (Exif 2.32), 4.5.4 (segments
+of a JPEG) and 4.6 (tags); PNG specification (third edition), 11.3.
 """
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,21 +34,44 @@ from thermocald.arrays import scratch
 from thermocald.errors import ImageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
     from numpy.typing import NDArray
 
 
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+_BASELINE = {0xC0, 0xC1}
+_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_DRI, _SOS, _EOI = 0xDD, 0xDA, 0xD9
 _TIFF_TAGS = {256: 0, 257: 1}
 _MOST_TAGS = 500
+
+
+def _segments(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Marker, begin and end of each segment of a JPEG, the head of its first scan the last."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # fills up
+            at += 1
+        elif marker == 0x01 or 0xD0 <= marker <= 0xD8:  # stands alone
+            at += 2
+        else:
+            begin, at = at, at + 2 + max(int.from_bytes(data[at + 2 : at + 4], "big"), 2)
+            yield marker, begin, at
+            if marker == _SOS:
+                return
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
     """Width and height px of PNG, JPEG, TIFF, BMP and PGM bytes; None for others and for damage."""
     try:
-        if data[:8] == b"\x89PNG\r\n\x1a\n":
+        if data[:8] == _PNG:
             return struct.unpack(">II", data[16:24])
-        if data[:2] == b"\xff\xd8":
-            return _jpeg(data)
+        if data[:2] == _JPEG:
+            at = next(begin for marker, begin, _ in _segments(data) if marker in _FRAMES)
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return width, height
         if data[:4] in (b"II*\0", b"MM\0*"):
             return _tiff(data, "<" if data[:2] == b"II" else ">")
         if data[:2] == b"BM":
@@ -54,24 +82,8 @@ def image_size(data: bytes) -> tuple[int, int] | None:
                 w for line in data[:4096].split(b"\n") for w in line.partition(b"#")[0].split()
             ]
             return int(words[1][:9]), int(words[2][:9])
-    except (struct.error, ValueError, IndexError):
-        return None
-    return None
-
-
-def _jpeg(data: bytes) -> tuple[int, int] | None:
-    at = 2
-    while at + 9 < len(data):
-        if data[at] != 0xFF:
-            return None
-        marker = data[at + 1]
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
-            at += 1 if marker == 0xFF else 2
-            continue
-        if marker in _JPEG_FRAMES:
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        at += 2 + max(int.from_bytes(data[at + 2 : at + 4], "big"), 2)
+    except (struct.error, ValueError, IndexError, StopIteration):
+        pass
     return None
 
 
@@ -88,16 +100,6 @@ def _tiff(data: bytes, order: str) -> tuple[int, int] | None:
     return (size[0], size[1]) if all(size) else None
 
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Boxes = NDArray[np.int64]
-    Grey = NDArray[np.uint8]
-
-
-_BASELINE = (0xC0, 0xC1)
-_OTHER_FRAMES = frozenset(range(0xC2, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_DRI, _SOS, _EOI = 0xDD, 0xDA, 0xD9
 _WORTH_IT = 0.98  # of the image: beyond, the whole is decoded
 
 
@@ -120,18 +122,22 @@ class _Layout:
         """Units in a row, and rows of them."""
         return -(-self.width // self.unit[0]), -(-self.height // self.unit[1])
 
+    @property
+    def tiles(self) -> tuple[int, int, int, int] | None:
+        """Width and height px of what one segment covers, and columns and rows of such tiles; None
+        for segments that neither divide a row of units nor hold whole ones.
+        """
+        across, down = self.units
+        if across % self.interval == 0:
+            columns = across // self.interval
+            return self.interval * self.unit[0], self.unit[1], columns, down
+        if self.interval % across == 0:
+            rows = self.interval // across
+            return across * self.unit[0], rows * self.unit[1], 1, -(-down // rows)
+        return None
 
-@dataclass(frozen=True, slots=True)
-class _Tiles:
-    """What one segment covers: width, height px; columns and rows of tiles in the image."""
 
-    width: int
-    height: int
-    columns: int
-    rows: int
-
-
-def decode_parts(data: bytes, boxes: Boxes) -> Grey | None:
+def decode_parts(data: bytes, boxes: NDArray[np.int64]) -> NDArray[np.uint8] | None:
     """Grey values (H, W) of a JPEG that hold within boxes (n, 4) px: left, top, right, bottom.
 
     Right and bottom are exclusive. Elsewhere the values are undefined, and the memory is used again
@@ -156,28 +162,16 @@ def decode_parts(data: bytes, boxes: Boxes) -> Grey | None:
 
 def _layout(data: bytes) -> _Layout | None:
     """The layout of a sequential JPEG with one scan; None for all others."""
-    at, interval, frame = 2, 0, None
-    while data[at] == 0xFF:
-        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
-        if marker == 0xFF:
-            at += 1
-            continue
-        if marker in _OTHER_FRAMES:
-            return None
-        if marker in _BASELINE:
-            frame = at
-        elif marker == _DRI:
-            interval = int.from_bytes(data[at + 4 : at + 6], "big")
-        elif marker == _SOS:
-            scan = at + 2 + length
-            break
-        at += 2 + length
-    else:
+    at = {marker: begin for marker, begin, _ in _segments(data)}
+    frame = next((at[marker] for marker in _BASELINE if marker in at), None)
+    if frame is None or _SOS not in at or (_FRAMES - _BASELINE) & at.keys():
         return None
-    if frame is None:
-        return None
+    head = at[_SOS]
+    scan = head + 2 + int.from_bytes(data[head + 2 : head + 4], "big")
+    restart = at.get(_DRI)
+    interval = 0 if restart is None else int.from_bytes(data[restart + 4 : restart + 6], "big")
     precision, components = data[frame + 4], data[frame + 9]
-    if precision != 8 or components not in (1, 3) or data[at + 4] != components:
+    if precision != 8 or components not in (1, 3) or data[head + 4] != components:
         return None
     sampling = [data[frame + 11 + 3 * k] for k in range(components)]
     across, down = ([s >> 4 for s in sampling], [s & 15 for s in sampling])
@@ -197,12 +191,12 @@ def _headed(data: bytes, layout: _Layout, width: int, height: int) -> bytes:
     return data[: layout.size_at] + size + data[layout.size_at + 4 : layout.scan]
 
 
-def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> Grey | None:
+def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> NDArray[np.uint8] | None:
     """The image down to a row; below it is undefined."""
     height = -(-bottom // layout.unit[1]) * layout.unit[1]
     if height > _WORTH_IT * layout.height:
         return None
-    grey: Grey = scratch("parts", (layout.height, layout.width), np.uint8)
+    grey: NDArray[np.uint8] = scratch("parts", (layout.height, layout.width), np.uint8)
     file = scratch("file", (len(data),), np.uint8)
     file[:] = np.frombuffer(data, np.uint8)
     file[layout.size_at : layout.size_at + 2] = divmod(height, 256)
@@ -211,64 +205,46 @@ def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> Grey | None:
     return grey
 
 
-def _by_segments(data: bytes, layout: _Layout, low: Boxes, high: Boxes) -> Grey | None:
+def _by_segments(
+    data: bytes, layout: _Layout, low: NDArray[np.int64], high: NDArray[np.int64]
+) -> NDArray[np.uint8] | None:
     """The image where its segments meet the boxes."""
-    tiles = _tiles(layout)
-    if tiles is None:
+    if layout.tiles is None:
         return None
-    needed = _touched(tiles, low, high)
-    segments = _segments(data, layout, tiles.columns * tiles.rows)
-    if segments is None or needed.sum() > _WORTH_IT * needed.size:
+    tile_width, tile_height, columns, rows = layout.tiles
+    # which tiles meet a box, by the sums of the boxes' corners
+    left, top = (low // (tile_width, tile_height)).T
+    right, bottom = ((high - 1) // (tile_width, tile_height) + 1).T
+    count = np.zeros((rows + 1, columns + 1), dtype=np.int64)
+    for y, x, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
+        np.add.at(count, (y, x), sign)
+    chosen = np.flatnonzero(count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1].ravel() > 0)
+    segments = _bits(data, layout, columns * rows)
+    if segments is None or len(chosen) > _WORTH_IT * columns * rows:
         return None
-    chosen = np.flatnonzero(needed)
-    row, column = np.divmod(chosen, tiles.columns)
-    lines = -(-len(chosen) // tiles.columns)
+    row, column = np.divmod(chosen, columns)
+    lines = -(-len(chosen) // columns)
     # the last line is filled up
-    filled = np.r_[chosen, np.repeat(chosen[-1:], lines * tiles.columns - len(chosen))]
-    width, unit_rows = tiles.columns * tiles.width, layout.units[1]
-    height = lines * tiles.height
-    if row[-1] == tiles.rows - 1:  # whose tile may have fewer rows of units than the others
-        height -= (tiles.rows * tiles.height) - unit_rows * layout.unit[1]
+    filled = np.r_[chosen, np.repeat(chosen[-1:], lines * columns - len(chosen))]
+    width, height = columns * tile_width, lines * tile_height
+    if row[-1] == rows - 1:  # whose tile may have fewer rows of units than the others
+        height -= rows * tile_height - layout.units[1] * layout.unit[1]
     parts = [_headed(data, layout, width, height)]
     for k, i in enumerate(filled.tolist()):
         parts += [data[segments[i, 0] : segments[i, 1]], bytes((0xFF, 0xD0 + k % 8))]
     parts[-1] = bytes((0xFF, _EOI))
-    packed: Grey = scratch("packed", (lines * tiles.height, width), np.uint8)
+    packed: NDArray[np.uint8] = scratch("packed", (lines * tile_height, width), np.uint8)
     simplejpeg.decode_jpeg(b"".join(parts), colorspace="GRAY", buffer=packed[:height])
-    shape = (tiles.height, tiles.columns, tiles.width)
-    image: Grey = scratch("parts", (tiles.rows * tiles.height, width), np.uint8)
+    shape = (tile_height, columns, tile_width)
+    image: NDArray[np.uint8] = scratch("parts", (rows * tile_height, width), np.uint8)
     places = np.arange(len(chosen))
-    image.reshape(tiles.rows, *shape)[row, :, column] = packed.reshape(lines, *shape)[
-        places // tiles.columns, :, places % tiles.columns
+    image.reshape(rows, *shape)[row, :, column] = packed.reshape(lines, *shape)[
+        places // columns, :, places % columns
     ]
     return np.ascontiguousarray(image[: layout.height, : layout.width])
 
 
-def _tiles(layout: _Layout) -> _Tiles | None:
-    """The tiles of segments that divide a row of units, or hold whole ones."""
-    across, down = layout.units
-    if across % layout.interval == 0:
-        columns = across // layout.interval
-        return _Tiles(layout.interval * layout.unit[0], layout.unit[1], columns, down)
-    if layout.interval % across == 0:
-        rows = layout.interval // across
-        return _Tiles(across * layout.unit[0], rows * layout.unit[1], 1, -(-down // rows))
-    return None
-
-
-def _touched(tiles: _Tiles, low: Boxes, high: Boxes) -> NDArray[np.bool_]:
-    """Which tiles (rows · columns,) meet a box, by the sums of the boxes' corners."""
-    size = (tiles.width, tiles.height)
-    left, top = (low // size).T
-    right, bottom = ((high - 1) // size + 1).T
-    count = np.zeros((tiles.rows + 1, tiles.columns + 1), dtype=np.int64)
-    for y, x, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
-        np.add.at(count, (y, x), sign)
-    touched: NDArray[np.bool_] = count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
-    return touched.ravel()
-
-
-def _segments(data: bytes, layout: _Layout, count: int) -> NDArray[np.int64] | None:
+def _bits(data: bytes, layout: _Layout, count: int) -> NDArray[np.int64] | None:
     """Start and end (count, 2) in `data` of each segment's bits; None where some are missing."""
     bits = np.frombuffer(data, np.uint8)[layout.scan :]
     at = np.flatnonzero(bits[:-1] == 0xFF)
@@ -305,7 +281,7 @@ class EncodedImage:
                 f"{self.name}: says that it has {self._size[0]} × {self._size[1]} px; at most "
                 f"{_MOST_PIXELS // 10**6} million are decoded"
             )
-        self._is_jpeg = data[:2] == b"\xff\xd8"
+        self._is_jpeg = data[:2] == _JPEG
         if self._is_jpeg and b"\xff\xd9" not in data[-64:]:
             raise ImageError(f"{self.name}: the JPEG is cut off: its end is missing")
 
@@ -321,16 +297,24 @@ class EncodedImage:
             except ValueError:
                 pass  # another colour space, or damage that OpenCV bears with or names
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        image = self._decoded(flags)
+        if image.dtype not in (np.uint8, np.uint16):
+            raise ImageError(f"{self.name}: {image.dtype} grey values; 8 or 16 bit are read")
+        return image
+
+    def as_it_is(self) -> NDArray[Any]:
+        """Values (H, W), or with channels (H, W, 3 or 4), of the file's own type, not turned."""
+        return self._decoded(cv2.IMREAD_UNCHANGED)
+
+    def _decoded(self, flags: int) -> NDArray[Any]:
         try:
-            image = cv2.imdecode(np.frombuffer(self._data, np.uint8), flags)
+            image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(self._data, np.uint8), flags)
         except cv2.error as error:
             raise ImageError(
                 f"{self.name}: is not an image that can be decoded ({error.err})"
             ) from error
         if image is None:
             raise ImageError(f"{self.name}: is not an image (JPEG, PNG and TIFF are read)")
-        if image.dtype not in (np.uint8, np.uint16):
-            raise ImageError(f"{self.name}: {image.dtype} grey values; 8 or 16 bit are read")
         return image
 
     def around(self, boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
@@ -362,3 +346,96 @@ def _read(path: Path, name: str) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise ImageError(f"{name}: cannot be read: {error.strerror or error}") from error
+
+
+_Value = str | int | float
+_APP1, _COMMENT = 0xE1, 0xFE
+_EXIF = b"Exif\0\0"
+_TOLD_JPEG = {_APP1, 0xE2, 0xED, _COMMENT}
+"""EXIF and XMP, colour profile, IPTC, comment."""
+_TOLD_PNG = {b"eXIf", b"iCCP", b"tEXt", b"zTXt", b"iTXt", b"pHYs"}
+_DETAILS = 0x8769  # the tag that points to EXIF's own directory
+_PER_MM = 4  # EXIF's unit of a focal plane's resolution
+_FRACTION = 10_000  # denominator of rational numbers
+
+
+def with_metadata(image: bytes, source: bytes) -> bytes:
+    """Return an encoded image with the metadata of another; both JPEG or PNG, else as it is."""
+    if image.startswith(_JPEG) and source.startswith(_JPEG):
+        told = b"".join(
+            source[begin:end] for kind, begin, end in _segments(source) if kind in _TOLD_JPEG
+        )
+        return image[:2] + told + image[2:]
+    if image.startswith(_PNG) and source.startswith(_PNG):
+        head, *rest = _chunks(image)
+        told_png = [chunk for chunk in _chunks(source) if chunk[4:8] in _TOLD_PNG]
+        return _PNG + b"".join(chain([head], told_png, rest))
+    return image
+
+
+def has_exif(image: bytes) -> bool:
+    """Whether an encoded image is a JPEG with EXIF."""
+    return image.startswith(_JPEG) and any(
+        kind == _APP1 and image[begin + 4 : begin + 10] == _EXIF
+        for kind, begin, _ in _segments(image)
+    )
+
+
+def with_exif(jpeg: bytes, camera: str, utc: float, focal_mm: float, pixels_per_mm: float) -> bytes:
+    """Return a JPEG with EXIF: camera, time, upright, focal length and pixels; utc: s."""
+    moment = datetime.fromtimestamp(utc, UTC)
+    base: dict[int, _Value] = {0x0110: camera, 0x0112: 1, 0x0131: "thermocald", _DETAILS: 0}
+    details: dict[int, _Value] = {
+        0x9003: moment.strftime("%Y:%m:%d %H:%M:%S"), 0x9011: "+00:00",
+        0x9291: f"{moment.microsecond // 1000:03d}", 0x920A: focal_mm,
+        0xA20E: pixels_per_mm, 0xA20F: pixels_per_mm, 0xA210: _PER_MM,
+    }  # fmt: skip
+    base[_DETAILS] = 8 + len(_directory(base, 8))
+    tiff = b"II*\0" + struct.pack("<I", 8) + _directory(base, 8)
+    return _with_segment(jpeg, _APP1, _EXIF + tiff + _directory(details, len(tiff)))
+
+
+def with_comment(jpeg: bytes, text: str) -> bytes:
+    """Return a JPEG with a comment behind what it says already; text: below 65 kB."""
+    return _with_segment(jpeg, _COMMENT, text.encode())
+
+
+def _directory(entries: Mapping[int, _Value], start: int) -> bytes:
+    """A directory of TIFF, little-endian, whose first byte is at `start`: ASCII, long, rational."""
+    head, tail = struct.pack("<H", len(entries)), b""
+    behind = start + 2 + 12 * len(entries) + 4
+    for tag, value in sorted(entries.items()):
+        kind, count = 4, 1
+        if isinstance(value, str):
+            data = value.encode("ascii", "replace") + b"\0"
+            kind, count = 2, len(data)
+        elif isinstance(value, float):
+            data, kind = struct.pack("<II", round(value * _FRACTION), _FRACTION), 5
+        else:
+            data = struct.pack("<I", value)
+        if len(data) > 4:
+            at = behind + len(tail)
+            tail += data + b"\0" * (len(data) % 2)
+            data = struct.pack("<I", at)
+        head += struct.pack("<HHI4s", tag, kind, count, data)
+    return head + struct.pack("<I", 0) + tail
+
+
+def _with_segment(jpeg: bytes, kind: int, content: bytes) -> bytes:
+    """Insert a segment behind those that say something of the image."""
+    place = 2
+    for known, _, end in _segments(jpeg):
+        if known not in _TOLD_JPEG and known != 0xE0:
+            break
+        place = end
+    segment = struct.pack(">BBH", 0xFF, kind, len(content) + 2) + content
+    return jpeg[:place] + segment + jpeg[place:]
+
+
+def _chunks(data: bytes) -> list[bytes]:
+    found, place = [], len(_PNG)
+    while place + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, place)
+        found.append(data[place : place + 12 + length])
+        place += 12 + length
+    return found

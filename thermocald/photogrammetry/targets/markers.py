@@ -21,7 +21,6 @@ A marker that is seen twice in an image is dropped: one of the two is not what i
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -29,13 +28,13 @@ import cv2
 import numpy as np
 
 from thermocald.errors import TestFieldError
-from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.targets.corner import fit_corners
+from thermocald.photogrammetry.targets.corner import Corners
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
+    from thermocald.photogrammetry.field.testfield import TestField
 
 
 _FEWEST = 3
@@ -43,13 +42,13 @@ _NEIGHBOURS = 4
 _AGREEMENT = 0.6
 
 
-def corners_turned_deg(found: MarkerCorners, testfield: TestField) -> int:
+def corners_turned_deg(found: Corners, testfield: TestField) -> int:
     """By how many degrees (0, 90, 180, 270) the field's corners are turned against the image's.
 
     0 too where fewer than three markers with four corners each are seen: one alone cannot tell.
     """
     corners: dict[tuple[str, int], list[tuple[int, Array]]] = {}
-    for row, at in zip(found.rows.tolist(), found.corners, strict=True):
+    for row, at in zip(found.rows.tolist(), found.places, strict=True):
         name, marker, _ = parse_marker(testfield.codes[row])
         corners.setdefault((name, marker), []).append((row, at))
     whole = [pairs for pairs in corners.values() if len(pairs) == 4]
@@ -92,6 +91,11 @@ def dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(number)
 
 
+def marker_dictionaries() -> list[str]:
+    """Return the names of all dictionaries."""
+    return sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+
+
 def marker_size(name: str, border: int = 1) -> int:
     """Cells along the side of a marker with a black border of so many cells."""
     return int(dictionary(name).markerSize) + 2 * border
@@ -128,8 +132,10 @@ def marker_cells(name: str, number: int, border: int = 1) -> NDArray[np.bool_]:
     return cells
 
 
-_LARGE_PIXELS = 3_000_000
-_SMALLEST_SIDE_PX = 16.0
+LARGE_PIXELS = 3_000_000
+"""An image with more is searched at half its size first."""
+SMALLEST_SIDE_PX = 16.0
+"""A marker that is seen smaller is not measured."""
 _LEAST_STEP_DN = 5.0
 
 
@@ -160,18 +166,6 @@ def parse_marker(code: str) -> tuple[str, int, int | None]:
     return parts[0], marker, corner
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DetectedMarkers:
-    """Markers of one dictionary: numbers (m,), corners (m, 4, 2) px, good to about a pixel; border:
-    cells of their black border.
-    """
-
-    dictionary: str
-    numbers: NDArray[np.int64]
-    corners: Array
-    border: int = 1
-
-
 def to_8_bit(image: Image) -> NDArray[np.uint8]:
     """The image itself, or a 16-bit one scaled so that its brightest value is 255."""
     if image.dtype == np.uint8:
@@ -179,41 +173,43 @@ def to_8_bit(image: Image) -> NDArray[np.uint8]:
     return cv2.convertScaleAbs(image, alpha=255.0 / max(int(image.max()), 1))  # type: ignore[return-value]
 
 
+def halved(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the image at half its size: x there is 2·x + ½ here."""
+    return cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+
+
 def detect_markers(
     image: Image, name: str, expected: frozenset[int] | None = None
-) -> DetectedMarkers:
+) -> tuple[dict[int, Array], int]:
     """Find the markers of one dictionary in an image; `expected` numbers, others are ignored.
 
-    A number that is found twice is dropped. A large image is searched at half its size first, and
-    at full size where that found less than half of what is expected; then with the wide border of
-    Kalibr's AprilGrids, where there may be some.
+    Returns the corners (4, 2) px by number, good to about a pixel, and how many cells the black
+    border has. A number that is found twice is dropped. A large image is searched at half its size
+    first, and at full size where that found less than half of what is expected; then with the wide
+    border of Kalibr's AprilGrids, where there may be some.
     """
     grey = to_8_bit(image)
-    large = grey.size > _LARGE_PIXELS
-    searches = [(scale, 1) for scale in ((2, 1) if large else (1,))]
+    searches = [(scale, 1) for scale in ((2, 1) if grey.size > LARGE_PIXELS else (1,))]
     if name.startswith("DICT_APRILTAG"):
         searches += [(scale, 2) for scale, _ in searches]
     best: dict[int, Array] = {}
     best_border = 1
     for scale, border in searches:
-        small = cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
-        found, numbers, _ = detector(name, border).detectMarkers(small if scale > 1 else grey)
+        looked_at = halved(grey) if scale > 1 else grey
+        found, numbers, _ = detector(name, border).detectMarkers(looked_at)
         seen: defaultdict[int, list[Array]] = defaultdict(list)
         if numbers is not None:
             for number, corners in zip(numbers.ravel().tolist(), found, strict=True):
                 if expected is None or number in expected:
-                    # cv2.resize maps pixel centres as x = scale·x' + (scale − 1)/2.
                     at = scale * corners.reshape(4, 2).astype(float) + (scale - 1) / 2
                     if _outlined(grey, at):
                         seen[number].append(np.roll(at, corner_shift(name), axis=0))
-        single = {number: at[0] for number, at in seen.items() if _one_place(at)}
+        single = {number: at[0] for number, at in sorted(seen.items()) if _one_place(at)}
         if len(single) > len(best):
             best, best_border = single, border
         if len(best) > 0.5 * (len(expected) if expected is not None else 0) and best:
             break
-    numbers = np.array(sorted(best), dtype=np.int64)
-    corners = np.array([best[n] for n in numbers.tolist()]).reshape(-1, 4, 2)
-    return DetectedMarkers(name, numbers, corners, best_border)
+    return best, best_border
 
 
 def _outlined(grey: NDArray[np.uint8], quad: Array) -> bool:
@@ -261,138 +257,29 @@ def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
     return rows
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkerCorners:
-    """Marker corners as found: rows (n,) of the test field, corners (n, 2) px and their neighbours
-    along the outline, before and after (n, 2) px; cell (n,) px, width of the marker's border.
-    """
-
-    rows: NDArray[np.int64]
-    corners: Array
-    before: Array
-    after: Array
-    cell: Array
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def moved(self, found: Observations) -> MarkerCorners:
-        """With corners and neighbours moved by what `found` says of these corners."""
-        at = {int(row): i for i, row in enumerate(found.targets)}
-        shift = np.array(
-            [
-                found.points[at[row]] - corner if row in at else (np.nan, np.nan)
-                for row, corner in zip(self.rows.tolist(), self.corners, strict=True)
-            ]
-        ).reshape(-1, 2)
-        if np.isfinite(shift).any():
-            shift = np.where(np.isfinite(shift), shift, np.nanmedian(shift, axis=0))
-        else:
-            shift = np.zeros_like(shift)
-        return MarkerCorners(
-            self.rows, self.corners + shift, self.before + shift, self.after + shift, self.cell
-        )
-
-
 def locate_markers(
     image: Image, testfield: TestField, missed: dict[int, str] | None = None
-) -> MarkerCorners:
+) -> Corners:
     """Find a test field's markers; `missed` receives {row: reason} for corners not found."""
     missed = {} if missed is None else missed
-    rows: list[int] = []
-    corners, before, after, cell = [], [], [], []
+    found: list[tuple[int, float, Array]] = []  # row, border, corner with its neighbours
     for name, known in marker_rows(testfield).items():
         expected = frozenset(marker for marker, _ in known)
-        found = detect_markers(image, name, expected)
-        cells = marker_size(name, found.border)
-        for number, quad in zip(found.numbers.tolist(), found.corners, strict=True):
+        quads, border = detect_markers(image, name, expected)
+        cells = marker_size(name, border)
+        for number, quad in quads.items():
             side = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min()
             for k in range(4):
                 row = known.get((number, k))
-                if row is not None and side >= _SMALLEST_SIDE_PX:
-                    rows.append(row)
-                    corners.append(quad[k])
-                    before.append(quad[k - 1])
-                    after.append(quad[(k + 1) % 4])
-                    cell.append(found.border * side / cells)
+                if row is not None and side >= SMALLEST_SIDE_PX:
+                    found.append((row, border * side / cells, quad[[k, k - 1, (k + 1) % 4]]))
                 elif row is not None:
                     missed[row] = "too small"
-        missing = expected.difference(found.numbers.tolist())
+        missing = expected.difference(quads)
         missed.update({r: "not found" for (m, _), r in known.items() if m in missing})
-    return MarkerCorners(
-        np.array(rows, dtype=np.int64), _xy(corners), _xy(before), _xy(after),
-        np.array(cell, dtype=float),
-    )  # fmt: skip
-
-
-def predicted_markers(
-    testfield: TestField, rows: list[int], image_points: Array, found: MarkerCorners
-) -> MarkerCorners:
-    """Marker corners (rows of the field) where an orientation has them.
-
-    image_points (N, 2) px of the whole field; found: those that were detected, for the width of the
-    border. Corners of which a neighbour is not in the field are left out.
-    """
-    side = np.linalg.norm(found.before - found.corners, axis=1)
-    share = float(np.median(found.cell / np.maximum(side, 1e-9))) if len(found) else 0.1
-    row_of = {(n, *key): row for n, m in marker_rows(testfield).items() for key, row in m.items()}
-    places, corners, before, after, cell = [], [], [], [], []
-    for row in rows:
-        name, marker, k = parse_marker(testfield.codes[row])
-        ends = [row_of.get((name, marker, ((k or 0) + step) % 4)) for step in (-1, 1)]
-        if ends[0] is None or ends[1] is None:
-            continue
-        at, first, second = (image_points[r] for r in (row, ends[0], ends[1]))
-        size = min(float(np.linalg.norm(first - at)), float(np.linalg.norm(second - at)))
-        if size >= _SMALLEST_SIDE_PX:
-            places.append(row)
-            corners.append(at)
-            before.append(first)
-            after.append(second)
-            cell.append(share * size)
-    return MarkerCorners(
-        np.array(places, dtype=np.int64), _xy(corners), _xy(before), _xy(after),
-        np.array(cell, dtype=float),
-    )  # fmt: skip
-
-
-def measure_corners(
-    image: Image, found: MarkerCorners, missed: dict[int, str] | None = None
-) -> Observations:
-    """Measure marker corners where they were found; `missed` receives reasons for the others."""
-    missed = {} if missed is None else missed
-    fit = fit_corners(image, found.corners, found.before, found.after, found.cell)
-    rows = found.rows.tolist()
-    missed.update({row: why for row, why in zip(rows, fit.reasons, strict=True) if why})
-    order = sorted((row, i) for i, row in enumerate(rows) if not fit.reasons[i])
-    keep = np.array([i for _, i in order], dtype=np.int64)
-    return Observations(
-        np.array([row for row, _ in order], dtype=np.int64),
-        fit.points[keep],
-        np.sqrt(np.stack([fit.covariances[keep, 0, 0], fit.covariances[keep, 1, 1]], axis=-1)),
-        fit.covariances[keep, 0, 1],
-        {
-            "blur": fit.blur[keep],
-            "contrast": fit.contrast[keep],
-            "grey": fit.background[keep],
-            "noise": fit.residual_sd[keep],
-            "saturation": fit.saturation[keep],
-        },
+    rows = np.array([row for row, _, _ in found], dtype=np.int64)
+    borders = np.array([border for _, border, _ in found])
+    places, before, after = (
+        np.array([three for *_, three in found]).reshape(-1, 3, 2).swapaxes(0, 1)
     )
-
-
-def measure_markers(
-    image: Image, testfield: TestField, missed: dict[int, str] | None = None
-) -> Observations:
-    """Measure the marker corners of a test field in an image (H, W), grey, 8 or 16 bit.
-
-    Returns the corners found, with standard deviation and covariance of each, and as quality
-    `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` (share of pixels).
-    `missed` receives {row: reason} for corners of markers that were found but not measured, and
-    for those not found at all.
-    """
-    return measure_corners(image, locate_markers(image, testfield, missed), missed)
-
-
-def _xy(points: list[Array]) -> Array:
-    return np.array(points, dtype=float).reshape(-1, 2)
+    return Corners(rows, places, before, after, borders)

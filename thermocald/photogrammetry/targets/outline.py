@@ -56,9 +56,10 @@ class LocalMap:
         """Some of the maps, by mask or rows."""
         return LocalMap(self.centre[keep], self.linear[keep], self.second[keep])
 
-    def without_eccentricity(self) -> LocalMap:
-        """The same with plain ellipses: what is then measured is the ellipse's centre."""
-        return LocalMap(self.centre, self.linear, np.zeros_like(self.second))
+    @classmethod
+    def none(cls) -> LocalMap:
+        """Return no maps."""
+        return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 3)))
 
     def at(self, centre: Array) -> LocalMap:
         """The same shapes about other centres (n, 2) px."""
@@ -98,6 +99,16 @@ def target_axes(normals: Array) -> tuple[Array, Array]:
     across: Array = np.cross(helper, normals)
     e1: Array = across / np.linalg.norm(across, axis=1, keepdims=True)
     return e1, np.cross(normals, e1)
+
+
+def facing(centre: Array, points: Array, normals: Array) -> tuple[Array, Array]:
+    """Return the normals (n, 3) of targets at points (n, 3), and the cosines (n,) under which a
+    camera at `centre` sees them. A normal that is not known (NaN) is taken to face the camera.
+    """
+    view = centre - points
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    known = np.where(np.isfinite(normals), normals, view)
+    return known, np.abs(np.sum(view * known, axis=1))
 
 
 def local_maps(
@@ -196,10 +207,8 @@ def windows(
     beyond = np.full((len(maps), 2), reach_px)
     clear = (RING_INNER - 1) * maps.semi_axes[coded] - _RING_CLEARANCE * blur
     beyond[coded] = np.clip(clear, 0.0, reach_px)
-    outer, inner = (
-        _grown_ellipses(maps, beyond),
-        _grown_ellipses(maps, np.full_like(beyond, -reach_px)),
-    )
+    outer = _grown_ellipses(maps, beyond)
+    inner = _grown_ellipses(maps, np.full_like(beyond, -reach_px))
     sizes = half[order].tolist()
     flat = image.ravel()
     start = 0
@@ -275,14 +284,7 @@ def _squared_radius(M: Array, centre: Array, powers: Single) -> Single:
     """
     shift = (M @ centre[:, :, None])[:, :, 0]
     constant = np.where(M[:, 0, 0] > 0, np.sum(shift * centre, axis=1), 2.0)
-    by_power = [
-        M[:, 0, 0],
-        2 * M[:, 0, 1],
-        M[:, 1, 1],
-        -2 * shift[:, 0],
-        -2 * shift[:, 1],
-        constant,
-    ]
+    by_power = [M[:, 0, 0], 2 * M[:, 0, 1], M[:, 1, 1], *(-2 * shift.T), constant]
     found: Single = np.stack(by_power, axis=1).astype(np.float32) @ powers
     return found
 
@@ -314,19 +316,10 @@ _SMALLEST_AXIS = 1.5
 _LARGEST_AXIS_RATIO = 3.2  # 60° obliqueness and then some perspective
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidates:
-    """n ellipses: maps (centre to some 0.1 px), and polarity (n,): -1 dark on light, 1 reverse."""
+def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -> LocalMap:
+    """Find ellipses of one kind (dark on light -1, light on dark 1) in an image (H, W).
 
-    maps: LocalMap
-    polarity: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.polarity)
-
-
-def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -> Candidates:
-    """Ellipses of one kind (dark on light -1, light on dark 1) in an image (H, W).
+    Their centres are good to some 0.1 px.
 
     scale: the image is searched at 1/scale of its size; ellipses with less than some six px across
     there are not found.
@@ -348,10 +341,7 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -
     ratio = np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]])
     centre = (e[:, :2] + 0.5) * ratio - 0.5
     # A contour runs through pixel centres, half a pixel inside of the outline.
-    return Candidates(
-        from_ellipses(centre, scale * (e[:, 2:4] + 0.5), e[:, 4]),
-        np.full(len(e), polarity, dtype=np.int64),
-    )
+    return from_ellipses(centre, scale * (e[:, 2:4] + 0.5), e[:, 4])
 
 
 def _ellipses(contours: Sequence[Any], longest: float) -> Array:

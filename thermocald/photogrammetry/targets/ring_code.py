@@ -31,7 +31,6 @@ size last, until enough are found for an orientation.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from functools import cache
 from math import inf
 from typing import TYPE_CHECKING
@@ -50,7 +49,6 @@ from thermocald.photogrammetry.targets.markers import (
 from thermocald.photogrammetry.targets.outline import (
     RING_INNER,
     RING_OUTER,
-    Candidates,
     LocalMap,
     find_circles,
 )
@@ -88,11 +86,6 @@ def codes(bits: int) -> tuple[int, ...]:
     )
 
 
-@cache
-def _code_set(bits: int) -> frozenset[int]:
-    return frozenset(codes(bits))
-
-
 def is_ring(code: str) -> bool:
     """Whether a test field's code names a ring code."""
     return code.startswith("RING")
@@ -113,7 +106,7 @@ def parse(code: str) -> tuple[int, int]:
             f"{codes(12)[0]}"
         )
     value = int(number)
-    if value not in _code_set(bits):
+    if value >> bits or _code_table(bits)[value] != value:
         raise TestFieldError(
             f"{code!r}: there is no {bits}-bit ring code {value}; a code is the smallest number "
             "among its rotations, has an even number of ones, and a pair of opposite ones"
@@ -149,6 +142,12 @@ _EDGE_RADII = (0.55, 0.65, 0.75, 0.85, 0.95, 1.05, 1.15, 1.25, 1.35, 1.45)
 _INSIDE = 0.6  # level of a sample, 0 background, 1 ink
 
 
+def _circle(angles: int) -> Array:
+    """Unit vectors (2, angles) all around."""
+    turn = 2 * np.pi * np.arange(angles) / angles
+    return np.stack([np.cos(turn), np.sin(turn)])
+
+
 def sample(
     image: NDArray[np.uint8], maps: LocalMap, radii: tuple[float, ...], angles: int
 ) -> Single:
@@ -156,8 +155,7 @@ def sample(
 
     radii: of the circles, in radii of the disc; angles: how many samples a circle has.
     """
-    turn = 2 * np.pi * np.arange(angles) / angles
-    circle = np.stack([np.cos(turn), np.sin(turn)])
+    circle = _circle(angles)
     grey = np.empty((len(maps), len(radii), angles), dtype=np.float32)
     chunk = 32_000 // len(radii)  # cv2.remap takes no more rows
     rho = np.array(radii, dtype=np.float32)[:, None, None]
@@ -184,11 +182,7 @@ def sized(image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Singl
     # The disc reaches as far as ink goes: its level, summed outwards.
     step = _EDGE_RADII[1] - _EDGE_RADII[0]
     radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
-    turn = 2 * np.pi * np.arange(COARSE_ANGLES) / COARSE_ANGLES
-    across = 1 / np.linalg.norm(
-        np.swapaxes(maps.inverse, 1, 2) @ np.stack([np.cos(turn), np.sin(turn)]),
-        axis=1,
-    )
+    across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ _circle(COARSE_ANGLES), axis=1)
     excess = np.median((radius - 1) * across, axis=1)
     axes = np.linalg.norm(maps.linear, axis=1)
     factor = np.maximum(1 + excess[:, None] / axes, 0.5)
@@ -208,17 +202,12 @@ def in_perspective(
     rho = np.arange(_PROFILE[0], _PROFILE[1], _PROFILE_STEP)
     level = sample(image, maps, tuple(rho.tolist()), ANGLES)
     level = (level - gap[:, None, None]) / contrast[:, None, None]
-    turn = 2 * np.pi * np.arange(ANGLES) / ANGLES
-    u = np.stack([np.cos(turn), np.sin(turn)])
+    u = _circle(ANGLES)
     # away from the ends of an arc, whose corners are rounded by blur
     ring = level[:, np.argmin(np.abs(rho - 2.5))] > _INSIDE
     ring &= np.roll(ring, 2, axis=1) & np.roll(ring, -2, axis=1)
     normal, rhs = np.zeros((len(maps), 7, 7)), np.zeros((len(maps), 7))
-    for radius, rising in (
-        (1.0, False),
-        (RING_INNER, True),
-        (RING_OUTER, False),
-    ):
+    for radius, rising in ((1.0, False), (RING_INNER, True), (RING_OUTER, False)):
         window = np.abs(rho - radius) < _PROFILE_REACH
         part = level[:, window] if rising else 1 - level[:, window]
         crossing = (part[:, :-1] < 0.5) & (part[:, 1:] >= 0.5)
@@ -282,8 +271,7 @@ def ring_misfit(
     # Angle to the nearest transition in rad, positive on ink; a bit farther off will do for far.
     angle = np.minimum(np.where(left, within, within + 1), np.where(right, 1 - within, 2 - within))
     angle = np.where(mine, angle, -angle) * (2 * np.pi / bits)
-    turn = 2 * np.pi * np.arange(ANGLES) / ANGLES
-    u = np.stack([np.cos(turn), np.sin(turn)])
+    u = _circle(ANGLES)
     # How many px a radius is: across the circles, and across a radial edge at that radius.
     across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ u, axis=1)
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
@@ -306,9 +294,8 @@ def ring_misfit(
 def _rms_after_shift(level: Single, drawn: Single) -> Array:
     """RMS (n,) of level minus drawn (n, radii, angles) after the ring may shift, turn, and grow."""
     n = len(level)
-    turn = (2 * np.pi * np.arange(ANGLES) / ANGLES).astype(np.float32)
     radii = np.array(RADII, dtype=np.float32)
-    rho, cosine, sine = radii[:, None], np.cos(turn), np.sin(turn)
+    rho, (cosine, sine) = radii[:, None], _circle(ANGLES).astype(np.float32)
     outwards = np.gradient(drawn, radii, axis=1)
     around = np.roll(drawn, -1, axis=2) - np.roll(drawn, 1, axis=2)
     around *= np.float32(ANGLES / (4 * np.pi))
@@ -343,60 +330,39 @@ _RASTER_TURNS = 0.006
 _MISFIT_OF_FEW = 0.06
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CodedTargets:
-    """Coded targets: bits, numbers (m,), and the row (m,) of each among the candidates."""
-
-    bits: NDArray[np.int64]
-    numbers: NDArray[np.int64]
-    rows: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-
 def read_codes(
     image: NDArray[np.uint8],
-    candidates: Candidates,
-    known: frozenset[tuple[int, int]] | None = None,
+    candidates: LocalMap,
+    polarity: int,
     wanted: tuple[Collection[tuple[int, int]], float] = ((), inf),
-) -> CodedTargets:
-    """The ring codes about candidates; `known` (bits, number), all others are ignored.
+) -> dict[tuple[int, int], int]:
+    """Read the ring codes about discs (dark on light -1, light on dark 1): the row of each code
+    (bits, number) among the candidates.
 
     Both families are always read, since a ring of one may be mistaken for one of the other. A code
     that is read at two places is dropped: one of the two is wrong. wanted: codes, and how many of
     them are enough: discs about which no code was found are then not looked at in perspective.
     """
-    rows, gap, contrast = _disc_and_gap(image, candidates)
-    maps = sized(image, candidates.maps.select(rows), gap, contrast)
-    bits, number = _read(image, maps, gap, contrast)
+    rows, gap, contrast = _disc_and_gap(image, candidates, polarity)
+    maps = sized(image, candidates.select(rows), gap, contrast)
+    found = _read(image, maps, gap, contrast)
     # Seen from near and aslant, a ring is not concentric with its disc: by pixels if it is large.
-    left = np.nonzero(bits == 0)[0]
+    left = np.nonzero(found[:, 0] == 0)[0]
     codes, enough = wanted
-    if len(left) and sum(c in codes for c in _pairs(bits, number)) < enough:
+    if len(left) and sum(tuple(c) in codes for c in found.tolist()) < enough:
         grey = gap[left], contrast[left]
-        bits[left], number[left] = _read(
-            image, in_perspective(image, maps.select(left), *grey), *grey
-        )
-    good = bits > 0
-    bits, number, rows = bits[good], number[good], rows[good]
-    found = _pairs(bits, number)
-    count = Counter(found)
-    keep = np.array(
-        [i for i, c in enumerate(found) if count[c] == 1 and (known is None or c in known)],
-        dtype=np.int64,
-    )
-    return CodedTargets(bits[keep], number[keep], rows[keep])
-
-
-def _pairs(bits: NDArray[np.int64], number: NDArray[np.int64]) -> list[tuple[int, int]]:
-    return list(zip(bits.tolist(), number.tolist(), strict=True))
+        found[left] = _read(image, in_perspective(image, maps.select(left), *grey), *grey)
+    read = [(bits, number) for bits, number in found.tolist()]
+    count = Counter(read)
+    return {
+        code: int(row) for code, row in zip(read, rows, strict=True) if code[0] and count[code] == 1
+    }
 
 
 def _read(
     image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Bits (n,), 0 where no code can be trusted, and numbers (n,) of the codes about discs."""
+) -> NDArray[np.int64]:
+    """Bits, 0 where no code can be trusted, and numbers (n, 2) of the codes about discs."""
     level = sample(image, maps, RADII, ANGLES)
     level = (level - gap[:, None, None]) / contrast[:, None, None]
     families = np.array(BITS, dtype=np.int64)
@@ -410,26 +376,26 @@ def _read(
     good = np.isfinite(misfit) & (
         misfits.min(axis=0, initial=np.inf) > 1.2 * np.where(np.isfinite(misfit), misfit, 0)
     )
-    return np.where(good, families[best], 0), numbers[best, at]
+    return np.stack([np.where(good, families[best], 0), numbers[best, at]], axis=1)
 
 
 def _disc_and_gap(
-    image: NDArray[np.uint8], candidates: Candidates
+    image: NDArray[np.uint8], candidates: LocalMap, polarity: int
 ) -> tuple[NDArray[np.int64], Single, Single]:
     """Candidates with disc, gap, something in the ring, background outside, and all in the image.
 
     Returns their rows, the grey value of the gap, and the contrast.
     """
     height, width = image.shape
-    reach = candidates.maps.half_extent * RING_OUTER
-    low, high = candidates.maps.centre - reach, candidates.maps.centre + reach
+    reach = candidates.half_extent * RING_OUTER
+    low, high = candidates.centre - reach, candidates.centre + reach
     inside = np.all((low > 0) & (high < (width - 1, height - 1)), axis=1)
-    large = candidates.maps.semi_axes[:, 1] >= _SMALLEST_SEMI_AXIS_PX
+    large = candidates.semi_axes[:, 1] >= _SMALLEST_SEMI_AXIS_PX
     rows = np.nonzero(inside & large)[0]
-    grey = sample(image, candidates.maps.select(rows), _COARSE_RADII, COARSE_ANGLES)
+    grey = sample(image, candidates.select(rows), _COARSE_RADII, COARSE_ANGLES)
     ink, gap = grey[:, 0].mean(axis=1), grey[:, 1].mean(axis=1)
     contrast = ink - gap
-    enough = contrast * candidates.polarity[rows] >= _LEAST_CONTRAST_DN
+    enough = contrast * polarity >= _LEAST_CONTRAST_DN
     level = (grey - gap[:, None, None]) / np.where(enough, contrast, 1.0)[:, None, None]
     passed = (
         enough
@@ -496,7 +462,8 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
     return codes, misfit
 
 
-_SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))  # scale, polarity
+SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))
+"""Scale and polarity (-1 dark on light) in which codes are looked for, until there are enough."""
 _ENOUGH_CODES = 0.5
 _LARGE_WIDTH = 1200
 _MARKER_NEIGHBOURHOOD = 2.0  # sides of the marker that names a circle
@@ -504,69 +471,53 @@ _MARKER_NEIGHBOURHOOD = 2.0  # sides of the marker that names a circle
 
 def find_coded(
     image: Image, testfield: TestField, fewest: int, needed: bool
-) -> tuple[NDArray[np.int64], Array, LocalMap, bool]:
-    """Rows, centres (n, 2), and maps of ring-coded and marker-named circles; whether codes were
-    seen that are not of this field. fewest: targets that carry an orientation; needed: search on
-    until enough are found.
+) -> tuple[NDArray[np.int64], LocalMap, bool]:
+    """Find ring-coded and marker-named circles: rows, maps, and whether codes were seen that are
+    not of this field. fewest: targets that carry an orientation; needed: search on until enough are
+    found.
     """
     row_of: dict[tuple[int, int], int] = {}
     named: dict[str, dict[int, int]] = {}
     for row, code in enumerate(testfield.codes):
-        if testfield.kinds[row] != "circle" or not code:
-            continue
-        if is_ring(code):
+        if testfield.kinds[row] == "circle" and is_ring(code):
             row_of[parse(code)] = row
-        elif is_marker(code):
+        elif testfield.kinds[row] == "circle" and is_marker(code):
             dictionary, marker, corner = parse_marker(code)
             if corner is None:
                 named.setdefault(dictionary, {})[marker] = row
-    if not row_of and not named:
-        return _nothing()
-    grey = to_8_bit(image)
-    best: tuple[NDArray[np.int64], Array, LocalMap] | None = None
-    foreign = False
-    enough = max(fewest + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
-    searches = _SEARCHES if image.shape[1] > _LARGE_WIDTH else _SEARCHES[2:]
-    for scale, polarity in searches:
-        candidates = find_circles(grey, scale, polarity)
-        codes = read_codes(grey, candidates, wanted=(row_of, enough))
-        keys = list(zip(codes.bits.tolist(), codes.numbers.tolist(), strict=True))
-        ours = [i for i, key in enumerate(keys) if key in row_of]
-        foreign = foreign or len(ours) < len(keys)
-        rows = [row_of[keys[i]] for i in ours]
-        which = [int(codes.rows[i]) for i in ours]
-        for row, place in _circles_by_marker(grey, candidates, named):
-            if place not in which:
-                rows.append(row)
-                which.append(place)
-        if best is None or len(rows) > len(best[0]):
-            maps = candidates.maps.select(np.array(which, dtype=np.int64))
-            best = np.array(rows, dtype=np.int64), maps.centre, maps
-        if len(best[0]) >= enough or (not needed and len(best[0]) >= fewest):
-            break
-    if best is None:
-        return _nothing()
-    return (*best, foreign)
-
-
-def _nothing() -> tuple[NDArray[np.int64], Array, LocalMap, bool]:
-    none = LocalMap(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 3)))
-    return np.zeros(0, dtype=np.int64), np.zeros((0, 2)), none, False
+    best: dict[int, int] = {}  # place among the candidates by row
+    maps, foreign = LocalMap.none(), False
+    if row_of or named:
+        grey = to_8_bit(image)
+        enough = max(fewest + 2, _ENOUGH_CODES * (len(row_of) + sum(map(len, named.values()))))
+        for scale, polarity in SEARCHES if image.shape[1] > _LARGE_WIDTH else SEARCHES[2:]:
+            candidates = find_circles(grey, scale, polarity)
+            codes = read_codes(grey, candidates, polarity, (row_of, enough))
+            ours = {row_of[code]: place for code, place in codes.items() if code in row_of}
+            foreign = foreign or len(ours) < len(codes)
+            for row, place in _circles_by_marker(grey, candidates, named):
+                if place not in ours.values():
+                    ours[row] = place
+            if len(ours) > len(best):
+                best = ours
+                maps = candidates.select(np.array(list(ours.values()), dtype=np.int64))
+            if len(best) >= enough or (not needed and len(best) >= fewest):
+                break
+    return np.array(list(best), dtype=np.int64), maps, foreign
 
 
 def _circles_by_marker(
-    grey: NDArray[np.uint8], candidates: Candidates, named: dict[str, dict[int, int]]
+    grey: NDArray[np.uint8], candidates: LocalMap, named: dict[str, dict[int, int]]
 ) -> list[tuple[int, int]]:
     """(row, candidate) of circles that a marker names: the one circle nearest to its centre."""
     pairs: list[tuple[int, int]] = []
     for dictionary, row_of in named.items():
-        found = detect_markers(grey, dictionary, frozenset(row_of))
-        for number, quad in zip(found.numbers.tolist(), found.corners, strict=True):
+        for number, quad in detect_markers(grey, dictionary, frozenset(row_of))[0].items():
             side = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean()
-            distance = np.linalg.norm(candidates.maps.centre - quad.mean(axis=0), axis=1)
+            distance = np.linalg.norm(candidates.centre - quad.mean(axis=0), axis=1)
             outside = np.array(
                 [cv2.pointPolygonTest(quad.astype(np.float32), tuple(c), True) < 0
-                 for c in candidates.maps.centre], dtype=bool,
+                 for c in candidates.centre], dtype=bool,
             )  # fmt: skip
             near = np.nonzero(outside & (distance < _MARKER_NEIGHBOURHOOD * side))[0]
             if len(near):

@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from thermocald.errors import DataError
+from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.physics.effect import (
     Effect,
     OfTime,
     Parameter,
+    Remembering,
     Steady,
     coefficient_units,
     say_estimate,
 )
 from thermocald.physics.history import DelayFollower, Follower, History, LagFollower
-from thermocald.physics.operators import interpolation_matrix, lag, lag_matrix, slope_matrix
+from thermocald.physics.operators import interpolation_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 
-class ThermalLag(Effect):
+class ThermalLag(Remembering):
     """The linear terms follow L instead of T, with τ dL/dt = T - L and L = T at the start.
 
     The lumped-capacity body: τ = heat capacity × thermal resistance to where T is measured.
@@ -34,6 +36,7 @@ class ThermalLag(Effect):
     """
 
     name = "thermal_lag"
+    operator = "lag"
     noun = "a thermal lag"
     kind = "drive"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
@@ -48,19 +51,6 @@ class ThermalLag(Effect):
 
     def follower(self, values: Mapping[str, Any]) -> Follower | None:
         return LagFollower(float(values["tau"]))
-
-    def drive(self, history: History, tau: float = 60.0, **_: Any) -> Array:
-        p = history.polygon()
-        return lag(p.times, p.values, tau, history.times)
-
-    def sensitivity(self, history: History, tau: float = 60.0, **_: Any) -> csr_array:
-        p = history.polygon()
-        return lag_matrix(p.times, tau, history.times) @ p.matrix
-
-    def propagate(self, history: History, errors: Array, tau: float = 60.0, **_: Any) -> Array:
-        p = history.polygon()
-        # the operator is linear: no matrix needed, whatever the length
-        return lag(p.times, p.matrix @ errors, tau, history.times)
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         return f"the camera follows the thermometer with a lag of {say_estimate(estimates['tau'])}"
@@ -123,7 +113,7 @@ class TimeOffset(Effect):
 _NOISE_JUMPS = 3.0  # standard deviations that a jump of the rate must be beyond noise
 
 
-class ThermalGradient(Effect):
+class ThermalGradient(Remembering):
     """Adds a dT/dt: the difference across a plate that heat flows through, so its bow.
 
     In a body that warms steadily the difference between its faces is proportional to the rate:
@@ -131,6 +121,7 @@ class ThermalGradient(Effect):
     """
 
     name = "thermal_gradient"
+    operator = "rate"
     noun = "a thermal gradient"
     kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("(K/s)")
@@ -146,11 +137,6 @@ class ThermalGradient(Effect):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, **_: Any) -> Array:
-        p = history.polygon()
-        rate: Array = slope_matrix(p.times, history.times) @ p.values
-        return rate[:, None]
-
     def unresolved(
         self,
         history: History,
@@ -164,14 +150,10 @@ class ThermalGradient(Effect):
         if len(p.times) < 5:
             return np.zeros(len(history.times))
         jumps = np.abs(np.diff(np.diff(p.values) / np.diff(p.times)))
-        noise = 1.4826 * float(np.median(jumps))
+        noise = mad_sd(jumps)
         excess = np.sqrt(np.maximum(jumps**2 - (_NOISE_JUMPS * noise) ** 2, 0.0))
         at_knots = np.concatenate([excess[:1], excess, excess[-1:]]) / 2.0
         return np.interp(history.times, p.times, at_knots)
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        p = history.polygon()
-        return slope_matrix(p.times, history.times) @ p.matrix
 
 
 class SelfHeating(OfTime):

@@ -12,20 +12,13 @@ from thermocald.physics.effect import (
     OfTime,
     Parameter,
     Proportional,
+    Remembering,
     Steady,
     coefficient_units,
     say_estimate,
 )
 from thermocald.physics.history import Follower, History, PlayFollower
-from thermocald.physics.operators import (
-    lag,
-    lag_matrix,
-    play,
-    play_matrix,
-    play_turns,
-    running_maximum,
-    running_maximum_matrix,
-)
+from thermocald.physics.operators import play_turns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,7 +29,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 
-class Hysteresis(Effect):
+class Hysteresis(Remembering):
     """The linear terms follow P = min(max(P, T - r), T + r): a play of half-width r on T.
 
     P rests until T is r away from it, then follows; the loop closes. P = T at the start.
@@ -44,6 +37,7 @@ class Hysteresis(Effect):
     """
 
     name = "hysteresis"
+    operator = "play"
     noun = "hysteresis"
     kind = "drive"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
@@ -58,14 +52,6 @@ class Hysteresis(Effect):
 
     def follower(self, values: Mapping[str, Any]) -> Follower | None:
         return PlayFollower(float(values["half_width"]))
-
-    def drive(self, history: History, half_width: float = 1.0, **_: Any) -> Array:
-        p = history.polygon()
-        return play(p.times, p.values, half_width, history.times)
-
-    def sensitivity(self, history: History, half_width: float = 1.0, **_: Any) -> csr_array:
-        p = history.polygon()
-        return play_matrix(p.times, p.values, half_width, history.times) @ p.matrix
 
     def turns(self, history: History, half_width: float = 1.0, **_: Any) -> NDArray[np.bool_]:
         p = history.polygon()
@@ -121,7 +107,7 @@ class Softening(Effect):
         return f"something gives way above {say_estimate(estimates['T_k'])}"
 
 
-class PermanentSet(Effect):
+class PermanentSet(Remembering):
     """Adds a (max over the past of T - T₀); the past begins with the series.
 
     Source: the reference study found it in the RPi camera v2.1 (Elias et al. 2020, Sensors 20, 643,
@@ -129,6 +115,7 @@ class PermanentSet(Effect):
     """
 
     name = "permanent_set"
+    operator = "maximum"
     noun = "a permanent set"
     kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
@@ -145,12 +132,7 @@ class PermanentSet(Effect):
     }
 
     def signal(self, history: History, **_: Any) -> Array:
-        p = history.polygon()
-        return (running_maximum(p.times, p.values, history.times) - history.T0)[:, None]
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        p = history.polygon()
-        return running_maximum_matrix(p.times, p.values, history.times) @ p.matrix
+        return (self.drive(history) - history.T0)[:, None]
 
 
 class Creep(OfTime):
@@ -221,7 +203,7 @@ class HousingTilt(Proportional):
     }
 
 
-class MountMotion(Effect):
+class MountMotion(Remembering):
     """Adds a (L - T₀) to the orientation and the projection centre; τ dL/dt = T - L, L = T at the
     start. Without tau, or where it is 0, L is T.
 
@@ -231,6 +213,7 @@ class MountMotion(Effect):
     """
 
     name = "mount_motion"
+    operator = "lag"
     noun = "a motion of the mount"
     kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
@@ -249,22 +232,13 @@ class MountMotion(Effect):
     }
 
     def signal(self, history: History, tau: float = 0.0, **_: Any) -> Array:
-        if tau <= 0:
-            return (history.temperature() - history.T0)[:, None]
-        p = history.polygon()
-        return (lag(p.times, p.values, tau, history.times) - history.T0)[:, None]
+        late = self.drive(history, tau=tau) if tau > 0 else history.temperature()
+        return (late - history.T0)[:, None]
 
     def sensitivity(self, history: History, tau: float = 0.0, **_: Any) -> csr_array:
-        if tau <= 0:
-            return history.temperature_matrix()
-        p = history.polygon()
-        return lag_matrix(p.times, tau, history.times) @ p.matrix
-
-    def propagate(self, history: History, errors: Array, tau: float = 0.0, **_: Any) -> Array:
-        if tau <= 0:
-            return super().propagate(history, errors)
-        p = history.polygon()
-        return lag(p.times, p.matrix @ errors, tau, history.times)
+        if tau > 0:
+            return super().sensitivity(history, tau=tau)
+        return history.temperature_matrix()
 
     def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
         moved = ", ".join(f"{k} = {say_estimate(e)}" for k, e in estimates.items() if k != "tau")

@@ -1,14 +1,16 @@
-"""A series of the store as a recording."""
+"""A series of the store as a recording; a verified copy of a store while a daemon writes it."""
 
 from __future__ import annotations
 
 import csv
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.errors import DataError, StoreError, UsageError
 from thermocald.files import make_folder, new_file
 from thermocald.names import FileFolder
 from thermocald.store.database.store import Store
@@ -18,7 +20,6 @@ from thermocald.store.series import series_times
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from thermocald.epoch import Epoch
     from thermocald.store.series import StoredSeries
 
 
@@ -46,7 +47,10 @@ def archive_store(
         make_folder(folder)
         every = opened.all_series()
         for one in chosen:
-            target = folder / _recording_name(one, every)
+            name = f"{one.camera}-{one.name}"
+            if sum(f"{other.camera}-{other.name}" == name for other in every) > 1:
+                name = f"{one.camera}--{one.name}"  # `a-b`/`c` and `a`/`b-c` are two
+            target = folder / name
             last = opened.last_epoch(one)
             if last is None or (skip_existing and target.exists()):
                 continue
@@ -60,13 +64,6 @@ def archive_store(
     for target in readings.values():
         say(f"{target}: readings")
     return {"recordings": written, "readings": readings}
-
-
-def _recording_name(one: StoredSeries, every: list[StoredSeries]) -> str:
-    """`<camera>-<series>`; `a-b`/`c` and `a`/`b-c` are two, with two hyphens each."""
-    name = f"{one.camera}-{one.name}"
-    alike = sum(f"{other.camera}-{other.name}" == name for other in every)
-    return name if alike == 1 else f"{one.camera}--{one.name}"
 
 
 def archive_series(
@@ -95,9 +92,9 @@ def archive_series(
     kept = FileFolder(frames or Path())
     with RecordingWriter(path, head, series.testfield) as writer:
         for stored in store.epochs(series):
-            epoch = _with_frame(stored.epoch, kept)
-            frame_time, temperature_time = times.of(epoch.number)
-            writer.append(replace(epoch, frame_time=frame_time, temperature_time=temperature_time))
+            frame = stored.epoch.frame
+            found = None if frame is None else kept.find(frame)
+            writer.append(replace(times.correct(stored).epoch, frame=found))
 
 
 def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
@@ -124,7 +121,41 @@ def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
     return written
 
 
-def _with_frame(epoch: Epoch, frames: FileFolder) -> Epoch:
-    if epoch.frame is None:
-        return epoch
-    return replace(epoch, frame=frames.find(epoch.frame))
+def back_up(store: Path, target: Path, keep: int = 0) -> dict[str, Any]:
+    """Copy a store to a file, or into a folder as `<store>-<UTC>.db`, and read the copy again.
+
+    keep: delete all but the newest so many of a folder, 0: none. Returns the document of the
+    command. Raises DataError where the file exists, UsageError where its folder does not,
+    StoreError for a damaged store, which is not copied.
+    """
+    if target.is_dir():
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        target = target / f"{store.stem}-{stamp}.db"
+    elif keep:
+        raise UsageError(f"--keep is for a folder of backups; {target} is not a folder")
+    if target.exists():
+        raise DataError(f"{target}: exists already; a backup is never written over")
+    if not target.absolute().parent.is_dir():
+        raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
+    with Store.open(store) as opened:
+        opened.copy_to(target)
+    try:
+        with Store.open(target) as copy:
+            found = copy.examine()
+        if found.damaged:
+            raise StoreError(
+                f"{store}: is damaged, and was not backed up: {found.damaged[0]}; "
+                "`thermocald check` lists all"
+            )
+    except StoreError:
+        target.unlink(missing_ok=True)
+        raise
+    stamp = "[0-9]" * 8 + "T" + "[0-9]" * 6 + "Z"
+    there = sorted(target.parent.glob(f"{store.stem}-{stamp}.db"))
+    old = [path for path in there[:-keep] if path != target] if keep else []
+    for path in old:
+        path.unlink(missing_ok=True)
+    return {
+        "format": "thermocald-backup/1", "store": store, "backup": target, "epochs": found.epochs,
+        "deleted": old,
+    }  # fmt: skip

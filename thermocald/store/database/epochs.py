@@ -4,33 +4,49 @@ An observation is 18 bytes: target row uint16, x and y int32 in units of 1e-5 px
 deviations float32; 4 more for the covariance of x and y where it is known, 4 for each quality.
 The rounding of 3e-6 px (rms) is a thousandth of the best measurement and the digits of
 observations.csv. A covariance is the 136 float64 of its upper triangle. All little-endian.
+
+And series as rows of the store.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import struct
 from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
-from thermocald.names import relative_path
+from thermocald.names import file_name, relative_path
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.store.database.columns import insert_row, require_checksum, row_checksum, rows_of
-from thermocald.store.series import EpochResult, ObservationRows, StoredEpoch
+from thermocald.store.database.columns import (
+    insert_row,
+    next_id,
+    read_epochs,
+    require_checksum,
+    row_checksum,
+)
+from thermocald.store.recording.head import Head, head_document, parse_head
+from thermocald.store.recording.observation_file import ObservationRows
+from thermocald.store.recording.testfield_file import parse_testfield, testfield_csv
+from thermocald.store.schema import sql_name
+from thermocald.store.series import EpochResult, StoredEpoch, StoredSeries
 
 if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Iterator, Mapping
-
-    from numpy.typing import NDArray
+    from pathlib import Path
+    from typing import Any
 
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.field.testfield import TestField
+
 
 POINT_QUANTUM_PX = 1e-5
 
@@ -40,6 +56,8 @@ _COVARIANCES, _LONG_ROWS, _FLOAT_POINTS = 1, 2, 4
 _UPPER = np.triu_indices(16)
 _PARTS = 1024  # detail.id = epoch.id * _PARTS + part; part 0 is the covariance
 _PART_BYTES = 1100  # seven to a page
+_VALUES = tuple(map(sql_name, PARAMETER_NAMES))
+_SDS = tuple(f"sd_{name}" for name in _VALUES)
 
 
 def pack_covariance(covariance: Array) -> bytes:
@@ -85,33 +103,18 @@ def pack_observations(seen: Observations) -> bytes:
 
 def unpack_observations(data: bytes) -> Observations:
     """The inverse of `pack_observations`; raises StoreError for bytes that are none."""
+    flags, n, start = _layout_of(data)
+    rows = _rows_of(flags, [(0, n, start, data)])
     try:
-        layout, flags, n, names_size = _HEADER.unpack_from(data)
-        if layout != _LAYOUT:
-            raise ValueError(f"layout {layout}")
-        position = _HEADER.size + names_size
-        names = data[_HEADER.size : position].decode()
-
-        def take(kind: str, count: int) -> NDArray[np.generic]:
-            nonlocal position
-            values: NDArray[np.generic] = np.frombuffer(data, kind, count, position)
-            position += values.nbytes
-            return values
-
-        targets = take("<u4" if flags & _LONG_ROWS else "<u2", n).astype(np.int64)
-        if flags & _FLOAT_POINTS:
-            points = take("<f8", 2 * n).astype(np.float64)
-        else:
-            # dividing by 1e5 gives the decimal number's nearest double, times 1e-5 would not
-            points = take("<i4", 2 * n).astype(np.float64) / round(1 / POINT_QUANTUM_PX)
-        sigmas = take("<f4", 2 * n).astype(np.float64)
-        covariances = take("<f4", n).astype(np.float64) if flags & _COVARIANCES else None
-        quality = {name: take("<f4", n).astype(np.float64) for name in names.split("\n") if name}
-        return Observations(
-            targets, points.reshape(n, 2), sigmas.reshape(n, 2), covariances, quality
-        )
-    except (struct.error, ValueError) as cause:
+        names = data[_HEADER.size : start].decode()
+        end = start + n * sum(_sizes(flags))
+        quality = {
+            name: np.frombuffer(data, "<f4", n, end + 4 * n * i).astype(np.float64)
+            for i, name in enumerate(filter(None, names.split("\n")))
+        }
+    except ValueError as cause:
         raise StoreError(f"observations in the store are broken: {cause}") from cause
+    return Observations(rows.targets, rows.points, rows.sigmas, rows.covariances, quality)
 
 
 def unpack_rows(packed: Mapping[int, bytes]) -> ObservationRows:
@@ -122,41 +125,45 @@ def unpack_rows(packed: Mapping[int, bytes]) -> ObservationRows:
     """
     kinds: dict[int, list[tuple[int, int, int, bytes]]] = {}
     for number, data in packed.items():
-        if len(data) < _HEADER.size or data[0] != _LAYOUT:
-            raise StoreError(f"epoch {number}: its observations in the store are broken")
-        _, flags, n, names_size = _HEADER.unpack_from(data)
-        kinds.setdefault(flags, []).append((number, n, _HEADER.size + names_size, data))
-    parts = [_rows_of(flags, epochs) for flags, epochs in kinds.items()] or [_rows_of(0, [])]
-    correlated = any(part.covariances is not None for part in parts)
-    return ObservationRows(
-        np.concatenate([part.numbers for part in parts]),
-        np.concatenate([part.targets for part in parts]),
-        np.concatenate([part.points for part in parts]),
-        np.concatenate([part.sigmas for part in parts]),
-        np.concatenate(
-            [np.zeros(len(p.numbers)) if p.covariances is None else p.covariances for p in parts]
-        )
-        if correlated
-        else None,
+        flags, n, start = _layout_of(data)
+        kinds.setdefault(flags, []).append((number, n, start, data))
+    return ObservationRows.join(
+        [_rows_of(flags, epochs) for flags, epochs in kinds.items()] or [_rows_of(0, [])]
     )
 
 
-def _rows_of(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> ObservationRows:
-    """The rows of epochs of one layout: their number, how many, where they begin, the bytes."""
+def _layout_of(data: bytes) -> tuple[int, int, int]:
+    """Return the flags of packed observations, how many there are, and where they begin."""
+    if len(data) < _HEADER.size or data[0] != _LAYOUT:
+        raise StoreError("observations in the store are broken: they are of another layout")
+    _, flags, n, names_size = _HEADER.unpack_from(data)
+    return flags, n, _HEADER.size + names_size
+
+
+def _sizes(flags: int) -> list[int]:
+    """Return the bytes of a target, a point, its standard deviations, and a covariance, if any.
+
+    The quality follows, column by column.
+    """
     sizes = [4 if flags & _LONG_ROWS else 2, 16 if flags & _FLOAT_POINTS else 8, 8]
-    if flags & _COVARIANCES:
-        sizes.append(4)
+    return [*sizes, 4] if flags & _COVARIANCES else sizes
+
+
+def _rows_of(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> ObservationRows:
+    """Unpack epochs of one layout: their number, how many rows, where they begin, the bytes."""
+    sizes = _sizes(flags)
     columns: list[list[bytes]] = [[] for _ in sizes]
-    for number, n, position, data in epochs:
+    for _, n, position, data in epochs:
         if len(data) < position + n * sum(sizes):
-            raise StoreError(f"epoch {number}: its observations in the store are broken")
+            raise StoreError("observations in the store are broken: some are missing")
         for column, size in zip(columns, sizes, strict=True):
             column.append(data[position : position + n * size])
             position += n * size
     whole = [b"".join(column) for column in columns]
     points = np.frombuffer(whole[1], "<f8" if flags & _FLOAT_POINTS else "<i4").astype(np.float64)
     if not flags & _FLOAT_POINTS:
-        points /= round(1 / POINT_QUANTUM_PX)  # as `unpack_observations` does
+        # dividing by 1e5 gives the decimal number's nearest double, times 1e-5 would not
+        points /= round(1 / POINT_QUANTUM_PX)
     numbers, counts = (np.array([e[k] for e in epochs], dtype=np.int64) for k in (0, 1))
     return ObservationRows(
         np.repeat(numbers, counts),
@@ -167,12 +174,11 @@ def _rows_of(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> Observati
     )
 
 
-def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoch) -> int:
-    """Insert one epoch with its details and return its id; within the caller's transaction."""
+def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoch) -> None:
+    """Insert one epoch with its details; within the caller's transaction."""
     epoch, result, seen = stored.epoch, stored.result, stored.epoch.observations
     connection.execute("INSERT OR IGNORE INTO status_code (status) VALUES (?)", (result.status,))
-    # not left to SQLite: the id is covered by the checksum, since the details depend on it
-    (id_,) = connection.execute("SELECT ifnull(max(id), 0) + 1 FROM epoch").fetchone()
+    id_ = next_id(connection, "epoch")
     parts = _parts(epoch.number, id_, result.covariance, seen)
     row: dict[str, Any] = {
         "id": id_,
@@ -187,6 +193,7 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
         "redundancy": result.redundancy,
         "n_observations": result.n_observations,
         "n_rejected": len(result.rejected),
+        # None where a later calibration uses the observations of the revision before
         "measured": None if seen is None else len(seen),
         "temperatures": _numbers_json(epoch.temperatures),
         "extra": _numbers_json(stored.extra),
@@ -194,13 +201,12 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
         "frame": "" if epoch.frame is None else str(epoch.frame),
         "note": epoch.note,
         "reason": result.reason,
-        **dict(zip(PARAMETER_NAMES, result.values.tolist(), strict=True)),
-        **dict(zip((f"sd_{n}" for n in PARAMETER_NAMES), result.sd.tolist(), strict=True)),
+        **dict(zip(_VALUES, result.values.tolist(), strict=True)),
+        **dict(zip(_SDS, result.sd.tolist(), strict=True)),
         "detail_checksum": row_checksum((), data=b"".join(data for _, data in parts)),
     }
-    insert_row(connection, row)
+    insert_row(connection, "epoch", row)
     connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts)
-    return int(id_)
 
 
 def _parts(
@@ -232,16 +238,21 @@ def select_epochs(
 
     details: False leaves out observations and covariances. Raises StoreError for damage.
     """
-    rows = rows_of(connection, series, first, last)
-    row = next(rows, None)
-    while row is not None:
-        latest = measured = row
-        # a later calibration of observations that stay the same does not keep them again
-        while (row := next(rows, None)) is not None and row["number"] == latest["number"]:
-            latest = row
-            if row["measured"] is not None:
-                measured = row
-        yield _epoch(connection, latest, measured, details)
+    rows = read_epochs(connection, series, first, last)
+    for _, revisions in groupby(rows, key=itemgetter("number")):
+        covariance = seen = None
+        every = list(revisions)
+        if details:
+            # a later calibration of observations that stay the same does not keep them again
+            measured = next((r for r in every[::-1] if r["measured"] is not None), every[-1])
+            covariance, seen = read_details(connection, every[-1])
+            if measured is not every[-1]:
+                _, seen = read_details(connection, measured)
+        yield stored_epoch(
+            every[-1],
+            unpack_covariance(covariance) if covariance else None,
+            unpack_observations(seen) if seen else None,
+        )
 
 
 def select_observations(
@@ -261,50 +272,34 @@ def select_observations(
         {"parts": _PARTS, "series": series, "first": first, "last": last},
     )
     packed: dict[int, bytes] = {}
-    for (_, number, measured, checksum), rows in groupby(parts, key=lambda row: row[:4]):
-        if measured is None and number in packed:
-            continue  # a later calibration of the same observations does not keep them again
-        found = [(part, bytes(data)) for *_, part, data in rows if data is not None]
-        what = f"epoch {number}: its covariance or its observations"
-        require_checksum(checksum, what, (), data=b"".join(data for _, data in found))
-        packed[number] = b"".join(data for part, data in found if part)
+    for (_, number, measured, checksum), rows in groupby(parts, key=itemgetter(0, 1, 2, 3)):
+        _, seen = _joined(
+            number, checksum, [(part, data) for *_, part, data in rows if data is not None]
+        )
+        if measured is not None or number not in packed:
+            packed[number] = seen
     return unpack_rows({number: data for number, data in packed.items() if data})
 
 
-def select_covariance(connection: sqlite3.Connection, series: int, number: int) -> Array | None:
-    """The (16, 16) covariance of an epoch's latest calibration, None if there is none."""
-    rows = list(rows_of(connection, series, number, number))
-    return _details(connection, rows[-1])[0] if rows else None
+def read_details(connection: sqlite3.Connection, row: Mapping[str, Any]) -> tuple[bytes, bytes]:
+    """Read the covariance and the observations of a row, packed; empty where it has none.
 
-
-def check_details(connection: sqlite3.Connection, row: dict[str, Any]) -> None:
-    """Raise StoreError where the covariance or the observations of a row are damaged."""
-    _details(connection, row)
-
-
-def select_details(connection: sqlite3.Connection, id_: int) -> tuple[bytes, bytes]:
-    """The covariance and the observations of the row `id_`, packed; empty where it has none."""
-    parts = _parts_of(connection, id_)
-    covariance = b"".join(data for part, data in parts if part == 0)
-    return covariance, b"".join(data for part, data in parts if part)
-
-
-def _parts_of(connection: sqlite3.Connection, id_: int) -> list[tuple[int, bytes]]:
-    return connection.execute(
+    Raises StoreError where they are not as they were written.
+    """
+    parts = connection.execute(
         "SELECT id - :low, data FROM detail WHERE id >= :low AND id < :high ORDER BY id",
-        {"low": id_ * _PARTS, "high": (id_ + 1) * _PARTS},
+        {"low": row["id"] * _PARTS, "high": (row["id"] + 1) * _PARTS},
     ).fetchall()
+    return _joined(row["number"], row["detail_checksum"], parts)
 
 
-def _epoch(
-    connection: sqlite3.Connection, row: dict[str, Any], measured: dict[str, Any], details: bool
-) -> StoredEpoch:
-    covariance = seen = None
-    if details:
-        covariance, seen = _details(connection, row)
-        if measured is not row:
-            _, seen = _details(connection, measured)
-    return stored_epoch(row, covariance, seen)
+def _joined(number: int, kept: int, parts: list[tuple[int, bytes]]) -> tuple[bytes, bytes]:
+    """Join covariance and observations from their parts, which must be as they were written."""
+    covariance = b"".join(bytes(data) for part, data in parts if part == 0)
+    seen = b"".join(bytes(data) for part, data in parts if part)
+    what = f"epoch {number}: its covariance or its observations"
+    require_checksum(kept, what, (), data=covariance + seen)
+    return covariance, seen
 
 
 def stored_epoch(
@@ -325,7 +320,7 @@ def stored_epoch(
     result = EpochResult(
         status=row["status"],
         reason=row["reason"],
-        values=np.array([row[name] for name in PARAMETER_NAMES], dtype=float),
+        values=np.array([row[name] for name in _VALUES], dtype=float),
         covariance=covariance,
         sigma0=_nan(row["sigma0"]),
         redundancy=row["redundancy"],
@@ -335,22 +330,6 @@ def stored_epoch(
     return StoredEpoch(
         epoch, result, _mapping(row["extra"]), bool(row["clock_trusted"]), row["revision"]
     )
-
-
-def _details(
-    connection: sqlite3.Connection, row: dict[str, Any]
-) -> tuple[Array | None, Observations | None]:
-    """(covariance, observations) of one row; StoreError where they are not as they were written."""
-    parts = _parts_of(connection, row["id"])
-    data = b"".join(bytes(part) for _, part in parts)
-    what = f"epoch {row['number']}: its covariance or its observations"
-    require_checksum(row["detail_checksum"], what, (), data=data)
-    covariance = seen = None
-    if parts and parts[0][0] == 0:
-        covariance, parts = unpack_covariance(parts[0][1]), parts[1:]
-    if parts:
-        seen = unpack_observations(b"".join(part for _, part in parts))
-    return covariance, seen
 
 
 def _numbers_json(values: Mapping[str, float]) -> str:
@@ -364,3 +343,73 @@ def _mapping(text: str) -> dict[str, float]:
 
 def _nan(value: float | None) -> float:
     return math.nan if value is None else value
+
+
+def insert_series(
+    connection: sqlite3.Connection,
+    head: Head,
+    testfield: TestField,
+    start: str,
+    identity: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    created_utc: float,
+) -> None:
+    """Insert a series, and its test field if it is a new one; within the caller's transaction."""
+    csv = testfield_csv(testfield)
+    digest = hashlib.sha256(csv.encode()).hexdigest()
+    connection.execute("INSERT OR IGNORE INTO testfield (digest, csv) VALUES (?, ?)", (digest, csv))
+    texts = (
+        head.camera.name,
+        head.series,
+        start,
+        to_json(head_document(head)),
+        to_json(identity),
+        to_json(settings),
+    )
+    connection.execute(
+        "INSERT INTO series (camera, name, start, head, identity, settings, created_utc, checksum, "
+        "testfield_id) SELECT ?, ?, ?, ?, ?, ?, ?, ?, id FROM testfield WHERE digest = ?",
+        (*texts, created_utc, row_checksum((created_utc,), (*texts, digest)), digest),
+    )
+
+
+def select_series(connection: sqlite3.Connection, path: Path) -> list[StoredSeries]:
+    """All series in the order in which they were begun; `path` is for the messages."""
+    rows = connection.execute(
+        "SELECT s.id, created_utc, s.checksum, csv, camera, name, start, head, identity, settings, "
+        "digest FROM series s JOIN testfield t ON t.id = testfield_id ORDER BY s.id"
+    ).fetchall()
+    if not rows and connection.execute("SELECT 1 FROM epoch LIMIT 1").fetchone():
+        known = connection.execute("SELECT 1 FROM series JOIN testfield LIMIT 1").fetchone()
+        if known is None:
+            raise StoreError(f"{path}: is damaged: its series or test fields are gone")
+    return [_series(path, *row) for row in rows]
+
+
+def _series(
+    path: Path, number: int, created: float, kept: int, csv: str, *texts: str
+) -> StoredSeries:
+    camera, name, start, head, identity, settings, digest = texts
+    what = f"{path}: series {camera}/{name}"
+    require_checksum(kept, what, (created,), texts)
+    if hashlib.sha256(csv.encode(errors="surrogateescape")).hexdigest() != digest:
+        raise StoreError(f"{what}: its test field is damaged: it is not what its digest says")
+    file_name(camera, f"{what}: camera", StoreError)
+    file_name(name, f"{what}: series", StoreError)
+    parsed = parse_head(json.loads(head), path)
+    if (parsed.camera.name, parsed.series) != (camera, name):
+        raise StoreError(f"{what}: its head is of {parsed.camera.name!r}/{parsed.series!r}")
+    return StoredSeries(
+        number,
+        parsed,
+        parse_testfield(csv, path),
+        start,
+        json.loads(identity),
+        json.loads(settings),
+        created,
+    )
+
+
+def to_json(mapping: Mapping[str, Any]) -> str:
+    """A mapping as the text that a row keeps."""
+    return json.dumps(dict(mapping), default=str)

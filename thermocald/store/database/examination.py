@@ -15,31 +15,23 @@ from typing import TYPE_CHECKING, Any
 from thermocald.errors import StoreError
 from thermocald.names import WITH_VALUES, relative_path
 from thermocald.store.database.columns import (
-    all_rows,
+    KEPT,
+    ROW,
     checked_chunks,
-    forgotten_calibrations,
-    require_checksum,
     require_sound,
+    select_rows,
 )
-from thermocald.store.database.epochs import check_details, select_details
+from thermocald.store.database.epochs import read_details
 from thermocald.store.series import NOT_CALIBRATED
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 log = logging.getLogger(__name__)
 
-KEPT = ("epoch", "event", "reading")
-"""The tables that grow while a daemon runs."""
-
 _CHECKSUMS = ("checksum", "detail_checksum")
-# what the checksum of a row is of, in its order: numbers and texts
-_CHECKED = {
-    "event": (("utc", "series_id", "epoch"), ("kind", "text", "data")),
-    "reading": (("utc", "clock_trusted"), ("thermometer", "temperatures")),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,53 +73,24 @@ def examine(connection: sqlite3.Connection) -> Examination:
         if verdict != "ok"
     ]
     epochs = 0
-    for row in all_rows(connection):
-        epochs += 1
-        if isinstance(row, StoreError):
-            damaged.append(_short(row))
-            continue
-        damaged += _failure(check_details, connection, row)
+    cameras = dict(connection.execute("SELECT id, camera || '/' || name FROM series"))
+    for table in KEPT:
+        for values in select_rows(connection, table, "NOT INDEXED ORDER BY id"):
+            row = _read_row(connection, table, values)
+            epochs += table == "epoch"
+            if row["damage"] and table == "epoch":
+                series = row["series_id"]
+                damaged.append(f"{cameras.get(series, f'series {series}')}, epoch {row['number']}")
+            elif row["damage"]:
+                damaged.append(row["damage"].partition(":")[0])
     damaged += checked_chunks(connection)
-    if not damaged:
-        damaged += forgotten_calibrations(connection)
-    damaged += _orphans(connection)
-    damaged += _events_and_readings(connection)
-    return Examination(tuple(damaged), tuple(_gaps(connection)), epochs)
-
-
-def _failure(check: Callable[..., None], *values: Any) -> list[str]:
-    try:
-        check(*values)
-    except StoreError as error:
-        return [_short(error)]
-    return []
-
-
-def _short(error: StoreError) -> str:
-    return str(error).partition(":")[0]
-
-
-def _orphans(connection: sqlite3.Connection) -> list[str]:
-    """Details whose epoch is gone."""
-    (count,) = connection.execute(
+    (orphans,) = connection.execute(
         "SELECT count(DISTINCT id / 1024) FROM detail "
         "WHERE id / 1024 NOT IN (SELECT id FROM epoch NOT INDEXED)"
     ).fetchone()
-    return [f"{count} epochs have observations but no row"] if count else []
-
-
-def _events_and_readings(connection: sqlite3.Connection) -> Iterator[str]:
-    tables: tuple[tuple[str, str, int], ...] = (
-        ("event", "utc, series_id, epoch, kind, text, data", 3),
-        ("reading", "utc, clock_trusted, thermometer, temperatures", 2),
-    )
-    for table, columns, numbers in tables:
-        rows: Iterator[tuple[Any, ...]] = connection.execute(
-            f"SELECT checksum, id, {columns} FROM {table} ORDER BY id"
-        )
-        for kept, id_, *values in rows:
-            what = f"{table} {id_}"
-            yield from _failure(require_checksum, kept, what, values[:numbers], values[numbers:])
+    if orphans:
+        damaged.append(f"{orphans} epochs have observations but no row")
+    return Examination(tuple(damaged), tuple(_gaps(connection)), epochs)
 
 
 def _gaps(connection: sqlite3.Connection) -> Iterator[Gap]:
@@ -145,44 +108,32 @@ def _gaps(connection: sqlite3.Connection) -> Iterator[Gap]:
 def rows_after(
     connection: sqlite3.Connection, table: str, after: int, limit: int
 ) -> Iterator[dict[str, Any]]:
-    """Up to `limit` rows of one of KEPT with an id above `after`, as {column: value}.
+    """Up to `limit` rows of a table in KEPT with an id above `after`, as {column: value}.
 
     An epoch also has `covariance` and `observations`, bytes as `blob` packs them, or None. Every
     row has `damage`: empty, or in a sentence how it is not as it was written.
     """
-    if table not in KEPT:
-        raise ValueError(f"{table!r} is not one of {', '.join(KEPT)}")
-    cursor = connection.execute(
-        f"SELECT * FROM {table} WHERE id > ? ORDER BY id LIMIT ?", (after, limit)
-    )
-    names = [column[0] for column in cursor.description]
-    for values in cursor:
-        row = dict(zip(names, values, strict=True))
-        row["damage"] = _damage(connection, table, row)
+    for values in select_rows(
+        connection, table, "WHERE id > ? ORDER BY id LIMIT ?", (after, limit)
+    ):
+        row = _read_row(connection, table, values)
         for name in _CHECKSUMS:  # of this file's rows, as SQLite gives them back
             row.pop(name, None)
-        if table == "epoch":
-            covariance, observations = select_details(connection, row["id"])
-            row |= {"covariance": covariance or None, "observations": observations or None}
         yield row
 
 
-def _damage(connection: sqlite3.Connection, table: str, row: dict[str, Any]) -> str:
+def _read_row(connection: sqlite3.Connection, table: str, values: Sequence[Any]) -> dict[str, Any]:
+    """Return a row by column, an epoch's with its details, and its `damage`."""
+    row = dict(zip(ROW[table], values, strict=True))
+    row["damage"] = ""
     try:
+        require_sound(table, values)
         if table == "epoch":
-            require_sound(row)
-            check_details(connection, row)
-        else:
-            numbers, texts = _CHECKED[table]
-            require_checksum(
-                row["checksum"],
-                f"{table} {row['id']}",
-                [row[name] for name in numbers],
-                [row[name] for name in texts],
-            )
+            covariance, observations = read_details(connection, row)
+            row |= {"covariance": covariance or None, "observations": observations or None}
     except StoreError as error:
-        return str(error)
-    return ""
+        row["damage"] = str(error)
+    return row
 
 
 @dataclass(frozen=True, slots=True)

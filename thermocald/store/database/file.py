@@ -4,6 +4,13 @@ The lock is on the file itself, whatever name it was opened by.
 SQLite keeps what was committed last in the file `<store>-wal` until it is moved into the store. To
 read it, the helper file `-shm` must be there, or be made; a file opened with `immutable=1`
 is read without it, and lacks those epochs.
+
+SQLite reads the frames of the -wal up to the first whose checksum does not match, and takes what
+follows for what a crash cut off. That is right for the last transaction, which may not have been
+committed; one that another follows, or that the index in the -shm file counts, was committed, and
+what does not match is damage.
+Formats: https://www.sqlite.org/fileformat2.html#the_write_ahead_log,
+https://www.sqlite.org/walformat.html#the_wal_index_file_format
 """
 
 from __future__ import annotations
@@ -14,19 +21,23 @@ import logging
 import os
 import shutil
 import sqlite3
+import struct
 import tempfile
+import time
 import uuid
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from thermocald.errors import StoreError, StoreFullError, StoreVersionError, ThermocaldError
-from thermocald.files import cannot_write, output_place
+from thermocald.files import cannot_write, is_ordinary, output_place
 from thermocald.store import schema
 from thermocald.store.database.columns import DamageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
 
 log = logging.getLogger(__name__)
 
@@ -56,13 +67,12 @@ class StoreFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._wal: tuple[int, int] | None = None
-        self._shm: tuple[int, int] | None = None
+        self._helpers: dict[str, tuple[int, int]] = {}
         found = _identity(path)
         if found in _CLAIMED:
             raise _taken(path)
         self._made = found is None
-        if found is not None and not path.is_dir() and not _is_ordinary(path):
+        if found is not None and not path.is_dir() and not is_ordinary(path):
             raise StoreError(f"{path}: is a device or a pipe; a store is a file of its own")
         try:
             self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -101,32 +111,21 @@ class StoreFile:
 
     def remember_helpers(self) -> None:
         """Note which -wal and -shm files the open database uses, as soon as they are there."""
-        if self._wal is None:
-            self._wal = _identity(self.wal_path)
-        if self._shm is None:
-            self._shm = _identity(self.shm_path)
+        for kind in HELPERS:
+            if kind not in self._helpers and (found := _identity(helper(self.path, kind))):
+                self._helpers[kind] = found
 
-    @property
-    def helpers_there(self) -> bool:
-        """Whether the -wal and the -shm file are still those that were noted."""
-        shm_there = self._shm is None or _identity(self.shm_path) == self._shm
-        return self.wal_there and shm_there
+    def helper_there(self, kind: str) -> bool:
+        """Whether one of HELPERS is still the file that was noted."""
+        return self._helpers.get(kind) in (None, _identity(helper(self.path, kind)))
 
-    @property
-    def wal_there(self) -> bool:
-        """Whether the -wal file is still the one that was noted."""
-        return self._wal is None or _identity(self.wal_path) == self._wal
 
-    @property
-    def wal_path(self) -> Path:
-        """Of the -wal file: next to the file that a link leads to."""
-        resolved = self.path.resolve()
-        return resolved.with_name(f"{resolved.name}-wal")
+HELPERS = ("wal", "shm")
 
-    @property
-    def shm_path(self) -> Path:
-        """Of the -shm file, the index of the -wal file."""
-        return self.wal_path.with_name(f"{self.wal_path.name.removesuffix('-wal')}-shm")
+
+def helper(path: Path, kind: str) -> Path:
+    """Return the path of a store's -wal or -shm file: next to what a link leads to."""
+    return Path(f"{path.resolve()}-{kind}")
 
 
 def written_elsewhere(path: Path) -> bool:
@@ -138,7 +137,7 @@ def written_elsewhere(path: Path) -> bool:
     would end with it.
     """
     found = path.stat()
-    wal = path.resolve().with_name(f"{path.resolve().name}-wal")
+    wal = helper(path, "wal")
     if found.st_nlink < 2 or wal.exists():
         return False
     here = (found.st_dev, found.st_ino)
@@ -156,11 +155,6 @@ def written_elsewhere(path: Path) -> bool:
         "FLOCK" in line and line.split()[-3].rsplit(":", 1)[-1] == str(found.st_ino)
         for line in locks.splitlines()
     )
-
-
-def _is_ordinary(path: Path) -> bool:
-    """Whether a path leads to a file on a disk: no device, no pipe, nothing of the kernel's."""
-    return path.is_file() and path.resolve().parts[:2] not in (("/", "proc"), ("/", "sys"))
 
 
 def _taken(path: Path) -> StoreError:
@@ -295,12 +289,8 @@ def _connect(path: Path, mode: str) -> sqlite3.Connection:
         check_same_thread=False,
     )
     # a damaged text must show as a wrong checksum of its row, not as an error of the whole query
-    connection.text_factory = _text
+    connection.text_factory = lambda data: data.decode(errors="surrogateescape")
     return connection
-
-
-def _text(data: bytes) -> str:
-    return data.decode(errors="surrogateescape")
 
 
 def _version(connection: sqlite3.Connection, path: Path) -> int:
@@ -394,7 +384,7 @@ def open_copy(
     temporary files, joined there and opened; the copy is gone with the connection. change: made to
     the copy first, which then is needed in any case. Raises StoreError, sqlite3.Error.
     """
-    wal = Path(f"{path.resolve()}-wal")  # SQLite follows links too
+    wal = helper(path, "wal")
     if change is None and not (wal.exists() and wal.stat().st_size):
         return _connect(path, "ro&immutable=1")
     try:
@@ -439,3 +429,96 @@ def _state(path: Path) -> tuple[int, int, int] | None:
     except OSError:
         return None
     return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+_HEADER = struct.Struct(">8I")  # magic, version, page size, sequence, two salts, two checksums
+_FRAME = struct.Struct(">6I")  # page, size of the database after a commit, two salts, checksums
+_MAGIC = 0x377F0682
+_INDEX_BYTES = 48
+_DAMAGED_SALT_BITS = 3  # salts of another run differ in about half of their 64 bits
+_LOOKS, _PAUSE_S = 3, 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class WalTail:
+    """lost: committed transactions that cannot be read, -1 for all of them; unfinished: the last
+    transaction cannot be read, and nothing says that it was committed: its writer was killed, or
+    the file was cut off when it was copied, and more may have followed.
+    """
+
+    lost: int = 0
+    unfinished: bool = False
+
+
+def read_wal_tail(path: Path) -> WalTail:
+    """Look at a -wal file, and at the -shm file beside it; it may be written meanwhile."""
+    for _ in range(_LOOKS):
+        tail = _look(path)
+        if tail == WalTail():
+            break
+        time.sleep(_PAUSE_S)  # half of what is just being written looks like damage
+    return tail
+
+
+def _look(path: Path) -> WalTail:
+    committed = _committed_frames(path)  # first: what is committed later may be read half-written
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return WalTail()
+    if len(data) < _HEADER.size:
+        return WalTail()
+    magic, _, page_size, _, *salts, first, second = _HEADER.unpack_from(data)
+    order = ">" if magic & 1 else "<"
+    sums = _checksum(order, data[:24], (0, 0))
+    if magic & ~1 != _MAGIC or sums != (first, second) or page_size % 512:
+        return WalTail(lost=-1)
+    broken = earlier = False
+    whole = ended = 0  # frames that are there, and up to the last end of a transaction
+    commits: list[int] = []  # numbers of the frames that end a transaction, from the broken one on
+    step = _FRAME.size + page_size
+    for number, at in enumerate(range(_HEADER.size, len(data) - step + 1, step), 1):
+        _, commit, *frame_salts, first, second = _FRAME.unpack_from(data, at)
+        if frame_salts != salts:
+            pairs = zip(frame_salts, salts, strict=True)
+            if sum((one ^ two).bit_count() for one, two in pairs) > _DAMAGED_SALT_BITS:
+                earlier = True  # of an earlier run
+                break
+            broken = True
+        if not broken:
+            head, page = data[at : at + 8], data[at + _FRAME.size : at + step]
+            sums = _checksum(order, page, _checksum(order, head, sums))
+            broken = sums != (first, second)
+        whole, ended = number, number if commit else ended
+        if broken and commit:
+            commits.append(number)
+    frames = committed.get(data[16:24], 0)
+    if not broken:
+        cut = ended < whole or (not earlier and (len(data) - _HEADER.size) % step)
+        return WalTail(int(whole < frames), unfinished=bool(cut) and whole >= frames)
+    lost = len([n for n in commits if n != commits[-1] or n <= frames])
+    return WalTail(lost, unfinished=not lost)
+
+
+def _committed_frames(wal: Path) -> dict[bytes, int]:
+    """{salts of a -wal file: how many frames of it the index counts as committed}."""
+    try:
+        with wal.with_name(f"{wal.name.removesuffix('-wal')}-shm").open("rb") as file:
+            one, two = file.read(_INDEX_BYTES), file.read(_INDEX_BYTES)
+    except OSError:
+        return {}
+    if len(one) < _INDEX_BYTES or one != two:
+        return {}
+    order = "<" if struct.pack("=I", 1)[0] else ">"
+    if _checksum(order, one[:40], (0, 0)) != struct.unpack("=2I", one[40:]):
+        return {}
+    return {one[32:40]: int(struct.unpack_from("=I", one, 16)[0])}
+
+
+def _checksum(order: str, data: bytes, start: tuple[int, int]) -> tuple[int, int]:
+    a, b = start
+    words = struct.unpack(f"{order}{len(data) // 4}I", data)
+    for one, two in zip(words[::2], words[1::2], strict=True):
+        a = (a + one + b) & 0xFFFFFFFF
+        b = (b + two + a) & 0xFFFFFFFF
+    return a, b

@@ -7,6 +7,7 @@ revision, and triggers in the file refuse everything else.
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 from contextlib import contextmanager
@@ -19,33 +20,47 @@ import numpy as np
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.files import cannot_write
 from thermocald.names import file_name, require_channels
-from thermocald.store.database import columns as column_chunks
-from thermocald.store.database.columns import COLUMN_NAMES, status_codes
+from thermocald.store.database import columns
+from thermocald.store.database.columns import (
+    KEPT,
+    ROW,
+    SeriesColumns,
+    insert_row,
+    next_id,
+    read_columns,
+    read_epochs,
+    read_page,
+    require_sound,
+    select_rows,
+)
 from thermocald.store.database.epochs import (
     insert_epoch,
-    select_covariance,
+    insert_series,
+    read_details,
     select_epochs,
     select_observations,
+    select_series,
+    to_json,
+    unpack_covariance,
 )
 from thermocald.store.database.examination import (
-    KEPT,
     Examination,
     KeptFrame,
     examine,
     frames_after,
     rows_after,
 )
-from thermocald.store.database.file import Mode, StoreFile, connect, copy_database, in_words
-from thermocald.store.database.rows import (
-    insert_events,
-    insert_readings,
-    insert_series,
-    select_events,
-    select_readings,
-    select_series,
+from thermocald.store.database.file import (
+    Mode,
+    StoreFile,
+    connect,
+    copy_database,
+    helper,
+    in_words,
+    read_wal_tail,
 )
-from thermocald.store.database.wal import read_wal_tail
 from thermocald.store.recording.head import head_document, parse_head
+from thermocald.store.schema import COLUMN_NAMES, sql_name
 from thermocald.store.series import (
     NOT_CALIBRATED,
     EpochResult,
@@ -67,7 +82,7 @@ if TYPE_CHECKING:
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
     from thermocald.store.recording.head import Head
-    from thermocald.store.series import ObservationRows
+    from thermocald.store.recording.observation_file import ObservationRows
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +101,8 @@ class Store(SeriesReader):
         self._file = file  # whose lock is given back with the store
         self._lock = threading.RLock()
         self._unchunked: set[int] = set()  # series whose chunks cannot be built
-        self._ends: dict[int, tuple[int, int]] = {}  # series → last number, rows in no chunk
+        # series → last number, rows in no chunk
+        self._ends: dict[int, tuple[int | None, int]] = {}
 
     @classmethod
     def open(
@@ -125,17 +141,17 @@ class Store(SeriesReader):
     @property
     def identity(self) -> str:
         """A UUID that the store was given when it was made: a copy has the same."""
-        ((identity,),) = self._query("SELECT identity FROM store", ())
-        return str(identity)
+        return str(self._value("SELECT identity FROM store"))
 
     def all_series(self) -> list[StoredSeries]:
         """All series, in the order in which they were begun."""
-        return self._select_series()
+        with self._reads("the series") as connection:
+            return select_series(connection, self.path)
 
     def last_epoch(self, series: StoredSeries) -> int | None:
         """The number of the last epoch kept, None if there is none: where to resume."""
-        last = self._end(series)[0]
-        return None if last < 0 else last
+        found = self._value("SELECT max(number) FROM epoch WHERE series_id = ?", series.id)
+        return None if found is None else int(found)
 
     def _epochs(
         self, series: StoredSeries, first: int, last: int | None, details: bool
@@ -165,8 +181,8 @@ class Store(SeriesReader):
             page: list[StoredEpoch] = []
             failed: StoreError | None = None
             try:
-                with self._lock, in_words(self.path, "epochs cannot be read", reading=True):
-                    found = select_epochs(self._db, series.id, first, last, details=details)
+                with self._reads("epochs") as connection:
+                    found = select_epochs(connection, series.id, first, last, details=details)
                     page.extend(islice(found, _EPOCHS_AT_ONCE))
                     del found
             except StoreError as error:
@@ -180,45 +196,26 @@ class Store(SeriesReader):
 
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
         """The observations of the epochs numbered `first` to `last`, without their quality."""
-        with self._lock, in_words(self.path, "observations cannot be read", reading=True):
-            return select_observations(self._db, series.id, first, last)
-
-    def observations(
-        self, series: StoredSeries, numbers: Iterable[int]
-    ) -> Iterator[Observations | None]:
-        """The observations of some epochs; StoreError for a number that is not there."""
-        for number in numbers:
-            stored = next(self.epochs(series, number, number), None)
-            if stored is None:
-                raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
-            yield stored.epoch.observations
+        with self._reads("observations") as connection:
+            return select_observations(connection, series.id, first, last)
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
         result = np.full((len(numbers), 16, 16), np.nan)
-        with self._lock, in_words(self.path, "covariances cannot be read", reading=True):
-            for i, number in enumerate(numbers):
-                covariance = select_covariance(self._db, series.id, int(number))
-                if covariance is not None:
-                    result[i] = covariance
+        with self._reads("covariances") as connection:
+            for i, number in enumerate(map(int, numbers)):
+                for row in read_epochs(connection, series.id, number, number):
+                    covariance, _ = read_details(connection, row)
+                    result[i] = unpack_covariance(covariance) if covariance else np.nan
         return result
-
-    def column_names(self, series: StoredSeries) -> list[str]:
-        """What `series_columns` can give, but extra columns."""
-        return ["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels]
 
     def stamped_columns(
         self, series: StoredSeries, names: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
         """Columns (E,) over all epochs by name, with times as they were stamped."""
         source = {name: _source(name, series) for name in names}
-        with self._lock, in_words(self.path, "columns cannot be read", reading=True):
-            columns: dict[str, NDArray[Any]] = dict(
-                column_chunks.read_columns(
-                    self._db, series.id, list(dict.fromkeys(source.values()))
-                )
-            )
-            self._name_statuses(columns)
+        with self._reads("columns") as connection:
+            columns = read_columns(connection, series.id, list(dict.fromkeys(source.values())))
         return {name: columns[source[name]] for name in names}
 
     def column_pages(
@@ -233,41 +230,51 @@ class Store(SeriesReader):
         wanted = list(dict.fromkeys(["number", *source.values()]))
         after = -1
         while True:
-            with self._lock, in_words(self.path, "columns cannot be read", reading=True):
-                columns: dict[str, NDArray[Any]] = dict(
-                    column_chunks.read_page(self._db, series.id, wanted, after, rows)
-                )
-                self._name_statuses(columns)
+            with self._reads("columns") as connection:
+                columns = read_page(connection, series.id, wanted, after, rows)
             if not len(columns["number"]):
                 return
             after = int(columns["number"][-1])
             yield {name: columns[source[name]] for name in names}
 
-    def _name_statuses(self, columns: dict[str, NDArray[Any]]) -> None:
-        """Put words in the place of the codes in the column `status`."""
-        if "status" in columns:
-            codes = status_codes(self._db)
-            words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
-            columns["status"] = words[columns["status"].astype(np.int64)]
-
     def readings(
         self, thermometer: str | None = None, since_utc: float = 0.0
     ) -> Iterator[LoggedReading]:
         """Readings apart from epochs, in the order they were kept."""
-        after = 0
+        after = -1
         while True:
-            with self._lock, in_words(self.path, "readings cannot be read", reading=True):
-                after, page = select_readings(
-                    self._db, thermometer, since_utc, after, _READINGS_AT_ONCE
-                )
-            yield from page
-            if not after:
+            with self._reads("readings") as connection:
+                page = select_rows(
+                    connection,
+                    "reading",
+                    "WHERE id > ? AND utc >= ? AND thermometer = ifnull(?, thermometer) "
+                    "ORDER BY id LIMIT ?",
+                    (after, since_utc, thermometer, _READINGS_AT_ONCE),
+                ).fetchall()
+                for row in _sound_rows("reading", page):
+                    name = file_name(row["thermometer"], "thermometer", StoreError)
+                    values, trusted = json.loads(row["temperatures"]), bool(row["clock_trusted"])
+                    yield LoggedReading(name, row["utc"], values, trusted)
+            if len(page) < _READINGS_AT_ONCE:
                 return
+            after = page[-1][0]
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or all."""
-        with self._lock, in_words(self.path, "events cannot be read", reading=True):
-            return select_events(self._db, None if series is None else series.id, since_utc)
+        with self._reads("events") as connection:
+            rows = select_rows(
+                connection,
+                "event",
+                "WHERE utc >= ? AND series_id IS ifnull(?, series_id) ORDER BY id",
+                (since_utc, None if series is None else series.id),
+            )
+            return [
+                Event(
+                    row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
+                    json.loads(row["data"]),
+                )
+                for row in _sound_rows("event", rows)
+            ]  # fmt: skip
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
         """The steps of the clock that the daemon noted, oldest first: of every series the same."""
@@ -275,36 +282,30 @@ class Store(SeriesReader):
         return [event for event in self.events() if event.kind == "clock_step"]
 
     def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
-        """Rows of a growing table as they were kept, see `changes`: for a forwarder."""
-        with self._lock, in_words(self.path, f"{table}s cannot be read", reading=True):
-            return list(rows_after(self._db, table, after, limit))
+        """Rows of a growing table as they were kept, see `examination`: for a forwarder."""
+        with self._reads(f"{table}s") as connection:
+            return list(rows_after(connection, table, after, limit))
 
     def frames_after(self, after: int, limit: int) -> list[KeptFrame]:
-        """Epochs' frames as they were kept, see `changes`: for a forwarder."""
-        with self._lock, in_words(self.path, "frames cannot be listed", reading=True):
-            return list(frames_after(self._db, after, limit))
+        """Epochs' frames as they were kept, see `examination`: for a forwarder."""
+        with self._reads("frames") as connection:
+            return list(frames_after(connection, after, limit))
 
     def rows_waiting(self, after: Mapping[str, int]) -> int:
         """How many rows of the growing tables have ids above those given, by table."""
         return sum(
-            int(self._query(f"SELECT count(*) FROM {table} WHERE id > ?", (after[table],))[0][0])
+            int(self._value(f"SELECT count(*) FROM {table} WHERE id > ?", after[table]))
             for table in KEPT
         )
-
-    def check(self) -> None:
-        """Read the whole file; StoreError if anything in it is damaged."""
-        if damaged := self.examine().damaged:
-            more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
-            raise StoreError(f"{self.path}: is damaged: {damaged[0]}{more}")
 
     def examine(self) -> Examination:
         """Read the whole file: what is damaged, and which epochs are missing.
 
         Raises StoreError where it cannot be read as a store at all.
         """
-        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
-            found = examine(self._db)
-        tail = read_wal_tail(self.path.resolve().with_name(f"{self.path.resolve().name}-wal"))
+        with self._reads("the store") as connection:
+            found = examine(connection)
+        tail = read_wal_tail(helper(self.path, "wal"))
         if tail.lost:
             many = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
             many = "all transactions" if tail.lost < 0 else many
@@ -313,7 +314,8 @@ class Store(SeriesReader):
         found = replace(found, unfinished=tail.unfinished)
         if not found.damaged:
             for series in self.all_series():
-                self.series_columns(series, self.column_names(series))
+                names = ["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels]
+                self.series_columns(series, names)
             self.events()
         return found
 
@@ -328,23 +330,16 @@ class Store(SeriesReader):
             except OSError as error:
                 raise cannot_write(target, error) from error
 
-    def _select_series(
-        self, camera: str | None = None, name: str | None = None
-    ) -> list[StoredSeries]:
-        with self._lock, in_words(self.path, "the series cannot be read", reading=True):
-            return select_series(self._db, self.path, camera, name)
+    @contextmanager
+    def _reads(self, what: str) -> Iterator[sqlite3.Connection]:
+        """Hold the connection for this thread alone; `what` begins the message of an error."""
+        with self._lock, in_words(self.path, f"{what} cannot be read", reading=True):
+            yield self._db
 
-    def _end(self, series: StoredSeries) -> tuple[int, int]:
-        """The last epoch number of a series (-1: none) and how many rows are in no chunk."""
-        ((last,),) = self._query(
-            "SELECT ifnull(max(number), -1) FROM epoch WHERE series_id = ?", (series.id,)
-        )
-        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
-            return int(last), column_chunks.loose_rows(self._db, series.id)
-
-    def _query(self, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
-        with self._lock, in_words(self.path, "the store cannot be read", reading=True):
-            return self._db.execute(statement, values).fetchall()
+    def _value(self, statement: str, *values: Any) -> Any:
+        """Return the one value that a statement asks for."""
+        with self._reads("the store") as connection:
+            return connection.execute(statement, values).fetchone()[0]
 
     def create_series(
         self,
@@ -362,7 +357,8 @@ class Store(SeriesReader):
         file_name(head.camera.name, "camera", StoreError)
         file_name(head.series, "series", StoreError)
         with self._transaction(f"series {head.series!r} was not begun"):
-            if self._select_series(head.camera.name, head.series):
+            names = {(one.camera, one.name) for one in self.all_series()}
+            if (head.camera.name, head.series) in names:
                 raise StoreError(
                     f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
                     "already; choose another name"
@@ -404,15 +400,18 @@ class Store(SeriesReader):
     def _append(self, series: StoredSeries, stored: StoredEpoch, events: list[Event]) -> None:
         epoch = stored.epoch
         with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not kept"):
-            last, loose = self._ends.get(series.id) or self._end(series)
-            if epoch.number <= last:
+            last, loose = self._ends.get(series.id) or (
+                self.last_epoch(series), SeriesColumns(self._db, series.id).count_loose()
+            )  # fmt: skip
+            if last is not None and epoch.number <= last:
                 raise StoreError(
                     f"{self.path}: epoch {epoch.number} of series {series.name!r} comes after "
                     f"epoch {last}; numbers must increase"
                 )
             insert_epoch(self._db, series.id, stored)
-            insert_events(self._db, events)
-            full = loose + 1 >= column_chunks.CHUNK
+            for event in events:
+                self._insert_event(event)
+            full = loose + 1 >= columns.CHUNK
             if full and series.id not in self._unchunked:
                 self._build_chunks(series)
         self._ends[series.id] = (epoch.number, 0 if full else loose + 1)
@@ -421,7 +420,7 @@ class Store(SeriesReader):
         """Damage in an old row must not stop new ones: then columns are read from the rows."""
         self._db.execute("SAVEPOINT chunks")
         try:
-            column_chunks.build_missing_chunks(self._db, series.id)
+            SeriesColumns(self._db, series.id).build()
         except StoreError as error:
             self._db.execute("ROLLBACK TO chunks")
             self._unchunked.add(series.id)
@@ -449,28 +448,36 @@ class Store(SeriesReader):
                 then.clock_trusted,
                 then.revision + 1,
             )
-            epoch_id = insert_epoch(self._db, series.id, stored)
-            column_chunks.note_amended(self._db, series.id, number, epoch_id)
+            insert_epoch(self._db, series.id, stored)
 
     def add_event(self, event: Event) -> None:
         """Log something that happened apart from an epoch."""
         with self._transaction("an event was not kept"):
-            insert_events(self._db, [event])
+            self._insert_event(event)
+
+    def _insert_event(self, event: Event) -> None:
+        row = {
+            "id": next_id(self._db, "event"), "utc": event.utc, "series_id": event.series,
+            "epoch": event.epoch, "kind": event.kind, "text": event.text,
+            "data": to_json(event.data),
+        }  # fmt: skip
+        insert_row(self._db, "event", row)
 
     def add_readings(self, readings: Sequence[LoggedReading]) -> None:
         """Keep what thermometers said apart from epochs, in one transaction."""
         with self._transaction("readings were not kept"):
-            insert_readings(self._db, readings)
-
-    def rebuild_columns(self, series: StoredSeries) -> None:
-        """Derive the column chunks again: after many `amend`s reading is faster for it."""
-        with self._transaction("the columns were not rebuilt"):
-            column_chunks.rebuild_chunks(self._db, series.id)
+            for reading in readings:
+                row = {
+                    "id": next_id(self._db, "reading"), "utc": reading.utc,
+                    "clock_trusted": int(reading.clock_trusted),
+                    "thermometer": reading.thermometer, "temperatures": to_json(reading.values),
+                }  # fmt: skip
+                insert_row(self._db, "reading", row)
 
     def checkpoint(self) -> bool:
         """Move what is in the -wal file into the store; False if a reader or the disk forbids."""
         try:
-            ((busy, _, _),) = self._query("PRAGMA wal_checkpoint(TRUNCATE)", ())
+            busy = self._value("PRAGMA wal_checkpoint(TRUNCATE)")
         except StoreFullError:
             return False
         return not busy
@@ -490,10 +497,21 @@ class Store(SeriesReader):
                 raise
 
 
+def _sound_rows(table: str, rows: Iterable[tuple[Any, ...]]) -> Iterator[dict[str, Any]]:
+    """Yield rows by column; leave out what is damaged, with a warning: no result depends on it."""
+    for values in rows:
+        try:
+            require_sound(table, values)
+        except StoreError as error:
+            log.warning("%s; it is left out", error)
+        else:
+            yield dict(zip(ROW[table], values, strict=True))
+
+
 def _source(name: str, series: StoredSeries) -> str:
     """The name in the chunks of a column by its public name."""
     if name == "epoch":
         return "number"
     if name in COLUMN_NAMES or name == "status":
-        return name
+        return sql_name(name)
     return f"temperatures.{name}" if name in series.head.channels else f"extra.{name}"

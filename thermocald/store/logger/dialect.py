@@ -3,6 +3,8 @@
 Lines above the table (a logger's name, its serial number) are passed over; a second line of the
 header with units is joined to the names. The rows are read one by one: a year of them has to fit
 into memory. What was found is kept, to be shown.
+
+Units of temperatures are those that heads of columns and the readings of any device state.
 """
 
 from __future__ import annotations
@@ -13,14 +15,61 @@ import re
 from collections import Counter, deque
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermocald.errors import DataError
-from thermocald.store.logger.moments import is_date_like, parse_moment
+from thermocald.store.logger.clock import is_date_like, parse_moment
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
-    from pathlib import Path
+
+    from thermocald.arrays import Array
+
+
+UNITS = ("degC", "K", "degF")
+
+_LETTERS = {"c": "degC", "k": "K", "f": "degF"}
+_STATED = re.compile(
+    r"(?:°|º|˚|(?<![^\W\d_])deg(?:rees?|\.)?|(?<![^\W\d_])grad)[\s_]*(?P<degree>[CFK])(?![^\W\d_])"
+    r"|[(\[{]\s*(?P<bracket>[CFK])\s*[)\]}]"
+    r"|(?P<word>celsius|fahrenheit|kelvin)"
+    r"|(?P<sign>[℃℉])"
+    r"|temp(?:eratur[ae]?)?[\s_./-]*(?P<temp>[CFK])(?![^\W\d_])"
+    r"|[_,/]\s*(?P<tail>[CFK])$",
+    re.IGNORECASE,
+)
+
+
+def stated_unit(text: str) -> str | None:
+    """Return the unit, one of `UNITS`, that a column's head or a reading states, or None.
+
+    `(F)`, `[F]`, `°F`, `ºF`, `℉`, `degF`, `deg. F`, `TempF`, `temp_f`, `Temperature, F` and
+    `Fahrenheit` state the same.
+    """
+    found = _STATED.search(text)
+    if found is None:
+        return None
+    kind, value = next((k, v.lower()) for k, v in found.groupdict().items() if v)
+    if kind == "sign":
+        return "degC" if value == "℃" else "degF"
+    return _LETTERS[value[0]]
+
+
+def without_unit(text: str) -> str:
+    """Return a column's head without the unit that it states: `Temp` of `Temp (°F)`, `temp_f`."""
+    while found := _STATED.search(text):
+        begin = found.start("temp") if found["temp"] else found.start()
+        text = f"{text[:begin]} {text[found.end() :]}"
+    return " ".join(text.split()).strip(" _.,/-()[]{}")
+
+
+def to_celsius(values: Array, unit: str) -> Array:
+    """Convert temperatures (n,) in one of `UNITS` to °C."""
+    if unit == "K":
+        return values - 273.15
+    return (values - 32.0) / 1.8 if unit == "degF" else values
+
 
 OUR_TIMES = ("time", "temperature_time", "frame_time", "timestamp")
 """Names of a column of seconds in files of ours, which may count from any day."""
@@ -77,9 +126,10 @@ class LoggerFile:
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Every row with its line: as many fields as there are names, missing ones empty."""
         width = len(self.names)
-        for line, row in _rows(self.path, self.encoding, self.separator):
-            if line >= self.first_line:
-                yield line, _fitted(row, width)
+        with self.path.open(encoding=self.encoding, errors="replace", newline="") as file:
+            for line, row in _parsed(self.path, file, self.separator):
+                if line >= self.first_line:
+                    yield line, _fitted(row, width)
 
 
 def open_log(path: Path, separator: str | None = None, decimal: str | None = None) -> LoggerFile:
@@ -116,13 +166,8 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
     return LoggerFile(path, names, start[first][0], encoding, mark, found, rows)
 
 
-def _rows(path: Path, encoding: str, mark: str) -> Iterator[tuple[int, list[str]]]:
-    """Rows that are not empty, with their lines."""
-    with path.open(encoding=encoding, errors="replace", newline="") as file:
-        yield from _parsed(path, file, mark)
-
-
 def _parsed(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
+    """Rows that are not empty, with their lines."""
     reader = csv.reader(lines, delimiter=mark)
     try:
         for row in reader:
@@ -135,11 +180,9 @@ def _parsed(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, 
 
 def _cut(lines: list[str], mark: str) -> list[tuple[int, list[str]]]:
     try:
-        reader = csv.reader(lines, delimiter=mark)
-        rows = [(reader.line_num, [field.strip() for field in row]) for row in reader]
-    except csv.Error:
+        return list(_parsed(Path(), lines, mark))
+    except DataError:
         return []  # said with its line where all rows are read
-    return [(line, row) for line, row in rows if any(row)]
 
 
 def _fitted(row: list[str], width: int) -> list[str]:

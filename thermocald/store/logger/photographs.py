@@ -18,7 +18,7 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import DataError, DriverMissing, ImageError
-from thermocald.store.logger.moments import parse_moment
+from thermocald.store.logger.clock import parse_moment
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

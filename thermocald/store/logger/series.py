@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.epoch import Epoch
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files import read_camera
@@ -58,24 +57,6 @@ class PhotographSeries:
         """The median time between photographs, s; 1 for a single one."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
 
-    @property
-    def readings(self) -> Readings:
-        """Every reading of the log."""
-        return Readings(self.log.times, self.log.channels)
-
-    def epochs(self) -> list[Epoch]:
-        """The epochs from 1 on, their frames the photographs."""
-        found = []
-        for i, (photograph, row) in enumerate(
-            zip(self.photographs, self.reading.tolist(), strict=True)
-        ):
-            temperatures = {
-                n: float(v[row]) if row >= 0 else np.nan for n, v in self.log.channels.items()
-            }
-            moment = float(self.log.times[row]) if row >= 0 else np.nan
-            found.append(Epoch(i + 1, float(self.times[i]), moment, temperatures, photograph.path))
-        return found
-
     def preview(self) -> list[str]:
         """Lines for a person: what would be written."""
         first = next(iter(self.log.channels))
@@ -115,11 +96,12 @@ def put_together(
     """
     sizes = {(p.width, p.height) for p in photographs}
     if len(sizes) > 1:
-        other = next(p for p in photographs if (p.width, p.height) != _size(photographs[0]))
+        head = photographs[0]
+        other = next(p for p in photographs if (p.width, p.height) != (head.width, head.height))
         raise DataError(
-            f"{other.path}: has {other.width} × {other.height} px, {photographs[0].path.name} "
-            f"{photographs[0].width} × {photographs[0].height}: one recording is of one camera in "
-            "one position; import them apart"
+            f"{other.path}: has {other.width} × {other.height} px, {head.path.name} "
+            f"{head.width} × {head.height}: one recording is of one camera in one position; "
+            "import them apart"
         )
     if strange := other_camera(photographs):
         raise DataError(
@@ -154,10 +136,6 @@ def put_together(
             f"({iso(times[0])} to {iso(times[-1])})"
         )
     return PhotographSeries(placed, times, logged, reading, at_frame, tuple(notes))
-
-
-def _size(photograph: Photograph) -> tuple[int, int]:
-    return photograph.width, photograph.height
 
 
 def _overlap(frames: Array, log: Array) -> None:
@@ -237,7 +215,7 @@ def in_memory(
         channels,
         tuple(str(p.path.absolute()) for p in placed.photographs),
         {},
-        placed.readings,
+        Readings(log.times, log.channels),
     )
     interval = max(placed.interval, 0.001)
     thermometers = dict.fromkeys(channels, Channel())
@@ -245,10 +223,11 @@ def in_memory(
     return Recording(Path(), head, testfield, columns, has_observations=False)
 
 
-def write_photographs(folder: Path, recording: Recording, placed: PhotographSeries) -> None:
-    """Write photographs and a log as a recording, in a new folder."""
+def write_photographs(folder: Path, recording: Recording) -> None:
+    """Write what `in_memory` returned, in a new folder."""
     head = replace(recording.head, name=folder.name)
     with RecordingWriter(folder, head, recording.testfield) as writer:
-        for epoch in placed.epochs():
+        for epoch in recording.iter_epochs():
             writer.append(epoch)
-        writer.keep_readings(placed.readings)
+        assert recording.columns.readings is not None
+        writer.keep_readings(recording.columns.readings)

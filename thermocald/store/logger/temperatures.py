@@ -19,16 +19,25 @@ import numpy as np
 from thermocald.errors import DataError, UsageError
 from thermocald.names import channel_fault
 from thermocald.numbers import column_label
-from thermocald.store.logger.clock import DeviceClock, device_clock, time_zone
-from thermocald.store.logger.dialect import OUR_TIMES, TIME_NAME, LoggerFile, open_log
-from thermocald.store.logger.moments import (
-    MomentFormat,
+from thermocald.store.logger.clock import (
+    DeviceClock,
     day_and_month,
+    device_clock,
     is_date_like,
     parse_moment,
+    time_zone,
     whole_seconds,
 )
-from thermocald.store.logger.units import UNITS, stated_unit, to_celsius
+from thermocald.store.logger.dialect import (
+    OUR_TIMES,
+    TIME_NAME,
+    UNITS,
+    LoggerFile,
+    open_log,
+    stated_unit,
+    to_celsius,
+    without_unit,
+)
 from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts
 
 if TYPE_CHECKING:
@@ -157,7 +166,7 @@ def read_log(
     clock, notes = _clock(options.clock, " ".join(time_names))
     names = _temperature_columns(file, time_names, options)
     order, told = _date_order(file, time_names, options, clock, near)
-    table = _Table(file, time_names, names, MomentFormat(order))
+    table = _Table(file, time_names, names, order)
     table.read()
     times = table.times(clock)
     if len(times) < 2:
@@ -166,7 +175,7 @@ def read_log(
     channels = {}
     for name in names:
         values, unit_note = _celsius(table, name, options)
-        channel = options.names.get(name) or _channel(name)
+        channel = options.names.get(name) or (name if name in options.wanted else _channel(name))
         while channel in channels:  # `T (1)` and `T [1]` are two columns
             channel += "_"
         channels[channel] = values
@@ -203,9 +212,9 @@ class _Table:
     """The rows of a log while they are read: a year of them, as numbers."""
 
     def __init__(
-        self, file: LoggerFile, times: tuple[str, ...], names: tuple[str, ...], form: MomentFormat
+        self, file: LoggerFile, times: tuple[str, ...], names: tuple[str, ...], order: str | None
     ) -> None:
-        self.file, self.names, self._form = file, names, form
+        self.file, self.names, self._order = file, names, order
         self._time_names = times
         self._places = [file.names.index(name) for name in times]
         self._seconds, self._lines = array("d"), array("q")
@@ -268,7 +277,7 @@ class _Table:
     def _moment(self, line: int, text: str) -> datetime | None:
         """The time of a row, None where it is no row of readings."""
         try:
-            moment = parse_moment(text, self._form)
+            moment = parse_moment(text, self._order)
         except ValueError as cause:
             if not text[:1].isdigit():
                 return None
@@ -276,7 +285,7 @@ class _Table:
                 f"{self.file.path}, line {line}, column {self._time_names[0]!r}: {text[:40]!r} is "
                 f"not a date with a time ({cause})"
             ) from cause
-        if isinstance(moment, time) or not isinstance(moment, datetime):
+        if not isinstance(moment, datetime):
             raise DataError(
                 f"{self.file.path}, line {line}: {text[:40]!r} is a date or a time alone; name "
                 "both columns (--time-column twice)"
@@ -341,8 +350,9 @@ def _quoted(names: Sequence[str] | dict[str, Array]) -> str:
 
 
 def _channel(name: str) -> str:
-    """A name that a recording can have for a column."""
-    plain = re.sub(r"[^\w .°+-]", "", column_label(name)).strip() or "temperature"
+    """A name that a recording can have for a column, without its unit: a recording's is °C."""
+    quantity = without_unit(column_label(name))
+    plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
     plain = plain[:48]
     return f"{plain} of the log" if channel_fault(plain) else plain
 
@@ -437,12 +447,15 @@ def _date_order(
     if same:
         return "dmy", []
     if not orders:
-        spans = {order: _span(first, last, order) for order in ("dmy", "mdy")}
+        spans: dict[str, list[datetime]] = {}
+        for order in ("dmy", "mdy"):
+            ends = [parse_moment(text, order) for text in (first, last)]
+            spans[order] = [e if isinstance(e, datetime) else datetime.now(UTC) for e in ends]
         if near is not None:
-            far = {
-                order: _apart(clock.utc(list(span), lambda _: f"{file.path}"), near)
-                for order, span in spans.items()
-            }
+            far = {}
+            for order, span in spans.items():
+                utc = clock.utc(span, lambda _: f"{file.path}")
+                far[order] = float(max(utc.min() - near[1], near[0] - utc.max(), 0.0))
             if abs(far["dmy"] - far["mdy"]) > 86400.0:
                 order = min(far, key=lambda o: far[o])
                 return order, [
@@ -460,20 +473,6 @@ def _date_order(
 
 def _words(order: str) -> str:
     return "day/month" if order == "dmy" else "month/day"
-
-
-def _span(first: str, last: str, order: str) -> tuple[datetime, datetime]:
-    """First and last moment of a log in an order of day and month."""
-    found = []
-    for text in (first, last):
-        moment = parse_moment(text, MomentFormat(order))
-        found.append(moment if isinstance(moment, datetime) else datetime.now(UTC))
-    return found[0], found[1]
-
-
-def _apart(span: Array, near: tuple[float, float]) -> float:
-    """How many seconds lie between two spans, 0 where they overlap."""
-    return float(max(span.min() - near[1], near[0] - span.max(), 0.0))
 
 
 def _temperature_columns(

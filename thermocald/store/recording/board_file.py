@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import TestFieldError, UsageError
-from thermocald.files import read_yaml
+from thermocald.files import QuantityReader, read_yaml
 from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.targets import boards
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
 
 _MOST_LINES = 20_000
+_MOST_ROWS = 1000
 _LARGEST_BYTES = 5_000_000
 _SYNONYMS = {
     "columns": ("squaresx", "numsquaresx", "cols", "columns", "boardcols", "numcols", "ncols",
@@ -53,39 +54,43 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
     named = _CALIB_IO.fullmatch(path.name)
     if named is not None:
         return _of_calib_io(path, named, sigma)
-    document = {_key(k): v for k, v in read_yaml(path, TestFieldError).items()}
-    kind = str(document.get("targettype", document.get("type", ""))).lower()
-    if not kind and any(k in document for k in _SYNONYMS["dictionary"]):
+    # how a key is compared: `Square_Length_mm` → `squarelength`
+    plain = {re.sub(r"[^a-z0-9]", "", k.lower().removesuffix("_mm")): v
+             for k, v in read_yaml(path, TestFieldError).items()}  # fmt: skip
+    board = _Reader(path, plain)
+    kind = str(plain.get("targettype", plain.get("type", ""))).lower()
+    if not kind and any(k in plain for k in _SYNONYMS["dictionary"]):
         kind = "charuco"
     if kind in ("aprilgrid", "april_grid"):
-        columns, rows = _count(path, document, "tagcols"), _count(path, document, "tagrows")
-        size, spacing = (
-            1e3 * _number(path, document, "tagsize"),
-            _number(path, document, "tagspacing"),
-        )
-        first = int(document.get("startid", document.get("lowid", 0)) or 0)
+        columns, rows = board.count("columns"), board.count("rows")
+        size = 1e3 * board.number("tagsize", "m", above=0.0, high=1e6)
+        spacing = board.number("tagspacing", "1", above=0.0, high=1e6)
+        first = int(plain.get("startid", plain.get("lowid", 0)) or 0)
         field = boards.aprilgrid(columns, rows, size, spacing, first=first, sigma=sigma)
         said = (
             f"Kalibr's AprilGrid of {columns} × {rows} tags of {size:g} mm, {spacing * size:g} mm"
         )
         return field, said + " apart"
-    if kind in ("checkerboard", "chessboard") and "rowspacingmeters" in document:
-        columns, rows = _count(path, document, "targetcols"), _count(path, document, "targetrows")
-        wide = 1e3 * _number(path, document, "colspacingmeters")
-        high = 1e3 * _number(path, document, "rowspacingmeters")
+    if kind in ("checkerboard", "chessboard") and "rowspacingmeters" in plain:
+        columns, rows = board.count("columns"), board.count("rows")
+        wide = 1e3 * board.number("colspacingmeters", "m", above=0.0, high=1e6)
+        high = 1e3 * board.number("rowspacingmeters", "m", above=0.0, high=1e6)
         field = boards.chessboard(columns, rows, wide, high, sigma=sigma)
         return field, f"Kalibr's checkerboard of {columns} × {rows} corners, {wide:g} × {high:g} mm"
     if kind in ("charuco", "charucoboard", "checkerboard", "chessboard", "checker"):
-        columns, rows = (_count(path, document, *_SYNONYMS[k]) for k in ("columns", "rows"))
-        square = _length(path, document, "square")
+        columns, rows = board.count("columns"), board.count("rows")
+        square = board.length("square")
         if "charuco" not in kind:
-            if {"squaresx", "numsquaresx"} & set(document):  # one more than corners
+            if {"squaresx", "numsquaresx"} & set(plain):  # one more than corners
                 columns, rows = columns - 1, rows - 1
             field = boards.chessboard(columns, rows, square, sigma=sigma)
             return field, f"a chessboard of {columns} × {rows} inner corners, {square:g} mm"
-        marker = _length(path, document, "marker")
-        name = _dictionary(path, _value(path, document, *_SYNONYMS["dictionary"]))
-        legacy = bool(document.get("legacy", document.get("legacypattern", False)))
+        marker = board.length("marker")
+        key = board.known("dictionary")
+        if plain.get(key) is None:
+            raise board.fail(key, f"is missing; there are {', '.join(plain)[:200]}")
+        name = _dictionary(path, plain[key])
+        legacy = bool(plain.get("legacy", plain.get("legacypattern", False)))
         field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
         return field, (
             f"a ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
@@ -97,9 +102,24 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
     )
 
 
-def _key(name: object) -> str:
-    """`Square_Length_mm` → `squarelength`: how a key is compared."""
-    return re.sub(r"[^a-z0-9]", "", str(name).lower().removesuffix("_mm"))
+class _Reader(QuantityReader):
+    """The keys of a board, by what they mean."""
+
+    error = TestFieldError
+
+    def known(self, meaning: str) -> str:
+        """The key of `_SYNONYMS` that the file has; the first where it has none."""
+        names = _SYNONYMS[meaning]
+        return next((name for name in names if self.mapping.get(name) is not None), names[0])
+
+    def count(self, meaning: str) -> int:
+        """Read a count."""
+        return self.whole(self.known(meaning), "1", high=_MOST_ROWS)
+
+    def length(self, meaning: str) -> float:
+        """Read a length in mm; below 1 it is in metres, as ROS and OpenCV's samples have it."""
+        length = self.number(self.known(meaning), "mm", above=0.0, high=1e6)
+        return 1e3 * length if length < 1 else length
 
 
 def _of_calib_io(path: Path, named: re.Match[str], sigma: float | None) -> tuple[TestField, str]:
@@ -126,41 +146,6 @@ def _of_calib_io(path: Path, named: re.Match[str], sigma: float | None) -> tuple
         f"calib.io's ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
         f"{float(named[5]):g} mm of {name}"
     )
-
-
-def _value(path: Path, document: dict[str, Any], *names: str) -> Any:
-    for name in names:
-        if document.get(name) is not None:
-            return document[name]
-    raise TestFieldError(
-        f"{path}: key {names[0]} is missing; there are {', '.join(document)[:200]}"
-    )
-
-
-def _number(path: Path, document: dict[str, Any], *names: str) -> float:
-    value = _value(path, document, *names)
-    try:
-        number = float(value) if isinstance(value, int | float | str) else np.nan
-    except (ValueError, OverflowError):
-        number = np.nan
-    if isinstance(value, bool) or not 0 < number < 1e6:
-        raise TestFieldError(
-            f"{path}, key {names[0]}: {str(value)[:40]!r} is not a length or count"
-        )
-    return number
-
-
-def _count(path: Path, document: dict[str, Any], *names: str) -> int:
-    number = _number(path, document, *names)
-    if number != int(number) or number > 1000:
-        raise TestFieldError(f"{path}, key {names[0]}: {number:g} is not a count up to 1000")
-    return int(number)
-
-
-def _length(path: Path, document: dict[str, Any], key: str) -> float:
-    """A length in mm; below 1 it is in metres, as ROS and OpenCV's samples have it."""
-    length = _number(path, document, *_SYNONYMS[key])
-    return 1e3 * length if length < 1 else length
 
 
 def _dictionary(path: Path, value: Any) -> str:

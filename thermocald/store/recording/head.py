@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import DataError, RecordingError
-from thermocald.files import dump_yaml, read_yaml
+from thermocald.files import QuantityReader, read_yaml
 from thermocald.names import require_channels
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    IOP_NAMES,
+    InteriorOrientation,
+    Sensor,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 
 FORMAT = "thermocald-recording/1"
 _LONGEST_NAME = 200
+_MOST_PX = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,66 +76,19 @@ class Head:
             )
 
 
-class _Reader:
-    """One mapping of the file; errors name file and dotted key."""
+class _Reader(QuantityReader):
+    """One mapping of the file."""
 
-    def __init__(self, path: Path, mapping: Mapping[str, Any], prefix: str = "") -> None:
-        self._path = path
-        self._mapping = mapping
-        self._prefix = prefix
-
-    def fail(self, key: str, message: str) -> RecordingError:
-        return RecordingError(f"{self._path}, key {self._prefix}{key}: {message}")
+    error = RecordingError
 
     def text(self, key: str, default: str | None = None) -> str:
-        value = self._mapping.get(key, default)
-        if value is None:
-            raise self.fail(key, "is missing")
-        if isinstance(value, bool) or not isinstance(value, str | int | float):
-            raise self.fail(key, "must be text")
-        text = str(value)
+        """Read text as a message or a table can show it."""
+        text = super().text(key, default)
         if not text.isprintable() or len(text) > _LONGEST_NAME:
             raise self.fail(
                 key, f"{text[:40]!r} must be printable text of at most {_LONGEST_NAME} characters"
             )
         return text
-
-    def positive(self, key: str, unit: str, bounds: tuple[float, float] = (1e-9, 1e9)) -> float:
-        """A number above 0; bounds: what a camera or a thermometer can have."""
-        value = self.number(key)
-        if value is None:
-            raise self.fail(key, "is missing")
-        if value <= 0:
-            raise self.fail(key, f"is {value:g} {unit}; it must be above 0")
-        if not bounds[0] <= value <= bounds[1]:
-            between = f"{bounds[0]:g} to {bounds[1]:g} {unit}"
-            raise self.fail(key, f"is {value:g} {unit}; {between} are possible")
-        return value
-
-    def number(self, key: str) -> float | None:
-        value = self._mapping.get(key)
-        if value is None:
-            return None
-        try:
-            # PyYAML reads 1e-3 as text, since YAML 1.1 wants a point
-            number = float(value) if isinstance(value, str | int | float) else math.nan
-        except (ValueError, OverflowError):
-            number = math.nan
-        if isinstance(value, bool) or not math.isfinite(number):
-            raise self.fail(key, f"{str(value)[:40]!r} is not a finite number")
-        return number
-
-    def size(self, key: str) -> int:
-        value = self.positive(key, "px")
-        if value != int(value) or value > 100_000:
-            raise self.fail(key, f"is {value:g} px; it must be a whole number up to 100000")
-        return int(value)
-
-    def inner(self, key: str) -> tuple[Mapping[str, Any], _Reader]:
-        value = self._mapping.get(key)
-        if not isinstance(value, dict):
-            raise self.fail(key, "is missing" if value is None else "must hold `key: value` pairs")
-        return value, _Reader(self._path, value, f"{self._prefix}{key}.")
 
 
 def read_head(folder: Path) -> Head:
@@ -149,14 +106,12 @@ def read_head(folder: Path) -> Head:
 def parse_head(document: Mapping[str, Any], path: Path) -> Head:
     """The head in a mapping of `recording.yaml`; `path` is for the messages."""
     top = _Reader(path, document)
-    found = top.text("format")
-    if found != FORMAT:
-        raise top.fail("format", f"is {found[:60]!r}; this program reads {FORMAT!r}")
+    top.require_format(FORMAT)
     known = {"format", "name", "series", "interval", "camera", "temperatures"}
     return Head(
         name=top.text("name", path.resolve().parent.name),
         series=top.text("series", "M1"),
-        interval=top.positive("interval", "s", (1e-4, 1e8)),
+        interval=top.number("interval", "s", above=0.0, low=1e-4, high=1e8),
         camera=_camera(top),
         channels=_channels(top) if "temperatures" in document else {},
         extra=_plain(top, {key: value for key, value in document.items() if key not in known}),
@@ -173,29 +128,31 @@ def _plain(top: _Reader, extra: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _camera(top: _Reader) -> CameraSpec:
-    mapping, camera = top.inner("camera")
-    pitch = camera.positive("pixel_pitch", "mm")
+    camera = top.inner("camera")
+    pitch = camera.number("pixel_pitch", "mm", above=0.0)
     if not 1e-5 <= pitch <= 0.1:
         raise camera.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
-    sensor = Sensor(camera.size("width"), camera.size("height"), pitch)
+    sensor = Sensor(
+        camera.whole("width", "px", high=_MOST_PX), camera.whole("height", "px", high=_MOST_PX),
+        pitch,
+    )  # fmt: skip
     distance = None
-    if mapping.get("principal_distance") is not None:
-        distance = camera.positive("principal_distance", "mm", (1e-3, 1e5))
+    if camera.mapping.get("principal_distance") is not None:
+        distance = camera.number("principal_distance", "mm", above=0.0, low=1e-3, high=1e5)
     interior = None
-    if mapping.get("interior") is not None:
-        values, reader = camera.inner("interior")
-        for key in values:
-            if key not in IOP_NAMES:
-                raise reader.fail(key, f"is unknown; known are {', '.join(IOP_NAMES)}")
-        reader.positive("c", "mm", (1e-3, 1e5))
-        interior = InteriorOrientation.from_mapping({k: reader.number(k) or 0.0 for k in values})
+    if camera.mapping.get("interior") is not None:
+        reader = camera.inner("interior")
+        reader.only(IOP_NAMES)
+        reader.number("c", "mm", above=0.0, low=1e-3, high=1e5)
+        known = {k: reader.finite(k, v) for k, v in reader.mapping.items() if v is not None}
+        interior = InteriorOrientation.from_mapping(known)
     return CameraSpec(camera.text("name", "camera"), sensor, distance, interior)
 
 
 def _channels(top: _Reader) -> dict[str, Channel]:
-    mapping, reader = top.inner("temperatures")
+    reader = top.inner("temperatures")
     channels: dict[str, Channel] = {}
-    for name, value in mapping.items():
+    for name, value in reader.mapping.items():
         if not isinstance(name, str):
             raise reader.fail(str(name), "a column's name must be text")
         if not name.isprintable():
@@ -206,11 +163,9 @@ def _channels(top: _Reader) -> dict[str, Channel]:
         unit = inner.text("unit", "degC")
         if unit != "degC":
             raise inner.fail("unit", f"is {unit!r}; temperatures must be in degC: convert them")
-        resolution = (
-            None
-            if inner.number("resolution") is None
-            else inner.positive("resolution", "K", (1e-6, 100.0))
-        )
+        resolution = None
+        if inner.mapping.get("resolution") is not None:
+            resolution = inner.number("resolution", "K", above=0.0, low=1e-6, high=100.0)
         channels[name] = Channel(unit, resolution)
     return channels
 
@@ -244,8 +199,3 @@ def head_document(head: Head) -> dict[str, Any]:
     if temperatures:
         document["temperatures"] = temperatures
     return {**document, **head.extra}
-
-
-def head_yaml(head: Head) -> str:
-    """The text of `recording.yaml`."""
-    return dump_yaml(head_document(head))

@@ -16,7 +16,7 @@ import os
 import shutil
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,8 +27,8 @@ from thermocald.files import new_file
 from thermocald.store.recording.table import Chunk, Table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from typing import NoReturn, Self
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from typing import NoReturn
 
     from numpy.typing import NDArray
 
@@ -47,11 +47,13 @@ _TEXT_BLOCK = 1 << 24  # bytes of text that are parsed at a time
 _KEPT_DAYS = 14.0  # since a copy was last read
 
 
-class ParquetTable:
+class ParquetTable(Table):
     """A Parquet file with the columns of a CSV table; RecordingError where one is missing.
 
     original: the table of which the file is a copy, which then says what is wrong with a row.
     """
+
+    seeks = True
 
     def __init__(self, path: Path, required: Sequence[str], original: Table | None = None) -> None:
         parquet = _pyarrow().parquet
@@ -78,10 +80,7 @@ class ParquetTable:
         columns: Sequence[str] | None = None,
         epochs: tuple[int, int] | None = None,
     ) -> Iterator[ColumnChunk]:
-        """The rows, at most `rows` at a time.
-
-        columns: only these; epochs: only parts of the file that may hold epochs of this range.
-        """
+        """The rows, at most `rows` at a time; only of `columns`, and of `epochs` where known."""
         pyarrow = _pyarrow()
         first = 0
         try:
@@ -153,7 +152,7 @@ class ColumnChunk(Chunk):
         return found
 
 
-def parse_once(table: Table, required: Sequence[str]) -> Table | ParquetTable:
+def parse_once(table: Table, required: Sequence[str]) -> Table:
     """Return a table of text as its binary copy in the user's cache, which is made where missing.
 
     The table itself is returned where pyarrow or room on the disk is missing, and where the text is
@@ -228,34 +227,25 @@ def _parse(table: Table, target: Path) -> None:
             column_types=kinds, null_values=[""], include_columns=list(kinds), check_utf8=True
         ),
     )
-    with reader, _Writer(target) as writer:
-        for batch in reader:
-            writer.write({name: batch.column(name) for name in kinds})
+    with reader:
+        _write(target, ({name: batch.column(name) for name in kinds} for batch in reader))
 
 
-class _Writer:
-    """Columns to a Parquet file."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._writer: Any = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def write(self, columns: Mapping[str, Any]) -> None:
-        pyarrow = _pyarrow()
-        batch = pyarrow.table(dict(columns))
-        if self._writer is None:
-            words = [f.name for f in batch.schema if f.type == pyarrow.string()]
-            self._writer = pyarrow.parquet.ParquetWriter(
-                self._path, batch.schema, compression="zstd", use_dictionary=words
-            )
-        self._writer.write_table(batch)
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.close()
+def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
+    """Write columns, which come in parts, to a Parquet file."""
+    pyarrow = _pyarrow()
+    with ExitStack() as opened:
+        writer = None
+        for columns in batches:
+            batch = pyarrow.table(dict(columns))
+            if writer is None:
+                words = [f.name for f in batch.schema if f.type == pyarrow.string()]
+                writer = opened.enter_context(
+                    pyarrow.parquet.ParquetWriter(
+                        path, batch.schema, compression="zstd", use_dictionary=words
+                    )
+                )
+            writer.write_table(batch)
 
 
 def write_parquet(path: Path, columns: Mapping[str, Any]) -> None:
@@ -265,8 +255,8 @@ def write_parquet(path: Path, columns: Mapping[str, Any]) -> None:
         name: pyarrow.array(values, from_pandas=isinstance(values, np.ndarray))
         for name, values in columns.items()
     }
-    with new_file(path) as partial, _Writer(partial) as writer:
-        writer.write(arrays)
+    with new_file(path) as partial:
+        _write(partial, [arrays])
 
 
 def csv_to_parquet(source: Path, target: Path, advance: Any = lambda _: None) -> None:
@@ -277,19 +267,22 @@ def csv_to_parquet(source: Path, target: Path, advance: Any = lambda _: None) ->
     pyarrow = _pyarrow()
     table = Table(source, ("epoch", "target", "x", "y", "sx", "sy"))
     numeric: dict[str, bool] = {}
-    with new_file(target) as partial, _Writer(partial) as writer:
-        for chunk in table.chunks(_ROWS):
-            columns: dict[str, Any] = {}
-            for name in filter(None, table.columns):
-                if name == "epoch":
-                    columns[name] = pyarrow.array(chunk.integers(name))
-                elif name != "target" and numeric.setdefault(name, _numeric(chunk, name)):
-                    values = chunk.numbers(name, empty_is_nan=True)
-                    columns[name] = pyarrow.array(values, mask=np.isnan(values))
-                else:
-                    columns[name] = pyarrow.array(chunk.text(name))
-            writer.write(columns)
-            advance(len(chunk))
+
+    def columns_of(chunk: Chunk) -> dict[str, Any]:
+        columns: dict[str, Any] = {}
+        for name in filter(None, table.columns):
+            if name == "epoch":
+                columns[name] = pyarrow.array(chunk.integers(name))
+            elif name != "target" and numeric.setdefault(name, chunk.is_number(name)):
+                values = chunk.numbers(name, empty_is_nan=True)
+                columns[name] = pyarrow.array(values, mask=np.isnan(values))
+            else:
+                columns[name] = pyarrow.array(chunk.text(name))
+        advance(len(chunk))
+        return columns
+
+    with new_file(target) as partial:
+        _write(partial, map(columns_of, table.chunks(_ROWS)))
 
 
 def parquet_to_csv(source: Path, target: Path, advance: Any = lambda _: None) -> None:
@@ -336,15 +329,6 @@ def _holding(metadata: Any, column: int, epochs: tuple[int, int]) -> tuple[range
     first = next((i for i, top in enumerate(high) if top >= epochs[0]), len(high))
     stop = next((i for i, bottom in enumerate(low) if bottom > epochs[1]), len(low))
     return range(first, stop), sum(metadata.row_group(i).num_rows for i in range(first))
-
-
-def _numeric(chunk: Chunk, name: str) -> bool:
-    try:
-        for text in chunk.text(name)[:100]:
-            float(text or "nan")
-    except ValueError:
-        return False
-    return True
 
 
 def _pyarrow() -> Any:

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
-from typing import TYPE_CHECKING, Any, overload
+from itertools import repeat
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.names import FileFolder
+from thermocald.photogrammetry.series.normals import runs
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.observation_file import (
     LONG_FROM_BYTES,
     ObservationFile,
-    ObservationTable,
 )
 from thermocald.store.recording.readings import (
     READINGS,
     Readings,
     interpolate_readings,
     read_readings,
-    temperature_at_frame,
-    temperatures_at_frame,
 )
 from thermocald.store.recording.sense import (
     pairing_doubts,
@@ -43,7 +40,7 @@ from thermocald.store.recording.testfield_file import (
 from thermocald.store.recording.writer import RecordingWriter, write_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -63,13 +60,12 @@ __all__ = [
     "open_recording",
     "read_recording",
     "read_testfield",
-    "temperature_at_frame",
-    "temperatures_at_frame",
     "write_recording",
     "write_testfield",
 ]
 
 _KELVIN_FROM = 220.0  # hotter than any camera, and a cold day in kelvin
+_STRETCH = 8192  # readings: a part of a log in kelvin
 _HOTTEST_C = 1000.0  # no camera works there: another unit, or a damaged line
 
 
@@ -115,10 +111,6 @@ class Recording:
     has_observations: bool
 
     @property
-    def name(self) -> str:
-        return self.head.name
-
-    @property
     def series(self) -> str:
         return self.head.series
 
@@ -128,10 +120,6 @@ class Recording:
         return str(self.path)
 
     @property
-    def interval(self) -> float:
-        return self.head.interval
-
-    @property
     def camera(self) -> CameraSpec:
         return self.head.camera
 
@@ -139,25 +127,42 @@ class Recording:
     def channels(self) -> Mapping[str, Channel]:
         return self.head.channels
 
-    @property
-    def extra(self) -> Mapping[str, Any]:
-        return self.head.extra
+    def extra_columns(self) -> dict[str, tuple[str, ...]]:
+        """Return the unknown columns of epochs.csv, as text."""
+        return self.columns.extra
 
     @cached_property
-    def epochs(self) -> Sequence[Epoch]:
+    def epochs(self) -> list[Epoch]:
         """All epochs with their observations, which are read now if they were not."""
-        return _Epochs(self, self._observation_file.load() if self.has_observations else None)
+        if not self.has_observations:
+            return [self._epoch(i, None) for i in range(len(self))]
+        rows = self._observation_file.load()
+        return [self._epoch(i, rows.of_epoch(i)) for i in range(len(self))]
 
     def iter_epochs(self) -> Iterator[Epoch]:
         """One epoch after the other; a recording of months in constant memory.
 
         Then the rows of the observations must be in the order of the epochs.
         """
-        if "epochs" in self.__dict__ or not self.is_long:
+        if "epochs" in self.__dict__ or (self.has_observations and not self.is_long):
             yield from self.epochs
             return
-        for i, observations in enumerate(self._observation_file.stream()):
-            yield _epoch(self, i, observations)
+        seen = self._observation_file.stream() if self.has_observations else repeat(None)
+        for i, observations in zip(range(len(self)), seen, strict=False):
+            yield self._epoch(i, observations)
+
+    def _epoch(self, i: int, observations: Observations | None) -> Epoch:
+        columns = self.columns
+        frame = columns.frames[i]
+        return Epoch(
+            number=int(columns.numbers[i]),
+            frame_time=float(columns.frame_time[i]),
+            temperature_time=float(columns.temperature_time[i]),
+            temperatures={name: float(t[i]) for name, t in columns.temperatures.items()},
+            frame=self.path / frame if frame else None,
+            observations=observations,
+            note="" if frame or observations is not None else "neither frame nor observations",
+        )
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -178,7 +183,7 @@ class Recording:
             return None
         if "epochs" in self.__dict__ or not self.is_long:
             return self.epochs[row].observations
-        return next(self._observation_file.some(slice(row, row + 1)))
+        return next(self._observation_file.stream(slice(row, row + 1)))
 
     def doubts(self) -> list[str]:
         """Return what is doubtful in times, readings and repeated epochs, a sentence each.
@@ -186,8 +191,8 @@ class Recording:
         Observations too many for memory are not read.
         """
         columns = self.columns
-        found = list(time_doubts(columns.numbers, columns.frame_time, self.interval))
-        found += pairing_doubts(columns.frame_time, columns.temperature_time, self.interval)
+        found = list(time_doubts(columns.numbers, columns.frame_time, self.head.interval))
+        found += pairing_doubts(columns.frame_time, columns.temperature_time, self.head.interval)
         for name, values in columns.temperatures.items():
             found += reading_doubts(values, name)
         if columns.readings is not None:
@@ -232,43 +237,6 @@ class Recording:
         )
 
 
-class _Epochs(Sequence[Epoch]):
-    """Epochs over columns: a day of them costs arrays, not a million objects."""
-
-    def __init__(self, recording: Recording, table: ObservationTable | None) -> None:
-        self._recording = recording
-        self._table = table
-
-    def __len__(self) -> int:
-        return len(self._recording.columns)
-
-    @overload
-    def __getitem__(self, index: int) -> Epoch: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Epoch]: ...
-
-    def __getitem__(self, index: int | slice) -> Epoch | list[Epoch]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        i = range(len(self))[index]
-        return _epoch(self._recording, i, self._table.observations(i) if self._table else None)
-
-
-def _epoch(recording: Recording, i: int, observations: Any) -> Epoch:
-    columns = recording.columns
-    frame = columns.frames[i]
-    return Epoch(
-        number=int(columns.numbers[i]),
-        frame_time=float(columns.frame_time[i]),
-        temperature_time=float(columns.temperature_time[i]),
-        temperatures={name: float(t[i]) for name, t in columns.temperatures.items()},
-        frame=recording.path / frame if frame else None,
-        observations=observations,
-        note="" if frame or observations is not None else "neither frame nor observations",
-    )
-
-
 def open_recording(path: Path) -> Recording:
     """Read everything but the observations, which `epochs` or `iter_epochs` will.
 
@@ -303,80 +271,60 @@ def read_recording(path: Path) -> Recording:
 def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
     required = ["epoch", "frame_time", *(["temperature_time", *channels] if channels else [])]
     table = Table(folder / "epochs.csv", [*required, "frame"])
-    extra_names = [
-        n for n in table.columns if n and n not in {*required, "temperature_time", "frame"}
-    ]
-    numbers: list[NDArray[np.int64]] = []
-    times: dict[str, list[Array]] = {"frame_time": [], "temperature_time": []}
-    temperatures: dict[str, list[Array]] = {name: [] for name in channels}
-    # Text is kept chunk by chunk: the garbage collector would walk through a list of a year's.
-    frames: list[tuple[str, ...]] = []
+    extra = [n for n in table.columns if n and n not in {*required, "temperature_time", "frame"}]
+    timed = [n for n in ("temperature_time",) if n in table.columns]
+    found = table.read(["epoch"], ["frame_time"], [*timed, *channels], ["frame", *extra])
+    if not found:
+        raise RecordingError(f"{table.path}: holds no epochs")
+    numbers, frame_time = found["epoch"], found["frame_time"]
+    table.check(
+        "epoch",
+        np.diff(numbers, prepend=-1) <= 0,
+        "is duplicated or after a later one; numbers must increase",
+    )
+    for name in ("frame_time", *timed):
+        _check_times(table, name, found[name])
+    temperature_time = found.get("temperature_time", np.full(len(numbers), np.nan))
+    for name in channels:
+        values = found[name]
+        untimed = np.isfinite(values) & np.isnan(temperature_time)
+        table.check("temperature_time", untimed, f"is empty although {name} was read")
+        table.check(name, values < -273.15, "is below absolute zero")
+        table.check(name, values > _HOTTEST_C, f"is above {_HOTTEST_C:g} °C")
+        for rows in runs(len(values), _STRETCH):
+            known = rows.start + np.flatnonzero(np.isfinite(values[rows]))
+            if len(known) and values[known].min() > _KELVIN_FROM:
+                table.fail(int(known[0]), name, "reads as kelvin: subtract 273.15, K to °C")
+    frames = tuple(map(str.strip, found["frame"]))
     files = FileFolder(folder)
-    extra: dict[str, list[tuple[str, ...]]] = {name: [] for name in extra_names}
-    previous = {"epoch": -1.0, "frame_time": -np.inf, "temperature_time": -np.inf}
-    for chunk in table.chunks():
-        numbers.append(chunk.integers("epoch"))
-        repeated = _steps(numbers[-1], previous["epoch"]) <= 0
-        chunk.check("epoch", repeated, "is duplicated or after a later one; numbers must increase")
-        previous["epoch"] = float(numbers[-1][-1])
-        for name, columns in times.items():
-            if name not in table.columns:
-                columns.append(np.full(len(chunk), np.nan))
-                continue
-            columns.append(chunk.numbers(name, empty_is_nan=name == "temperature_time"))
-            latest = _running_latest(columns[-1], previous[name])
-            chunk.check(
-                name,
-                columns[-1] < latest[:-1],
-                lambda row, v=columns[-1], l=latest: (  # type: ignore[misc]  # noqa: E741
-                    f"time runs backwards: {v[row]:.3f} s after {l[row]:.3f} s"
-                ),
+    for row, frame in enumerate(frames):
+        if frame and files.find(frame) is None:
+            table.fail(
+                row,
+                "frame",
+                f"{frame!r} is missing, or leads out of the recording; leave it empty if it "
+                "was not kept",
             )
-            if fault := time_fault(columns[-1], previous[name]):
-                chunk.fail(fault[0], name, fault[1])
-            previous[name] = float(latest[-1])
-        for name, readings in temperatures.items():
-            readings.append(chunk.numbers(name, empty_is_nan=True))
-            untimed = np.isfinite(readings[-1]) & np.isnan(times["temperature_time"][-1])
-            chunk.check("temperature_time", untimed, f"is empty although {name} was read")
-            chunk.check(name, readings[-1] < -273.15, "is below absolute zero")
-            chunk.check(name, readings[-1] > _HOTTEST_C, f"is above {_HOTTEST_C:g} °C")
-            known = readings[-1][np.isfinite(readings[-1])]
-            if len(known) and known.min() > _KELVIN_FROM:
-                chunk.check(
-                    name, readings[-1] > _KELVIN_FROM, "reads as kelvin: subtract 273.15, K to °C"
-                )
-        frames.append(tuple(map(str.strip, chunk.text("frame"))))
-        for row, frame in enumerate(frames[-1]):
-            if frame and files.find(frame) is None:
-                chunk.fail(
-                    row,
-                    "frame",
-                    f"{frame!r} is missing, or leads out of the recording; leave it empty if it "
-                    "was not kept",
-                )
-        for name in extra_names:
-            extra[name].append(chunk.text(name))
-    if not numbers:
-        raise RecordingError(f"{folder / 'epochs.csv'}: holds no epochs")
-    joined = {name: np.concatenate(columns) for name, columns in times.items()}
-    if len(joined["frame_time"]) > 2 and np.ptp(joined["frame_time"]) == 0:
+    if len(frame_time) > 2 and np.ptp(frame_time) == 0:
         table.fail(1, "frame_time", "all epochs have one time; write when each frame was taken")
     return EpochColumns(
-        np.concatenate(numbers),
-        joined["frame_time"],
-        joined["temperature_time"],
-        {name: np.concatenate(readings) for name, readings in temperatures.items()},
-        tuple(chain.from_iterable(frames)),
-        {name: tuple(chain.from_iterable(values)) for name, values in extra.items()},
+        numbers,
+        frame_time,
+        temperature_time,
+        {name: found[name] for name in channels},
+        frames,
+        {name: found[name] for name in extra},
         read_readings(log, channels) if channels and (log := folder / READINGS).exists() else None,
     )
 
 
-def _steps(values: NDArray[np.int64], previous: float) -> Array:
-    return np.diff(np.concatenate([[previous], values.astype(float)]))
-
-
-def _running_latest(values: Array, previous: float) -> Array:
-    """The latest time before each row, and after the last one; NaN rows are passed over."""
-    return np.fmax.accumulate(np.concatenate([[previous], values]))
+def _check_times(table: Table, name: str, times: Array) -> None:
+    """Refuse times (E,) s, NaN for none, that run backwards or are no seconds since 1970."""
+    latest = np.fmax.accumulate(np.concatenate([[-np.inf], times]))
+    table.check(
+        name,
+        times < latest[:-1],
+        lambda row: f"time runs backwards: {times[row]:.3f} s after {latest[row]:.3f} s",
+    )
+    if fault := time_fault(times):
+        table.fail(fault[0], name, fault[1])

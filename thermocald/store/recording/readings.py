@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from thermocald.arrays import Array
-    from thermocald.epoch import Epoch
 
 READINGS = "readings.csv"
 """Every reading of a log, in a recording whose frames were taken beside one."""
@@ -48,36 +47,27 @@ def write_readings(path: Path, readings: Readings) -> None:
 def read_readings(path: Path, channels: Sequence[str]) -> Readings:
     """Read a `readings.csv`; RecordingError names line and column of what is wrong."""
     table = Table(path, ["time", *channels])
-    parts: dict[str, list[Array]] = {name: [] for name in ("time", *channels)}
-    before = -np.inf
-    for chunk in table.chunks():
-        times = chunk.numbers("time")
-        steps = np.diff(times, prepend=before)
-        chunk.check("time", steps <= 0, "times must increase")
-        if fault := time_fault(times, before):
-            chunk.fail(fault[0], "time", fault[1])
-        before = float(times[-1])
-        parts["time"].append(times)
-        for name in channels:
-            values = chunk.numbers(name, empty_is_nan=True)
-            chunk.check(name, values < -273.15, "is below absolute zero")
-            parts[name].append(values)
-    joined = {name: np.concatenate([np.empty(0), *found]) for name, found in parts.items()}
-    return Readings(joined.pop("time"), joined)
+    columns = table.read(numbers=["time"], optional=channels)
+    times = columns.pop("time", np.empty(0))
+    table.check("time", np.diff(times, prepend=-np.inf) <= 0, "times must increase")
+    if fault := time_fault(times):
+        table.fail(fault[0], "time", fault[1])
+    for name, values in columns.items():
+        table.check(name, values < -273.15, "is below absolute zero")
+    return Readings(times, {name: columns.get(name, np.empty(0)) for name in channels})
 
 
 def interpolate_readings(
     frame_times: ArrayLike,
     reading_times: ArrayLike,
     readings: ArrayLike,
-    largest_gap_s: float | None = None,
 ) -> Array:
     """Readings (R,) °C at `reading_times` (R,) s → temperatures (E,) °C at `frame_times` (E,) s.
 
     Linear between two readings; before the first and after the last, the line through the two
     outermost, for at most one interval. NaN readings are passed over. NaN where the readings on
-    both sides are more than `largest_gap_s` apart (default: ten times their median interval), or
-    where there are none: a gap is not filled with invention.
+    both sides are more than ten times their median interval apart, or where there are none: a gap
+    is not filled with invention.
     """
     frames = np.asarray(frame_times, dtype=float)
     times, values = np.asarray(reading_times, dtype=float), np.asarray(readings, dtype=float)
@@ -92,38 +82,16 @@ def interpolate_readings(
         only = float(values[0]) if len(values) else np.nan
         return np.where(np.isin(frames, times), only, np.nan)
     interval = float(np.median(np.diff(times)))
-    gap = _LARGEST_GAP_IN_INTERVALS * interval if largest_gap_s is None else largest_gap_s
+    gap = _LARGEST_GAP_IN_INTERVALS * interval
     result = np.empty(frames.shape)
     for first in range(0, len(frames), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        result[part] = _interpolated(frames[part], times, values, interval, gap)
+        at = frames[first : first + _AT_ONCE]
+        left = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+        span = times[left + 1] - times[left]
+        slope = (values[left + 1] - values[left]) / span
+        part = values[left] + slope * (at - times[left])
+        outside = np.maximum(times[0] - at, at - times[-1])
+        on_reading = (at == times[left]) | (at == times[left + 1])
+        part[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan
+        result[first : first + _AT_ONCE] = part
     return result
-
-
-def _interpolated(frames: Array, times: Array, values: Array, interval: float, gap: float) -> Array:
-    """Temperatures at some frames, from sorted readings."""
-    left = np.clip(np.searchsorted(times, frames, side="right") - 1, 0, len(times) - 2)
-    span = times[left + 1] - times[left]
-    slope = (values[left + 1] - values[left]) / span
-    result: Array = values[left] + slope * (frames - times[left])
-    outside = np.maximum(times[0] - frames, frames - times[-1])
-    on_reading = (frames == times[left]) | (frames == times[left + 1])
-    result[(outside > interval) | ((span > gap) & ~on_reading)] = np.nan
-    return result
-
-
-def temperature_at_frame(epochs: Sequence[Epoch], channel: str | None = None) -> Array:
-    """One channel (the first, the reference, if None) at the times of the frames, (E,) °C."""
-    if channel is None:
-        channel = next((name for epoch in epochs for name in epoch.temperatures), "")
-    return interpolate_readings(
-        [epoch.frame_time for epoch in epochs],
-        [epoch.temperature_time for epoch in epochs],
-        [epoch.temperatures.get(channel, np.nan) for epoch in epochs],
-    )
-
-
-def temperatures_at_frame(epochs: Sequence[Epoch]) -> dict[str, Array]:
-    """Every channel at the times of the frames, {name: (E,) °C}, the reference first."""
-    names = dict.fromkeys(name for epoch in epochs for name in epoch.temperatures)
-    return {name: temperature_at_frame(epochs, name) for name in names}

@@ -41,11 +41,10 @@ _CENTRE = 0.1  # of the image's diagonal
 _PITCH_OPTION = "--pixel-pitch, or pixel_pitch in recording.yaml or the camera file"
 
 
-def time_fault(times: Array, before: float = math.nan) -> tuple[int, str] | None:
+def time_fault(times: Array) -> tuple[int, str] | None:
     """Return the first row of times (n,) s that are no seconds since 1970, and what they are.
 
-    before: the time of the row before them, not finite for none. A clock that was not set says
-    1970.
+    A clock that was not set says 1970.
     """
     late = times > _LATEST_S
     if late.any():
@@ -54,11 +53,11 @@ def time_fault(times: Array, before: float = math.nan) -> tuple[int, str] | None
         unit = next((u for n, u in _UNITS.items() if 3e8 < times[row] / n < _LATEST_S), None)
         hint = f": are they {unit}? " if unit else ": "
         return row, f"{times[row]:.15g} s is the year {year:.0f}{hint}Write seconds since 1970"
-    pauses = np.diff(times, prepend=before)
+    pauses = np.diff(times, prepend=math.nan)
     leaps = np.isfinite(pauses) & (pauses > _LONGEST_PAUSE_S)
     if leaps.any():
         row = int(np.argmax(leaps))
-        years = (times[row] - (times[row - 1] if row else before)) / 31_556_952
+        years = pauses[row] / 31_556_952
         return row, (
             f"is {years:.0f} years after the row before: a clock that was not set? Correct the "
             "times, or leave the rows out"
@@ -66,21 +65,18 @@ def time_fault(times: Array, before: float = math.nan) -> tuple[int, str] | None
     return None
 
 
-def point_fault(values: Array) -> tuple[int, str, str] | None:
-    """Return the first row of x, y, sx, sy (n, 4) px that no measurement gives, column and why."""
-    far = np.abs(values[:, :2]) > _FARTHEST_PX
-    odd = (values[:, 2:4] < _SIGMAS_PX[0]) | (values[:, 2:4] > _SIGMAS_PX[1])
-    wrong = np.hstack([far, odd])
+def point_fault(points: Array, sigmas: Array) -> tuple[int, str, str] | None:
+    """Return the first row of points, sigmas (n, 2) px that none measures, its column and why."""
+    low, high = _SIGMAS_PX
+    wrong = np.hstack([np.abs(points) > _FARTHEST_PX, (sigmas < low) | (sigmas > high)])
     if not wrong.any():
         return None
     row, column = (int(i) for i in np.argwhere(wrong)[0])
-    value = f"{values[row, column]:g} px"
     if column < 2:
-        return row, "xy"[column], f"{value} lies on no image; leave the row out"
-    low, high = _SIGMAS_PX
+        return row, "xy"[column], f"{points[row, column]:g} px lies on no image; leave the row out"
     return row, ("sx", "sy")[column - 2], (
-        f"a standard deviation of {value} is none; image points are measured to between {low:g} "
-        f"and {high:g} px"
+        f"a standard deviation of {sigmas[row, column - 2]:g} px is none; image points are "
+        f"measured to between {low:g} and {high:g} px"
     )  # fmt: skip
 
 
@@ -300,6 +296,7 @@ def pitch_doubts(pitch: float, known: float | None) -> list[str]:
     return [doubt]
 
 
-def doubt_lines(doubts: Sequence[str]) -> list[str]:
-    """Return doubts as lines for a person."""
-    return [f"doubtful: {text}" for text in doubts]
+def doubt_lines(doubts: Sequence[str], series: str = "") -> list[str]:
+    """Return doubts as lines for a person; series: that they are of, where there are several."""
+    of = f", {series}" if series else ""
+    return [f"doubtful{of}: {text}" for text in doubts]

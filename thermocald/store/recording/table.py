@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import csv
 import io
-from itertools import islice
-from typing import TYPE_CHECKING, Protocol
+from itertools import chain, islice
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,8 @@ class Table:
     columns: the names in the header, in their order.
     """
 
+    seeks = False
+
     def __init__(
         self,
         path: Path,
@@ -52,8 +54,17 @@ class Table:
             if name not in self.columns:
                 raise error(self._missing(name))
 
-    def chunks(self, rows: int = 8192) -> Iterator[Chunk]:
-        """The rows below the header, at most `rows` at a time; empty lines are skipped."""
+    def chunks(
+        self,
+        rows: int = 8192,
+        columns: Sequence[str] | None = None,
+        epochs: tuple[int, int] | None = None,
+    ) -> Iterator[Chunk]:
+        """The rows below the header, at most `rows` at a time; empty lines are skipped.
+
+        columns, epochs: what is needed, first and last; a table that `seeks` leaves out the rest.
+        """
+        del columns, epochs
         first = 0
         with self._open() as file:
             reader = csv.reader(file, strict=True)
@@ -68,6 +79,37 @@ class Table:
                 raise self._error(
                     f"{self.path}, line {reader.line_num}: is not readable as CSV: {cause}"
                 ) from cause
+
+    def read(
+        self,
+        integers: Sequence[str] = (),
+        numbers: Sequence[str] = (),
+        optional: Sequence[str] = (),
+        texts: Sequence[str] = (),
+    ) -> dict[str, Any]:
+        """Whole columns by name; optional: numbers that may be missing, which are NaN."""
+        parts: dict[str, list[Any]] = {}
+        for chunk in self.chunks():
+            for name in integers:
+                parts.setdefault(name, []).append(chunk.integers(name))
+            for name in (*numbers, *optional):
+                found = chunk.numbers(name, empty_is_nan=name in optional)
+                parts.setdefault(name, []).append(found)
+            # chunk by chunk: the garbage collector would walk through a list of a year's
+            for name in texts:
+                parts.setdefault(name, []).append(chunk.text(name))
+        return {
+            name: tuple(chain.from_iterable(found)) if name in texts else np.concatenate(found)
+            for name, found in parts.items()
+        }
+
+    def check(
+        self, name: str, wrong: NDArray[np.bool_], message: Callable[[int], str] | str
+    ) -> None:
+        """Raise for the first row that is wrong; `message` may be a function of the row."""
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            self.fail(row, name, message if isinstance(message, str) else message(row))
 
     def fail(self, row: int, column: str | None, message: str) -> NoReturn:
         """Raise the error for one row (counted from 0 below the header) and column."""
@@ -130,16 +172,8 @@ class Table:
             return reader.line_num
 
 
-class _Rows(Protocol):
-    """What a chunk comes from."""
-
-    def fail(self, row: int, column: str | None, message: str) -> NoReturn: ...
-
-
 class Chunk:
     """Some consecutive rows of a table as columns. first: the first row's number in the table."""
-
-    table: _Rows
 
     def __init__(self, table: Table, first: int, rows: list[tuple[str, ...]]) -> None:
         self.table = table
@@ -205,9 +239,10 @@ class Chunk:
             return np.array([index.get(word.strip(), -1) for word in words], dtype=np.int64)
 
     def is_number(self, name: str) -> bool:
-        """Whether a column begins with a number, or with nothing."""
+        """Whether a column begins with numbers, or with nothing."""
         try:
-            float(self.text(name)[0] or "nan")
+            for text in self.text(name)[:100]:
+                float(text or "nan")
         except ValueError:
             return False
         return True
@@ -215,7 +250,7 @@ class Chunk:
     def check(
         self, name: str, wrong: NDArray[np.bool_], message: Callable[[int], str] | str
     ) -> None:
-        """Raise for the first row that is wrong; `message` may be a function of the row."""
+        """Raise for the first row of this chunk that is wrong, as `Table.check` does."""
         if wrong.any():
             row = int(np.argmax(wrong))
             self.fail(row, name, message if isinstance(message, str) else message(row))

@@ -9,9 +9,9 @@ import shutil
 from typing import TYPE_CHECKING, Self
 
 from thermocald.errors import RecordingError
-from thermocald.files import cannot_write
+from thermocald.files import cannot_write, dump_yaml
 from thermocald.names import require_channels
-from thermocald.store.recording.head import Head, head_yaml
+from thermocald.store.recording.head import Head, head_document
 from thermocald.store.recording.readings import READINGS, Readings, write_readings
 from thermocald.store.recording.testfield_file import testfield_csv
 
@@ -53,7 +53,8 @@ class RecordingWriter:
         try:
             shutil.rmtree(self._partial, ignore_errors=True)
             self._partial.mkdir(parents=True)
-            (self._partial / "recording.yaml").write_text(head_yaml(self._head), encoding="utf-8")
+            head = dump_yaml(head_document(self._head))
+            (self._partial / "recording.yaml").write_text(head, encoding="utf-8")
             (self._partial / "testfield.csv").write_text(
                 testfield_csv(self._field), encoding="utf-8"
             )

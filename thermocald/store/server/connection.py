@@ -7,14 +7,15 @@
 
 from __future__ import annotations
 
+import os
 import re
 import threading
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
-from urllib.parse import parse_qsl, quote, urlencode, urlsplit, urlunsplit
+from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsplit
 
-from thermocald.addresses import without_secrets
+from thermocald.addresses import hide, hide_secrets, without_secrets
 from thermocald.errors import (
     DriverMissing,
     ServerError,
@@ -99,6 +100,9 @@ class ServerAddress:
                 f"{without_secrets(str(source))}: is not a valid address: "
                 f"{without_secrets(str(error))}"
             ) from None
+        for secret in (parts.password, os.environ.get("PGPASSWORD")):
+            hide(secret and unquote(secret))
+        hide_secrets(dict(query))
         selection = {name: value for name, value in query if name in _OURS}
         rest = urlencode([(n, v) for n, v in query if n not in _OURS], quote_via=quote)
         url = urlunsplit(("postgresql", parts.netloc, parts.path, rest, ""))
@@ -183,7 +187,13 @@ class Connected:
         if any_version:
             return
         try:
-            self._require_version()
+            ((found,),) = self._query("SELECT version FROM thermocald_version")
+            if found != (known := len(schema.SERVER_STEPS)):
+                remedy = "run `thermocald server init` there"
+                raise StoreVersionError(
+                    f"{address}: its tables are of version {found}, this program's are {known}; "
+                    f"{remedy if found < known else 'update thermocald here'}"
+                )
         except BaseException:
             self.close()
             raise
@@ -233,18 +243,6 @@ class Connected:
         """All rows of a statement with %s."""
         with self._transaction("it cannot be read") as connection:
             return connection.execute(statement, values).fetchall()
-
-    def _require_version(self) -> None:
-        """StoreVersionError where the server's tables are not of this program's version."""
-        ((found,),) = self._query("SELECT version FROM thermocald_version")
-        if found != (known := len(schema.SERVER_STEPS)):
-            remedy = (
-                "run `thermocald server init` there" if found < known else "update thermocald here"
-            )
-            raise StoreVersionError(
-                f"{self.address}: its tables are of version {found}, this program's are {known}; "
-                f"{remedy}"
-            )
 
 
 def _connect(address: ServerAddress) -> Connection[Any]:

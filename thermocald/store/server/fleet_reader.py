@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
 
 from thermocald.store.recording.head import parse_head
 from thermocald.store.server.connection import Connected
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from thermocald.arrays import Array
     from thermocald.store.recording.head import Head
 
 
@@ -33,25 +37,13 @@ _FIRST, _DAY_S = 946_684_800.0, 86400.0  # before 2000 a clock was not set
 _SLOTS = "slot BETWEEN thermocald_slot(%s) AND thermocald_slot(%s)"
 
 
-@dataclass(frozen=True, slots=True)
-class RecentEpoch:
+class RecentEpoch(NamedTuple):
     """One of the last epochs: times in s UTC (received: the server's clock, NaN if not known)."""
 
     frame_time: float
     received: float
     status: str
     temperatures: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """An epoch with a result: °C of the reference, c, x0, y0 in mm and their sds; its series."""
-
-    series: int
-    frame_time: float
-    temperature: float
-    values: tuple[float, float, float]
-    sds: tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,14 +62,46 @@ class StationState:
     stores: int = 1
 
 
-@dataclass(slots=True)
-class CameraRecord:
-    """A camera at a station: its last series' head, last epochs (newest first), spread samples.
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """A change with temperature, mm/K, and its standard deviation."""
 
-    epochs, results: of all its series; last_ok: s UTC, of the last epoch with a result; range: °C
-    of the reference in all epochs with a result; both NaN without; copied: whether one of its last
+    value: float
+    sd: float
+    unit: str = "mm/K"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that a person should look at: one word, see `fleet.overview`, and a sentence."""
+
+    kind: str
+    text: str
+
+
+@dataclass(slots=True, eq=False)
+class FleetCamera:
+    """A camera at a station, as a server knows it, and from `state` on its overview.
+
+    head, identity: of its last series; epochs, results: of all; last_ok: s UTC, of the last epoch
+    with a result; range: °C of the reference in all epochs with a result; both NaN without; recent:
+    the last epochs, newest first; samples (n, 9): series, frame_time, °C of the reference, c, its
+    sd, x0, sd, y0, sd (mm) of epochs with a result spread over all; copied: whether one of the last
     epochs was taken at two times, as two copies of one store take them.
+
+    lag_s: since its last epoch, by the server's clock; on_the_way_s: the median time that its last
+    epochs took to the server, NaN if not known; ok: fraction of its last epochs with a result;
+    temperature: °C, the last of the reference, NaN without; shift_px: how far c, x0 or y0 has left
+    its own line lately, and in standard deviations; odd: the probability that a camera of this type
+    is as unlike the others, NaN where that is not known.
     """
+
+    JSON: ClassVar = {
+        "head": "", "identity": "", "last_time": "last_epoch", "last_ok": "", "range": "",
+        "copied": "", "recent": "", "samples": "", "state": "", "calibrated_range":
+        "temperature_range", "shift_sds": "", "odd": "odd_p", "waiting": "waiting",
+        "clock_s": "clock_s", "version": "version",
+    }  # fmt: skip
 
     station: str
     camera: str
@@ -85,13 +109,69 @@ class CameraRecord:
     head: Head
     identity: Mapping[str, Any]
     last_time: float
-    epochs: int = 0
-    results: int = 0
-    last_ok: float = math.nan
-    range: tuple[float, float] = (math.nan, math.nan)
+    epochs: int
+    results: int
+    last_ok: float
+    range: tuple[float, float]
     copied: bool = False
     recent: list[RecentEpoch] = field(default_factory=list)
-    samples: list[Sample] = field(default_factory=list)
+    samples: Array = field(default_factory=lambda: np.empty((0, 9)))
+    type: str = ""
+    state: StationState | None = None
+    lag_s: float = math.nan
+    on_the_way_s: float = math.nan
+    ok: float = math.nan
+    temperature: float = math.nan
+    rates: dict[str, Rate] = field(default_factory=dict)
+    shift_px: float = math.nan
+    shift_sds: float = math.nan
+    odd: float = math.nan
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        return f"{self.station}/{self.camera}"
+
+    @property
+    def calibrated_range(self) -> tuple[float, float] | None:
+        """`range`, None without a result."""
+        return self.range if math.isfinite(self.range[0]) else None
+
+    @property
+    def waiting(self) -> int | None:
+        """How many rows wait at its station."""
+        return None if self.state is None else self.state.waiting
+
+    @property
+    def clock_s(self) -> float | None:
+        """Its station's clock minus the server's."""
+        return None if self.state is None else self.state.clock
+
+    @property
+    def version(self) -> str | None:
+        """Its station's program."""
+        return None if self.state is None else self.state.version
+
+
+class _Series(NamedTuple):
+    """A series, and what the summary says of it: first and last epoch (s UTC), how many epochs,
+    results, and slots with a sample.
+    """
+
+    key: Any
+    station: str
+    camera: str
+    name: str
+    head: str
+    identity: str
+    first: float
+    last: float
+    epochs: int
+    results: int
+    last_ok: float | None
+    low: float | None
+    high: float | None
+    sampled: int
 
 
 class FleetReader(Connected):
@@ -113,7 +193,7 @@ class FleetReader(Connected):
         )
         return {name: StationState(*state) for name, *state in rows}
 
-    def cameras(self, now: float, path: Path) -> list[CameraRecord]:
+    def cameras(self, now: float, path: Path) -> list[FleetCamera]:
         """All cameras by station and name; path: of the server, for messages."""
         wanted = self.address
         # an epoch from the future is of a wrong clock: it must not hide those of today
@@ -127,27 +207,29 @@ class FleetReader(Connected):
             "GROUP BY s.key ORDER BY station, camera, max(last)",
             (*sane, wanted.station, wanted.camera, wanted.series),
         )
-        records: dict[tuple[str, str], CameraRecord] = {}
-        current: dict[Any, CameraRecord] = {}
-        spans: list[_Span] = []
-        for key, station, camera, name, head, identity, first, last, *found in rows:
-            parsed = parse_head(json.loads(head), path)
-            record = CameraRecord(station, camera, name, parsed, json.loads(identity), last)
-            if older := records.get((station, camera)):
-                current = {k: r for k, r in current.items() if r is not older}
-                record.epochs, record.results = older.epochs, older.results
-                record.last_ok, record.range = older.last_ok, older.range
-            _add_up(record, *found[:-1])
-            records[station, camera] = current[key] = record
-            reference = next(iter(parsed.channels), "")
-            spans.append(_Span(key, reference, first, last, found[-1]))
-        owner = {row[0]: records[row[1], row[2]] for row in rows}
-        self._read_recent(current)
-        self._read_samples(spans, owner, sane)
-        return list(records.values())
+        series = [_Series(*row) for row in rows]
+        heads = {one.key: parse_head(json.loads(one.head), path) for one in series}
+        owned: list[tuple[FleetCamera, list[_Series]]] = []
+        for _, found in groupby(series, key=lambda one: (one.station, one.camera)):
+            every = list(found)
+            newest = every[-1]
+            camera = FleetCamera(
+                newest.station, newest.camera, newest.name, heads[newest.key],
+                json.loads(newest.identity), newest.last,
+                sum(one.epochs for one in every), sum(one.results for one in every),
+                _extreme(max, (one.last_ok for one in every)),
+                (_extreme(min, (o.low for o in every)), _extreme(max, (o.high for o in every))),
+            )  # fmt: skip
+            owned.append((camera, every))
+        self._read_recent({every[-1].key: camera for camera, every in owned})
+        self._read_samples(owned, heads, sane)
+        return [camera for camera, _ in owned]
 
-    def _read_recent(self, current: Mapping[Any, CameraRecord]) -> None:
-        """The last epochs; the summary says in which slots they are, so in which month."""
+    def _read_recent(self, current: Mapping[Any, FleetCamera]) -> None:
+        """The last epochs; the summary says in which slots they are, so in which month.
+
+        A series is copied where one of the newest was taken at two times: by two stores.
+        """
         rows = self._query(
             "SELECT s.key, e.frame_time, e.received, e.status, e.temperatures, e.number, "
             "e.revision "
@@ -169,15 +251,6 @@ class FleetReader(Connected):
             if not recent or recent[-1].frame_time != frame_time:  # an older revision follows
                 values = {n: _nan(v) for n, v in json.loads(temperatures).items()}
                 recent.append(RecentEpoch(frame_time, _nan(received), status, values))
-
-        self._find_copies(current, newest)
-
-    def _find_copies(
-        self,
-        current: Mapping[Any, CameraRecord],
-        newest: Sequence[tuple[Any, int, int, float]],
-    ) -> None:
-        """Mark series of which one of the newest epochs was taken at two times: by two stores."""
         columns = [list(column) for column in zip(*newest, strict=True)] or [[]] * 4
         for (key,) in self._query(
             "SELECT DISTINCT s.key FROM unnest(%s::uuid[], %s::int8[], %s::int4[], %s::float8[]) "
@@ -189,45 +262,25 @@ class FleetReader(Connected):
 
     def _read_samples(
         self,
-        spans: Sequence[_Span],
-        owner: Mapping[Any, CameraRecord],
+        owned: Sequence[tuple[FleetCamera, list[_Series]]],
+        heads: Mapping[Any, Head],
         sane: tuple[float, float],
     ) -> None:
-        """Epochs with a result of every series, spread over it."""
-        series_of = Counter(id(owner[span.key]) for span in spans)
-        short: list[tuple[_Span, int]] = []
-        long: list[tuple[_Span, int]] = []
-        for span in spans:
-            count = max(FEWEST, SPREAD // series_of[id(owner[span.key])])
-            (long if span.slots >= count else short).append((span, count))
-        found = [*self._from_summary(long, sane), *self._from_epochs(short)]
-        place = {span.key: i for i, span in enumerate(spans)}
-        for key, (frame_time, _, *numbers) in sorted(found, key=lambda f: (place[f[0]], f[1][0])):
-            temperature, c, sd_c, x0, sd_x0, y0, sd_y0 = map(_nan, numbers)
-            samples = owner[key].samples
-            one = Sample(place[key], frame_time, temperature, (c, x0, y0), (sd_c, sd_x0, sd_y0))
-            if not samples or (samples[-1].series, samples[-1].frame_time) != (
-                one.series, one.frame_time,
-            ):  # fmt: skip
-                samples.append(one)
-
-    def _from_summary(
-        self, spans: Sequence[tuple[_Span, int]], sane: tuple[float, float]
-    ) -> list[tuple[Any, Any]]:
-        """(series, sample) of every so many-th slot."""
+        """Epochs with a result of every series, spread over it: its slots', where they suffice."""
+        counted = [(o, max(FEWEST, SPREAD // len(every))) for _, every in owned for o in every]
+        long = [(one, count) for one, count in counted if one.sampled >= count]
+        short = [(one, count) for one, count in counted if one.sampled < count]
         # odd: with four slots a day, every time of day has its turn
-        steps = [(span.slots // count) | 1 for span, count in spans]
-        return self._query(
+        steps = [(one.sampled // count) | 1 for one, count in long]
+        found = self._query(
             "SELECT series, sample FROM (SELECT series, sample, step, "
             "row_number() OVER (PARTITION BY series ORDER BY slot DESC) AS place "
             "FROM unnest(%s::uuid[], %s::int[]) s(key, step) JOIN summary ON series = s.key "
             f"WHERE sample IS NOT NULL AND {_SLOTS}) counted WHERE (place - 1) %% step = 0",
-            ([span.key for span, _ in spans], steps, *sane),
+            ([one.key for one, _ in long], steps, *sane),
         )
-
-    def _from_epochs(self, spans: Sequence[tuple[_Span, int]]) -> list[tuple[Any, Any]]:
-        """(series, sample) of one epoch in each of equal intervals of a series."""
-        return self._query(
+        # one epoch in each of equal intervals of a short series
+        found += self._query(
             "SELECT s.key, ARRAY[e.frame_time, e.number, "
             "(e.temperatures::json->>s.channel)::float8, "
             'e."c", e."sd_c", e."x0", e."sd_x0", e."y0", e."sd_y0"] '
@@ -242,43 +295,26 @@ class FleetReader(Connected):
             "WHERE series = s.key AND frame_time = first.t ORDER BY revision DESC LIMIT 1) e "
             "WHERE e.status = 'ok'",
             (
-                [span.key for span, _ in spans],
-                [span.reference for span, _ in spans],
-                [span.first for span, _ in spans],
-                [span.last for span, _ in spans],
-                [count for _, count in spans],
+                [one.key for one, _ in short],
+                [next(iter(heads[one.key].channels), "") for one, _ in short],
+                [one.first for one, _ in short],
+                [one.last for one, _ in short],
+                [count for _, count in short],
             ),
         )
+        samples: dict[Any, dict[float, list[float]]] = defaultdict(dict)
+        for key, (frame_time, _, *numbers) in found:  # neighbouring intervals may share one
+            samples[key][frame_time] = [frame_time, *numbers]
+        for camera, every in owned:
+            rows = [
+                [i, *s] for i, one in enumerate(every) for _, s in sorted(samples[one.key].items())
+            ]
+            camera.samples = np.array(rows, dtype=float).reshape(-1, 9)
 
 
-class _Span(NamedTuple):
-    """A series: key, reference temperature, first and last epoch (s UTC), slots with a sample."""
-
-    key: Any
-    reference: str
-    first: float
-    last: float
-    slots: int
-
-
-def _add_up(
-    record: CameraRecord,
-    epochs: int,
-    results: int,
-    last_ok: float | None,
-    low: float | None,
-    high: float | None,
-) -> None:
-    """Add one series of a camera to what is known of it."""
-    record.epochs += epochs
-    record.results += results
-    record.last_ok = _extreme(max, record.last_ok, last_ok)
-    record.range = _extreme(min, record.range[0], low), _extreme(max, record.range[1], high)
-
-
-def _extreme(of: Callable[[list[float]], float], known: float, new: float | None) -> float:
-    values = [v for v in (known, _nan(new)) if not math.isnan(v)]
-    return of(values) if values else math.nan
+def _extreme(of: Callable[[list[float]], float], values: Iterable[float | None]) -> float:
+    known = [v for v in values if v is not None and not math.isnan(v)]
+    return of(known) if known else math.nan
 
 
 def _nan(value: float | None) -> float:

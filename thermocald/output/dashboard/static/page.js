@@ -23,8 +23,10 @@ function element(name, text, className) {
 function rows(target, content) { $(target).replaceChildren(...content); }
 
 function fixed(value, digits) {
-  return value === null || value === undefined ? "–" : Number(value).toFixed(digits);
+  return value === null || value === undefined ? "–" : Number(value).toFixed(digits).replace("-", "−");
 }
+
+function counted(count, noun) { return `${count} ${noun}${count === 1 ? "" : "s"}`; }
 
 function time(utc) {
   return new Date(utc * 1000).toISOString().replace("T", " ").slice(0, 19);
@@ -82,12 +84,12 @@ function showCamera(camera) {
   state.textContent = good ? (online.sentence || last.state) : `${last.status}: ${last.reason}`;
   const figures = [["Epoch", String(last.epoch), time(last.frame_time) + " UTC"],
     ["Temperature", fixed(last.temperature, 2) + " °C", ""]];
-  for (const name of ["c", "x0", "y0"]) {
+  for (const [name, label] of [["c", "c"], ["x0", "x₀"], ["y0", "y₀"]]) {
     const sd = online["sd_" + name] ?? last["sd_" + name];
-    figures.push([name, `${fixed(online[name] ?? last[name], 5)} mm`,
+    figures.push([label, `${fixed(online[name] ?? last[name], 5)} mm`,
       sd ? `± ${fixed(sd, 5)}; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : ""]);
   }
-  figures.push(["sigma0", fixed(last.sigma0, 3), `${last.n_observations} targets, ${last.n_rejected} rejected`]);
+  figures.push(["σ₀", fixed(last.sigma0, 3), `${counted(last.n_observations, "target")}, ${last.n_rejected} rejected`]);
   if (online.orientation) figures.push(["Camera", online.orientation, ""]);
   rows("figures", figures.flatMap(([name, value, more]) => {
     const dd = element("dd", value + " ");
@@ -121,7 +123,7 @@ async function showFrame(name) {
   });
   overlay.replaceChildren(...parts);
   const count = (targets.x || []).length, bad = (targets.rejected || []).filter(Boolean).length;
-  const text = `epoch ${epoch.row.epoch}: ${count} targets, ${bad} rejected (red); residuals ×${RESIDUAL_SCALE}`;
+  const text = `epoch ${epoch.row.epoch}: ${counted(count, "target")}, ${bad} rejected (red); residuals ×${RESIDUAL_SCALE}`;
   $("frame-caption").textContent = text;
   overlay.setAttribute("aria-label", text);
   const picture = await fetch(`api/cameras/${encodeURIComponent(name)}/frame`).catch(() => null);
@@ -141,9 +143,9 @@ function showDevices() {
       const row = element("tr"), state = element("td");
       const good = ["open", "finished"].includes(device.device);
       state.append(element("span", device.device, good ? "ready" : "failed"),
-        (device.since ? ` since ${time(device.since)} UTC ` : " ") + (device.why || ""));
+        (device.since ? ` since ${time(device.since)} UTC` : "") + (device.why ? `: ${device.why}` : ""));
       const rhythm = kind === "cameras" ?
-        `every ${device.period_s} s, late ${fixed(1000 * device.late_p99_s, 1)} ms (p99), ` +
+        `every ${device.period_s} s, 99 of 100 less than ${fixed(1000 * device.late_p99_s, 1)} ms late, ` +
         `${device.skipped} skipped, ${device.lost} lost, ${device.deferred - device.caught_up} to catch up` : "";
       const first = element("th", name);
       first.scope = "row";
@@ -251,7 +253,12 @@ $("camera").addEventListener("change", () => {
 });
 $("series").addEventListener("change", refreshCourse);
 $("range").addEventListener("change", refreshCourse);
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", refreshCourse);
+// paper has a width of its own: A4 less margins, in px of CSS
+addEventListener("beforeprint", () => { if ($("course").data) Plotly.relayout("course", { width: 670, height: 430, "font.size": 9 }); });
+addEventListener("afterprint", () => { if ($("course").data) refreshCourse(); });
+for (const look of ["(prefers-color-scheme: dark)", "(max-width: 600px)"]) {
+  matchMedia(look).addEventListener("change", refreshCourse);
+}
 refreshCourse();
 refreshEvents();
 listen();

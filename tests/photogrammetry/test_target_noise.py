@@ -1,0 +1,61 @@
+"""The noise of single targets: how far it is believed, and what the test of a point makes of it."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from thermocald.photogrammetry.epoch.snooping import limit_2d
+from thermocald.photogrammetry.series.target_noise import noise_ratios
+
+TARGETS = 150
+
+
+def drawn(rng, epochs, spread):
+    """Residuals and weights of targets whose standard deviations scatter by exp(spread z)."""
+    true = np.exp(2.0 * spread * rng.standard_normal(TARGETS))
+    noise = np.sqrt(true)[:, None] * rng.standard_normal((epochs, TARGETS, 2))
+    weights = np.ones((epochs, TARGETS, 3))
+    return noise, weights, np.ones((epochs, TARGETS), dtype=bool), true
+
+
+@pytest.mark.parametrize("freedom", [5.0, 30.0, 1000.0])
+@pytest.mark.parametrize("alpha", [0.01, 0.0005])
+def test_the_limit_is_the_quantile_of_f(freedom, alpha):
+    expected = 2.0 * stats.f.isf(alpha, 2, freedom)
+    np.testing.assert_allclose(limit_2d(alpha, np.array([1.0 / freedom])), expected, rtol=1e-9)
+
+
+def test_targets_measured_alike_are_not_told_apart_by_chance():
+    rng = np.random.default_rng(5)
+    ratio, freedom = noise_ratios(*drawn(rng, 10, 0.0)[:3], 1.0)
+    assert np.std(np.log(ratio)) < 0.1  # of single targets: 0.45
+    assert freedom.min() > 100
+
+
+@pytest.mark.parametrize("epochs", [10, 20, 100])
+@pytest.mark.parametrize("spread", [0.0, 0.3, 0.8])
+def test_as_many_good_points_fail_as_stated(epochs, spread):
+    """Points of further epochs, tested with what the first ones showed of each target.
+
+    Medians of few epochs are believed less than they could be: no more than stated, then.
+    """
+    alpha, outside, tried = 0.002, 0, 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        residuals, weights, used, true = drawn(rng, epochs, spread)
+        ratio, freedom = noise_ratios(residuals, weights, used, 1.0)
+        further = np.sqrt(true)[:, None] * rng.standard_normal((10, TARGETS, 2))
+        tests = (further**2 / ratio).sum(axis=2)
+        outside += int((tests > limit_2d(alpha, 1.0 / freedom)).sum())
+        tried += tests.size
+    assert outside / tried < 1.35 * alpha
+    assert outside / tried > 0.5 * alpha or epochs < 100
+
+
+def test_a_few_jumps_do_not_raise_a_targets_noise():
+    rng = np.random.default_rng(8)
+    residuals, weights, used, _ = drawn(rng, 40, 0.3)
+    before, _ = noise_ratios(residuals, weights, used, 1.0)
+    residuals[3, :, 0] += 50.0
+    after, _ = noise_ratios(residuals, weights, used, 1.0)
+    assert np.median(np.abs(after / before - 1.0)) < 0.2

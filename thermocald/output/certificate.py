@@ -1,0 +1,179 @@
+"""The certificate of a thermal model: how the camera follows its temperature, and how far."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermocald.figures import BAND, PALETTE, Curve, Figure, Panel
+from thermocald.numbers import UNITS, parameter_label, signed, with_sd
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.report import Answer, Chapter, Section, Table, as_sentence, render_report
+from thermocald.store.recording.sense import doubt_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.arrays import Array
+
+_DISTANCE_MM = 10_000.0
+_STEPS = 41
+
+
+def render_certificate(camera: ThermalCamera) -> str:
+    """Return the page as HTML text."""
+    document = camera.as_dict()
+    low, high = next(iter(document["validity"].values()))
+    T = np.linspace(low, high, _STEPS)
+    states = [camera.at(float(t)) for t in T]
+    values = np.array([state.interior.as_array() for state in states])
+    sds = np.array([[state.sd.get(name, 0.0) for name in IOP_NAMES] for state in states])
+    missing = bool(document.get("effect_missing"))
+    chapter = Chapter(
+        f"Thermal model of {document['camera']}",
+        Answer(
+            _sentence(document, camera.model.sensor.pixel_pitch, low, high),
+            _drift(T, values, sds, missing),
+            tuple(_judged(document)),
+            ("Find what is missing: thermocald discover.",) if missing
+            else ("Correct measurements with: thermocald correct.",),
+            (
+                f"Temperatures below {low:g} and above {high:g} °C.",
+                "Focus or lens moved since: calibrate again.",
+                "Errors of the camera model itself, which no standard deviation here holds.",
+            ),
+        ),
+        (
+            _section("The model", _values(document), _effects(document)),
+            _section("What it rests on", *_evidence(document)),
+        ),
+        about=(_about(camera, document),),
+        notes=tuple(as_sentence(line) for line in doubt_lines(document.get("doubts", ()))),
+    )  # fmt: skip
+    return render_report(chapter.title, [chapter])
+
+
+def _section(title: str, *tables: Table) -> Section:
+    return Section(title, tables=tuple(table for table in tables if table.rows))
+
+
+def _about(camera: ThermalCamera, document: Mapping[str, Any]) -> str:
+    sensor = camera.model.sensor
+    text = f"{sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm"
+    series = ", ".join(str(s["name"]) for s in document.get("series", ()))
+    return f"{text}; fitted to {series}." if series else f"{text}."
+
+
+def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float) -> str:
+    """The largest of the rates with its sd, the range, and what that is on a plane."""
+    rates = {n: (r["value"], r.get("sd", float("nan"))) for n, r in document["rates"].items()}
+    if not rates:
+        return f"The camera does not follow the temperature between {low:.0f} and {high:.0f} °C."
+    name = max(rates, key=lambda n: abs(rates[n][0]))
+    rate, sd = rates[name]
+    text = (
+        f"{parameter_label(name)} moves by {signed(rate / pitch, sd / pitch, 'px/K')} between "
+        f"{low:.0f} and {high:.0f} °C"
+    )
+    if name != "c":
+        c = document["interior"]["c"]["value"]
+        per_rate = (high - low) / c * _DISTANCE_MM
+        text += f"; at 10 m that is {with_sd(abs(rate) * per_rate, sd * per_rate, 'mm')}"
+    return f"{text}."
+
+
+def _judged(document: Mapping[str, Any]) -> list[str]:
+    if why := document.get("not_examined"):
+        return [f"Whether an effect is missing was not examined: {why}."]
+    if document.get("effect_missing"):
+        left = document.get("misfit_px")
+        size = "" if left is None else f" of {left:.3f} px"
+        return [(f"An effect is missing: the model leaves smooth trajectories{size}. The standard "
+                "deviations are widened by that, and no 95 % band is stated.")]  # fmt: skip
+    return ["The model leaves no more than noise."]
+
+
+def _drift(T: Array, values: Array, sds: Array, missing: bool) -> Figure:
+    middle = len(T) // 2
+    panels = []
+    for name in ("c", "x0", "y0"):
+        k = IOP_NAMES.index(name)
+        y, half = 1e3 * (values[:, k] - values[middle, k]), 1e3 * BAND * sds[:, k]
+        curve = (
+            Curve("", T, y, "line", PALETTE[0]) if missing
+            else Curve("", T, y, "band", PALETTE[0], y - half, y + half)
+        )  # fmt: skip
+        label = parameter_label(name)
+        panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
+    band = "no band is stated" if missing else "bands hold 95 %, the level's uncertainty included"
+    return Figure(
+        "drift", "How the camera follows its temperature",
+        f"Each parameter less its value in the middle of the range, of a camera that has long been "
+        f"at a temperature; {band}.",
+        tuple(panels),
+    )  # fmt: skip
+
+
+def _shown(entry: Mapping[str, Any], unit: str, scale: float = 1.0) -> str:
+    return with_sd(scale * entry["value"], scale * entry.get("sd", float("nan")), unit)
+
+
+def _values(document: Mapping[str, Any]) -> Table:
+    rates = document["rates"]
+    return Table.of(
+        "Interior orientation",
+        document["interior"].items(),
+        {
+            "parameter": lambda r: parameter_label(r[0]),
+            f"at {document['reference_temperature']:g} °C": lambda r: _shown(
+                r[1], UNITS.get(r[0], "")
+            ),
+            "rate": lambda r: _shown(rates[r[0]], "µm/K", 1e3) if r[0] in rates else "",
+        },
+    )
+
+
+def _effects(document: Mapping[str, Any]) -> Table:
+    found = [
+        (effect["effect"], name, entry)
+        for effect in document["effects"]
+        for name, entry in effect["parameters"].items()
+        if isinstance(entry, dict)
+    ]
+    return Table.of(
+        "Effects",
+        found,
+        {
+            "effect": lambda r: str(r[0]),
+            "parameter": lambda r: str(r[1]),
+            "value ± sd": lambda r: _shown(r[2], "" if r[2]["unit"] == "1" else r[2]["unit"]),
+        },
+    )
+
+
+def _evidence(document: Mapping[str, Any]) -> list[Table]:
+    return [
+        Table.of(
+            "Series",
+            document.get("series", ()),
+            {
+                "series": lambda s: str(s["name"]),
+                "epochs": lambda s: str(s["epochs"]),
+                "left over px RMS": lambda s: f"{s['rms_px']:.4f}",
+                "noise px": lambda s: f"{s['noise_px']:.4f}",
+                "thermometer ± K": lambda s: f"{s['thermometer_sd']:.3f}",
+            },
+        ),
+        Table.of(
+            "Each series predicted from the others",
+            document.get("prediction_test", ()),
+            {
+                "series": lambda s: str(s["name"]),
+                "error px RMS": lambda s: f"{s['rms_px']:.4f}",
+                "noise alone px": lambda s: f"{s['floor_px']:.4f}",
+                "mm at 10 m": lambda s: f"{s['object_mm']:.2f}",
+            },
+        ),
+    ]

@@ -113,7 +113,7 @@ class StoreFullError(StoreError):
 
 
 class StoreVersionError(StoreError):
-    """A store was written by a newer program."""
+    """A store was written by a newer program, or by one that was never published."""
 
 
 class ServerError(StoreError):

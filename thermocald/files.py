@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import yaml
 
@@ -45,9 +45,18 @@ _ADVICE = {
 _DATABASE = b"SQLite format 3\0"
 _KERNEL = (("/", "proc"), ("/", "sys"))
 _WAL_MAGIC = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
-_RECORDED = {"epochs.csv", "observations.csv", "observations.parquet", "readings.csv"}
+_RECORDED = {
+    "recording.yaml",
+    "epochs.csv",
+    "observations.csv",
+    "observations.parquet",
+    "readings.csv",
+}
 
 _LONGEST_NAME = 60
+
+Output = Literal["file", "folder", "recording", "either"]
+"""What a command writes: "recording" a folder that is new, "either" a folder where one is there."""
 
 
 def cannot_write(path: Path | str, cause: OSError) -> OutputError:
@@ -58,34 +67,45 @@ def cannot_write(path: Path | str, cause: OSError) -> OutputError:
     return OutputError(f"{path}: cannot be written: {why}{advice}", status)
 
 
-def check_output(path: Path) -> None:
-    """Refuse an output before it is computed: OutputError where nothing could be written there.
+def check_output(path: Path, kind: Output = "file") -> None:
+    """Refuse an output before it is computed: OutputError where it could not be written.
 
-    What is found out is whether the nearest folder that exists takes a file; folders below it are
-    made when it is written.
+    What may be replaced is what `output_place` says; a new recording replaces nothing. The nearest
+    folder that exists must take a file; folders below it are made when it is written.
     """
     place = Path(os.path.realpath(path))
-    folder = next(folder for folder in (place, *place.parents) if folder.exists())
-    if folder == place and not folder.is_dir():
-        return  # a file, a device, a pipe: `output_place` knows
-    if folder.parts[:2] in _KERNEL:
-        raise cannot_write(path, OSError(errno.EROFS, "the kernel keeps this folder"))
-    if not folder.is_dir():
-        raise cannot_write(path, OSError(errno.ENOTDIR, f"{folder} is a file"))
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise cannot_write(path, OSError(errno.EACCES, os.strerror(errno.EACCES)))
+    if kind == "either":
+        kind = "folder" if place.is_dir() else "file"
+    try:
+        if kind == "file" and output_place(path)[1]:
+            return  # a device or a pipe
+        within = place.parent if kind == "file" else place
+        folder = next(one for one in (within, *within.parents) if one.exists())
+        if folder.parts[:2] in _KERNEL:
+            raise OSError(errno.EROFS, "the kernel keeps this folder")
+        if not folder.is_dir():
+            raise OSError(
+                errno.ENOTDIR, "it is a file" if folder == place else f"{folder} is a file"
+            )
+        if not os.access(folder, os.W_OK | os.X_OK):
+            code = errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES
+            raise OSError(code, os.strerror(code))
+        if kind == "recording" and folder == place and any(place.iterdir()):
+            raise OSError(errno.EEXIST, "it exists already")
+    except OSError as cause:
+        raise cannot_write(path, cause) from cause
 
 
 def output_place(path: Path) -> tuple[Path, bool]:
     """Where an output goes: (the file that links lead to, whether it is written straight).
 
     Straight is what must stay what it is: a device, a pipe, a descriptor of this process. Raises
-    OSError for a folder, for a file that may not be written, and for what was measured: `-o` where
-    `--store` was meant must not cost a store.
+    OSError for a folder, a disk, a file that may not be written, and for what was measured: `-o`
+    where `--store` was meant must not cost a store.
     """
     try:
         found = path.stat()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         found = None
     place = Path(os.path.realpath(path))
     if found is None:
@@ -94,9 +114,16 @@ def output_place(path: Path) -> tuple[Path, bool]:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if not os.access(path, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    if stat.S_ISBLK(found.st_mode):
+        raise FileExistsError(errno.EEXIST, "it is a disk")
+    if stat.S_ISSOCK(found.st_mode):
+        raise OSError(errno.ENXIO, "it is a socket")
     if not is_ordinary(path):
         return path, True
-    if what := is_measured(place):
+    what = is_measured(place)
+    if place.name in _RECORDED and (place.parent / "recording.yaml").exists():
+        what = "part of a recording"
+    if what:
         raise FileExistsError(errno.EEXIST, f"it is {what}")
     return place, False
 
@@ -172,9 +199,6 @@ def write_text(path: Path, text: str) -> None:
 
 def write_parts(path: Path, parts: Iterable[str]) -> None:
     """Write a text file that comes in parts, whole or not at all; raises OutputError."""
-    place = Path(os.path.realpath(path))
-    if place.name in _RECORDED and place.exists() and (place.parent / "recording.yaml").exists():
-        raise cannot_write(path, FileExistsError(errno.EEXIST, "it is part of a recording"))
     with new_file(path) as partial, partial.open("w", encoding="utf-8") as file:
         file.writelines(parts)
 

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import re
+import socket
+import sqlite3
+import stat
 import subprocess
 import sys
+from contextlib import closing, suppress
 
 import pytest
+import typer
 
+from thermocald.cli import application, commands
 from thermocald.errors import OutputError
 from thermocald.files import check_output
 
@@ -69,10 +77,113 @@ def test_an_output_that_cannot_be_is_refused_before_the_work(option, tmp_path):
     assert lines[0].endswith("file is a file")
 
 
+def _leaves(command, name=()):
+    """Every command, by its words, with its options and arguments."""
+    for key, value in getattr(command, "commands", {}).items():
+        yield from _leaves(value, (*name, key))
+    if not hasattr(command, "commands"):
+        yield " ".join(name), command.params
+
+
+PROGRAM = typer.main.get_command(application())
+COMMANDS = dict(_leaves(PROGRAM))
+
+
+def _kind(name: str, option: str) -> str | None:
+    return commands._OUTPUTS.get(f"{name} {option}", commands._OUTPUTS.get(option))
+
+
+OUTPUTS = [
+    (name, parameter.name)
+    for name, parameters in COMMANDS.items()
+    for parameter in parameters
+    if _kind(name, parameter.name) and not parameter.secondary_opts  # `--report / --no-report`
+]
+
+
+@pytest.fixture
+def occupied(tmp_path):
+    """What may not be replaced, by what it is."""
+    places = {
+        "a folder": "folder", "a store": "k.db", "its -wal": "k.db-wal", "a recording": "M1",
+        "its head": "M1/recording.yaml", "its Parquet": "M1/observations.parquet",
+        "within a file": "file/a", "a file": "file", "the kernel's": "/proc/x", "a socket": "s",
+        "a disk": "disk",
+    }  # fmt: skip
+    (tmp_path / "folder").mkdir()
+    with closing(sqlite3.connect(tmp_path / "k.db")) as database:
+        database.execute("CREATE TABLE x (y)")
+    (tmp_path / "k.db-wal").write_bytes(b"\x37\x7f\x06\x82 and more")
+    (tmp_path / "M1").mkdir()
+    for name in ("recording.yaml", "observations.parquet"):
+        (tmp_path / "M1" / name).touch()
+    (tmp_path / "file").touch()
+    with closing(socket.socket(socket.AF_UNIX)) as server:
+        server.bind(str(tmp_path / "s"))
+    with suppress(PermissionError):
+        os.mknod(tmp_path / "disk", 0o666 | stat.S_IFBLK, os.makedev(240, 200))
+    return {what: tmp_path / place for what, place in places.items()}
+
+
+TAKEN = {
+    "file": {"a folder", "a store", "its -wal", "a recording", "its head", "its Parquet",
+             "within a file", "the kernel's", "a socket", "a disk"},
+    "folder": {"a file", "within a file", "the kernel's", "a store", "a socket"},
+}  # fmt: skip
+TAKEN["recording"] = TAKEN["folder"] | {"a recording"}
+TAKEN["either"] = TAKEN["file"] - {"a folder", "a recording"}
+
+
+@pytest.mark.parametrize(("name", "option"), OUTPUTS)
+def test_what_may_not_be_replaced_is_refused_before_the_work(
+    name, option, occupied, tmp_path, monkeypatch
+):
+    """Whatever else the command needs does not exist: nobody has looked for it."""
+    monkeypatch.chdir(tmp_path)
+    words = name.split()
+    for other in COMMANDS[name]:
+        if other.required and other.name != option:
+            words += [o for o in other.opts[:1] if o.startswith("-")] + ["1"]
+    (given,) = (p.opts[0] for p in COMMANDS[name] if p.name == option)
+    if option == "code":  # FILE.h and FILE.py are written
+        for place in occupied.values():
+            if place.is_relative_to(tmp_path) and place.parent.is_dir():
+                place.with_suffix(".py").mkdir(exist_ok=True)
+    before = sorted(tmp_path.rglob("*"))
+    for what in sorted(TAKEN[_kind(name, option)]):
+        place = occupied[what]
+        if what == "a disk" and not place.exists():
+            continue
+        with pytest.raises(OutputError, match="cannot be written"):
+            PROGRAM.main([*words, given, str(place)], standalone_mode=False)
+        assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_every_option_that_says_that_it_writes_is_looked_at():
+    for name, parameters in COMMANDS.items():
+        for one in parameters:
+            told = getattr(one, "help", None) or ""
+            if re.match(r"(Also )?[Ww]rite|The .* to write", told):
+                assert (name, one.name) in OUTPUTS
+
+
+def test_one_file_for_two_results_is_refused(tmp_path):
+    words = ("study", "nowhere", "--report", "a.html", "--json", "./a.html")
+    status, lines = _typed(*words, cwd=tmp_path)
+    assert (status, lines) == (2, ["error: --report and --json: both would be ./a.html"])
+    status, lines = _typed("fit", "1", "-o", "c.yaml", "--code", "a", "--json", "a.h", cwd=tmp_path)
+    assert status == 2
+    assert "both would be" in lines[0]
+
+
 def test_outputs_that_can_be(tmp_path):
     (tmp_path / "there").touch()
-    for path in (tmp_path / "there", tmp_path / "new" / "deep" / "a.csv", tmp_path, "/dev/null"):
+    for path in (tmp_path / "there", tmp_path / "new" / "deep" / "a.csv", "/dev/null"):
         check_output(tmp_path / path)
+    for kind in ("folder", "recording", "either"):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        check_output(tmp_path / "empty", kind)
+        check_output(tmp_path / "new" / "deep", kind)
     assert not (tmp_path / "new").exists()
     with pytest.raises(OutputError, match="the kernel keeps this folder; choose another folder"):
         check_output(tmp_path / "/proc/a.csv")

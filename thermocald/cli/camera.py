@@ -25,7 +25,6 @@ from thermocald.cli.options import (
     takes_log_options,
 )
 from thermocald.errors import DataError, UsageError
-from thermocald.files import make_folder
 
 
 def calibrate(
@@ -69,9 +68,6 @@ def calibrate(
     """
     import thermocald as tc
 
-    for out in (camera_out, report):
-        if out is not None:  # what cannot be made is refused before the work
-            make_folder(out.absolute().parent)
     if camera_out is not None and camera_out.suffix.lower() not in (".json", ".yaml", ".yml"):
         raise UsageError(
             f"{camera_out}: --camera-out writes .json or .yaml; for another program convert it "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,9 +11,25 @@ from typing import Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from thermocald.files import check_output
+from thermocald.errors import UsageError
+from thermocald.files import Output, check_output
 
-_OUTPUTS = {"camera_out", "effect_out", "json", "model_out", "out", "output", "report"}
+# what the options of all commands write, and where one of a command is no file
+_OUTPUTS: dict[str, Output] = {
+    **dict.fromkeys(
+        ("camera_out", "code", "effect_out", "json", "model_out", "out", "output", "report"), "file"
+    ),
+    "figures": "folder",
+    "recording_out": "recording",
+    "archive folder": "folder",
+    "correct out": "either",
+    "demo out": "folder",
+    "import out": "recording",
+    "reprocess out": "folder",
+    "session start output": "folder",
+    "simulate out": "recording",
+    "testfield print out": "folder",
+}  # fmt: skip
 ADVANCED = "Advanced"
 """The section of options that only experts need."""
 
@@ -85,10 +102,8 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Look where the outputs go, and run the command."""
-        for name in _OUTPUTS & ctx.params.keys():
-            given = ctx.params[name]  # `--report / --no-report` is no file
-            if isinstance(given, (str, Path)) and str(given) not in ("", "-"):
-                check_output(Path(given))
+        if not ctx.params.get("dry_run"):
+            _check_outputs(ctx)
         return super().invoke(ctx)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
@@ -102,6 +117,25 @@ class Command(TyperCommand):
         for title in sorted(sections, key=["Arguments", "Options", ADVANCED].index):
             with formatter.section(title):
                 formatter.write_dl(sections[title])
+
+
+def _check_outputs(ctx: Any) -> None:
+    """Refuse outputs that could not be written: OutputError; one for two results: UsageError."""
+    command, above = ctx.info_name, ctx.parent
+    while above is not None and above.parent is not None:
+        command, above = f"{above.info_name} {command}", above.parent
+    written: dict[str, str] = {}
+    for name, given in ctx.params.items():
+        kind = _OUTPUTS.get(f"{command} {name}", _OUTPUTS.get(name))
+        # `--report / --no-report` is no file
+        if kind is None or not isinstance(given, (str, Path)) or str(given) in ("", "-"):
+            continue
+        path, option = Path(given), f"--{name.replace('_', '-')}"
+        for file in map(path.with_suffix, (".h", ".py")) if name == "code" else (path,):
+            check_output(file, kind)
+            place = os.path.realpath(file)
+            if written.setdefault(place, option) != option and not place.startswith("/dev/"):
+                raise UsageError(f"{written[place]} and {option}: both would be {given}")
 
 
 class Group(TyperGroup):

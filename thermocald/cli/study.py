@@ -24,7 +24,7 @@ from thermocald.cli.options import (
     takes_log_options,
 )
 from thermocald.errors import UsageError
-from thermocald.files import make_folder, write_text
+from thermocald.files import write_text
 from thermocald.store.server.connection import is_server
 from thermocald.store.sources import require_source
 
@@ -98,10 +98,6 @@ def study(
         "thermometer_sd": thermometer_sd,
         "jobs": jobs,
     }
-    # Refused before the work, not after it.
-    for path in (report, figures):
-        if path is not None:
-            make_folder(path.absolute().parent)
     if reference:
         with progress(None, "simulating, adjusting, studying") as advance:
             result = tc.reference_study(progress=advance, **settings)

@@ -44,6 +44,8 @@ log = logging.getLogger(__name__)
 Mode = Literal["read", "append"]
 
 _APPLICATION_ID = 0x74686572  # "ther": distinguishes our files from other SQLite files
+# of version 1 as it was before it was published
+_EARLIER_TABLE = "SELECT 1 FROM sqlite_master WHERE name = 'late_epoch'"
 # 4 KiB pages would hold one row of 2.1 to 4 kB each and stand half empty.
 _PAGE_SIZE = 8192
 _BUSY_S = 10.0
@@ -220,7 +222,8 @@ def _advice(cause: sqlite3.Error) -> str:
 def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
     """Open or, for appending, make the file; older versions are brought up to date.
 
-    Raises StoreError, StoreVersionError for a file of a newer program.
+    Raises StoreError, StoreVersionError for a file of a newer program, or of one that was never
+    published.
     """
     if mode == "read" and not path.is_file():
         raise StoreError(f"{path}: there is no such store")
@@ -306,6 +309,12 @@ def _version(connection: sqlite3.Connection, path: Path) -> int:
         raise StoreVersionError(
             f"{path}: is a store of version {version}, this program knows up to {known}; "
             f"update thermocald{older}"
+        )
+    if connection.execute(_EARLIER_TABLE).fetchone():
+        raise StoreVersionError(
+            f"{path}: was written by an earlier development state of this program; to keep its "
+            f"data, run `thermocald archive {path} --to FOLDER` with the program that wrote it, "
+            "then `thermocald replay` with --store for each recording in FOLDER"
         )
     return int(version)
 

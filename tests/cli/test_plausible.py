@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import numpy as np
@@ -11,12 +12,14 @@ import thermocald as tc
 from tests.cli.test_import import arguments, photograph, place, run
 from tests.commands import invoke
 from thermocald.analysis.camera.photographs import calibrate_observations
-from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import Sensor, project
 from thermocald.photogrammetry.camera_files import CameraFile
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.physics.testfields import corner_field, demonstration_model
+from thermocald.physics.scene import Scene
+from thermocald.physics.testfields import corner_field, demonstration_field, demonstration_model
 from thermocald.results import Calibration
+from thermocald.store.recording.testfield_file import write_testfield
 
 __all__ = ["place"]
 
@@ -65,3 +68,32 @@ def test_photographs_of_another_focal_length_are_flagged_at_calibrate(tmp_path, 
     # what the camera file says comes before EXIF
     stated = CameraFile("camera", model.sensor, found.interior.c, None)
     assert Calibration(found, stated).as_dict()["doubts"] == []
+
+
+def test_binned_photographs_are_flagged_at_import_where_exif_knows_the_focal_length_alone(tmp_path):
+    """820 px of a sensor of 3280 with the sensor's own pitch: a quarter of c is found."""
+    Image = pytest.importorskip("PIL.Image")
+    field = demonstration_field("markers")
+    model = demonstration_model(field)
+    sensor = Sensor(820, 616, 0.00448)
+    pixels = Scene(sensor, field).render(
+        model.interior.as_array(), model.exterior.as_array(), None, [1], 1.0
+    )
+    (tmp_path / "photos").mkdir()
+    rows = ["time,temperature"]
+    for i in range(3):
+        exif = Image.Exif()
+        inner = exif.get_ifd(0x8769)
+        inner[0x9003], inner[0x920A] = f"2026:06:14 12:00:{10 * i:02d}", 3.04
+        Image.fromarray(pixels).save(tmp_path / "photos" / f"{i}.jpg", exif=exif, quality=95)
+        rows.append(f"2026-06-14T12:00:{10 * i:02d},{20 + i}")
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    write_testfield(tmp_path / "field.csv", field)
+    given = (tmp_path / "photos", "--log", tmp_path / "log.csv", "--timezone", "UTC",
+             "--testfield", tmp_path / "field.csv", "--json", "-")  # fmt: skip
+    for pitch, doubts in (("0.00112", 1), ("0.00448", 0)):
+        result = run(*given, "--out", tmp_path / pitch, "--pixel-pitch", pitch)
+        notes = json.loads(result.stdout)["notes"]
+        flagged = [note for note in notes if "where 3.04 mm is stated, 0.25 times" in note]
+        assert len(flagged) == doubts, notes
+        assert ("Pixels of 0.00448 mm would fit (--pixel-pitch" in result.stderr) == bool(doubts)

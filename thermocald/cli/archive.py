@@ -61,6 +61,7 @@ def import_(
     Example: thermocald import photos/ --log logger.csv --timezone Europe/Berlin --testfield
     surveyed.csv --out M1
     """
+    from thermocald.daemon.soundness import calibration_doubts
     from thermocald.store.logger.clock import device_clock
     from thermocald.store.logger.photographs import SOURCES, find_photographs, read_photograph
     from thermocald.store.logger.series import (
@@ -69,6 +70,8 @@ def import_(
         put_together,
         write_photographs,
     )
+    from thermocald.store.recording.reader import read_recording
+    from thermocald.store.recording.sense import doubt_lines
     from thermocald.store.recording.testfield_file import read_testfield
 
     if times not in SOURCES:
@@ -83,8 +86,16 @@ def import_(
     pictures = [read_photograph(path, times) for path in find_photographs(photos)]
     placed = put_together(pictures, clock, log, log_options)
     spec, notes = camera_of(pictures[0], camera, pixel_pitch, principal_distance, dry_run)
-    for line in [*placed.preview(), *notes]:
+    notes = [*placed.preview(), *notes]
+    for line in notes:
         say(line)
+    if not dry_run and out is not None and field is not None:
+        write_photographs(out, in_memory(placed, spec, field, series))
+        # what EXIF does not tell of the pixels, the camera that some photographs give does
+        doubts = doubt_lines(calibration_doubts(read_recording(out)))
+        for line in doubts:
+            say(line)
+        notes += doubts
     document = {
         "format": "thermocald-import/1",
         "recording": None if dry_run else out,
@@ -97,10 +108,8 @@ def import_(
             "width": spec.sensor.width, "height": spec.sensor.height,
             "pixel_pitch": spec.sensor.pixel_pitch, "principal_distance": spec.principal_distance,
         },
-        "notes": [*placed.preview(), *notes],
+        "notes": notes,
     }  # fmt: skip
-    if not dry_run and out is not None and field is not None:
-        write_photographs(out, in_memory(placed, spec, field, series))
     if write_result(document, json):
         typer.echo(
             "nothing was written (--dry-run)" if dry_run

@@ -185,7 +185,7 @@ def _examine_recording(path: Path) -> dict[str, Any]:
     doubts = [
         *recording.doubts(),
         *strange_photographs([e.frame for e in recording.epochs if e.frame is not None]),
-        *_calibration_doubts(recording),
+        *calibration_doubts(recording),
     ]
     sort = "a doubtful" if doubts else "a sound"
     lines = [
@@ -208,7 +208,7 @@ def _examine_recording(path: Path) -> dict[str, Any]:
     }
 
 
-def _calibration_doubts(recording: Recording) -> list[str]:
+def calibration_doubts(recording: Recording) -> list[str]:
     """Return what is doubtful in the interior orientation that some epochs give."""
     from thermocald.acquisition.calibrator import Calibrator
     from thermocald.store.recording.sense import interior_doubts

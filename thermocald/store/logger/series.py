@@ -21,7 +21,7 @@ from thermocald.store.logger.temperatures import LogOptions, TemperatureLog, rea
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import EpochColumns, Recording
 from thermocald.store.recording.readings import Readings, interpolate_readings
-from thermocald.store.recording.sense import pitch_doubts
+from thermocald.store.recording.sense import doubt_lines, pitch_doubts
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def camera_of(
                 f"{file}: is of {known.sensor.width} × {known.sensor.height} px, the photographs "
                 f"have {photograph.width} × {photograph.height}"
             )
-        notes += pitch_doubts(known.sensor.pixel_pitch, photograph.pixel_pitch)
+        notes += doubt_lines(pitch_doubts(known.sensor.pixel_pitch, photograph.pixel_pitch))
         return CameraSpec(known.name, known.sensor, known.principal_distance, known.interior), notes
     if distance is None and photograph.focal_length is not None:
         distance = photograph.focal_length
@@ -195,7 +195,7 @@ def camera_of(
         notes.append(f"camera: {said}")
         pitch = pitch or 0.001
     else:
-        notes += pitch_doubts(pitch, photograph.pixel_pitch)
+        notes += doubt_lines(pitch_doubts(pitch, photograph.pixel_pitch))
     sensor = Sensor(photograph.width, photograph.height, pitch)
     return CameraSpec(photograph.camera or "camera", sensor, distance), notes
 

@@ -1,8 +1,9 @@
 """Every printed standard deviation against the scatter of what it belongs to, and every level.
 
 Run: python -m benchmarks.audit [SECTION …] [--draws N] [--seed S] [--page FILE]
-Prints what docs/reference/standard-deviations.md shows: error over stated standard deviation (root
-mean square over the draws; 1 where the statement is true) or the fraction of false alarms. Exit
+Prints every row of which docs/reference/standard-deviations.md shows the range: error over stated
+standard deviation (root mean square over the draws; 1 where the statement is true) or the fraction
+of false alarms. Exit
 status 1 where a ratio lies outside 0.9 to 1.1 by more than three of its own sds, or a level is
 exceeded by as much; rows that are known to be cautious have a lower bound of their own. With
 --page the tables of that page are written again.
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -51,10 +53,9 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
 
 
 def with_rows(page: str, section: str, rows: list[Row]) -> str:
-    """The page with the table of one section written again."""
-    start = page.index(HEADER, page.index(f"## {section.capitalize()}\n"))
-    end = page.index("\n\n", start)
-    return page[:start] + table(rows) + page[end:]
+    """The page with the lines of one section written again."""
+    old = rf"(^\| {section} \|.*\n)+"
+    return re.sub(old, lambda _: table(section, rows) + "\n", page, flags=re.M)
 
 
 def main() -> int:

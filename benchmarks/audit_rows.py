@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-HEADER = "| printed by | error / sd, or share of false alarms |\n|---|---|"
+HEADER = (
+    "| section | printed by | cases | error / sd, or share of false alarms |\n|---|---|---|---|"
+)
+_FAR = 0.1  # from 1: the case is named
 
 
 @dataclass(frozen=True)
@@ -47,16 +50,17 @@ class Row:
         )
 
 
-def table(rows: list[Row]) -> str:
-    """Return the rows as the page has them: a line per command, equal figures together."""
-    lines = [HEADER]
-    for printed_by in dict.fromkeys(row.printed_by for row in rows):
-        figures: dict[str, list[str]] = {}
-        for row in rows:
-            if row.printed_by == printed_by:
-                figures.setdefault(row.shown, []).append(row.what)
-        cell = "<br>".join(f"{shown}: {' · '.join(whats)}" for shown, whats in figures.items())
-        lines.append(f"| {printed_by} | {cell} |")
+def table(section: str, rows: list[Row]) -> str:
+    """Return the lines of a section as the page has them: one per command, from least to most."""
+    lines = []
+    for kind in dict.fromkeys((row.printed_by, row.level is None) for row in rows):
+        alike = (r for r in rows if (r.printed_by, r.level is None) == kind)
+        of_command = sorted(alike, key=lambda r: r.value)
+        cell = " to ".join(dict.fromkeys(r.shown for r in (of_command[0], of_command[-1])))
+        far = max(of_command, key=lambda r: abs(r.value - 1))
+        if far.level is None and abs(far.value - 1) > _FAR:
+            cell += f" ({far.what})"
+        lines.append(f"| {section} | {kind[0]} | {len(of_command)} | {cell} |")
     return "\n".join(lines)
 
 

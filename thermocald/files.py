@@ -128,6 +128,18 @@ def output_place(path: Path) -> tuple[Path, bool]:
     return place, False
 
 
+def mount_point(path: Path) -> Path:
+    """Return where the disk that a path lies on, or would lie on, is mounted."""
+    folder = Path(os.path.realpath(path))
+    return next(one for one in (folder, *folder.parents) if os.path.ismount(one))
+
+
+def is_unmounted(path: Path, mount: Path) -> bool:
+    """Whether what was mounted when `mount_point` gave that answer is gone."""
+    now = mount_point(path)
+    return now != mount and mount.is_relative_to(now)
+
+
 def is_ordinary(path: Path) -> bool:
     """Whether a path leads to a file on a disk: no device, no pipe, nothing of the kernel's."""
     return path.is_file() and Path(os.path.realpath(path)).parts[:2] not in _KERNEL

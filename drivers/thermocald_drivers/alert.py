@@ -204,7 +204,7 @@ class NoResult(Condition):
 
 
 class Lost(Condition):
-    """Epochs that were taken and not kept since the last result."""
+    """Epochs that were taken and not kept since the last result, or wait in memory in a row."""
 
     per_device: ClassVar[bool] = False
     lost: Count
@@ -253,7 +253,7 @@ class Watch:
         self._out: set[tuple[str, str]] = set()
         self._failed: dict[str, int] = {}
         self._seen: dict[str, tuple[Any, Any]] = {}
-        self._lost = 0
+        self._lost = self._waiting = 0
 
     def changes(self, result: Mapping[str, Any], device: str) -> list[Alert]:
         """Return what this result changes; the same result again changes nothing."""
@@ -264,10 +264,12 @@ class Watch:
         failed = 0 if result.get("status") in WITH_VALUES else self._failed.get(device, 0) + 1
         self._failed[device] = failed
         before, self._lost = self._lost, int(result.get("lost", self._lost))
+        self._waiting = self._waiting + 1 if result.get("stored") is False else 0
+        lost = max(0, self._lost - before, self._waiting)
         changes = []
         for condition in self.conditions:
             key = (device if condition.per_device else "", condition.name)
-            found = condition.measure(result, failed, max(0, self._lost - before))
+            found = condition.measure(result, failed, lost)
             if math.isnan(found.beyond) and not (key in self._out and found.inside):
                 continue
             if key in self._out and not math.isnan(found.beyond):

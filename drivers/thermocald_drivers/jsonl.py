@@ -4,9 +4,10 @@
       - {name: log, driver: jsonl, path: /var/lib/thermocald/results.jsonl}
       - {name: feed, driver: jsonl, path: /run/thermocald/results.fifo, timeout_s: 1}
 
-A line is written completely or not at all: if the disk fills up within a line, the incomplete line
-is removed. A file that was moved away (logrotate) is created again. A pipe without a reader is an
-error; it is not waited for. NaN and infinities become null, since JSON has neither.
+A line is written completely or not at all: if the disk fills up or the daemon is killed within a
+line, the incomplete line is removed. A file that was moved away (logrotate) is created again. A
+pipe without a reader is an error; it is not waited for. NaN and infinities become null, since JSON
+has neither.
 """
 
 from __future__ import annotations
@@ -24,12 +25,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from thermocald.errors import DeviceGone, DeviceTimeout, TransientDeviceError
+from thermocald.files import is_unmounted, mount_point
 from thermocald.hal import DriverOptions, Output
 from thermocald.result import jsonable
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+
+_LONGEST_LINE = 1_000_000
 
 
 def encode(result: Mapping[str, Any]) -> bytes:
@@ -54,9 +59,13 @@ class JsonLinesOutput(Output):
         self.path = Path(self.options.path)
         self._file = -1
         self._seen = False
+        self._mount = mount_point(self.path)
 
     def open(self) -> None:
         self.close()
+        if is_unmounted(self.path, self._mount):
+            raise DeviceGone(f"{self.path}: {self._mount} is not mounted any more")
+        self._mount = mount_point(self.path)
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
         try:
             self._file = os.open(self.path, flags, 0o644)
@@ -66,8 +75,10 @@ class JsonLinesOutput(Output):
             raise support.fault(error, str(self.path), seen=self._seen) from error
         mode = os.fstat(self._file).st_mode
         self._pipe = stat.S_ISFIFO(mode)
-        if stat.S_ISREG(mode) and not mode & 0o600:  # of a umask of 777
-            os.fchmod(self._file, 0o600)
+        if stat.S_ISREG(mode):
+            if not mode & 0o600:  # of a umask of 777
+                os.fchmod(self._file, 0o600)
+            self._end_half_line()
         self._seen = True
 
     def close(self) -> None:
@@ -92,6 +103,22 @@ class JsonLinesOutput(Output):
                     f"{self.path}: the disk is full; line not written"
                 ) from error
             raise support.fault(error, str(self.path), seen=True) from error
+
+    def _end_half_line(self) -> None:
+        """Remove the half of a line that a killed process or a power cut left at the end."""
+        size = os.fstat(self._file).st_size
+        with contextlib.suppress(OSError), self.path.open("rb") as file:
+            file.seek(max(0, size - _LONGEST_LINE))
+            half = file.read().rpartition(b"\n")[2]
+            try:
+                json.loads(half or b"0")
+                ours = False  # whole, and written by hand
+            except ValueError:
+                ours = half.strip(b"\0")[:1] in (b"", b"{")  # what was not written may read as 0
+            if ours and len(half) < _LONGEST_LINE:
+                os.ftruncate(self._file, size - len(half))
+            elif half:
+                os.write(self._file, b"\n")
 
     def _reopen_if_moved(self) -> None:
         try:

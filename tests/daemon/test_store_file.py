@@ -18,6 +18,7 @@ from thermocald.daemon.store_guard import FollowedStore, Row, StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
 from thermocald.files import read_json
+from thermocald.output.dashboard.view import View
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
@@ -366,4 +367,145 @@ def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemo
     assert daemon.stop() == 0
     numbers, _ = daemon.stored()
     assert numbers == [r["epoch"] for r in daemon.results()] == list(range(1, len(numbers) + 1))
+    assert "Traceback" not in daemon.log()
+
+
+@pytest.fixture
+def card(tmp_path):
+    """A folder on which cards are mounted and unmounted: `card("a")`, `card(None)`."""
+    folder = tmp_path / "card"
+    folder.mkdir()
+
+    def mount(*words: object) -> bool:
+        done = subprocess.run([*map(str, words)], capture_output=True, check=False)
+        return done.returncode == 0
+
+    cards = {}
+
+    def insert(name: str | None) -> Path:
+        if os.path.ismount(folder):
+            assert mount("umount", "-l", folder)
+        if name and name not in cards:
+            cards[name] = tmp_path / name
+            cards[name].mkdir()
+            if not shutil.which("mount") or not mount("mount", "-t", "tmpfs", "x", cards[name]):
+                pytest.skip("nothing can be mounted here: needs root")
+        if name:
+            assert mount("mount", "--bind", cards[name], folder)
+        return folder
+
+    yield insert
+    for place in (folder, *cards.values()):
+        while os.path.ismount(place) and mount("umount", "-l", place):
+            pass
+
+
+def test_an_unmounted_card_is_waited_for_and_nothing_is_begun_in_its_place(card):
+    path = card("a") / "t.db"
+    guard = keeping(path)
+    card(None)
+    for number in (4, 5, 6):
+        guard.keep(number)
+        assert guard.waiting == number - 3
+    status = guard.status()
+    assert (status["state"], guard.lost) == ("out", 0)
+    assert "not mounted any more" in status["why"]
+    assert [guard.told[number] for number in (4, 5, 6)] == [False] * 3
+    assert list(path.parent.iterdir()) == []
+    card("a")
+    guard.keep(7)
+    assert (guard.status()["state"], guard.waiting, guard.lost) == ("ok", 0, 0)
+    assert "store_out" in [event.kind for event in guard.stored_events()]
+    guard.close()
+    assert numbers(path) == [1, 2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("folder", ["", "deep/er"])
+def test_another_card_gets_what_waited(card, folder):
+    place = card("a") / folder
+    place.mkdir(parents=True, exist_ok=True)
+    path = place / "t.db"
+    guard = keeping(path)
+    card(None)
+    guard.keep(4)
+    card("b")
+    guard.keep(5)
+    assert guard.waiting == guard.lost == 0
+    assert "on another disk than is mounted there now; a new store" in guard.status()["notice"]
+    guard.close()
+    assert numbers(path) == [4, 5]
+    card("a")
+    assert numbers(path) == [1, 2, 3, 4]  # where 4 had been tried; nothing said that it was kept
+
+
+def test_a_card_that_was_plugged_in_again_keeps_what_its_wal_file_holds(card, tmp_path):
+    """The same files, of the same numbers of inodes, on a disk of another number."""
+    path = card("a") / "t.db"
+    guard = keeping(path, durable=True)
+    for name in ("t.db", "t.db-wal", "t.db-shm"):  # in the order in which they were made
+        assert (path.parent / name).exists()
+    card("b")
+    for name in ("t.db", "t.db-wal", "t.db-shm"):
+        shutil.copy(tmp_path / "a" / name, tmp_path / "b" / name)
+    assert (tmp_path / "b/t.db").stat().st_ino == (tmp_path / "a/t.db").stat().st_ino
+    guard.keep(4)
+    assert (
+        "the file at its path" in guard.status()["notice"] or "which is" in guard.status()["notice"]
+    )
+    guard.close()
+    assert numbers(path) == [1, 2, 3, 4]
+
+
+def test_a_card_that_is_mounted_over_a_running_store_gets_a_copy_of_what_it_held(card):
+    path = card(None) / "t.db"
+    guard = keeping(path)
+    card("a")
+    guard.keep(4)
+    assert guard.told[4]
+    (rescued,) = path.parent.glob("t-rescued-*.db")
+    assert numbers(rescued) == [1, 2, 3]
+    assert str(rescued) in guard.status()["notice"]
+    guard.close()
+    assert numbers(path) == [4]
+
+
+def test_what_waits_for_a_card_that_does_not_come_back_is_reported_as_lost(card):
+    path = card("a") / "t.db"
+    guard = keeping(path)
+    card(None)
+    guard.keep(4)
+    guard.close()
+    assert guard.lost == 1
+    assert list(path.parent.iterdir()) == []
+    card("a")
+    assert set(numbers(path)) >= {1, 2, 3}
+
+
+def test_a_running_daemon_whose_card_is_unmounted_and_mounted_again(card, daemon, devices):
+    folder = card("a")
+    daemon.store = folder / "thermocald.db"
+    frames = {"keep": "all", "folder": str(folder / "frames"), "min_free_gb": 0.0}
+    sections = devices()
+    shell = ["/bin/sh", "-c", f'echo "$THERMOCALD_STATE" >> {daemon.folder}/told']
+    told = {"name": "tell", "driver": "alert_exec", "when": [{"lost": 2}], "command": shell}
+    sections["outputs"].append(told)
+    daemon.configure(**sections, frames=frames)
+    daemon.start()
+    daemon.until(lambda: len(daemon.results()) > 3)
+    card(None)
+    daemon.until(lambda: "not mounted any more" in daemon.log())
+    daemon.until(lambda: not daemon.results()[-1]["stored"])
+    status = folder / "thermocald.db.live/status.json"
+    daemon.until(lambda: read_json(status).get("store", {}).get("state") == "out")
+    assert {p.name for p in folder.iterdir()} == {"thermocald.db.live"}
+    assert View(daemon.store, status.parent).healthy() == (False, "the store cannot be written")
+    daemon.until((daemon.folder / "told").exists)
+    card("a")
+    daemon.until(lambda: daemon.results()[-1]["stored"])
+    daemon.until(lambda: (daemon.folder / "told").read_text() == "out\nin\n")
+    assert daemon.stop() == 0
+    found, _ = daemon.stored()
+    assert found == [r["epoch"] for r in daemon.results()] == list(range(1, len(found) + 1))
+    kept = {int(p.stem) for p in (folder / "frames").rglob("*.png")}
+    assert kept <= set(found)
     assert "Traceback" not in daemon.log()

@@ -43,6 +43,24 @@ def test_a_file_that_was_rotated_is_begun_anew(tmp_path):
     assert len(lines(path)) == 1 == len(lines(tmp_path / "results.jsonl.1"))
 
 
+@pytest.mark.parametrize(
+    ("end", "left"),
+    [
+        (b"", b""), (b'{"a": 1}\n{"device": "rp', b'{"a": 1}\n'), (b"{", b""),
+        (b'{"a": 1}\n\0\0\0', b'{"a": 1}\n'), (b'{"a": 1}\n{"b\0\0', b'{"a": 1}\n'),
+        (b'{"a": 1}', b'{"a": 1}\n'), (b"my own notes", b"my own notes\n"),
+        (b'{"\xc3', b""), (b"{" * 1_000_000, b"{" * 1_000_000 + b"\n"),
+    ],
+    ids=lambda text: str(text[:20]),
+)  # fmt: skip
+def test_half_a_line_of_a_killed_process_costs_no_further_line(tmp_path, end, left):
+    path = tmp_path / "results.jsonl"
+    path.write_bytes(end)
+    with output(path) as device:
+        device.emit({"epoch": 1})
+    assert path.read_bytes() == left + b'{"epoch": 1}\n'
+
+
 def test_a_full_disk_leaves_no_half_line(tmp_path, monkeypatch):
     path = tmp_path / "results.jsonl"
     with output(path) as device:

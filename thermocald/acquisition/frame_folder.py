@@ -8,6 +8,7 @@ not at all.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import re
@@ -15,6 +16,8 @@ import shutil
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from thermocald.files import is_unmounted, mount_point
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -42,6 +45,7 @@ class FrameFolder:
         self.root = config.folder
         self.paused = ""  # why no frame is written just now
         self._since = time.time()
+        self._mount = mount_point(self.root)
 
     def wanted(self, number: int, eventful: bool) -> bool:
         """Return whether the configuration wants the frame of an epoch."""
@@ -177,6 +181,9 @@ class FrameFolder:
         path = self.root / relative
         partial = path.with_name(path.name + ".partial")
         try:
+            if is_unmounted(self.root, self._mount):
+                raise OSError(errno.ENODEV, f"{self._mount} is not mounted any more")
+            self._mount = mount_point(self.root)
             path.parent.mkdir(parents=True, exist_ok=True)
             partial.write_bytes(data)
             os.replace(partial, path)

@@ -3,7 +3,8 @@ memory for a store that cannot be written, and the file is followed when it goes
 
 A deleted file lives on in the process that has it open, and a deleted -wal or -shm file makes other
 processes see another state of the store: so all three are watched, what they held is brought to the
-path again, and the store is opened once more.
+path again, and the store is opened once more. A card that is no longer mounted leaves an empty
+folder of the system's disk: nothing is begun there, results wait for the card.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 
 from thermocald.addresses import without_secrets
 from thermocald.errors import OutputError, StoreError, StoreFullError
+from thermocald.files import is_unmounted, make_folder, mount_point
 from thermocald.store.database.file import HELPERS, StoreFile, helper, read_wal_tail
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event
@@ -49,10 +51,16 @@ class FollowedStore:
         self.notice = ""
         self._events = events
         self._durable = durable
+        self._mount = mount_point(path)
         self._open()
 
     def _open(self) -> None:
+        self._require_mount()
+        aside = _aside(self.path)
+        if aside.exists() and not helper(self.path, "wal").exists():
+            os.replace(aside, helper(self.path, "wal"))  # killed while it was away
         self._file = StoreFile(self.path)
+        self._mount = mount_point(self.path)
         tail = read_wal_tail(helper(self.path, "wal"))
         kept = self._keep_damaged_wal() if tail.lost else ""
         try:
@@ -110,10 +118,22 @@ class FollowedStore:
         except OutputError as error:
             raise StoreError(str(error)) from error
 
+    def _require_mount(self) -> None:
+        """Raise StoreError where the disk of the store is not mounted any more."""
+        if is_unmounted(self.path, self._mount):
+            raise StoreError(
+                f"{self.path}: its disk is gone, {self._mount} is not mounted any more"
+            )
+
     def _follow(self) -> bool:
+        self._require_mount()
         file, copy = self._file, None
-        # else what is in a -wal file that has no name any more would be lost with the connection
-        if file.deleted or not self._emptied_wal():
+        covered = mount_point(self.path) != self._mount
+        swapped = not covered and not file.deleted and _device(self.path) != file.identity[0]
+        # else what is in a -wal file that has no name any more would be lost with the connection;
+        # what is below another disk now is not found by its name; what was on another disk stays
+        # there, and cannot be read where that was pulled out
+        if not swapped and (file.deleted or covered or not self._emptied_wal()):
             copy = self._rescued()
         there, other = file.there, self.path.exists()
         if there:
@@ -122,11 +142,14 @@ class FollowedStore:
             text = "was deleted; it was written again with all that it held"
         else:
             gone = "replaced by another file" if file.deleted else "moved away"
+            if covered or swapped:
+                gone = "on another disk than is mounted there now"
             what = ", which is used now" if file.deleted else "; the file at its path is used now"
             rest = "" if copy is None else f"; what it held is in {copy}"
             text = f"was {gone}{what if other else '; a new store was begun'}{rest}"
         carried = there or (file.deleted and not other)
         self.close()
+        make_folder(self.path.resolve().parent)
         if carried and copy is not None:
             os.replace(copy, self.path.resolve())  # a link stays one
         self._open()
@@ -159,15 +182,32 @@ class FollowedStore:
             return
         foreign = not self._file.there and self.path.exists() and not self._file.helper_there("wal")
         stale = not self.in_place and not foreign
+        wal, aside = helper(self.path, "wal"), _aside(self.path)
         try:
+            if foreign and wal.exists():
+                # SQLite deletes it by its name, and compares only the numbers of inodes: those of
+                # a card that was plugged in again are the same
+                os.replace(wal, aside)
             self.store.close()
-        except StoreError as error:
+        except (OSError, StoreError) as error:
             log.error("%s", error)
+        finally:
+            if aside.exists():
+                os.replace(aside, wal)
         if stale:
             for kind in HELPERS:
                 with contextlib.suppress(OSError):
                     helper(self.path, kind).unlink(missing_ok=True)
         self._file.release()
+
+
+def _aside(path: Path) -> Path:
+    return helper(path, "wal-aside")
+
+
+def _device(path: Path) -> int:
+    """The disk on which a path lies, or would lie."""
+    return next(folder for folder in path.resolve().parents if folder.exists()).stat().st_dev
 
 
 def _stamp() -> str:

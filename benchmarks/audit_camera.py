@@ -12,6 +12,7 @@ from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.analysis.online.equilibrium import slope
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
 from thermocald.photogrammetry.camera.camera_model import (
+    CameraSpec,
     ExteriorOrientation,
     InteriorOrientation,
     project,
@@ -206,7 +207,8 @@ def calibrate(draws: int, rng: np.random.Generator) -> list[Row]:
             scene = Scene(rng, sigma)
             found = calibrate_observations(
                 ["a", "b", "c", "d"], photographs(scene, few, gross_px), {}, scene.field,
-                scene.sensor, AdjustmentSettings(), None, InteriorOrientation.from_array(scene.iop),
+                CameraSpec("", scene.sensor, None, InteriorOrientation.from_array(scene.iop)),
+                AdjustmentSettings(),
             )  # fmt: skip
             if found.interior is None or not found.estimated:
                 failed += 1

@@ -160,10 +160,8 @@ def calibrate(
     found = calibrate_photographs(
         paths,
         read_testfield(testfield),
-        file.sensor,
+        file,
         AdjustmentSettings(free=free_names(free)),
-        file.principal_distance,
-        file.interior,
         progress,
     )
     return Calibration(found, file, camera is None and pixel_pitch is None)

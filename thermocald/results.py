@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from thermocald.analysis.camera.photographs import Photographs
     from thermocald.analysis.study.reference import Comparison
     from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
-    from thermocald.photogrammetry.camera_files import CameraFile
     from thermocald.physics.model import ThermalModel
 
 
@@ -153,7 +152,7 @@ class Calibration(Result):
     }  # fmt: skip
 
     photographs: Photographs
-    file: CameraFile
+    file: CameraSpec
     pitch_assumed: bool = False
 
     @property

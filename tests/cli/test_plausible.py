@@ -12,8 +12,7 @@ import thermocald as tc
 from tests.cli.test_import import arguments, photograph, place, run
 from tests.commands import invoke
 from thermocald.analysis.camera.photographs import calibrate_observations
-from thermocald.photogrammetry.camera.camera_model import Sensor, project
-from thermocald.photogrammetry.camera_files import CameraFile
+from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor, project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.scene import Scene
@@ -59,14 +58,19 @@ def test_photographs_of_another_focal_length_are_flagged_at_calibrate(tmp_path, 
         names.append(str(tmp_path / f"{k}.jpg"))
         photograph(tmp_path / f"{k}.jpg", "", focal=focal)
     found = calibrate_observations(
-        names, measured, {}, field, model.sensor, AdjustmentSettings(), model.interior.c
+        names,
+        measured,
+        {},
+        field,
+        CameraSpec("", model.sensor, model.interior.c),
+        AdjustmentSettings(),
     )
-    calibration = Calibration(found, CameraFile("camera", model.sensor, None, None))
+    calibration = Calibration(found, CameraSpec("camera", model.sensor))
     assert len(calibration.as_dict()["doubts"]) == doubts
     said = str(calibration)
     assert ("doubtful: the principal distance is" in said) == bool(doubts)
     # what the camera file says comes before EXIF
-    stated = CameraFile("camera", model.sensor, found.interior.c, None)
+    stated = CameraSpec("camera", model.sensor, found.interior.c)
     assert Calibration(found, stated).as_dict()["doubts"] == []
 
 

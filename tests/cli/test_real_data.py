@@ -12,7 +12,7 @@ import pytest
 
 from tests.commands import call
 from thermocald.analysis.camera.photographs import calibrate_observations
-from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 
@@ -132,8 +132,8 @@ def test_a_hand_held_board_is_called_weak(shared):
         )  # fmt: skip
     video.release()
     result = calibrate_observations(
-        [str(i) for i in range(len(measured))], measured, {}, field, Sensor(1920, 1080, 0.001),
-        AdjustmentSettings(),
+        [str(i) for i in range(len(measured))], measured, {}, field,
+        CameraSpec("", Sensor(1920, 1080, 0.001)), AdjustmentSettings(),
     )  # fmt: skip
     assert len(measured) == 10
     assert result.status == "weak_geometry"

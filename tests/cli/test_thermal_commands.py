@@ -433,7 +433,7 @@ def camera():
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_camera_of_any_format_is_an_initial_value(tmp_path, camera, name):
-    path = tmp_path / camera_files.file_name("camera", name)
+    path = tmp_path / f"camera{camera_files.FORMATS[name].suffix}"
     camera_files.write(camera, path, name)
     read = read_camera(path)
     assert read.sensor.pixel_pitch == pytest.approx(camera.sensor.pixel_pitch)
@@ -467,7 +467,7 @@ def photographs(tmp_path_factory, camera):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_calibrate_starts_from_a_camera_of_any_format(photographs, tmp_path, camera, name):
-    path = tmp_path / camera_files.file_name("camera", name)
+    path = tmp_path / f"camera{camera_files.FORMATS[name].suffix}"
     near = CameraModel(camera.sensor, camera.interior.with_values(c=camera.interior.c * 1.01))
     camera_files.write(near, path, name)
     images = sorted(photographs.glob("*.png"))

@@ -27,7 +27,7 @@ from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
 from thermocald.output.fleet import render_fleet
 from thermocald.output.study.report import render_study
-from thermocald.photogrammetry.camera.camera_model import Sensor, project
+from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor, project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
@@ -152,8 +152,8 @@ def _calibration(**_):
     measured[1].points[3] += 20.0
     names = [f"{NAMES[k % 3]}-{k}.jpg" for k in range(5)]
     result = calibrate_observations(
-        names, measured, {}, field, model.sensor, AdjustmentSettings(),
-        model.interior.c,
+        names, measured, {}, field, CameraSpec("", model.sensor, model.interior.c),
+        AdjustmentSettings(),
     )  # fmt: skip
     return render_calibration(result, model.sensor, NAMES[2])
 
@@ -162,7 +162,7 @@ def _not_calibrated(**_):
     field = corner_field("plain", per_side=2, pitch_mm=100.0)
     result = calibrate_observations(
         ["a.jpg"], [Observations(np.arange(0), np.zeros((0, 2)), np.zeros((0, 2)))], {}, field,
-        Sensor(640, 480, 0.001), AdjustmentSettings(),
+        CameraSpec("", Sensor(640, 480, 0.001)), AdjustmentSettings(),
     )  # fmt: skip
     return render_calibration(result, Sensor(640, 480, 0.001), "camera")
 

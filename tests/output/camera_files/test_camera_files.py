@@ -247,7 +247,7 @@ def test_affinity_costs_thousandths_and_shear_a_quarter_of_a_pixel(tmp_path, pla
 
 @pytest.mark.parametrize("name", list(camera_files.FORMATS))
 def test_round_trip(tmp_path, camera, view, truth, name):
-    path = tmp_path / camera_files.file_name("camera", name)
+    path = tmp_path / f"camera{camera_files.FORMATS[name].suffix}"
     camera_files.write(camera, path, name, comment="21 °C\nin the workshop")
     text = path.read_text(encoding="utf-8")
     assert "in the workshop" in text

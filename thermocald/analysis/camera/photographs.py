@@ -14,11 +14,11 @@ from thermocald.errors import GeometryError, ImageError, UsageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
+    CameraSpec,
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.camera_files import CameraFile
 from thermocald.photogrammetry.epoch.adjustment import (
     AdjustmentSettings,
     cold_start,
@@ -150,16 +150,14 @@ def _names(rows: NDArray[np.int64]) -> list[str]:
 def calibrate_photographs(
     paths: Sequence[Path],
     testfield: TestField,
-    sensor: Sensor,
+    camera: CameraSpec,
     settings: AdjustmentSettings,
-    nominal_c: float | None = None,
-    interior: InteriorOrientation | None = None,
-    advance: Callable[[int], None] | None = None,
+    advance: Callable[[int], None] | None,
 ) -> Photographs:
     """Measure and calibrate photographs; a file that is not an image has a status and a reason."""
     measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
-    prior = Prior(sensor, interior=interior, principal_distance=nominal_c)
+    prior = Prior(camera.sensor, camera.interior, principal_distance=camera.principal_distance)
     for k, path in enumerate(paths):
         try:
             found = measure(decode_grey(path), testfield, prior)
@@ -174,9 +172,7 @@ def calibrate_photographs(
         if advance is not None:
             advance(1)
     names = [str(p) for p in paths]
-    return calibrate_observations(
-        names, measured, failures, testfield, sensor, settings, nominal_c, interior
-    )
+    return calibrate_observations(names, measured, failures, testfield, camera, settings)
 
 
 def calibrate_observations(
@@ -184,14 +180,12 @@ def calibrate_observations(
     measured: Sequence[Observations | None],
     failures: dict[int, tuple[str, str]],
     testfield: TestField,
-    sensor: Sensor,
+    camera: CameraSpec,
     settings: AdjustmentSettings,
-    nominal_c: float | None = None,
-    interior: InteriorOrientation | None = None,
 ) -> Photographs:
     """Calibrate image points; failures: {position: (status, reason)} known beforehand."""
     seen = {k: o for k, o in enumerate(measured) if o is not None}
-    given = _Given(names, seen, dict(failures), testfield, sensor, settings, nominal_c, interior)
+    given = _Given(names, seen, dict(failures), testfield, camera, settings)
     reason = "no photograph shows enough targets"
     if not settings.free:
         reason = "the interior orientation is held (--free none)"
@@ -218,10 +212,8 @@ class _Given:
     seen: dict[int, Observations]
     failures: dict[int, tuple[str, str]]
     testfield: TestField
-    sensor: Sensor
+    camera: CameraSpec
     settings: AdjustmentSettings
-    nominal_c: float | None
-    interior: InteriorOrientation | None
 
     @property
     def usable(self) -> dict[int, Observations]:
@@ -230,15 +222,16 @@ class _Given:
 
     def first_camera(self) -> InteriorOrientation:
         """Return the camera of the photograph with most targets, to start from."""
-        o = max(self.usable.values(), key=len)
+        o, camera = max(self.usable.values(), key=len), self.camera
+        nominal = camera.principal_distance
         first = cold_start(
-            self.sensor, self.testfield, o, self.settings, self.nominal_c, self.interior
+            camera.sensor, self.testfield, o, self.settings, nominal, camera.interior
         )
-        start = first.interior or self.interior
+        start = first.interior or camera.interior
         if start is None:
             points = self.testfield.points[o.targets]
-            start = approximate_orientation(self.sensor, points, o.points, self.nominal_c)[0]
-        if not first.ok and self.interior is None:
+            start = approximate_orientation(camera.sensor, points, o.points, nominal)[0]
+        if not first.ok and camera.interior is None:
             # Distortion from a weak photograph would only mislead the others.
             start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
         return start
@@ -250,7 +243,7 @@ class _Given:
             with suppress(GeometryError):
                 points = self.testfield.points[o.targets]
                 _, pose, fits = approximate_orientation(
-                    self.sensor, points, o.points, interior=interior
+                    self.camera.sensor, points, o.points, interior=interior
                 )
                 rows.append(k)
                 poses.append(pose)
@@ -259,7 +252,7 @@ class _Given:
         if not chosen:
             raise GeometryError("no pose explains the targets of any photograph")
         return rows, adjust_common_interior(
-            self.sensor, self.testfield, chosen, interior, poses, self.settings, fitting
+            self.camera.sensor, self.testfield, chosen, interior, poses, self.settings, fitting
         )
 
     def poor_ones(
@@ -309,12 +302,14 @@ class _Given:
         for k, name in enumerate(self.names):
             if k in self.failures:
                 results.append(self._failed(k, *self.failures[k]))
-            elif self.interior is None:
+            elif self.camera.interior is None:
                 why = f"without an interior orientation there is no pose: {reason}"
                 results.append(self._failed(k, "weak_geometry", why))
             else:
                 o = self.seen[k]
-                pose = pose_only(self.sensor, self.testfield, o, self.interior, self.settings)
+                pose = pose_only(
+                    self.camera.sensor, self.testfield, o, self.camera.interior, self.settings
+                )
                 if not pose.ok:
                     results.append(self._failed(k, pose.status, pose.reason))
                     continue
@@ -327,7 +322,7 @@ class _Given:
         status = "weak_geometry" if self.settings.free else "held"
         nothing = np.zeros((16, 16))
         return Photographs(
-            status, reason, self.interior, False, nothing, float("nan"), 0, tuple(results)
+            status, reason, self.camera.interior, False, nothing, float("nan"), 0, tuple(results)
         )
 
     def _failed(self, k: int, status: str, reason: str) -> PhotographResult:
@@ -374,7 +369,7 @@ def images_of(given: Sequence[Path]) -> list[Path]:
     return images
 
 
-def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraFile:
+def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraSpec:
     """A camera of which no file says anything, its image size that of most photographs; without
     its pitch a pixel counts as 1 µm.
     """
@@ -390,4 +385,4 @@ def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraF
         raise first
     height, width = sizes.most_common(1)[0][0]
     pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
-    return CameraFile("camera", Sensor(width, height, pitch), None, None)
+    return CameraSpec("camera", Sensor(width, height, pitch))

@@ -195,6 +195,19 @@ class CameraModel:
         return rays(self.sensor, self.interior.as_array(), image_points)
 
 
+@dataclass(frozen=True, slots=True)
+class CameraSpec:
+    """A camera: name, sensor, and what is known of its interior orientation beforehand.
+
+    principal_distance: mm, nominal, or None; interior: initial values, or None.
+    """
+
+    name: str
+    sensor: Sensor
+    principal_distance: float | None = None
+    interior: InteriorOrientation | None = None
+
+
 def rotation(angles: ArrayLike) -> Array:
     """Angles (..., 3) omega, phi, kappa → R (..., 3, 3), camera to object."""
     a = np.asarray(angles, dtype=float)

@@ -16,17 +16,25 @@ import numpy as np
 import yaml
 
 from thermocald.errors import ConfigurationError, DataError, UsageError
-from thermocald.files import read_yaml, write_text
+from thermocald.files import QuantityReader, read_yaml, write_text
 from thermocald.photogrammetry.camera import conversions
 from thermocald.photogrammetry.camera.camera_model import (
     IOP_NAMES,
     CameraModel,
+    CameraSpec,
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.camera_files.brown import COLMAP, KALIBR, MRCAL, OPENCV, ROS
 from thermocald.photogrammetry.camera_files.camera_record import OWN, CameraRecord, Format
-from thermocald.photogrammetry.camera_files.photogrammetric import AICON, METASHAPE
+from thermocald.photogrammetry.camera_files.formats import (
+    AICON,
+    COLMAP,
+    KALIBR,
+    METASHAPE,
+    MRCAL,
+    OPENCV,
+    ROS,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,6 +45,7 @@ FORMATS: dict[str, Format] = {
     format_.name: format_ for format_ in (OPENCV, ROS, COLMAP, MRCAL, KALIBR, METASHAPE, AICON, OWN)
 }
 _LARGEST_FILE = 10_000_000
+_MOST_PX = 100_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,11 +64,6 @@ class ImportedCamera:
     def how_read(self) -> str:
         """How well our model is the file's, in words."""
         return "exact" if self.exact else f"fitted, largest residual {self.largest_px:.3g} px"
-
-
-def file_name(stem: str, format_name: str) -> str:
-    """A file's name with the suffix that the format usually has."""
-    return stem + _format(format_name).suffix
 
 
 def _format(name: str) -> Format:
@@ -210,17 +214,7 @@ def _recognised(text: str, path: Path) -> Format:
     raise ConfigurationError(f"{path}: no camera file of any of {', '.join(FORMATS)}")
 
 
-@dataclass(frozen=True, slots=True)
-class CameraFile:
-    """A camera as a YAML file describes it: sensor, nominal c mm, interior orientation if known."""
-
-    name: str
-    sensor: Sensor
-    principal_distance: float | None
-    interior: InteriorOrientation | None
-
-
-def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
+def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
     """Read a camera file: name, width, height, pixel_pitch, principal_distance, interior.
 
     With `interior:` (c, x0, y0 mm, A1 … C2; CONVENTIONS §2) the camera counts as calibrated. A file
@@ -230,40 +224,31 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraFile:
     if recognised(path) is not None:
         found = read(path, pixel_pitch=pixel_pitch)
         model = found.model
-        return CameraFile(found.name, model.sensor, model.interior.c, model.interior)
-    document = read_yaml(path, ConfigurationError)
-    if not isinstance(document, dict):
-        raise ConfigurationError(f"{path}: is not a camera file; it must hold `width: …` and so on")
-    camera = document.get("camera", document)
+        return CameraSpec(found.name, model.sensor, model.interior.c, model.interior)
+    reader = QuantityReader(path, read_yaml(path, ConfigurationError))
+    return camera_of(reader.inner("camera") if "camera" in reader.mapping else reader, path.stem)
 
-    def number(key: str) -> float:
-        value = camera.get(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e5:
-            raise ConfigurationError(
-                f"{path}: {key} must be a number above 0 and below 100000, it is {str(value)[:40]}"
-            )
-        return float(value)
 
-    sensor = Sensor(int(number("width")), int(number("height")), number("pixel_pitch"))
-    known = camera.get("principal_distance") is not None
-    nominal = number("principal_distance") if known else None
+def camera_of(reader: QuantityReader, name: str = "camera") -> CameraSpec:
+    """Read a camera from a mapping of a YAML file; name: where it has none."""
+    pitch = reader.number("pixel_pitch", "mm", above=0.0)
+    if not 1e-5 <= pitch <= 0.1:
+        raise reader.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
+    width, height = (reader.whole(side, "px", high=_MOST_PX) for side in ("width", "height"))
+    distance = None
+    if reader.mapping.get("principal_distance") is not None:
+        distance = reader.number("principal_distance", "mm", above=0.0, low=1e-3, high=1e5)
     interior = None
-    given = camera.get("interior")
-    if given is not None:
-        unknown = set(given) - set(IOP_NAMES) if isinstance(given, dict) else {str(given)}
-        if unknown or "c" not in given:
-            raise ConfigurationError(
-                f"{path}: interior must hold c and any of {', '.join(IOP_NAMES[1:])}"
-                + (f"; {min(unknown)!r} is none of them" if unknown else "")
-            )
-        try:
-            interior = InteriorOrientation(**{k: float(v) for k, v in given.items()})
-        except (TypeError, ValueError) as error:
-            raise ConfigurationError(f"{path}: interior: {error}") from error
-    return CameraFile(str(camera.get("name", path.stem)), sensor, nominal, interior)
+    if reader.mapping.get("interior") is not None:
+        inner = reader.inner("interior")
+        inner.only(IOP_NAMES)
+        inner.number("c", "mm", above=0.0, low=1e-3, high=1e5)
+        known = {k: inner.finite(k, v) for k, v in inner.mapping.items() if v is not None}
+        interior = InteriorOrientation.from_mapping(known)
+    return CameraSpec(reader.text("name", name), Sensor(width, height, pitch), distance, interior)
 
 
-def write_camera(path: Path, camera: CameraFile, covariance: Array, comment: str) -> None:
+def write_camera(path: Path, camera: CameraSpec, covariance: Array, comment: str) -> None:
     """Write a camera whose interior orientation is known, as our own file.
 
     path: `.json` with covariance (10, 10), which every `--camera` takes, or `.yaml`; comment: one

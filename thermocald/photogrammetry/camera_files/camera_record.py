@@ -25,12 +25,15 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import CameraModel
 
 
-def yaml_document(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
-    """What a YAML text holds; ConfigurationError for a text that is not YAML."""
+def yaml_mapping(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> dict[Any, Any]:
+    """What a YAML text holds; ConfigurationError for a text that is not YAML, or holds no keys."""
     try:
-        return yaml.load(text, loader)
+        document = yaml.load(text, loader)
     except (yaml.YAMLError, ValueError) as cause:
         raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
+    if not isinstance(document, dict):
+        raise ConfigurationError("the file holds no keys")
+    return document
 
 
 def yaml_text(document: dict[str, Any]) -> str:

@@ -179,7 +179,7 @@ def camera_of(
                 f"have {photograph.width} × {photograph.height}"
             )
         notes += doubt_lines(pitch_doubts(known.sensor.pixel_pitch, photograph.pixel_pitch))
-        return CameraSpec(known.name, known.sensor, known.principal_distance, known.interior), notes
+        return known, notes
     if distance is None and photograph.focal_length is not None:
         distance = photograph.focal_length
         notes.append(f"camera: principal distance {distance:g} mm from EXIF (--principal-distance)")

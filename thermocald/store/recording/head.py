@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import DataError, RecordingError
 from thermocald.files import QuantityReader, read_yaml
 from thermocald.names import require_channels
-from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
-    InteriorOrientation,
-    Sensor,
-)
+from thermocald.photogrammetry.camera.camera_model import CameraSpec as CameraSpec  # noqa: TC001
+from thermocald.photogrammetry.camera_files import camera_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,20 +19,6 @@ if TYPE_CHECKING:
 
 FORMAT = "thermocald-recording/1"
 _LONGEST_NAME = 200
-_MOST_PX = 100_000
-
-
-@dataclass(frozen=True, slots=True)
-class CameraSpec:
-    """A camera: name, sensor, and what is known of its interior orientation beforehand.
-
-    principal_distance: mm, nominal, or None; interior: initial values, or None.
-    """
-
-    name: str
-    sensor: Sensor
-    principal_distance: float | None = None
-    interior: InteriorOrientation | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +95,7 @@ def parse_head(document: Mapping[str, Any], path: Path) -> Head:
         name=top.text("name", path.resolve().parent.name),
         series=top.text("series", "M1"),
         interval=top.number("interval", "s", above=0.0, low=1e-4, high=1e8),
-        camera=_camera(top),
+        camera=camera_of(top.inner("camera")),
         channels=_channels(top) if "temperatures" in document else {},
         extra=_plain(top, {key: value for key, value in document.items() if key not in known}),
     )
@@ -125,28 +108,6 @@ def _plain(top: _Reader, extra: Mapping[str, Any]) -> dict[str, Any]:
     except TypeError as cause:
         raise top.fail(next(iter(extra)), f"or another unknown key: {cause}") from cause
     return plain
-
-
-def _camera(top: _Reader) -> CameraSpec:
-    camera = top.inner("camera")
-    pitch = camera.number("pixel_pitch", "mm", above=0.0)
-    if not 1e-5 <= pitch <= 0.1:
-        raise camera.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
-    sensor = Sensor(
-        camera.whole("width", "px", high=_MOST_PX), camera.whole("height", "px", high=_MOST_PX),
-        pitch,
-    )  # fmt: skip
-    distance = None
-    if camera.mapping.get("principal_distance") is not None:
-        distance = camera.number("principal_distance", "mm", above=0.0, low=1e-3, high=1e5)
-    interior = None
-    if camera.mapping.get("interior") is not None:
-        reader = camera.inner("interior")
-        reader.only(IOP_NAMES)
-        reader.number("c", "mm", above=0.0, low=1e-3, high=1e5)
-        known = {k: reader.finite(k, v) for k, v in reader.mapping.items() if v is not None}
-        interior = InteriorOrientation.from_mapping(known)
-    return CameraSpec(camera.text("name", "camera"), sensor, distance, interior)
 
 
 def _channels(top: _Reader) -> dict[str, Channel]:
@@ -182,8 +143,7 @@ def head_document(head: Head) -> dict[str, Any]:
     if head.camera.principal_distance is not None:
         camera["principal_distance"] = head.camera.principal_distance
     if head.camera.interior is not None:
-        values = head.camera.interior.as_array().tolist()
-        camera["interior"] = dict(zip(IOP_NAMES, values, strict=True))
+        camera["interior"] = asdict(head.camera.interior)
     temperatures = {
         name: {"unit": channel.unit}
         | ({} if channel.resolution is None else {"resolution": channel.resolution})

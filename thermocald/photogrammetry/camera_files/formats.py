@@ -1,0 +1,504 @@
+"""Files of other programs: OpenCV, ROS, Kalibr, mrcal, COLMAP; AICON and Agisoft Metashape.
+
+OpenCV: YAML as cv2.FileStorage reads it and `calibration` in OpenCV's samples writes it, with
+camera_matrix (3, 3), distortion_coefficients (1, 4 … 12) in OpenCV's order, image_width,
+image_height. A covariance goes into nodes of our own, which OpenCV's readers pass over:
+intrinsics_covariance in the order fx fy cx cy k1 k2 p1 p2 k3, and std_deviation_intrinsics.
+
+ROS: camera_info YAML as camera_calibration_parsers reads it, model plumb_bob, or rational.
+
+Kalibr: camchain YAML, pinhole with radtan, which has no sixth-order radial term.
+
+mrcal: .cameramodel, a Python dictionary literal; LENSMODEL_OPENCV4 or 5, pixel centres at 0.
+
+COLMAP: cameras.txt, `CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]`, pixel centres at 0.5. Written as
+FULL_OPENCV, or as OPENCV where there is no k3; read from these and the simpler models.
+
+AICON's .ior holds photogrammetric terms in mm, radial ones balanced by R0.
+
+Written is the record that TU Dresden's FlowVeloTool (github.com/AnetteEltner/FlowVeloTool,
+photogrammetry_functions.py) reads as an AICON .ior, the one public reader there is: one line of
+numbers between single blanks,
+
+    camera type Ck Xh Yh A1 A2 R0 A3 B1 B2 C1 C2 width height columns rows
+
+with Ck < 0 and mm; the first two are skipped by it. With R0 ≠ 0 it has, ideal points (x̂, ŷ) of
+principal distance -Ck, x' = Xh + (1 + C1)(x̂ + Δx) + C2 (ŷ + Δy), y' = Yh + ŷ + Δy: exact without
+affinity and shear. (With R0 = 0 it takes the terms as numbers without unit: never written here,
+and refused.) Comments follow the record, where its reader does not look.
+
+Read are both this record and `name value [sd]` per line, as calibration sheets are typed over;
+there the terms are those of the measured point (Luhmann et al. 2014, section 3.3.2).
+
+Metashape's camera calibration is XML with the frame projection; a document of exported cameras with
+one sensor is read too, its covariance included.
+"""
+
+from __future__ import annotations
+
+import ast
+import xml.etree.ElementTree as ET
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+import yaml
+
+from thermocald.errors import ConfigurationError
+from thermocald.photogrammetry.camera.conversions import METASHAPE as METASHAPE_FRAME
+from thermocald.photogrammetry.camera.conversions import Family, aicon, measured_point, opencv
+from thermocald.photogrammetry.camera_files.camera_record import (
+    CameraRecord,
+    Format,
+    number,
+    numbers,
+    yaml_mapping,
+    yaml_text,
+)
+
+if TYPE_CHECKING:
+    from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import CameraModel
+
+
+def _encode_opencv(record: CameraRecord) -> str:
+    import cv2
+
+    fx, fy, cx, cy = record.values[:4]
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("camera_name", record.name)
+    storage.write("image_width", record.size[0])
+    storage.write("image_height", record.size[1])
+    storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
+    storage.write("distortion_coefficients", record.values[None, 4:])
+    if record.covariance is not None:
+        storage.write("std_deviation_intrinsics", np.sqrt(np.diag(record.covariance))[None])
+        storage.write("intrinsics_covariance", record.covariance)
+    begin, mark, rest = storage.releaseAndGetString().partition("---\n")
+    return begin + mark + record.head() + rest
+
+
+class _OpenCVLoader(yaml.SafeLoader):
+    """YAML with OpenCV's matrices."""
+
+
+def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> dict[Any, Any]:
+    if not isinstance(node, yaml.MappingNode):
+        raise ConfigurationError("an opencv-matrix has no rows, cols, and data")
+    return loader.construct_mapping(node, deep=True)
+
+
+# OpenCV 5 writes vectors as the second kind
+for _kind in ("opencv-matrix", "opencv-nd-matrix"):
+    _OpenCVLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", _opencv_matrix)
+
+
+def _decode_opencv(text: str) -> CameraRecord:
+    # not with cv2.FileStorage: a damaged file makes it crash the process (OpenCV 5.0.0)
+    document = yaml_mapping(text.partition("\n")[2], _OpenCVLoader)
+    return _of_matrices(document, (0, 4, 5, 8, 12, 14))
+
+
+def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRecord:
+    """Read a camera in OpenCV's matrices, with so many distortion coefficients."""
+
+    def matrix(key: str, counts: tuple[int, ...]) -> Array:
+        node = document.get(key, {"data": []})
+        return numbers(node.get("data") if isinstance(node, dict) else node, key, counts)
+
+    K, d = matrix("camera_matrix", (9,)), matrix("distortion_coefficients", counts)
+    if np.any(d[12:]):
+        raise ConfigurationError("a tilted sensor (tau) has no counterpart in this model")
+    if K[1] != 0:
+        raise ConfigurationError("a skewed camera_matrix is nothing that OpenCV itself uses")
+    values = np.concatenate([K[[0, 4, 2, 5]], d[:12]])
+    covariance = None
+    if "intrinsics_covariance" in document:
+        n = len(values)
+        covariance = matrix("intrinsics_covariance", (n * n,)).reshape(n, n)
+    width, height = (int(number(document.get(key), key)) for key in ("image_width", "image_height"))
+    name = str(document.get("camera_name", "camera"))
+    return CameraRecord((width, height), opencv(len(values) - 4), values, name, covariance)
+
+
+OPENCV = Format(
+    "opencv", ".yaml", "OpenCV FileStorage YAML", lambda _: opencv(5),
+    _encode_opencv, _decode_opencv,
+    lambda text: text.startswith("%YAML") and "camera_matrix" in text,
+)  # fmt: skip
+
+
+_ROS_COUNTS = {"plumb_bob": 5, "rational_polynomial": 8}
+
+
+def _ros_matrix(values: Any, rows: int) -> dict[str, Any]:
+    flat = [float(v) for v in np.ravel(values)]
+    return {"rows": rows, "cols": len(flat) // rows, "data": flat}
+
+
+def _encode_ros(record: CameraRecord) -> str:
+    fx, fy, cx, cy = record.values[:4]
+    K = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
+    document = {
+        "image_width": record.size[0],
+        "image_height": record.size[1],
+        "camera_name": record.name,
+        "camera_matrix": _ros_matrix(K, 3),
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": _ros_matrix(record.values[4:], 1),
+        "rectification_matrix": _ros_matrix(np.eye(3), 3),
+        "projection_matrix": _ros_matrix([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0], 3),
+    }
+    return record.head() + yaml_text(document)
+
+
+def _decode_ros(text: str) -> CameraRecord:
+    document = yaml_mapping(text)
+    model = document.get("distortion_model")
+    if model not in _ROS_COUNTS:
+        raise ConfigurationError(
+            f"distortion_model {model!r}: plumb_bob and rational_polynomial can be read"
+        )
+    return _of_matrices(document, (_ROS_COUNTS[model],))
+
+
+ROS = Format(
+    "ros", ".yaml", "ROS camera_info", lambda _: opencv(5), _encode_ros, _decode_ros,
+    lambda text: "distortion_model:" in text and "image_width:" in text,
+)  # fmt: skip
+
+
+def _encode_kalibr(record: CameraRecord) -> str:
+    values = record.values.tolist()
+    document = {
+        "cam0": {
+            "camera_model": "pinhole",
+            "intrinsics": values[:4],
+            "distortion_model": "radtan",
+            "distortion_coeffs": values[4:],
+            "resolution": list(record.size),
+            "rostopic": f"/{record.name}/image_raw",
+        }
+    }
+    return record.head() + yaml_text(document)
+
+
+def _decode_kalibr(text: str) -> CameraRecord:
+    document = yaml_mapping(text)
+    camera = document.get("cam0")
+    if not isinstance(camera, dict):
+        raise ConfigurationError("no camchain: there is no cam0")
+    if "cam1" in document:
+        raise ConfigurationError("the chain holds several cameras: leave the one that is wanted")
+    kinds = camera.get("camera_model"), camera.get("distortion_model")
+    if kinds[0] != "pinhole" or kinds[1] not in ("radtan", "none", None):
+        raise ConfigurationError(
+            f"camera_model {kinds[0]!r} with distortion_model {kinds[1]!r}: pinhole with radtan "
+            "can be read"
+        )
+    f = numbers(camera.get("intrinsics"), "intrinsics", (4,))
+    d = numbers(camera.get("distortion_coeffs") or [], "distortion_coeffs", (0, 4))
+    size = numbers(camera.get("resolution"), "resolution", (2,))
+    return CameraRecord((int(size[0]), int(size[1])), opencv(len(d)), np.concatenate([f, d]))
+
+
+KALIBR = Format(
+    "kalibr", ".yaml", "Kalibr camchain", lambda _: opencv(4), _encode_kalibr, _decode_kalibr,
+    lambda text: "cam0:" in text and "camera_model" in text,
+)  # fmt: skip
+
+
+_MRCAL_COUNTS = {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)} | {"LENSMODEL_PINHOLE": 0}
+
+
+def _four_or_five(model: CameraModel) -> Family:
+    """Without k3 where there is no such term."""
+    return opencv(4 if model.interior.A3 == 0 else 5)
+
+
+def _encode_mrcal(record: CameraRecord) -> str:
+    values = ", ".join(map(repr, record.values.tolist()))
+    width, height = record.size
+    return record.head() + (
+        "{\n"
+        f"    'lensmodel':  'LENSMODEL_OPENCV{len(record.values) - 4}',\n\n"
+        "    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
+        f"    'intrinsics': [ {values},],\n\n"
+        "    # extrinsics are rt_fromref\n"
+        "    'extrinsics': [ 0., 0., 0., 0., 0., 0.,],\n\n"
+        f"    'imagersize': [ {width}, {height},],\n"
+        "}\n"
+    )
+
+
+def _decode_mrcal(text: str) -> CameraRecord:
+    try:
+        document = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        raise ConfigurationError("no .cameramodel: not a dictionary in Python's notation") from None
+    if not isinstance(document, dict):
+        raise ConfigurationError("no .cameramodel: not a dictionary")
+    lens = document.get("lensmodel")
+    if lens not in _MRCAL_COUNTS:
+        raise ConfigurationError(
+            f"lensmodel {lens!r}: {', '.join(sorted(_MRCAL_COUNTS))} can be read"
+        )
+    count = _MRCAL_COUNTS[lens]
+    values = numbers(document.get("intrinsics"), "intrinsics", (4 + count,))
+    size = numbers(document.get("imagersize"), "imagersize", (2,))
+    return CameraRecord((int(size[0]), int(size[1])), opencv(count), values)
+
+
+MRCAL = Format(
+    "mrcal", ".cameramodel", "mrcal cameramodel", _four_or_five, _encode_mrcal, _decode_mrcal,
+    lambda text: "lensmodel" in text and "imagersize" in text,
+)  # fmt: skip
+
+
+# Where each model's parameters stand in fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6.
+_COLMAP_SLOTS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "SIMPLE_PINHOLE": ((0, 1), (2,), (3,)),
+    "PINHOLE": ((0,), (1,), (2,), (3,)),
+    "SIMPLE_RADIAL": ((0, 1), (2,), (3,), (4,)),
+    "RADIAL": ((0, 1), (2,), (3,), (4,), (5,)),
+    "OPENCV": tuple((i,) for i in range(8)),
+    "FULL_OPENCV": tuple((i,) for i in range(12)),
+}
+_COLMAP_CENTRE = 0.5
+
+
+def _encode_colmap(record: CameraRecord) -> str:
+    model = "OPENCV" if len(record.values) == 8 else "FULL_OPENCV"
+    values = np.zeros(len(_COLMAP_SLOTS[model]))
+    values[: len(record.values)] = record.values
+    values[2:4] += _COLMAP_CENTRE
+    fields = ["1", model, *map(repr, record.size), *map(repr, values.tolist())]
+    head = record.head() + "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    return head + " ".join(fields) + "\n"
+
+
+def _colmap_cameras(text: str) -> list[list[str]]:
+    return [line.split() for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
+
+
+def _decode_colmap(text: str) -> CameraRecord:
+    cameras = _colmap_cameras(text)
+    if len(cameras) != 1:
+        raise ConfigurationError(
+            f"the file holds {len(cameras)} cameras: leave the line of the one that is wanted"
+        )
+    fields = cameras[0]
+    if len(fields) < 5 or fields[1] not in _COLMAP_SLOTS:
+        shown = fields[1] if len(fields) > 1 else ""
+        raise ConfigurationError(f"camera model {shown!r}: {', '.join(_COLMAP_SLOTS)} can be read")
+    slots = _COLMAP_SLOTS[fields[1]]
+    given = [number(f, f"parameter {i + 1}") for i, f in enumerate(fields[4:])]
+    if len(given) != len(slots):
+        raise ConfigurationError(f"{fields[1]} has {len(slots)} parameters, not {len(given)}")
+    values = np.zeros(12)
+    for where, value in zip(slots, given, strict=True):
+        values[list(where)] = value
+    values[2:4] -= _COLMAP_CENTRE
+    size = int(number(fields[2], "WIDTH")), int(number(fields[3], "HEIGHT"))
+    return CameraRecord(size, opencv(8), values)
+
+
+COLMAP = Format(
+    "colmap", ".txt", "COLMAP cameras.txt", _four_or_five, _encode_colmap, _decode_colmap,
+    lambda text: any(len(f) > 4 and f[1].isupper() for f in _colmap_cameras(text)[:1]),
+)  # fmt: skip
+
+
+# In the order of our ten: c x0 y0 A1 A2 A3 B1 B2 C1 C2.
+_AICON_NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
+_AICON_LINES = ("Ck", "Xh", "Yh", "A1", "A2", "R0", "A3", "B1", "B2", "C1", "C2")
+_AICON_SIZES = ("sensor_width_mm", "sensor_height_mm", "pixels_x", "pixels_y")
+_AICON_FIELDS = ("camera", "type", *_AICON_LINES, *_AICON_SIZES)
+_TAGS = METASHAPE_FRAME.parameters
+
+
+def _aicon_family(model: CameraModel) -> Family:
+    """The radial correction vanishes at two thirds of the way to the corner, as is usual."""
+    return aicon(_usual_r0((model.sensor.width, model.sensor.height), model.sensor.pixel_pitch))
+
+
+def _usual_r0(size: tuple[int, int], pitch: float) -> float:
+    half_diagonal = 0.5 * float(np.hypot(*size)) * pitch
+    return float(f"{2 / 3 * half_diagonal:.4g}")
+
+
+def _encode_aicon(record: CameraRecord) -> str:
+    assert record.pixel_pitch is not None
+    values = dict(zip(_AICON_NAMES, record.values.tolist(), strict=True))
+    values |= {"Ck": -values["Ck"], "R0": _usual_r0(record.size, record.pixel_pitch)}
+    extent = [side * record.pixel_pitch for side in record.size]
+    numbers = [*(values[n] for n in _AICON_LINES), *extent, *record.size]
+    lines = [" ".join(["1", "1", *map(repr, numbers)]) + " "]
+    lines += [f"# fields: {' '.join(_AICON_FIELDS)}", f"# name: {' '.join(record.name.split())}"]
+    if record.covariance is not None:
+        sds = np.sqrt(np.diag(record.covariance)).tolist()
+        lines += [f"# sd {n} {sd!r}" for n, sd in zip(_AICON_NAMES, sds, strict=True)]
+    return "\n".join(lines) + "\n" + record.head()
+
+
+def _decode_aicon(text: str) -> CameraRecord:
+    fields = _aicon_record(text)
+    if fields is None:
+        return _typed(text)
+    found = dict(zip(_AICON_FIELDS, fields, strict=True))
+    spread, name = {}, "camera"
+    for line in text.splitlines():
+        words = line.split()
+        if words[:2] == ["#", "name:"]:
+            name = " ".join(words[2:]) or name
+        if words[:2] == ["#", "sd"] and len(words) == 4:
+            spread[words[2]] = number(words[3], f"standard deviation of {words[2]}")
+    r0 = number(found["R0"], "R0")
+    if r0 == 0 and any(number(found[n], n) for n in _AICON_NAMES[3:8]):
+        raise ConfigurationError(
+            "R0 is 0: programs differ in the unit of such terms; type the numbers over, one name "
+            "and value per line"
+        )
+    return _aicon_record_of(found, spread, aicon(r0), name)
+
+
+def _aicon_record(text: str) -> list[str] | None:
+    """The fields of a record, or None where the text is none."""
+    words = [w for line in text.splitlines() for w in line.split("#")[0].split()]
+    if len(words) != len(_AICON_FIELDS):
+        return None
+    try:
+        values = [float(w) for w in words]
+    except ValueError:
+        return None
+    return words if values[2] < 0 else None
+
+
+def _typed(text: str) -> CameraRecord:
+    """One `name value [sd]` per line."""
+    found: dict[str, str] = {}
+    spread: dict[str, float] = {}
+    name = "camera"
+    for i, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        key, rest = words[0], words[1:]
+        if key == "camera":
+            name = " ".join(rest)
+        elif key not in (*_AICON_LINES, *_AICON_SIZES):
+            raise ConfigurationError(
+                f"line {i}: {key!r} is none of {', '.join(_AICON_LINES + _AICON_SIZES)}"
+            )
+        elif key in found:
+            raise ConfigurationError(f"line {i}: {key} is duplicated")
+        elif not rest:
+            raise ConfigurationError(f"line {i}: {key} has no value")
+        else:
+            found[key] = rest[0]
+            if len(rest) > 1:
+                spread[key] = number(rest[1], f"line {i}: standard deviation of {key}")
+    missing = [key for key in ("Ck", *_AICON_SIZES) if key not in found]
+    if missing:
+        raise ConfigurationError(f"{', '.join(missing)} missing")
+    r0 = number(found.get("R0", 0.0), "R0")
+    return _aicon_record_of(found, spread, measured_point(r0), name)
+
+
+def _aicon_record_of(
+    found: dict[str, str], spread: dict[str, float], family: Family, name: str
+) -> CameraRecord:
+    values = np.array([number(found.get(key, 0.0), key) for key in _AICON_NAMES])
+    values[0] = abs(values[0])
+    sizes = [number(found[key], key) for key in _AICON_SIZES]
+    r0 = number(found.get("R0", 0.0), "R0")
+    if not 0 <= r0 < 1000:
+        raise ConfigurationError(f"R0 is {r0:g} mm; it is a radius in the image")
+    if not 1 <= sizes[2] < 1e6:
+        raise ConfigurationError(f"{sizes[2]:g} columns of pixels are impossible")
+    covariance = None
+    if spread:
+        covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _AICON_NAMES])
+    size = int(sizes[2]), int(sizes[3])
+    return CameraRecord(size, family, values, name, covariance, sizes[0] / sizes[2])
+
+
+AICON = Format(
+    "aicon", ".ior", "AICON interior orientation", _aicon_family, _encode_aicon, _decode_aicon,
+    lambda text: _aicon_record(text) is not None
+    or any(line.split()[:1] == ["Ck"] for line in text.splitlines()),
+)  # fmt: skip
+
+
+def _encode_metashape(record: CameraRecord) -> str:
+    # a comment must not hold a double hyphen
+    words = escape(record.head("  ")).replace("--", "- -")
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f"<!--\n{words}-->",
+        "<calibration>",
+        "  <projection>frame</projection>",
+        f"  <width>{record.size[0]}</width>",
+        f"  <height>{record.size[1]}</height>",
+        *(
+            f"  <{tag}>{value!r}</{tag}>"
+            for tag, value in zip(_TAGS, record.values.tolist(), strict=True)
+        ),
+        "</calibration>",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _decode_metashape(text: str) -> CameraRecord:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ConfigurationError("a calibration needs no DOCTYPE and no entities")
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as cause:
+        raise ConfigurationError(f"no valid XML: {cause}") from None
+    found = [root] if root.tag == "calibration" else root.findall(".//sensor/calibration")
+    found = [c for c in found if c.get("class") != "initial"]
+    if len(found) != 1:
+        raise ConfigurationError(
+            f"the file holds {len(found)} calibrations: one is wanted (Tools, Camera Calibration, "
+            "save as XML)"
+        )
+    calibration = found[0]
+    projection = calibration.findtext("projection") or calibration.get("type") or "frame"
+    if projection != "frame":
+        raise ConfigurationError(f"projection {projection!r}: only frame cameras can be read")
+    resolution = calibration.find("resolution")
+    size = [
+        calibration.findtext(side) if resolution is None else resolution.get(side)
+        for side in ("width", "height")
+    ]
+    values = np.array([number(calibration.findtext(tag, "0"), f"<{tag}>") for tag in _TAGS])
+    for tag in ("p3", "p4"):
+        if number(calibration.findtext(tag, "0"), f"<{tag}>") != 0:
+            raise ConfigurationError(f"<{tag}> has no counterpart in this model")
+    width, height = int(number(size[0], "width")), int(number(size[1], "height"))
+    covariance = _metashape_covariance(root)
+    return CameraRecord((width, height), METASHAPE_FRAME, values, covariance=covariance)
+
+
+def _metashape_covariance(root: ET.Element) -> Array | None:
+    """The covariance of a sensor in the order of the family, zero for what was held."""
+    node = root.find(".//sensor/covariance")
+    if node is None:
+        return None
+    names = (node.findtext("params") or "").split()
+    n = len(names)
+    C = numbers((node.findtext("coeffs") or "").split(), "covariance", (n * n,)).reshape(n, n)
+    full = np.zeros((len(_TAGS),) * 2)
+    rows = [_TAGS.index(name) for name in names if name in _TAGS]
+    if len(rows) != n:
+        raise ConfigurationError("the covariance names parameters that this model does not have")
+    full[np.ix_(rows, rows)] = C
+    return full
+
+
+METASHAPE = Format(
+    "metashape", ".xml", "Agisoft Metashape calibration XML", lambda _: METASHAPE_FRAME,
+    _encode_metashape, _decode_metashape,
+    lambda text: "<calibration" in text,
+)  # fmt: skip

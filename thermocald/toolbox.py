@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.camera.difference import CameraDifference
-    from thermocald.analysis.field.advice import FieldAssessment
+    from thermocald.analysis.field import FieldCheck
     from thermocald.analysis.thermal.places import Places
     from thermocald.analysis.thermal.predictions import Prediction
     from thermocald.analysis.thermal.scene import SceneCourse
@@ -384,7 +384,7 @@ def check_testfield(
     look_at: Point | None = None,
     roll: float = 0.0,
     sigma_px: float = 0.03,
-) -> FieldAssessment:
+) -> FieldCheck:
     """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
 
     camera: a file of any format, by default a Raspberry Pi camera v2.1; pixel_pitch mm, where that
@@ -396,7 +396,7 @@ def check_testfield(
     True
     """
     from thermocald.analysis.camera.camera import Camera
-    from thermocald.analysis.field.advice import assess_field
+    from thermocald.analysis.field import assess_field
     from thermocald.api import read_testfield
     from thermocald.photogrammetry import camera_files
     from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.analysis.field.advice import advise
-from thermocald.analysis.field.check import (
+from thermocald.analysis.field import (
     FREE,
+    advise,
     check_field,
     precision,
     station_at,

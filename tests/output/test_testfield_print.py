@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.printed_sheets import rasterised
-from thermocald.analysis.field.check import usual_station
+from thermocald.analysis.field import usual_station
 from thermocald.errors import UsageError
 from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, paper_size
 from thermocald.output.testfield.print import default_diameter, print_testfield

@@ -56,7 +56,8 @@ def test_the_camera_is_as_sure_as_stated(sigma_mm, count):
         r = adjust_common_interior(
             scene.SENSOR, known, measured, InteriorOrientation(3.0), STATIONS
         )
-        z.append((r.interior.as_array() - scene.INTERIOR.as_array())[PRINCIPAL] / r.sd[PRINCIPAL])
+        sd = np.sqrt(np.diag(r.covariance))[PRINCIPAL]
+        z.append((r.interior.as_array() - scene.INTERIOR.as_array())[PRINCIPAL] / sd)
         sigma0.append(r.sigma0)
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert rms == pytest.approx(np.ones(3), abs=max(3 / np.sqrt(2 * count), 0.1))

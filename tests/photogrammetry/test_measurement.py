@@ -64,13 +64,6 @@ def test_quality_tells_blur_contrast_and_light(frame):
     assert np.all(quality["saturation"] == 0)
 
 
-def test_the_eccentricity_can_be_switched_off(frame):
-    on, off = (measure(frame, FIELD, eccentricity=e).observations for e in (True, False))
-    assert np.array_equal(on.targets, off.targets)
-    shift = np.abs(on.points - off.points).max(axis=1)
-    assert 0.01 < shift.max() < 0.3
-
-
 @pytest.mark.parametrize(
     ("name", "change"),
     [

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.field.check import CELLS, FieldCheck
+from thermocald.analysis.field import CELLS, FieldCheck
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel
 from thermocald.numbers import (
     UNITS,
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
-    from thermocald.analysis.field.advice import FieldAssessment
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
@@ -282,9 +281,9 @@ def _photographs(result: Photographs) -> Table:
     )
 
 
-def render_field_check(assessed: FieldAssessment) -> str:
+def render_field_check(result: FieldCheck) -> str:
     """Return the report as HTML text."""
-    result, field, model = assessed.check, assessed.check.field, assessed.check.camera
+    field, model = result.field, result.camera
     pitch = model.sensor.pixel_pitch
     sds = result.precision.pixels(pitch)
     said = ", ".join(f"{parameter_label(n)} to ± {_sd(one)}" for n, (one, *_) in sds.items())
@@ -312,7 +311,7 @@ def render_field_check(assessed: FieldAssessment) -> str:
             sentence,
             _seen(result, field, model),
             (more,),
-            tuple(map(as_sentence, assessed.advice))
+            tuple(map(as_sentence, result.advice))
             or ("Nothing would help by a seventh: put it up.",),
             (
                 "Blur, shadow, glare and paper that is not flat: look at the first frames.",

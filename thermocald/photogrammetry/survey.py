@@ -23,7 +23,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.field.planes import sheet_normals, target_normals
+from thermocald.photogrammetry.field.planes import field_sheets, sheet_normals, target_normals
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import predict_circles
 from thermocald.photogrammetry.network.adjustment import Network, Photo, adjust_network, advice
@@ -41,8 +41,6 @@ from thermocald.result import with_sds
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image
 
@@ -104,42 +102,7 @@ def targets_in(
 
 
 _ONE_SIZE = 0.15
-_NEIGHBOURS = 8  # of a target on its sheet
-_SAME_SHEET_COSINE = 0.97  # between the normals of neighbours on one sheet, which may be bent
-_SAME_SHEET_STEP = 0.1  # of their distance: how far one may lie off the other's plane
-
-
-def sheet_labels(points: Array) -> NDArray[np.int64]:
-    """The sheet (n,) that each target at points (n, 3) mm belongs to, -1 for none.
-
-    Sheets grow from neighbour to neighbour, so one may be bent, and two may meet in a corner.
-    """
-    normals = target_normals(points)
-    labels = np.full(len(points), -1)
-    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
-    near = np.argsort(distance, axis=1)[:, 1 : _NEIGHBOURS + 1]
-    step = np.abs(np.einsum("njk,nk->nj", points[near] - points[:, None], normals))
-    alike = np.abs(np.einsum("njk,nk->nj", normals[near], normals)) > _SAME_SHEET_COSINE
-    linked = alike & (step < _SAME_SHEET_STEP * np.take_along_axis(distance, near, axis=1))
-    for first in range(len(points)):
-        if labels[first] >= 0 or not np.isfinite(normals[first, 0]):
-            continue
-        labels[first] = labels.max() + 1
-        waiting = [first]
-        while waiting:
-            row = waiting.pop()
-            for other in near[row, linked[row]]:
-                if labels[other] < 0:
-                    labels[other] = labels[first]
-                    waiting.append(int(other))
-    # what has found no plane of its own belongs to its nearest neighbour's, if it lies in it
-    placed = labels >= 0
-    for lost in np.flatnonzero(~placed) if placed.any() else ():
-        nearest = int(np.argmin(np.where(placed, distance[lost], np.inf)))
-        off = abs(float((points[lost] - points[nearest]) @ normals[nearest]))
-        if off < _SAME_SHEET_STEP * distance[lost, nearest]:
-            labels[lost] = labels[nearest]
-    return labels
+_NEAREST = 9  # of a target on its sheet, with itself
 
 
 def expected_field(network: Network, nominal: TestField, *, trusted_only: bool) -> TestField:
@@ -196,7 +159,7 @@ def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> 
     radii: semi-major axes px by photograph and target, from which the diameters are found: what a
     disc of 1 mm would measure there, lying as its neighbours do.
     """
-    normals = sheet_normals(network.points, sheet_labels(network.points), _NEIGHBOURS + 1)
+    normals = target_normals(network.points)
     ratios: dict[str, list[float]] = {name: [] for name in network.names}
     interior = network.camera.interior.as_array()
     for s in network.stations:
@@ -344,13 +307,13 @@ def survey(
         of_field = None
         if nominal is None:
             expected = field_of_codes(network, sizes)
-            labels = sheet_labels(expected.points)
+            normals = target_normals(expected.points)
         else:
             expected = expected_field(network, nominal, trusted_only=number > 0)
             rows = [nominal.index[name] for name in expected.names]
             # the nominal field knows best which sheet a target is on: its sheets are plane
-            of_field, labels = nominal.points[rows], sheet_labels(nominal.points)[rows]
-        normals = sheet_normals(expected.points, labels, _NEIGHBOURS + 1)
+            of_field, labels = nominal.points[rows], field_sheets(nominal)[rows]
+            normals = sheet_normals(expected.points, labels, _NEAREST)
         photos = _look_again(pictures, network, expected, normals, said, progress)
         progress(f"adjustment {number + 2} of {_PASSES + 1}")
         # targets that the network does not have begin where they are expected

@@ -12,7 +12,7 @@ image tells a tilted or shifting lens from plain defocus, and heat does both.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,7 +58,6 @@ def predict_circles(
     camera: CameraModel,
     exterior: ExteriorOrientation,
     normals: Array | None = None,
-    eccentricity: bool = True,
 ) -> tuple[NDArray[np.int64], LocalMap]:
     """Predict the outlines of the field's circles that face the camera and lie in the image.
 
@@ -80,8 +79,6 @@ def predict_circles(
         & camera.sensor.contains(np.nan_to_num(maps.centre, nan=-1e9))
         & (cosine > _LARGEST_TILT_COSINE)
     )
-    if not eccentricity:
-        maps = replace(maps, second=np.zeros_like(maps.second))
     return rows[visible], maps.select(visible)
 
 
@@ -135,16 +132,10 @@ class Measurement:
     renewed: int = 0
 
 
-def measure(
-    image: NDArray[Any],
-    testfield: TestField,
-    prior: Prior | None = None,
-    eccentricity: bool = True,
-) -> Measurement:
+def measure(image: NDArray[Any], testfield: TestField, prior: Prior | None = None) -> Measurement:
     """Measure a test field in a frame (H, W), grey, 8 or 16 bit.
 
     Never raises for what a camera may deliver: the status says what is wrong with the frame.
-    eccentricity: False measures the centres of ellipses instead of the projected target centres.
     Quality per target: `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` and
     `misfit` (residuals over noise; markers have none: NaN).
     Raises TestFieldError where the field's codes are wrong.
@@ -154,17 +145,14 @@ def measure(
     status = inspect_frame(image, size)
     if not status.ok:
         return Measurement(Observations.none(), status)
-    return _Frame(image, testfield, prior, eccentricity).measure()
+    return _Frame(image, testfield, prior).measure()
 
 
 class _Frame:
     """One frame while it is measured; `missed` grows and shrinks."""
 
-    def __init__(
-        self, image: Image, testfield: TestField, prior: Prior, eccentricity: bool
-    ) -> None:
+    def __init__(self, image: Image, testfield: TestField, prior: Prior) -> None:
         self._image, self._field, self._prior = image, testfield, prior
-        self._eccentricity = eccentricity
         self._sensor = prior.sensor or Sensor(image.shape[1], image.shape[0], 1.0)
         self._missed: dict[int, str] = {}
         self._markers = locate_markers(image, testfield, self._missed)
@@ -258,9 +246,7 @@ class _Frame:
         observations, {row: reason} for circles that were not measured, and the orientation.
         """
         image, field = self._image, self._field
-        rows, maps = predict_circles(
-            field, orientation.camera, orientation.exterior, None, self._eccentricity
-        )
+        rows, maps = predict_circles(field, orientation.camera, orientation.exterior)
         coded = have_rings(field, rows)
         fit = fit_circles(image, maps, coded, _USUAL_BLUR_PX)
         blur = float(np.median(fit.parameters[:, 5])) if len(rows) else _USUAL_BLUR_PX
@@ -269,19 +255,14 @@ class _Frame:
             fit = fit_circles(image, maps, coded, blur)
         good = fit.good
         if good.sum() + len(corners) < _FEWEST:
-            return (
-                Observations.none(),
-                dict(zip(rows.tolist(), fit.reasons, strict=True)),
-                orientation,
-            )
+            missed = dict(zip(rows.tolist(), fit.reasons, strict=True))
+            return Observations.none(), missed, orientation
         pairs = np.concatenate([corners.targets, rows[good]])
         better = refine(
             self._sensor, orientation.camera.interior, orientation.exterior, field.points[pairs],
             np.concatenate([corners.points, fit.points[good]]), known=known,
         )  # fmt: skip
-        new_rows, new_maps = predict_circles(
-            field, better.camera, better.exterior, None, self._eccentricity
-        )
+        new_rows, new_maps = predict_circles(field, better.camera, better.exterior)
         same = np.array_equal(new_rows, rows)
         # The outlines' asymmetry decides about the centres, the rest is estimated anyway.
         settled = (
@@ -310,26 +291,23 @@ class _Frame:
         foreign: bool = False,
     ) -> Measurement:
         """Return the result; foreign: whether codes of another field were seen."""
-        n = len(observations)
+        word: Word = "ok"
+        n, why = len(observations), ""
         if n < _FEWEST and foreign:
-            return self._result(
-                "other_field", "the ring codes in the frame are not those of this test field",
-                observations, orientation,
-            )  # fmt: skip
-        if n == 0 and not any(self._field.codes):
-            return self._result(
-                "nothing_found",
-                "the test field has no coded target and the camera's orientation is not known: "
-                "plain circles alone cannot be separated",
-                observations, orientation,
-            )  # fmt: skip
-        if n == 0:
-            why = _why_nothing(self._missed)
-            return self._result("nothing_found", why, observations, orientation)
-        if n < _FEWEST:
-            why = f"only {n} targets are found in the frame"
-            return self._result("too_few", why, observations, orientation)
-        return self._result("ok", "", observations, orientation)
+            word, why = (
+                "other_field",
+                "the ring codes in the frame are not those of this test field",
+            )
+        elif n == 0:
+            word, why = "nothing_found", _why_nothing(self._missed)
+            if not any(self._field.codes):
+                why = (
+                    "the test field has no coded target and the camera's orientation is not known: "
+                    "plain circles alone cannot be separated"
+                )
+        elif n < _FEWEST:
+            word, why = "too_few", f"only {n} targets are found in the frame"
+        return self._result(word, why, observations, orientation)
 
     def _result(
         self,

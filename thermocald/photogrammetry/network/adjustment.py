@@ -135,9 +135,8 @@ def refuse_before(
     reasons = []
     targets = len(np.unique(rays.target))
     if photos < MIN_PHOTOS:
-        _refuse(
-            [f"{photos} photographs show targets, {MIN_PHOTOS} are the least and 8 to 12 are good"]
-        )
+        few = f"{photos} photographs show targets, {MIN_PHOTOS} are the least and 8 to 12 are good"
+        _refuse([few])
     if targets < MIN_TARGETS:
         reasons.append(f"{targets} targets are seen {MIN_RAYS} times, {MIN_TARGETS} are the least")
     if not distances:
@@ -152,17 +151,6 @@ def refuse_before(
         if not d.length > 0:
             reasons.append(f"the distance {d.a}–{d.b} is {d.length:g} mm, it must be positive")
     _refuse(reasons)
-
-
-def refuse_narrow(angles: Array) -> None:
-    """Refuse rays that hardly intersect, given the largest angle at each target (m,) rad."""
-    angle = float(np.median(angles)) if len(angles) else 0.0
-    if angle < MIN_ANGLE:
-        reason = (
-            f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° are "
-            "the least: take photographs from further to the left, right, above, and below"
-        )
-        _refuse([reason])
 
 
 def refuse_weak(network: Network, weakest: tuple[str, ...]) -> None:
@@ -361,27 +349,30 @@ def adjust_network(
     kept_names = tuple(names[int(t)] for t in targets)
 
     angles = _intersection_angles(bundle, final)
-    refuse_narrow(angles)
+    angle = float(np.median(angles)) if len(angles) else 0.0
+    if angle < MIN_ANGLE:
+        reason = (
+            f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° are "
+            "the least: take photographs from further to the left, right, above, and below"
+        )
+        _refuse([reason])
     adjustment = BundleAdjustment(sensor, final, free_rows)
     unknowns = len(free_rows) + 6 * len(in_use) + 3 * len(kept_names) - 7
     redundancy = 2 * len(final) - unknowns
     variance = float(np.sum(adjustment.residuals(bundle) ** 2)) / max(redundancy, 1)
     found = adjustment.cofactors(bundle)
     of_interior, of_centres, of_points = inner_constraints(bundle, found, free_rows)
-    placed = bring_to_datum(
+    placed, covariance, to_datum, sd_scale, datum = bring_to_datum(
         bundle,
         of_points * variance,
         distances,
         {name: i for i, name in enumerate(kept_names)},
         None if nominal is None else np.asarray(nominal, dtype=float)[targets],
     )
-    to_datum = placed.scale * placed.turn
     stations = []
     for i, row in enumerate(in_use):
         x, y, z = np.sqrt(np.diag(to_datum @ of_centres[i] @ to_datum.T) * variance).tolist()
-        exterior = ExteriorOrientation.from_rotation(
-            placed.bundle.rotations[i], placed.bundle.centres[i]
-        )
+        exterior = ExteriorOrientation.from_rotation(placed.rotations[i], placed.centres[i])
         n = int(np.count_nonzero(final.photo == i))
         stations.append(Station(photos[kept[int(row)]].name, exterior, n, (x, y, z)))
     sizes = np.linalg.norm(
@@ -396,8 +387,8 @@ def adjust_network(
     ]  # fmt: skip
     network = Network(
         names=kept_names,
-        points=placed.bundle.points,
-        covariance=placed.covariance,
+        points=placed.points,
+        covariance=covariance,
         n_rays=np.bincount(final.target, minlength=len(kept_names)),
         angles=angles,
         camera=CameraModel(sensor, InteriorOrientation.from_array(bundle.interior)),
@@ -408,8 +399,8 @@ def adjust_network(
         redundancy=redundancy,
         rejected=tuple(sorted(rejections, key=lambda r: (r.photo, r.target))),
         unused=left_out,
-        datum=placed.statement,
-        sd_scale=placed.sd_scale,
+        datum=datum,
+        sd_scale=sd_scale,
     )
     refuse_weak(network, found.weakest)
     return network
@@ -441,7 +432,7 @@ def _intersection_angles(bundle: Bundle, rays: ImageRays) -> Array:
     d = bundle.centres[rays.photo] - bundle.points[rays.target]
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     angles = np.zeros(len(bundle.points))
-    for t in range(len(bundle.points)):
+    for t in np.unique(rays.target):
         mine = d[rays.target == t]
-        angles[t] = np.arccos(np.clip((mine @ mine.T).min(), -1, 1)) if len(mine) > 1 else 0.0
+        angles[t] = np.arccos(np.clip((mine @ mine.T).min(), -1, 1))
     return angles

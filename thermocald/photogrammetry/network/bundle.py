@@ -149,17 +149,6 @@ class KnownTargets:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Linearised:
-    """Whitened residuals (n, 2), and their partials by camera and pose (n, 2, f + 6) and by the
-    target (n, 2, 3), 0 where that is held.
-    """
-
-    residuals: Array
-    by_camera: Array
-    by_target: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _NormalEquations:
     """Normal equations: cameras (interior first, then six per photo) and targets."""
 
@@ -242,7 +231,7 @@ class BundleAdjustment:
             if robust:
                 w = _cauchy(v)
             cost = self._cost(bundle, v, w)
-            normals = self._normal_equations(bundle, self._linearised(bundle, w))
+            normals = self._normal_equations(bundle, w)
             fraction = 1.0
             for _attempt in range(12):
                 step = self._step(bundle, normals, damping)
@@ -281,8 +270,7 @@ class BundleAdjustment:
 
     def cofactors(self, bundle: Bundle) -> Cofactors:
         """Return the cofactors at the solution; GeometryError where it is undetermined."""
-        linearised = self._linearised(bundle, np.ones(len(self.rays)))
-        normals = self._normal_equations(bundle, linearised)
+        normals = self._normal_equations(bundle, np.ones(len(self.rays)))
         S, _, inverses = normals.reduced()
         weakest: tuple[str, ...] = ()
         if self.known is None:
@@ -312,8 +300,7 @@ class BundleAdjustment:
         """Return the cofactors (n, 2, 2) of the adjusted, whitened image points; independent of the
         gauge. The rays may be others than those of the adjustment.
         """
-        linearised = self._linearised(bundle, np.ones(len(self.rays)))
-        J, by_target = linearised.by_camera, linearised.by_target
+        _, J, by_target = self._linearised(bundle, np.ones(len(self.rays)))
         f = len(self.free)
         pose = f + 6 * self.rays.photo[:, None] + np.arange(6)
         interior = np.broadcast_to(np.arange(f), (len(self.rays), f))
@@ -332,7 +319,10 @@ class BundleAdjustment:
         prior = 0.0 if self.known is None else self.known.cost(bundle)
         return float(weights @ np.sum(v * v, axis=1)) + prior
 
-    def _linearised(self, bundle: Bundle, weights: Array) -> _Linearised:
+    def _linearised(self, bundle: Bundle, weights: Array) -> tuple[Array, Array, Array]:
+        """Return whitened residuals (n, 2), and their partials by camera and pose (n, 2, f + 6) and
+        by the target (n, 2, 3), 0 where that is held.
+        """
         rays = self.rays
         eop = bundle.exteriors()[rays.photo]
         points = bundle.points[rays.target]
@@ -353,13 +343,13 @@ class BundleAdjustment:
         v = (root @ np.nan_to_num(rays.points - computed[:, 0])[..., None])[..., 0]
         if self.known is not None:
             by_point = by_point * self.known.uncertain[rays.target, None, None]
-        return _Linearised(v, root @ by_camera, root @ by_point)
+        return v, root @ by_camera, root @ by_point
 
-    def _normal_equations(self, bundle: Bundle, linearised: _Linearised) -> _NormalEquations:
+    def _normal_equations(self, bundle: Bundle, weights: Array) -> _NormalEquations:
         """The normal equations in blocks: camera and poses, targets, and between them."""
-        v, by_point = linearised.residuals, linearised.by_target
+        v, by_camera, by_point = self._linearised(bundle, weights)
         rays, f = self.rays, len(self.free)
-        by_interior, by_pose = np.split(linearised.by_camera, [f], axis=2)
+        by_interior, by_pose = np.split(by_camera, [f], axis=2)
         k, m = len(bundle.centres), len(bundle.points)
         u = f + 6 * k
         A, a = np.zeros((u, u)), np.zeros(u)

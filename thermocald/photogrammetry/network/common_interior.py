@@ -68,11 +68,6 @@ class CommonInterior:
     residuals: tuple[Array, ...]
     reasons: tuple[str, ...]
 
-    @property
-    def sd(self) -> Array:
-        """Standard deviations (16,), 0 where held."""
-        return np.sqrt(np.diag(self.covariance))
-
 
 def adjust_common_interior(
     sensor: Sensor,

@@ -32,30 +32,18 @@ class Distance:
     sigma: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Datum:
-    """A bundle in its datum, the targets' covariance (3m, 3m) mm² in it, and how it was brought
-    there: `x_new = scale · turn · x + shift`.
-    """
-
-    bundle: Bundle
-    covariance: Array
-    scale: float
-    turn: Array
-    sd_scale: float
-    statement: str
-
-
 def bring_to_datum(
     bundle: Bundle,
     covariance: Array,
     distances: Sequence[Distance],
     index: dict[str, int],
     nominal: Array | None,
-) -> Datum:
+) -> tuple[Bundle, Array, Array, float, str]:
     """Scale and place a free network whose covariance (3m, 3m) has inner constraints.
 
-    index: the row of each target by name; nominal (m, 3) mm, NaN where unknown.
+    index: the row of each target by name; nominal (m, 3) mm, NaN where unknown. Returns the bundle
+    in its datum, the targets' covariance in it, scale times rotation (3, 3) into it, the scale's
+    relative standard deviation, and the datum in words.
     """
     scaled, Q, scale, sd_scale = _scaled(bundle.points, covariance, distances, index)
     turn, shift, where = _placement(scaled, scale * bundle.centres, nominal, distances[0], index)
@@ -71,7 +59,7 @@ def bring_to_datum(
     )
     by = ", ".join(f"{d.a}–{d.b} = {d.length:g} ± {d.sigma:g} mm" for d in distances)
     statement = f"inner constraints over {m} targets, {where}; scale by {by}"
-    return Datum(placed, turned, scale, turn, sd_scale, statement)
+    return placed, turned, scale * turn, sd_scale, statement
 
 
 def _scaled(

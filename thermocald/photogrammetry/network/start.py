@@ -131,13 +131,34 @@ class _Start:
                 self.refine()
         self.intersect()
 
+    def common(self, first: int, second: int) -> tuple[Index, Index]:
+        """The rays of two photographs to the targets that both show."""
+        a, b = self.rows(first), self.rows(second)
+        _, ia, ib = np.intersect1d(self.rays.target[a], self.rays.target[b], return_indices=True)
+        return a[ia], b[ib]
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Pairs of photographs to begin with, the most promising first.
+
+        Promising: many common targets, and directions to them that no rotation alone explains,
+        which tells a base from a turn on the spot.
+        """
+        scored = []
+        for a, b in combinations(np.unique(self.rays.photo).tolist(), 2):
+            d1, d2 = (self.directions[rows] for rows in self.common(a, b))
+            if len(d1) >= _MIN_PAIR:
+                U, _, Vt = np.linalg.svd(d1.T @ d2)
+                turned = d2 @ (U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt).T
+                parallax = float(np.median(np.linalg.norm(d1 - turned, axis=1)))
+                scored.append((len(d1) * min(parallax, 0.3), a, b))
+        return [(a, b) for _, a, b in sorted(scored, key=lambda row: -row[0])]
+
     def begin_with_pair(self, pair: tuple[int, int]) -> None:
         """Orient two photographs to each other; GeometryError where the pair is of no use."""
         import cv2
 
-        a, b = (self.rows(p) for p in pair)
-        _, ia, ib = np.intersect1d(self.rays.target[a], self.rays.target[b], return_indices=True)
-        first, second = self.normalised[a[ia]], self.normalised[b[ib]]
+        a, b = self.common(*pair)
+        first, second = self.normalised[a], self.normalised[b]
         cv2.setRNGSeed(1)
         E, mask = cv2.findEssentialMat(
             first, second, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=0.9999,
@@ -147,7 +168,7 @@ class _Start:
         if E is not None and E.shape == (3, 3):
             n, R, t, _ = cv2.recoverPose(E, first, second, focal=1.0, pp=(0.0, 0.0), mask=mask)
         # a pair that disagrees in half of its targets is not a pair, whatever its parallax promised
-        if n < max(_MIN_PAIR, len(ia) // 2):
+        if n < max(_MIN_PAIR, len(a) // 2):
             raise GeometryError("the two photographs do not fit together")
         self.poses = {
             pair[0]: (np.eye(3), np.zeros(3)),
@@ -182,37 +203,6 @@ class _Start:
         return bundle, photos, used
 
 
-def _pairs(rays: ImageRays, normalised: Array) -> list[tuple[int, int]]:
-    """Pairs of photographs to begin with, the most promising first.
-
-    Promising: many common targets, and directions to them that no rotation alone explains, which
-    tells a base from a turn on the spot.
-    """
-    photos = np.unique(rays.photo)
-    by_photo = {
-        int(p): dict(
-            zip(rays.target[rays.photo == p], np.flatnonzero(rays.photo == p), strict=True)
-        )
-        for p in photos
-    }
-    scored = []
-    for a, b in combinations(by_photo, 2):
-        common = sorted(set(by_photo[a]) & set(by_photo[b]))
-        if len(common) < _MIN_PAIR:
-            continue
-        d1, d2 = (
-            np.column_stack([normalised[[by_photo[i][t] for t in common]], np.ones(len(common))])
-            for i in (a, b)
-        )
-        d1 /= np.linalg.norm(d1, axis=1, keepdims=True)
-        d2 /= np.linalg.norm(d2, axis=1, keepdims=True)
-        U, _, Vt = np.linalg.svd(d1.T @ d2)
-        turned = d2 @ (U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt).T
-        parallax = float(np.median(np.linalg.norm(d1 - turned, axis=1)))
-        scored.append((len(common) * min(parallax, 0.3), a, b))
-    return [(a, b) for _, a, b in sorted(scored, key=lambda row: -row[0])]
-
-
 def approximate(
     sensor: Sensor,
     rays: ImageRays,
@@ -237,7 +227,7 @@ def approximate(
     for trial in trials:
         start = _Start(sensor, trial.as_array(), rays, n_targets)
         ways: list[tuple[int, int] | None] = [] if nominal is None else [None]
-        ways += list(_pairs(rays, start.normalised)[:_PAIRS])
+        ways += start.pairs()[:_PAIRS]
         good = 0
         for way in ways:
             try:

@@ -1,1 +1,0 @@
-"""What a test field and a camera position can give."""

@@ -52,6 +52,12 @@ _RAISED = 0.25  # of the distance: how far in front of the field proposed target
 _GOOD_SIZE_PX = 12.0
 _FEW = 40
 _FLAT = 0.02  # depth of a field over its distance below which it is a plane
+_ONE_PLANE = (
+    "the field is one plane: no single image separates c, x0 and y0 from where the camera "
+    "stands. For a series of a fixed camera print the corner (thermocald testfield print). A "
+    "flat sheet gives a drift too: photograph it in ten poses with the cold camera and in ten "
+    "with the warm one, run `thermocald calibrate` on each, and take the difference"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -417,20 +423,8 @@ def advise(check: FieldCheck) -> list[str]:
     if len(points) < _FEW:
         propose(points, f"twice as many targets ({len(points)} are visible)")
     sentences = [text for _, text in sorted(proposals)]
-    return [*_of_a_plane(check), *sentences, *_remarks(check)]
-
-
-def _of_a_plane(check: FieldCheck) -> list[str]:
-    """What one flat sheet is good for."""
-    if check.flatness >= _FLAT:
-        return []
-    text = (
-        "the field is one plane: no single image separates c, x0 and y0 from where the camera "
-        "stands. For a series of a fixed camera print the corner (thermocald testfield print). A "
-        "flat sheet gives a drift too: photograph it in ten poses with the cold camera and in ten "
-        "with the warm one, run `thermocald calibrate` on each, and take the difference"
-    )
-    return [text]
+    plane = [_ONE_PLANE] if check.flatness < _FLAT else []
+    return [*plane, *sentences, *_remarks(check)]
 
 
 def _remarks(check: FieldCheck) -> list[str]:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
+    from thermocald.files import QuantityReader
 
 IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
 EOP_NAMES = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
@@ -78,6 +79,7 @@ _BEND = np.array([[6, 0], [0, 2], [0, 2], [2, 0], [2, 0], [0, 6]], dtype=float)
 
 _RAY_TOLERANCE_PX = 1e-9
 _RAY_ITERATIONS = 50
+_MOST_PX = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +208,27 @@ class CameraSpec:
     sensor: Sensor
     principal_distance: float | None = None
     interior: InteriorOrientation | None = None
+
+    @classmethod
+    def read(cls, reader: QuantityReader, name: str = "camera") -> Self:
+        """Read a camera from a mapping of a YAML file; name: where it has none."""
+        pitch = reader.number("pixel_pitch", "mm", above=0.0)
+        if not 1e-5 <= pitch <= 0.1:
+            raise reader.fail(
+                "pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm"
+            )
+        width, height = (reader.whole(side, "px", high=_MOST_PX) for side in ("width", "height"))
+        distance = None
+        if reader.mapping.get("principal_distance") is not None:
+            distance = reader.number("principal_distance", "mm", above=0.0, low=1e-3, high=1e5)
+        interior = None
+        if reader.mapping.get("interior") is not None:
+            inner = reader.inner("interior")
+            inner.only(IOP_NAMES)
+            inner.number("c", "mm", above=0.0, low=1e-3, high=1e5)
+            known = {k: inner.finite(k, v) for k, v in inner.mapping.items() if v is not None}
+            interior = InteriorOrientation.from_mapping(known)
+        return cls(reader.text("name", name), Sensor(width, height, pitch), distance, interior)
 
 
 def rotation(angles: ArrayLike) -> Array:

@@ -19,11 +19,9 @@ from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.files import QuantityReader, read_yaml, write_text
 from thermocald.photogrammetry.camera import conversions
 from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
     CameraModel,
     CameraSpec,
     InteriorOrientation,
-    Sensor,
 )
 from thermocald.photogrammetry.camera_files.camera_record import OWN, CameraRecord, Format
 from thermocald.photogrammetry.camera_files.formats import (
@@ -45,7 +43,6 @@ FORMATS: dict[str, Format] = {
     format_.name: format_ for format_ in (OPENCV, ROS, COLMAP, MRCAL, KALIBR, METASHAPE, AICON, OWN)
 }
 _LARGEST_FILE = 10_000_000
-_MOST_PX = 100_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,26 +223,8 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
         model = found.model
         return CameraSpec(found.name, model.sensor, model.interior.c, model.interior)
     reader = QuantityReader(path, read_yaml(path, ConfigurationError))
-    return camera_of(reader.inner("camera") if "camera" in reader.mapping else reader, path.stem)
-
-
-def camera_of(reader: QuantityReader, name: str = "camera") -> CameraSpec:
-    """Read a camera from a mapping of a YAML file; name: where it has none."""
-    pitch = reader.number("pixel_pitch", "mm", above=0.0)
-    if not 1e-5 <= pitch <= 0.1:
-        raise reader.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
-    width, height = (reader.whole(side, "px", high=_MOST_PX) for side in ("width", "height"))
-    distance = None
-    if reader.mapping.get("principal_distance") is not None:
-        distance = reader.number("principal_distance", "mm", above=0.0, low=1e-3, high=1e5)
-    interior = None
-    if reader.mapping.get("interior") is not None:
-        inner = reader.inner("interior")
-        inner.only(IOP_NAMES)
-        inner.number("c", "mm", above=0.0, low=1e-3, high=1e5)
-        known = {k: inner.finite(k, v) for k, v in inner.mapping.items() if v is not None}
-        interior = InteriorOrientation.from_mapping(known)
-    return CameraSpec(reader.text("name", name), Sensor(width, height, pitch), distance, interior)
+    camera = reader.inner("camera") if "camera" in reader.mapping else reader
+    return CameraSpec.read(camera, path.stem)
 
 
 def write_camera(path: Path, camera: CameraSpec, covariance: Array, comment: str) -> None:

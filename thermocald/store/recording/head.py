@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.errors import DataError, RecordingError
 from thermocald.files import QuantityReader, read_yaml
 from thermocald.names import require_channels
-from thermocald.photogrammetry.camera.camera_model import CameraSpec as CameraSpec  # noqa: TC001
-from thermocald.photogrammetry.camera_files import camera_of
+from thermocald.photogrammetry.camera.camera_model import CameraSpec as CameraSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -95,7 +94,7 @@ def parse_head(document: Mapping[str, Any], path: Path) -> Head:
         name=top.text("name", path.resolve().parent.name),
         series=top.text("series", "M1"),
         interval=top.number("interval", "s", above=0.0, low=1e-4, high=1e8),
-        camera=camera_of(top.inner("camera")),
+        camera=CameraSpec.read(top.inner("camera")),
         channels=_channels(top) if "temperatures" in document else {},
         extra=_plain(top, {key: value for key, value in document.items() if key not in known}),
     )

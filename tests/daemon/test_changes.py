@@ -21,15 +21,15 @@ from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.stored_recording import StoredRecording
 
-EPOCHS, WHEN = 70, 41
+EPOCHS, WHEN = 44, 27
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
-    """One daemon, five cameras that see the same until epoch 41."""
+    """One daemon, five cameras that see the same until epoch 27."""
     folder = tmp_path_factory.mktemp("changes")
-    taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=5, interval=10.0))
+    taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4, interval=10.0))
     field, sensor = taken.testfield, taken.camera.sensor
     model = demonstration_model(demonstration_field("markers"))
     iop, eop = model.interior.as_array(), model.exterior.as_array()

@@ -38,16 +38,8 @@ def error_over_sd(x, coloured, phi, draws, seed, thermometer=0.0):
     ("coloured", "phi"), [(0.0, 0.0), (1.0, 0.5), (1.0, 0.9), (0.5, 0.8), (0.5, 0.97)]
 )
 def test_errors_of_the_slope_are_as_large_as_its_sd(x, coloured, phi):
-    """150 epochs; 400 draws, whose ratio is known to 4 %, under slow noise to 8 %."""
+    """150 epochs; 400 draws, whose ratio is known to 4 %, under slow noise to 8 % (1.5 before)."""
     assert 0.75 < error_over_sd(x, coloured, phi, 400, 2) < 1.2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("x", [WARM_UP, UP_AND_DOWN], ids=["warm-up", "up and down"])
-@pytest.mark.parametrize(("coloured", "phi"), [(0.0, 0.0), (1.0, 0.5), (1.0, 0.9), (0.5, 0.97)])
-def test_errors_of_the_slope_over_two_thousand_draws(x, coloured, phi):
-    """White noise, and AR(1) of 0.97 on white noise of equal size (1.5 before)."""
-    assert 0.82 < error_over_sd(x, coloured, phi, 2000, 3) < 1.22
 
 
 def test_a_thermometer_whose_noise_is_an_eighth_of_the_rise():

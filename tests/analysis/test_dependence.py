@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy import signal, stats
-from statsmodels.stats.multitest import multipletests
 
 from thermocald.analysis.statistics.dependence import (
     correlation_matrix,
@@ -34,6 +33,8 @@ def test_p_value_of_a_perfect_correlation_and_of_too_few_values():
 
 
 def test_holm_is_statsmodels():
+    from statsmodels.stats.multitest import multipletests
+
     p = np.random.default_rng(2).uniform(0, 0.1, 9)
     assert holm(p) == pytest.approx(multipletests(p, method="holm")[1])
 

@@ -158,13 +158,13 @@ def test_wrong_use_is_one_line(recording, tmp_path, arguments, status, words):
 
 def test_photographs_of_markers_give_the_camera(tmp_path):
     """Three rendered photographs of a corner field: c, x0, y0 within 4 sd of the truth."""
-    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
+    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, Sensor
     from thermocald.physics.scene import Scene
     from thermocald.physics.testfields import demonstration_field, demonstration_model
     from thermocald.store.recording.testfield_file import write_testfield
 
     field = demonstration_field("markers")
-    model = demonstration_model(field)
+    model = replace(demonstration_model(field), sensor=Sensor(1640, 1232, 0.00224))
     scene = Scene(model.sensor, field)
     images = []
     for k, turn in enumerate((0.0, 0.05, -0.05)):

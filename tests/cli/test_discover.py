@@ -38,16 +38,20 @@ def discover(*arguments):
     return answer("discover", *arguments)
 
 
-def test_everything_is_written(recordings, tmp_path):
-    model, report = tmp_path / "model.yaml", tmp_path / "report.html"
-
+@pytest.fixture(scope="module")
+def found(recordings):
+    """What is discovered in M1 and verified on M2; model.yaml and report.html beside them."""
     result = discover(
-        recordings / "M1", "--verify", recordings / "M2", "--json", "-",
-        "--model-out", model, "--report", report,
+        recordings / "M1", "--verify", recordings / "M2", "--json", "-", "--model-out",
+        recordings / "model.yaml", "--report", recordings / "report.html",
     )  # fmt: skip
-
     assert result.exit_code == 0, result.stderr
-    document = json.loads(result.stdout)
+    return result
+
+
+def test_everything_is_written(recordings, found):
+    model, report = recordings / "model.yaml", recordings / "report.html"
+    document = json.loads(found.stdout)
     assert document["verdict"] == "effects_found"
     assert [e["effect"] for e in document["effects"]] == ["thermal_lag"]
     assert document["model"] == str(model)
@@ -58,20 +62,17 @@ def test_everything_is_written(recordings, tmp_path):
         "http://purl.org", ""
     ).replace("http://creativecommons.org", "")
     assert document["effects"][0]["statement"][1:] in page
-    assert "reading" in result.stderr
+    assert "reading" in found.stderr
 
 
-def test_with_the_model_found_nothing_is_missing(recordings, tmp_path):
+def test_with_the_model_found_nothing_is_missing(recordings, found):
     """The new model is read back: it explains the recording, and no effect is found twice."""
-    model = tmp_path / "model.yaml"
-    assert discover(recordings / "M1", "--model-out", model).exit_code == 0
-
-    result = discover(recordings / "M1", "--model", model, "--json", "-")
+    result = discover(recordings / "M1", "--model", recordings / "model.yaml", "--json", "-")
 
     assert json.loads(result.stdout)["verdict"] == "adequate"
 
 
-def test_simulate_runs_the_new_model(recordings, tmp_path):
+def test_simulate_runs_the_new_model(recordings, found):
     import numpy as np
 
     from thermocald.physics.history import History
@@ -79,10 +80,8 @@ def test_simulate_runs_the_new_model(recordings, tmp_path):
     from thermocald.store.recording.reader import read_recording
     from thermocald.thermal.source import series_input
 
-    model = tmp_path / "model.yaml"
-    assert discover(recordings / "M1", "--model-out", model).exit_code == 0
     recording = read_recording(recordings / "M1")
-    thermal = read_model(model)
+    thermal = read_model(recordings / "model.yaml")
     frames, (times, readings) = (
         recording.columns.frame_time, recording.columns.readings_of("temperature")
     )  # fmt: skip
@@ -117,9 +116,8 @@ def test_no_m1_is_wrong_usage():
     assert isinstance(result.exception, UsageError)
 
 
-@pytest.mark.parametrize("camera", ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"])
-def test_real_recordings_without_temperature(shared, camera):
-    result = discover(shared / "data" / camera, "--json", "-")
+def test_a_real_recording_without_temperature(shared):
+    result = discover(shared / "data" / "aviary-cam1", "--json", "-")
     assert isinstance(result.exception, DataError)
     assert result.exception.exit_status == 1
     assert "temperature" in str(result.exception)
@@ -151,10 +149,9 @@ def test_plan_of_a_preset():
 
 
 @pytest.mark.slow
-def test_plan_of_a_programme(recordings, tmp_path):
+def test_plan_of_a_programme(recordings, found, tmp_path):
     """A model and a programme of one's own stand for the set-up."""
-    model, programme = tmp_path / "model.yaml", tmp_path / "programme.yaml"
-    assert discover(recordings / "M1", "--model-out", model).exit_code == 0
+    model, programme = recordings / "model.yaml", tmp_path / "programme.yaml"
     programme.write_text(PROGRAMME)
     result = discover("--plan", "--model", model, "--programme", programme, "--seeds", "1",
                       "--strength", "0.3", "--json", "-")  # fmt: skip

@@ -241,9 +241,12 @@ QUICK = ["camera convert", "check", "testfield print", "testfield import", "impo
 SLOW = [name for name in COMMANDS if name not in QUICK]
 
 
-@pytest.mark.parametrize("kind", ["read-only", "full", "denied"])
 @pytest.mark.parametrize(
-    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+    ("name", "kind"),
+    [
+        *((name, kind) for name in QUICK for kind in ("read-only", "full", "denied")),
+        *(pytest.param(n, k, marks=pytest.mark.slow) for n in SLOW for k in ("full", "denied")),
+    ],
 )
 def test_a_place_that_cannot_be_written_is_one_sentence(
     world, refusing, monkeypatch, capsys, tmp_path, name, kind

@@ -117,11 +117,6 @@ def test_the_configuration_is_looked_for_here_then_in_etc(monkeypatch, tmp_path)
         run("status")
 
 
-def test_a_dashboard_of_no_store_is_an_error(tmp_path):
-    with pytest.raises(ThermocaldError, match="does not exist"):
-        run("dashboard", "--store", tmp_path / "none.db")
-
-
 def test_a_flat_field_says_what_it_is_good_for():
     told = " ".join(run("testfield", "check", "--flat").stdout.split())
     assert told.startswith("NOT ENOUGH: a series of a fixed camera gets no result")

@@ -7,24 +7,20 @@ import re
 import socket
 import sqlite3
 import stat
-import subprocess
-import sys
 from contextlib import closing, suppress
 
 import pytest
 import typer
 
+from tests.commands import call
 from thermocald.cli import application, commands
 from thermocald.errors import OutputError
 from thermocald.files import check_output
 
 
-def _typed(*words: object, cwd=None) -> tuple[int, list[str]]:
-    """Exit status and lines on standard error of the real program."""
-    done = subprocess.run(
-        [sys.executable, "-m", "thermocald", *map(str, words)],
-        cwd=cwd, check=False, capture_output=True, text=True,
-    )  # fmt: skip
+def _typed(*words: object, folder=None) -> tuple[int, list[str]]:
+    """Exit status and lines on standard error."""
+    done = call(*words, folder=folder)
     return done.returncode, done.stderr.splitlines()
 
 
@@ -70,7 +66,7 @@ def test_nothing_typed_is_answered_by_the_help():
 def test_an_output_that_cannot_be_is_refused_before_the_work(option, tmp_path):
     """The recording does not even exist: it has not been looked at."""
     (tmp_path / "file").touch()
-    status, lines = _typed("study", "nowhere", option, "file/page.html", cwd=tmp_path)
+    status, lines = _typed("study", "nowhere", option, "file/page.html", folder=tmp_path)
     assert status == 2
     assert len(lines) == 1
     assert lines[0].startswith("error: file/page.html: cannot be written: ")
@@ -169,9 +165,11 @@ def test_every_option_that_says_that_it_writes_is_looked_at():
 
 def test_one_file_for_two_results_is_refused(tmp_path):
     words = ("study", "nowhere", "--report", "a.html", "--json", "./a.html")
-    status, lines = _typed(*words, cwd=tmp_path)
+    status, lines = _typed(*words, folder=tmp_path)
     assert (status, lines) == (2, ["error: --report and --json: both would be ./a.html"])
-    status, lines = _typed("fit", "1", "-o", "c.yaml", "--code", "a", "--json", "a.h", cwd=tmp_path)
+    status, lines = _typed(
+        "fit", "1", "-o", "c.yaml", "--code", "a", "--json", "a.h", folder=tmp_path
+    )
     assert status == 2
     assert "both would be" in lines[0]
 

@@ -53,8 +53,10 @@ def test_a_tilted_sheet_is_found_whole_at_every_scale(sheet):
 @pytest.mark.parametrize("stand", STANDS)
 @pytest.mark.parametrize("noise", [0.0, 2.0])
 def test_fifty_scales(sheet, stand, noise):
+    """Every second one without noise, the others with it."""
     frame, seen = frame_from(sheet, stand, noise)
-    found = [found_at(frame, sheet[0], scale) for scale in np.linspace(0.2, 1.0, 50)]
+    scales = np.linspace(0.2, 1.0, 50)[noise > 0 :: 2]
+    found = [found_at(frame, sheet[0], scale) for scale in scales]
     assert min(found) >= 0.97 * seen, found
     assert seen >= 50
 

@@ -449,12 +449,11 @@ MEASURED = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=() if name in QUICK_FILES else pytest.mark.slow) for name in FILES],
-)
-def test_what_was_measured_is_never_written_over(world, monkeypatch, capsys, tmp_path, name):
-    """`-o thermocald.db` in place of `--store`: a month of epochs for a table."""
+def test_what_was_measured_is_never_written_over(world, monkeypatch, capsys, tmp_path):
+    """`-o thermocald.db` in place of `--store`: a month of epochs for a table.
+
+    By every name of the file; that every command looks is in test_wrong_usage.
+    """
     with Store.open(tmp_path / "t.db", "append") as store:
         store.add_event(Event(1.0, "started", "kept"))
         for part in ("", "-wal"):
@@ -467,7 +466,7 @@ def test_what_was_measured_is_never_written_over(world, monkeypatch, capsys, tmp
     (tmp_path / "epochs-link").symlink_to("M/epochs.csv")
     for what, place in MEASURED.items():
         before = (tmp_path / place).read_bytes()
-        code, said = written_to(world, monkeypatch, capsys, name, tmp_path / place)
+        code, said = written_to(world, monkeypatch, capsys, "check", tmp_path / place)
         assert code == 2, what
         assert "cannot be written: it is" in said
         assert "choose another name" in said

@@ -20,6 +20,7 @@ import numpy as np
 
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study.montecarlo import draw_root, on_plane, plane_errors, simulate_errors
+from thermocald.analysis.study.series_study import StudySettings
 from thermocald.photogrammetry.camera.camera_model import Sensor
 
 SENSOR = Sensor(3264, 2448, 0.0014)
@@ -61,7 +62,7 @@ def main() -> int:
     points = image_grid(SENSOR)
     root = draw_root(SDS, CORRELATION)
     sets = IOP + np.random.default_rng(0).standard_normal((SETS, len(root))) @ root
-    ours = best(lambda: simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=SETS))
+    ours = best(lambda: simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=SETS)))
     loop = best(lambda: opencv_loop(sets, points), 3)
 
     plane = opencv_loop(sets, points) * [DISTANCE_MM, -DISTANCE_MM]
@@ -71,7 +72,7 @@ def main() -> int:
 
     def peak_mb(count: int) -> float:
         tracemalloc.start()
-        simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=count)
+        simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=count))
         peak = tracemalloc.get_traced_memory()[1] / 1e6
         tracemalloc.stop()
         return peak

@@ -199,7 +199,7 @@ def study(
     'rpi-v2.1'
     """
     from thermocald.analysis.study.measured import refuse_copies
-    from thermocald.analysis.study.study import StudySettings
+    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.analysis.study.study import study as run
     from thermocald.results import Study
 
@@ -230,11 +230,11 @@ def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
     Source: Elias et al. 2020, Sensors 20, 643, section 4.
     """
     from thermocald.analysis.study.reference import compare, reference_studies
-    from thermocald.analysis.study.study import StudySettings
+    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.results import Study
 
     chosen = StudySettings(**settings)
-    cameras = tuple(reference_studies(chosen, advance=progress or (lambda _: None)))
+    cameras = tuple(reference_studies(chosen, progress or (lambda _: None)))
     return Study(chosen, cameras, tuple(c for camera in cameras for c in compare(camera)))
 
 

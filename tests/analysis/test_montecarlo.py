@@ -14,9 +14,9 @@ from thermocald.analysis.study.montecarlo import (
     on_plane,
     plane_errors,
     plane_jacobian,
-    propagate,
     simulate_errors,
 )
+from thermocald.analysis.study.series_study import StudySettings
 from thermocald.errors import GeometryError
 
 
@@ -57,17 +57,17 @@ def test_affine_terms_are_inverted_as_the_camera_model_does():
 
 
 def test_a_seed_gives_the_same_numbers_whatever_the_chunks(monkeypatch):
-    first = simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=5000, seed=7)
+    first = simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=5000, seed=7))
     monkeypatch.setattr(montecarlo, "_CHUNK", 300)
-    second = simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=5000, seed=7)
+    second = simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=5000, seed=7))
     np.testing.assert_array_equal(first.counts, second.counts)
     np.testing.assert_allclose(first.largest, second.largest, rtol=1e-12)
-    other = simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=5000, seed=8)
+    other = simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=5000, seed=8))
     assert not np.array_equal(first.counts, other.counts)
 
 
 def test_clusters_means_and_ellipses_are_those_of_the_errors():
-    result = simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=3000, seed=3)
+    result = simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=3000, seed=3))
     rng = np.random.default_rng(3)
     root = draw_root(SDS, CORRELATION)
     sets = np.concatenate(
@@ -86,8 +86,9 @@ def test_clusters_means_and_ellipses_are_those_of_the_errors():
 
 def test_small_errors_are_those_of_first_order():
     root = draw_root(SDS, CORRELATION)
-    result = simulate_errors(SENSOR, IOP, SDS, CORRELATION)
-    first = propagate(plane_jacobian(SENSOR, IOP, result.image_points, 1e4), root.T @ root)
+    result = simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings())
+    jacobian = plane_jacobian(SENSOR, IOP, result.image_points, 1e4)
+    first = jacobian @ (root.T @ root) @ jacobian.mT
     # 50,000 draws: a variance is known to 0.6 %, a mean to 0.0045 of the standard deviation.
     np.testing.assert_allclose(result.covariance[:, 0, 0], first[:, 0, 0], rtol=0.03)
     assert np.linalg.norm(result.mean_error, axis=1).max() < 0.02 * np.sqrt(first[0, 0, 0])
@@ -96,7 +97,7 @@ def test_small_errors_are_those_of_first_order():
 def test_large_errors_are_not_and_the_bias_is_that_of_second_order():
     """A principal distance uncertain by 10 %: E(1/c) exceeds 1/c by 1 %."""
     sds = np.array([0.397, 0, 0, 0, 0, 0, 0, 0, 0, 0])
-    result = simulate_errors(SENSOR, IOP, sds, CORRELATION)
+    result = simulate_errors(SENSOR, IOP, sds, CORRELATION, StudySettings())
     np.testing.assert_allclose(
         result.mean_error[[0, 2, 6, 8]], 0.0103 * result.expected[[0, 2, 6, 8]], rtol=0.15
     )
@@ -122,10 +123,10 @@ def test_an_indefinite_matrix_of_medians_becomes_the_nearest_correlation_matrix(
 
 
 def test_fifty_thousand_sets_need_less_than_20_mb():
-    simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=2000)
+    simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=2000))
     tracemalloc.start()
     try:
-        simulate_errors(SENSOR, IOP, SDS, CORRELATION)
+        simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings())
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -135,7 +136,7 @@ def test_fifty_thousand_sets_need_less_than_20_mb():
 def test_sets_that_fold_the_image_are_counted_and_left_out():
     wild = SDS.copy()
     wild[3] = 0.06
-    result = simulate_errors(SENSOR, IOP, wild, CORRELATION, sets=2000)
+    result = simulate_errors(SENSOR, IOP, wild, CORRELATION, StudySettings(sets=2000))
     assert 0 < result.folded < 2000
     assert result.counts.sum() == 9 * (2000 - result.folded)
     assert np.isfinite(result.overall_mean)
@@ -145,7 +146,7 @@ def test_an_expected_point_that_does_not_exist_is_an_error():
     folded = IOP.copy()
     folded[3] = -0.2
     with pytest.raises(GeometryError, match="no ray"):
-        simulate_errors(SENSOR, folded, SDS, CORRELATION, sets=100)
+        simulate_errors(SENSOR, folded, SDS, CORRELATION, StudySettings(sets=100))
 
 
 @pytest.mark.slow
@@ -153,9 +154,8 @@ def test_five_million_sets_in_constant_memory_with_progress():
     done = []
     tracemalloc.start()
     try:
-        result = simulate_errors(
-            SENSOR, IOP, SDS, CORRELATION, sets=5_000_000, progress=done.append
-        )
+        settings = StudySettings(sets=5_000_000)
+        result = simulate_errors(SENSOR, IOP, SDS, CORRELATION, settings, done.append)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -168,7 +168,7 @@ def test_five_million_sets_in_constant_memory_with_progress():
 def test_processes_do_not_matter():
     """Sets projected on two processes give the bits of one."""
     one, two = (
-        simulate_errors(SENSOR, IOP, SDS, CORRELATION, sets=5000, seed=3, jobs=jobs)
+        simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=5000, seed=3, jobs=jobs))
         for jobs in (1, 2)
     )
     for name in ("counts", "mean", "largest", "mean_error", "covariance", "sample"):

@@ -160,15 +160,12 @@ class Maps:
 
     def __init__(self, sensor: Sensor, steady: Array, to: float) -> None:
         self.to, self.sensor = to, sensor
-        width, height = self.sensor.width, self.sensor.height
         # one node beyond each edge, where `cv2.resize` puts it
-        self._shape = (-(-height // _CELL) + 2, -(-width // _CELL) + 2)
+        self._shape = (-(-sensor.height // _CELL) + 2, -(-sensor.width // _CELL) + 2)
         v, u = (_CELL * np.arange(n) - (_CELL + 1) / 2.0 for n in self._shape)
         self._nodes = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
         self._directions = _directions(sensor, steady, self._nodes)
-        u, v = np.linspace(0, width - 1, _CHECKED), np.linspace(0, height - 1, _CHECKED)
-        points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-        self._checked = _directions(sensor, steady, points)
+        self._checked = _directions(sensor, steady, image_grid(sensor, _CHECKED))
         self._seen: Array | None = None
         self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
 

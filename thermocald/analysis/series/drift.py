@@ -9,7 +9,7 @@ where it does not rest on a single marker or target: a board that gives way is n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -18,34 +18,20 @@ import numpy as np
 from thermocald.analysis.series.epochs import LEVEL, Course
 from thermocald.analysis.statistics.dependence import holm, slope_noise, slope_p_value
 from thermocald.analysis.statistics.noise_models import drift_test
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PRINCIPAL
 from thermocald.photogrammetry.series.target_noise import slow_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from thermocald.analysis.series.epochs import Epochs
     from thermocald.arrays import Array
-
-__all__ = ["courses", "with_drifts"]
 
 _FEWEST = 10
 _LEAST_WARMING_K = 0.5  # below, the thermometer's own noise is all there is
 _MOST_VALUES = 100_000  # of a line: neighbours beyond that are averaged
 _SUSPECTS = 5  # groups that are left out in turn
 _SHRUNK = 0.5  # of its change must go with a group that a parameter's drift rests on
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Line:
-    """A straight line through one parameter: values and sds (n,), its change, sd and p-value."""
-
-    name: str
-    values: Array
-    sds: Array
-    change: float
-    sd_change: float
-    p: float
 
 
 def _thinned(*columns: Array) -> list[Array]:
@@ -57,59 +43,47 @@ def _thinned(*columns: Array) -> list[Array]:
     return [c[: n // size * size].reshape(-1, size).mean(axis=1) for c in columns]
 
 
-def _lines(table: Epochs, names: tuple[str, ...]) -> dict[str, _Line]:
-    """Lines through the parameters that were estimated, p corrected for their number (Holm)."""
-    found = []
-    ok = table.ok
+def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
+    """Straight lines through the parameters that were estimated, p corrected for their number
+    (Holm).
+    """
+    found, ok = [], table.ok
     t = table.frame_time[ok]
     for name in names:
         column = IOP_NAMES.index(name)
         y, sd = table.values[ok, column], table.sd[ok, column]
         if len(y) < _FEWEST or not np.isfinite(sd).all() or np.ptp(t) == 0:
             continue
-        tilt = float(table.trend_sd[column])
-        found.append(_Line(name, y, sd, *_line(t, y, sd, tilt)))
-    corrected = holm([line.p for line in found])
-    return {line.name: replace(line, p=p) for line, p in zip(found, corrected, strict=True)}
+        line = Course(
+            name, float(y.mean()), float(y.std(ddof=1)), float(np.sqrt(np.mean(sd**2))),
+            *_line(t, y, sd, float(table.trend_sd[column])), drifts=False,
+            last_minus_first=float(y[-1] - y[0]),
+            sd_last_minus_first=float(np.hypot(sd[-1], sd[0])),
+            sd_by_perspective=float(np.sqrt(2.0) * table.perspective_sd[column]),
+        )  # fmt: skip
+        found.append(line)
+    corrected = zip(found, holm([line.p for line in found]), strict=True)
+    return {line.name: replace(line, p=p, drifts=p < LEVEL) for line, p in corrected}
 
 
-def courses(table: Epochs, names: tuple[str, ...] = ("c", "x0", "y0")) -> list[Course]:
-    """How parameters changed over a series; those that were held are left out."""
+def courses(table: Epochs) -> list[Course]:
+    """How c, x0 and y0 changed over a series; those that were held are left out."""
     ok = table.ok
-    lines = _lines(table, names)
-    warm = _with_temperature(
-        table.frame_time[ok], table.temperature[ok], [line.values for line in lines.values()]
-    )
-    result = []
+    lines = _lines(table, IOP_NAMES[PRINCIPAL])
+    columns = [table.values[ok, IOP_NAMES.index(name)] for name in lines]
+    warm = _with_temperature(table.frame_time[ok], table.temperature[ok], columns)
 
     @cache
-    def without(group: str) -> dict[str, _Line]:
+    def without(group: str) -> dict[str, Course]:
         assert table.without is not None  # _single_support asks only then
         left = table.without(table.groups[group], True)
         return _lines(left, tuple(lines)) if left.ok.sum() >= _FEWEST else {}
 
+    result = []
     for line, (slope, sd_slope, p_warm) in zip(lines.values(), warm, strict=True):
-        rests_on = _single_support(table, line, without) if line.p < LEVEL else None
-        y, sd = line.values, line.sds
-        result.append(
-            Course(
-                line.name,
-                float(y.mean()),
-                float(y.std(ddof=1)),
-                float(np.sqrt(np.mean(sd**2))),
-                line.change,
-                line.sd_change,
-                line.p,
-                line.p < LEVEL and not rests_on,
-                rests_on,
-                slope,
-                p_warm,
-                float(y[-1] - y[0]),
-                float(np.hypot(sd[-1], sd[0])),
-                sd_slope,
-                float(np.sqrt(2.0) * table.perspective_sd[IOP_NAMES.index(line.name)]),
-            )
-        )
+        rests_on = _single_support(table, line, without) if line.drifts else None
+        line = replace(line, per_kelvin=slope, sd_per_kelvin=sd_slope, p_temperature=p_warm)
+        result.append(replace(line, drifts=line.drifts and not rests_on, rests_on=rests_on))
     return result
 
 
@@ -147,33 +121,25 @@ def with_drifts(table: Epochs) -> Epochs:
 
 
 def _single_support(
-    table: Epochs, line: _Line, lines_without: Callable[[str], dict[str, _Line]]
+    table: Epochs, line: Course, lines_without: Callable[[str], dict[str, Course]]
 ) -> str | None:
     """The group of targets that alone makes a parameter drift, or None.
 
-    lines_without: all lines of the series without a group. Without the group that is named the
-    change must shrink by more than half and no longer be significant, corrected as with it: a group
-    whose absence only makes the change less certain is not accused.
+    lines_without: all lines of the series without a group. Asked are those whose own residuals
+    wander most over the series. Without the group that is named the change must shrink by more than
+    half and no longer be significant, corrected as with it: a group whose absence only makes the
+    change less certain is not accused.
     """
-    if table.without is None or len(table.groups) < 3:
+    if table.without is None or table.adjustment is None or len(table.groups) < 3:
         return None
-    best, least = None, _SHRUNK * abs(line.change)
-    for first in _suspects(table):
-        without = lines_without(first).get(line.name)
-        if without is None or without.p < LEVEL:
-            continue
-        if abs(without.change) < least:
-            best, least = first, abs(without.change)
-    return best
-
-
-def _suspects(table: Epochs) -> list[str]:
-    """The groups whose own residuals wander most over the series."""
-    if table.adjustment is None:
-        return []
     slow = slow_errors(table.adjustment.residuals, table.adjustment.observed)
     size = {first: float(np.nansum(slow[rows] ** 2)) for first, rows in table.groups.items()}
-    return sorted(size, key=lambda first: -size[first])[:_SUSPECTS]
+    best, least = None, _SHRUNK * abs(line.change)
+    for first in sorted(size, key=lambda first: -size[first])[:_SUSPECTS]:
+        without = lines_without(first).get(line.name)
+        if without is not None and not without.drifts and abs(without.change) < least:
+            best, least = first, abs(without.change)
+    return best
 
 
 def _line(t: Array, y: Array, sds: Array, tilt_sd: float) -> tuple[float, float, float]:

@@ -499,37 +499,24 @@ def _stood_still(stillness: Array) -> dict[str, Any]:
 
 def _table_of(drifts: Sequence[Course]) -> list[str]:
     """A line for each parameter below a line of titles; nothing without parameters."""
+    titles = ("", "mean mm", "scatter µm", "sd µm", "ratio", "line µm ± sd",
+              "last - first µm ± sd", "drift")  # fmt: skip
     rows = [
         (
-            "",
-            "mean mm",
-            "scatter µm",
-            "sd µm",
-            "ratio",
-            "line µm ± sd",
-            "last - first µm ± sd",
-            "drift",
-        )
-    ]
-    rows += [
-        (
-            c.name,
-            f"{c.mean:.5f}",
-            f"{1e3 * c.scatter:.3f}",
-            f"{1e3 * c.sd:.3f}",
-            f"{c.scatter / c.sd:.2f}",
-            f"{1e3 * c.change:+.3f} ± {1e3 * c.sd_change:.3f}",
-            f"{1e3 * c.last_minus_first:+.3f} ± {1e3 * c.sd_last_minus_first:.3f}",
-            c.in_words,
+            c.name, f"{c.mean:.5f}", f"{1e3 * c.scatter:.3f}", f"{1e3 * c.sd:.3f}",
+            f"{c.scatter_over_sd:.2f}", f"{1e3 * c.change:+.3f} ± {1e3 * c.sd_change:.3f}",
+            f"{1e3 * c.last_minus_first:+.3f} ± {1e3 * c.sd_last_minus_first:.3f}", c.in_words,
         )
         for c in drifts
-    ]
-    if not drifts:
+    ]  # fmt: skip
+    if not rows:
         return []
-    width = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    placed = [[f"{t:>{w}}" for t, w in zip(row, width, strict=True)] for row in rows]
-    return [" ".join([f"{name:<{width[0]}}", *right]) for (name, *_), (_, *right) in
-            zip(rows, placed, strict=True)]  # fmt: skip
+    rows = [titles, *rows]
+    width = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        " ".join([f"{name:<{width[0]}}", *map(str.rjust, right, width[1:])])
+        for name, *right in rows
+    ]
 
 
 def calibrate_epochs(
@@ -543,26 +530,24 @@ def calibrate_epochs(
 
     temperature (E,): °C at the frames' times; jobs: processes.
     """
-    rows, observations = [], []
+    rows, found, observations = [], [], []
     for done in calibrated_epochs(calibrator, epochs, jobs):
-        a = done.adjustment
-        rows.append((done.epoch.number, done.epoch.frame_time, a))
+        rows.append((done.epoch.number, done.epoch.frame_time))
+        found.append(done.adjustment)
         observations.append(done.epoch.observations)
         if advance is not None:
             advance(1)
+    nothing = np.full(16, np.nan)
     table = Epochs(
-        np.array([n for n, _, _ in rows], dtype=np.int64),
-        np.array([t for _, t, _ in rows]),
+        np.array([n for n, _ in rows], dtype=np.int64), np.array([t for _, t in rows]),
         temperature,
-        np.array([a.values if a.ok else np.full(16, np.nan) for _, _, a in rows]).reshape(-1, 16),
-        np.array([a.sd if a.ok else np.full(16, np.nan) for _, _, a in rows]).reshape(-1, 16),
-        np.array([a.sigma0 if a.ok else np.nan for _, _, a in rows]),
-        np.array([a.n_observations for _, _, a in rows], dtype=np.int64),
-        np.array([len(a.rejected) for _, _, a in rows], dtype=np.int64),
-        tuple(a.status for _, _, a in rows),
-        tuple(a.reason for _, _, a in rows),
-        "per_epoch",
-    )
+        np.array([a.values if a.ok else nothing for a in found]).reshape(-1, 16),
+        np.array([a.sd if a.ok else nothing for a in found]).reshape(-1, 16),
+        np.array([a.sigma0 if a.ok else np.nan for a in found]),
+        np.array([a.n_observations for a in found], dtype=np.int64),
+        np.array([len(a.rejected) for a in found], dtype=np.int64),
+        tuple(a.status for a in found), tuple(a.reason for a in found), "per_epoch",
+    )  # fmt: skip
     return table, observations
 
 

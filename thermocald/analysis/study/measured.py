@@ -178,28 +178,14 @@ def measured_series(
         covariances = adjustment.covariance[some][:, :10, :10]
     time_s = table.frame_time[ok]
     return MeasuredSeries(
-        label,
-        source.head.series,
-        source.head.camera.name,
-        source.head.camera.sensor,
-        source.title,
-        table.number[ok],
-        time_s - time_s[0],
-        _thermometers(source, time_s, thermometer_sd),
-        table.values[ok, :10],
-        table.sd[ok, :10],
-        table.sigma0[ok],
-        redundancy[: len(ok)][ok],
-        correlations_of(covariances),
-        rows,
-        exterior,
-        without_result,
-        _clip(source, ok, observations),
-        float(time_s[0]),
+        label, source.head.series, source.head.camera.name, source.head.camera.sensor, source.title,
+        table.number[ok], time_s - time_s[0], _thermometers(source, time_s, thermometer_sd),
+        table.values[ok, :10], table.sd[ok, :10], table.sigma0[ok], redundancy[: len(ok)][ok],
+        correlations_of(covariances), rows, exterior, without_result,
+        _clip(source, ok, observations), float(time_s[0]),
         "" if adjustment is None else adjustment.choice,
-        float("nan") if adjustment is None else adjustment.noise_ratio,
-        table.field_movements,
-    )
+        float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,
+    )  # fmt: skip
 
 
 def _assessed(table: Epochs) -> tuple[NDArray[np.bool_], dict[str, int]]:

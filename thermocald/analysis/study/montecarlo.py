@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.analysis.study.measured import MeasuredSeries
+    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import Sensor
 
@@ -103,12 +104,6 @@ def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: f
     return np.asarray(-solved, dtype=np.float64)
 
 
-def propagate(jacobian: Array, covariance: Array) -> Array:
-    """Covariances (k, 2, 2) mm² of the plane points from the covariance (10, 10) of the IOP."""
-    return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2))
-
-
-CLUSTERS_MM = (15.0, 50.0, 100.0)
 _CHUNK = 1024
 _SAMPLE = 1500
 _STEPS = 30
@@ -178,37 +173,31 @@ def simulate_errors(
     iop: Array,
     sds: Array,
     correlation: Array,
-    *,
-    sets: int = 50_000,
-    seed: int = 0,
-    distance_mm: float = 10_000.0,
-    grid: int = 3,
-    clusters_mm: tuple[float, ...] = CLUSTERS_MM,
+    settings: StudySettings,
     progress: Callable[[int], None] | None = None,
-    jobs: int = 1,
 ) -> MonteCarlo:
     """Draw IOP about `iop` (10,) and cluster the errors on the plane.
 
     sds (10,) in the units of the IOP, correlation (10, 10); progress receives how many sets were
-    done; jobs: processes that project them, with the same bits for any number. Raises
-    GeometryError where the expected point of a grid point does not exist.
+    done. The processes that project them give the same bits for any number. Raises GeometryError
+    where the expected point of a grid point does not exist.
     """
-    points = image_grid(sensor, grid)
+    points, sets = image_grid(sensor, settings.grid), settings.sets
     root = draw_root(sds, correlation)
-    project = _PlaneErrors(sensor, iop, points, distance_mm)
+    project = _PlaneErrors(sensor, iop, points, settings.distance_mm)
     k = len(points)
-    limits = np.asarray(clusters_mm)
+    limits = np.asarray(settings.clusters_mm)
     counts = np.zeros((k, len(limits) + 1), dtype=np.int64)
     largest, sums = np.zeros(k), np.zeros((k, 6))
     sample: list[Array] = []
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(settings.seed)
     folded = 0
     draws = (
         (rng.standard_normal((min(_CHUNK, sets - done), len(root))), max(_SAMPLE - done, 0))
         for done in range(0, sets, _CHUNK)
     )
     for drawn, ok, part_counts, part_largest, part_sums, first_errors in in_order(
-        _simulated, (project, iop, root, limits), draws, jobs
+        _simulated, (project, iop, root, limits), draws, settings.jobs
     ):
         folded += drawn - ok
         counts += part_counts
@@ -228,20 +217,9 @@ def simulate_errors(
     second = means[:, [3, 5, 5, 4]].reshape(k, 2, 2)
     covariance = second - mean_error[:, :, None] * mean_error[:, None, :]
     return MonteCarlo(
-        sets,
-        seed,
-        distance_mm,
-        clusters_mm,
-        points,
-        project.expected,
-        counts,
-        means[:, 0],
-        largest,
-        mean_error,
-        covariance,
-        np.concatenate(sample),
-        folded,
-    )
+        sets, settings.seed, settings.distance_mm, settings.clusters_mm, points, project.expected,
+        counts, means[:, 0], largest, mean_error, covariance, np.concatenate(sample), folded,
+    )  # fmt: skip
 
 
 def _simulated(
@@ -387,11 +365,7 @@ def trajectories(
 def _distances(one: MeasuredSeries, reference: str, distance_mm: float, size: int) -> Array:
     """Distances (e, k) mm on the plane of image points (k,) at epochs (e,)."""
     rows = np.unique(np.linspace(0, len(one) - 1, min(len(one), _MOST_EPOCHS)).astype(int))
-    fixed = {
-        "first": one.values[0],
-        "mean": one.mean,
-        "last": one.values[-1],
-    }[reference]
+    fixed = {"first": one.values[0], "mean": one.mean, "last": one.values[-1]}[reference]
     points = image_grid(one.sensor, size)
     errors = plane_errors(one.sensor, fixed, one.values[rows], points, distance_mm)
     distances = np.linalg.norm(errors, axis=-1)

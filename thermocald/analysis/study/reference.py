@@ -17,16 +17,16 @@ import numpy as np
 
 from thermocald.analysis.series.recorded import recorded_table
 from thermocald.analysis.study.measured import measured_series
-from thermocald.analysis.study.study import StudySettings, study_camera
+from thermocald.analysis.study.study import study_camera
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.physics.presets import PRESETS, preset_simulation
 from thermocald.store.recording.reader import open_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
-    from thermocald.analysis.study.measured import MeasuredSeries
     from thermocald.analysis.study.montecarlo import MonteCarlo
+    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.analysis.study.study import CameraStudy
 
     _Row = tuple[str, str, str, float, float, float]
@@ -116,39 +116,29 @@ class Comparison:
         return self.low <= self.ours <= self.high
 
 
-def reference_series(
-    preset: str, advance: Callable[[int], None] = lambda _: None
-) -> list[MeasuredSeries]:
-    """Both series of a preset, simulated to a recording, read again, and adjusted."""
-    measured = []
-    with tempfile.TemporaryDirectory() as folder:
-        for name, seed in SERIES:
-            path = Path(folder) / name
-            preset_simulation(preset, seed, name).write(path)
-            recording = open_recording(path)
-            table, seen = recorded_table(recording, AdjustmentSettings(), "series")
-            one = measured_series(recording, table, seen, preset)
-            # The folder is gone when the study is read.
-            measured.append(replace(one, source=f"preset {preset}, series {name}, seed {seed}"))
-            advance(1)
-    return measured
-
-
 def reference_studies(
-    settings: StudySettings | None = None,
-    presets: Sequence[str] = tuple(QUOTED),
-    advance: Callable[[int], None] = lambda _: None,
+    settings: StudySettings, advance: Callable[[int], None] = lambda _: None
 ) -> list[CameraStudy]:
-    """The study of every preset; the f-number is each camera's own."""
-    base = settings or StudySettings()
-    return [
-        study_camera(
-            preset,
-            reference_series(preset, advance),
-            replace(base, f_number=PRESETS[preset].f_number),
-        )
-        for preset in presets
-    ]
+    """The study of every preset, whose two series are simulated to a recording, read again, and
+    adjusted; the f-number is each camera's own.
+    """
+    studies = []
+    for preset in QUOTED:
+        measured = []
+        with tempfile.TemporaryDirectory() as folder:
+            for name, seed in SERIES:
+                path = Path(folder) / name
+                preset_simulation(preset, seed, name).write(path)
+                recording = open_recording(path)
+                table, seen = recorded_table(recording, AdjustmentSettings(), "series")
+                one = measured_series(recording, table, seen, preset)
+                # The folder is gone when the study is read.
+                source = f"preset {preset}, series {name}, seed {seed}"
+                measured.append(replace(one, source=source))
+                advance(1)
+        own = replace(settings, f_number=PRESETS[preset].f_number)
+        studies.append(study_camera(preset, measured, own))
+    return studies
 
 
 def compare(camera: CameraStudy) -> list[Comparison]:

@@ -269,19 +269,11 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
         series.sigma0,
         *(t.values for t in series.thermometers),
     ]
+    focus = _focus(series, settings, deviations, notes)
     return SeriesStudy(
-        series,
-        deviations,
-        _focus(series, settings, deviations, notes),
-        grid,
-        displacement,
-        significance,
-        channels,
-        names,
-        correlation_matrix(columns),
-        tuple(notes),
-        _noise_ratio(significance),
-    )
+        series, deviations, focus, grid, displacement, significance, channels, names,
+        correlation_matrix(columns), tuple(notes), _noise_ratio(significance),
+    )  # fmt: skip
 
 
 def _circumstances(series: MeasuredSeries) -> list[str]:

@@ -19,7 +19,6 @@ from thermocald.analysis.study.montecarlo import (
     correlations_over_time,
     draw_root,
     plane_jacobian,
-    propagate,
     simulate_errors,
     trajectories,
 )
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.study.measured import MeasuredSeries
     from thermocald.arrays import Array
-
-__all__ = ["CameraStudy", "FirstOrder", "Study", "StudySettings", "study", "study_camera"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,17 +132,9 @@ def study_camera(
         paths = ()
         notes.append(f"The camera's path cannot be projected on the plane: {error}.")
     return CameraStudy(
-        label,
-        studies,
-        iop,
-        sds,
-        correlations,
-        montecarlo,
-        first_order,
-        correlations_over_time(series),
-        paths,
-        tuple(notes),
-    )
+        label, studies, iop, sds, correlations, montecarlo, first_order,
+        correlations_over_time(series), paths, tuple(notes),
+    )  # fmt: skip
 
 
 def sds_over_time(series: Sequence[MeasuredSeries]) -> Array:
@@ -167,28 +156,11 @@ def _object_space(
     s: StudySettings,
     progress: Callable[[int], None] | None,
 ) -> tuple[MonteCarlo, FirstOrder]:
-    montecarlo = simulate_errors(
-        one.sensor,
-        iop,
-        sds,
-        correlation,
-        sets=s.sets,
-        seed=s.seed,
-        distance_mm=s.distance_mm,
-        grid=s.grid,
-        clusters_mm=s.clusters_mm,
-        progress=progress,
-        jobs=s.jobs,
-    )
+    montecarlo = simulate_errors(one.sensor, iop, sds, correlation, s, progress)
     root = draw_root(sds, correlation)
     jacobian = plane_jacobian(one.sensor, iop, montecarlo.image_points, s.distance_mm)
-    covariance = propagate(jacobian, root.T @ root)
+    covariance = jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
     law = DistanceLaw(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0)))
     below = np.mean(law.cumulative(s.clusters_mm), axis=0)
-    first_order = FirstOrder(
-        covariance,
-        law.mean(),
-        law.expected_maximum(s.sets),
-        np.diff(below, prepend=0.0, append=1.0),
-    )
-    return montecarlo, first_order
+    shares = np.diff(below, prepend=0.0, append=1.0)
+    return montecarlo, FirstOrder(covariance, law.mean(), law.expected_maximum(s.sets), shares)

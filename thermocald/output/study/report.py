@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.analysis.study.study import CameraStudy, Study, StudySettings
+    from thermocald.analysis.study.series_study import StudySettings
+    from thermocald.analysis.study.study import CameraStudy, Study
 
 _CLIP_PX = 96
 _CLIP_LONGEST_PX = 480

@@ -120,10 +120,7 @@ def convert(
     if covariance is not None:
         G = _derivative(seen, result, directions)
         F = _derivative(lambda v, d: source.project(sensor, v, d), values, directions)
-        scales = np.linalg.norm(G, axis=0)
-        used = scales > 0
-        J = np.zeros((len(result), len(values)))
-        J[used] = np.linalg.lstsq(G[:, used] / scales[used], F, rcond=1e-14)[0] / scales[used, None]
+        J = _least_squares(G, F)
         carried = J @ covariance @ J.T
     size = np.linalg.norm(residual, axis=1)
     largest, rms = float(size.max()), float(np.sqrt(np.mean(size**2)))
@@ -179,11 +176,7 @@ def _fit(
     cost = cost_of(values)
     for _ in range(50):
         G = _derivative(target, values, directions)
-        r = (pixels - target(values, directions)).ravel()
-        scales = np.linalg.norm(G, axis=0)
-        used = scales > 0
-        step = np.zeros(len(values))
-        step[used] = np.linalg.lstsq(G[:, used] / scales[used], r, rcond=1e-14)[0] / scales[used]
+        step = _least_squares(G, (pixels - target(values, directions)).reshape(-1, 1))[:, 0]
         for _halving in range(20):
             new = cost_of(values + step)
             if new < cost:
@@ -196,6 +189,16 @@ def _fit(
             return values
         cost = new
     return values
+
+
+def _least_squares(G: Array, rhs: Array) -> Array:
+    """The solution (u, k) of G (n, u) for rhs (n, k), 0 for parameters that G does not hold."""
+    scales = np.linalg.norm(G, axis=0)
+    used = scales > 0
+    found = np.zeros((G.shape[1], rhs.shape[1]))
+    scaled = G[:, used] / scales[used]
+    found[used] = np.linalg.lstsq(scaled, rhs, rcond=1e-14)[0] / scales[used, None]
+    return found
 
 
 def _derivative(
@@ -223,9 +226,8 @@ def _derivative(
         plus, minus = values.copy(), values.copy()
         plus[k] += h
         minus[k] -= h
-        G[:, k] = (
-            (function(plus, directions) - function(minus, directions)) / (plus[k] - minus[k])
-        ).ravel()
+        ahead, behind = (function(v, directions).ravel() for v in (plus, minus))
+        G[:, k] = (ahead - behind) / (plus[k] - minus[k])
     return G
 
 

@@ -192,11 +192,6 @@ _CODE = re.compile(r"CHESS:(\d{1,3})x(\d{1,3}):(\d{1,5})")
 _QUIET_SHARE = 0.45  # of the distance between corners, where no marker stands nearer
 
 
-def is_chess(code: str) -> bool:
-    """Whether a test field's code names a corner of a plain chessboard."""
-    return code.startswith("CHESS:")
-
-
 def chess_code(columns: int, rows: int, number: int) -> str:
     """The code of an inner corner; TestFieldError for boards that look the same upside down."""
     if (columns + rows) % 2 == 0:
@@ -220,15 +215,14 @@ def parse_chess(code: str) -> tuple[int, int, int]:
 
 
 def find_chessboards(
-    image: NDArray[Any], testfield: TestField, missed: dict[int, str] | None = None
+    image: NDArray[Any], testfield: TestField, missed: dict[int, str]
 ) -> Observations:
     """Find and measure the plain chessboards of a field; `missed` receives {row: reason}."""
     boards: dict[tuple[int, int], dict[int, int]] = {}
     for row, code in enumerate(testfield.codes):
-        if is_chess(code):
+        if code.startswith("CHESS:"):
             columns, rows, number = parse_chess(code)
             boards.setdefault((columns, rows), {})[number] = row
-    missed = {} if missed is None else missed
     found = Observations.none()
     grey = to_8_bit(image)
     for (columns, rows), row_of in boards.items():

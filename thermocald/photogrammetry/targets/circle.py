@@ -314,8 +314,14 @@ def fit_circles(
     cut = np.zeros(n, dtype=bool)
     top = np.iinfo(image.dtype).max
     for w in parts:
-        begin = parameters[w.rows]
-        f = _gauss_newton(w, maps.select(w.rows), begin, noise, iterations, work)
+        mine = maps.select(w.rows)
+        f = _step(w, mine, parameters[w.rows], noise, work)
+        for _ in range(iterations - 1):  # only what does not stand yet goes on
+            left = np.flatnonzero(~f.stands)
+            if not len(left):
+                break
+            some = w.select(left), mine.select(left), f.parameters[left]
+            f.put(left, _step(*some, noise, work))
         parameters[w.rows], normal[w.rows], last_step[w.rows] = f.parameters, f.normal, f.step
         pixels[w.rows] = w.weight.sum(axis=1)
         weight = w.weight / noise.variance(f.value)
@@ -353,28 +359,6 @@ class _Fit:
             getattr(self, name)[rows] = getattr(other, name)
 
 
-def _gauss_newton(
-    w: Windows,
-    maps: LocalMap,
-    begin: Array,
-    noise: NoiseModel | None,
-    rounds: int,
-    work: Single,
-) -> _Fit:
-    """Iterate until the centres stand; only what does not stand yet goes on.
-
-    work (2, m): memory for the partials; asking the system for it again costs more than the sums.
-    """
-    f = _step(w, maps, begin, noise, work)
-    for _ in range(rounds - 1):
-        left = np.flatnonzero(~f.stands)
-        if not len(left):
-            break
-        part = maps.select(left)
-        f.put(left, _step(w.select(left), part, f.parameters[left], noise, work))
-    return f
-
-
 def _step(
     w: Windows,
     maps: LocalMap,
@@ -383,7 +367,10 @@ def _step(
     work: Single,
     tells_noise: bool = False,
 ) -> _Fit:
-    """One step of Gauss-Newton; value and residual are those after it."""
+    """One step of Gauss-Newton; value and residual are those after it.
+
+    work (2, m): memory for the partials; asking the system for it again costs more than the sums.
+    """
     p = begin.copy()
     p[:, :2] -= w.origin
     shape = (10, *w.x.shape)

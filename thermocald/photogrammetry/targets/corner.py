@@ -68,17 +68,10 @@ class Corners:
 
     def moved(self, found: Observations) -> Corners:
         """Move places and neighbours by what `found` says of these corners."""
-        at = {int(row): i for i, row in enumerate(found.targets)}
-        shift = np.array(
-            [
-                found.points[at[row]] - place if row in at else (np.nan, np.nan)
-                for row, place in zip(self.rows.tolist(), self.places, strict=True)
-            ]
-        ).reshape(-1, 2)
-        if np.isfinite(shift).any():
-            shift = np.where(np.isfinite(shift), shift, np.nanmedian(shift, axis=0))
-        else:
-            shift = np.zeros_like(shift)
+        _, here, there = np.intersect1d(self.rows, found.targets, return_indices=True)
+        own = found.points[there] - self.places[here]
+        shift = np.zeros_like(self.places) + (np.median(own, axis=0) if len(own) else 0.0)
+        shift[here] = own
         return Corners(
             self.rows, self.places + shift, self.before + shift, self.after + shift, self.quiet
         )

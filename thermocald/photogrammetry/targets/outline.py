@@ -93,14 +93,6 @@ def inverse_2x2(M: Array) -> Array:
     return inverse
 
 
-def target_axes(normals: Array) -> tuple[Array, Array]:
-    """Two unit vectors (n, 3) each that span the planes with these normals (n, 3)."""
-    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    across: Array = np.cross(helper, normals)
-    e1: Array = across / np.linalg.norm(across, axis=1, keepdims=True)
-    return e1, np.cross(normals, e1)
-
-
 def facing(centre: Array, points: Array, normals: Array) -> tuple[Array, Array]:
     """Return the normals (n, 3) of targets at points (n, 3), and the cosines (n,) under which a
     camera at `centre` sees them. A normal that is not known (NaN) is taken to face the camera.
@@ -119,8 +111,10 @@ def local_maps(
     iop (10,), eop (6,). NaN for targets not in front of the camera. Derivatives are differences
     over the target's own radius, so that they hold for its outline and not only for its centre.
     """
-    e1, e2 = target_axes(normals)
-    e1, e2 = e1 * radii[:, None], e2 * radii[:, None]
+    # two radii that span each target's plane
+    across = np.cross(np.eye(3)[np.argmin(np.abs(normals), axis=1)], normals)
+    e1 = across * (radii / np.linalg.norm(across, axis=1))[:, None]
+    e2 = np.cross(normals, e1)
     offsets = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)]
     around = np.concatenate([points + s * e1 + t * e2 for s, t in offsets])
     f = project(sensor, iop, eop, around).reshape(len(offsets), -1, 2)
@@ -129,19 +123,6 @@ def local_maps(
         [f[1] + f[2] - 2 * f[0], (f[5] + f[6] - f[7] - f[8]) / 4, f[3] + f[4] - 2 * f[0]], axis=-1
     )
     return LocalMap(f[0], linear, second)
-
-
-def from_ellipses(centre: Array, semi_axes: Array, angle: Array) -> LocalMap:
-    """Maps of ellipses: centres, semi-axes (n, 2) px, angle (n,) rad of the first semi-axis."""
-    c, s = np.cos(angle), np.sin(angle)
-    linear = np.stack(
-        [
-            np.stack([semi_axes[:, 0] * c, -semi_axes[:, 1] * s], axis=-1),
-            np.stack([semi_axes[:, 0] * s, semi_axes[:, 1] * c], axis=-1),
-        ],
-        axis=1,
-    )
-    return LocalMap(np.array(centre, dtype=float), linear, np.zeros((len(centre), 2, 3)))
 
 
 REACH_PX = 4.0
@@ -341,7 +322,9 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -
     ratio = np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]])
     centre = (e[:, :2] + 0.5) * ratio - 0.5
     # A contour runs through pixel centres, half a pixel inside of the outline.
-    return from_ellipses(centre, scale * (e[:, 2:4] + 0.5), e[:, 4])
+    (a, b), c, s = scale * (e[:, 2:4].T + 0.5), np.cos(e[:, 4]), np.sin(e[:, 4])
+    linear = np.stack([a * c, -b * s, a * s, b * c], axis=1).reshape(-1, 2, 2)
+    return LocalMap(centre, linear, np.zeros((len(e), 2, 3)))
 
 
 def _ellipses(contours: Sequence[Any], longest: float) -> Array:

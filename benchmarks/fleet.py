@@ -37,7 +37,7 @@ from thermocald.acquisition.calibrator import Calibrator
 from thermocald.epoch import Epoch
 from thermocald.fleet.forward import Forwarder
 from thermocald.fleet.overview import fleet_document
-from thermocald.fleet.reprocess import find_blocks, run_blocks
+from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
@@ -166,7 +166,9 @@ def workers(full: bool) -> dict[str, float]:
             started = [cluster.scheduler, *cluster.workers] if cluster else []
             processes = [Process(p.pid) for p in started]
             begin = _processor_time(processes)
-            seconds, _ = timed(lambda: run_blocks(todo, cluster.address if cluster else "local"))
+            seconds, _ = timed(
+                lambda: run_tasks(calibrate_block, todo, cluster.address if cluster else "local")
+            )
             return _processor_time(processes) - begin, seconds
 
         clusters: list[DaskCluster | None] = [None]
@@ -176,7 +178,7 @@ def workers(full: bool) -> dict[str, float]:
         time.sleep(5)
         for count, cluster in enumerate(clusters):  # all is imported
             warm = blocks(f"warm{count}")[: 2 * max(count, 1)]
-            run_blocks(warm, cluster.address if cluster else "local")
+            run_tasks(calibrate_block, warm, cluster.address if cluster else "local")
         for number in range(6 if full else 2):
             rounds.append([])
             for count, cluster in enumerate(clusters):

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
-from thermocald.fleet.reprocess import find_blocks, run_blocks
+from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
@@ -18,10 +18,10 @@ pytestmark = pytest.mark.slow
 
 RUN_BLOCKS = (
     "import sys; from pathlib import Path;"
-    "from thermocald.fleet.reprocess import find_blocks, run_blocks;"
+    "from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks;"
     "from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE;"
     "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 10);"
-    "print([o.error for o in run_blocks(b, sys.argv[3]) if o.error])"
+    "print([o.error for o in run_tasks(calibrate_block, b, sys.argv[3]) if o.error])"
 )
 EVERY_S = 20.0
 
@@ -47,7 +47,7 @@ def start_client(archive, out, dask):
 
 def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, dask):
     """Two workers; one of them is killed while it works."""
-    run_blocks(blocks_of(archive, tmp_path / "one", 10))
+    run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10))
     out = tmp_path / "again"
     client = start_client(archive, out, dask)
     deadline = time.monotonic() + 120
@@ -63,7 +63,7 @@ def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, dask):
 def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archive, tmp_path, dask):
     """One after every few blocks, and another takes its place, as on machines that are lent."""
     archive = archive / "M1"
-    run_blocks(blocks_of(archive, tmp_path / "one", 10))
+    run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10))
     out = tmp_path / "many"
     client = start_client(archive, out, dask)
     killed = done = 0
@@ -85,7 +85,7 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archi
 def test_a_worker_killed_every_20_s_costs_no_frame(tmp_path, dask):
     """Frames are measured again; all recordings hold the same, so one done here is enough."""
     write_frame_archive(tmp_path / "archive", 40, 10)
-    run_blocks(blocks_of(tmp_path / "archive" / "M00", tmp_path / "one", 10))
+    run_tasks(calibrate_block, blocks_of(tmp_path / "archive" / "M00", tmp_path / "one", 10))
     (expected,) = (tmp_path / "one").iterdir()
     out = tmp_path / "many"
     client = start_client(tmp_path / "archive", out, dask)

@@ -11,8 +11,7 @@ import pytest
 
 from tests.fleet.deadly import die
 from thermocald.errors import DataError, UsageError
-from thermocald.fleet import reprocess
-from thermocald.fleet.reprocess import find_blocks, run_blocks
+from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
@@ -27,8 +26,8 @@ def blocks_of(archive, out, size=40):
 
 
 def test_processes_give_the_bits_of_one(archive, tmp_path):
-    run_blocks(blocks_of(archive, tmp_path / "one"))
-    done = run_blocks(blocks_of(archive, tmp_path / "two"), jobs=2)
+    run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one"))
+    done = run_tasks(calibrate_block, blocks_of(archive, tmp_path / "two"), jobs=2)
     assert sum(o.calibrated for o in done) == 300
     assert files(tmp_path / "one") == files(tmp_path / "two")
     table = parquet.read_table(tmp_path / "one")
@@ -38,21 +37,20 @@ def test_processes_give_the_bits_of_one(archive, tmp_path):
 
 def test_an_interrupted_run_goes_on(archive, tmp_path):
     blocks = blocks_of(archive, tmp_path)
-    run_blocks(blocks[:3])
+    run_tasks(calibrate_block, blocks[:3])
     assert blocks_of(archive, tmp_path) == blocks[3:]
 
 
 def test_what_fails_costs_itself(archive, tmp_path):
     blocks = blocks_of(archive, tmp_path, 75)
     blocks[1] = replace(blocks[1], recording=tmp_path / "gone")
-    done = run_blocks(blocks, jobs=2)
+    done = run_tasks(calibrate_block, blocks, jobs=2)
     assert sorted(bool(o.error) for o in done) == [False, False, False, True]
     assert len(files(tmp_path)) == 3
 
 
-def test_a_block_that_kills_its_process_costs_itself(archive, tmp_path, monkeypatch):
-    monkeypatch.setattr(reprocess, "calibrate_block", die)
-    done = run_blocks(blocks_of(archive, tmp_path, 75), jobs=2)
+def test_a_block_that_kills_its_process_costs_itself(archive, tmp_path):
+    done = run_tasks(die, blocks_of(archive, tmp_path, 75), jobs=2)
     assert sorted(o.error for o in done) == ["", "", "", "its process died twice"]
 
 
@@ -60,7 +58,7 @@ def test_bad_usage_is_said(archive, tmp_path):
     with pytest.raises(DataError, match="no recording"):
         find_blocks([tmp_path], tmp_path, ())
     with pytest.raises(UsageError, match="there is `local`"):
-        run_blocks([], "fast")
+        run_tasks(calibrate_block, [], "fast")
 
 
 @pytest.mark.slow
@@ -81,7 +79,7 @@ def test_an_unknown_analysis_and_a_server_to_calibrate_are_said(archive, tmp_pat
 
     with pytest.raises(UsageError, match="there are calibrate, discover, study"):
         find_series_tasks([archive], tmp_path, "dream", 100)
-    with pytest.raises(DataError, match="no series is there"):
+    with pytest.raises(DataError, match="no recording or series is there"):
         find_series_tasks([tmp_path], tmp_path, "study", 100)
 
 
@@ -100,7 +98,7 @@ def test_a_scheduler_that_is_not_there_is_said(archive, tmp_path):
 
 @pytest.mark.parametrize("reader", ["pandas", "duckdb"])
 def test_the_files_are_read_without_us(archive, tmp_path, reader):
-    run_blocks(blocks_of(archive, tmp_path, 75)[:2])
+    run_tasks(calibrate_block, blocks_of(archive, tmp_path, 75)[:2])
     if reader == "pandas":
         pandas = pytest.importorskip("pandas", reason="pip install pandas")
         table = pandas.read_parquet(tmp_path / "rpi-v2.1-M1")

@@ -11,7 +11,7 @@ import os
 import re
 import signal
 import sys
-from typing import Annotated, Any
+from typing import Any
 
 # Small matrices: threads of the linear algebra would only wait for one another (30 × slower on two
 # busy cores). It must be set before NumPy is imported.
@@ -68,13 +68,10 @@ def _say_version(wanted: bool) -> None:
 
 
 def _options(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", help="Say the version and stop.", is_eager=True, callback=_say_version
-        ),
-    ] = False,
-    verbose: Annotated[bool, typer.Option(*_VERBOSE, help="Log more.")] = False,
+    version: bool = typer.Option(
+        False, "--version", help="Say the version and stop.", is_eager=True, callback=_say_version
+    ),
+    verbose: bool = typer.Option(False, *_VERBOSE, help="Log more."),
 ) -> None:
     del version  # said already, before a command is asked for
     log_to_stderr("INFO" if verbose else "WARNING")

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import progress, say, write_json, write_result
-from thermocald.cli.options import (
+from thermocald.cli.common import (
     JsonOption,
     PhotosArgument,
     PixelPitchOption,
     StoreArgument,
     TimezoneOption,
+    progress,
+    say,
+    show,
     takes_log_options,
+    write_json,
 )
 from thermocald.errors import RecordingError, UsageError
 
@@ -23,31 +26,23 @@ from thermocald.errors import RecordingError, UsageError
 @takes_log_options
 def import_(
     photos: PhotosArgument,
-    log: Annotated[Path, typer.Option(help="The logger's file, in any dialect of CSV.")],
-    testfield: Annotated[
-        Path | None, typer.Option(help="The surveyed test field, testfield.csv.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The recording to write (a new folder).")
-    ] = None,
+    log: Path = typer.Option(..., help="The logger's file, in any dialect of CSV."),
+    testfield: Path | None = typer.Option(None, help="The surveyed test field, testfield.csv."),
+    out: Path | None = typer.Option(
+        None, "--out", "-o", help="The recording to write (a new folder)."
+    ),
     pixel_pitch: PixelPitchOption = None,
-    camera: Annotated[Path | None, typer.Option(help="A camera file of any format.")] = None,
-    series: Annotated[str, typer.Option(help="Name of this series.")] = "M1",
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be written, and write nothing.")
-    ] = False,
-    camera_timezone: Annotated[
-        str | None, expert(help="The camera's own, whatever EXIF says of it.")
-    ] = None,
-    camera_clock: Annotated[
-        str, expert(help="How far the camera's clock was ahead: +00:03:12.")
-    ] = "0",
-    times: Annotated[
-        str, expert(help="Of photographs: exif, name (of the file), file (date).")
-    ] = "exif",
-    principal_distance: Annotated[
-        float | None, expert(help="Of the lens, mm; EXIF's by default.", min=0.1)
-    ] = None,
+    camera: Path | None = typer.Option(None, help="A camera file of any format."),
+    series: str = typer.Option("M1", help="Name of this series."),
+    dry_run: bool = typer.Option(
+        False, "--dry-run", help="Show what would be written, and write nothing."
+    ),
+    camera_timezone: str | None = expert(None, help="The camera's own, whatever EXIF says of it."),
+    camera_clock: str = expert("0", help="How far the camera's clock was ahead: +00:03:12."),
+    times: str = expert("exif", help="Of photographs: exif, name (of the file), file (date)."),
+    principal_distance: float | None = expert(
+        None, help="Of the lens, mm; EXIF's by default.", min=0.1
+    ),
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
     log_options: Any = None,
@@ -110,34 +105,30 @@ def import_(
         },
         "notes": notes,
     }  # fmt: skip
-    if write_result(document, json):
-        typer.echo(
+    show(
+        document, json,
             "nothing was written (--dry-run)" if dry_run
             else f"{out}: {len(placed.times)} epochs; next: thermocald replay {out}"
-        )  # fmt: skip
+    )  # fmt: skip
 
 
 def archive(
     store: StoreArgument = None,
-    folder: Annotated[
-        Path, typer.Option("--to", help="The folder in which recordings are written.")
-    ] = Path(),
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="Store and frames of this configuration.")
-    ] = None,
-    frames: Annotated[Path | None, expert(help="The daemon's folder of frames.")] = None,
-    series: Annotated[
-        str | None, typer.Option(help="CAMERA/SERIES or SERIES; default: all.")
-    ] = None,
-    skip_existing: Annotated[
-        bool, expert("--skip-existing", help="Pass over recordings that are there already.")
-    ] = False,
-    finished: Annotated[
-        bool, expert("--finished", help="Only series after which the camera began another.")
-    ] = False,
-    retention: Annotated[
-        bool, expert("--retention", help="Then delete frames as the configuration's limits say.")
-    ] = False,
+    folder: Path = typer.Option(Path(), "--to", help="The folder in which recordings are written."),
+    config: Path | None = typer.Option(
+        None, "--config", "-c", help="Store and frames of this configuration."
+    ),
+    frames: Path | None = expert(None, help="The daemon's folder of frames."),
+    series: str | None = typer.Option(None, help="CAMERA/SERIES or SERIES; default: all."),
+    skip_existing: bool = expert(
+        False, "--skip-existing", help="Pass over recordings that are there already."
+    ),
+    finished: bool = expert(
+        False, "--finished", help="Only series after which the camera began another."
+    ),
+    retention: bool = expert(
+        False, "--retention", help="Then delete frames as the configuration's limits say."
+    ),
     json: JsonOption = None,
 ) -> None:
     """Write every series as a recording `<camera>-<series>`, a folder that replays anywhere.
@@ -166,21 +157,16 @@ def archive(
     deleted = enforce_retention(read) if retention and read is not None else []
     for sentence in deleted:
         say(sentence)
-    if json is not None:
-        write_json({"format": "thermocald-archive/1", **document, "deleted": deleted}, json)
+    write_json({"format": "thermocald-archive/1", **document, "deleted": deleted}, json)
 
 
 def backup(
     store: StoreArgument = None,
-    to: Annotated[
-        Path | None, typer.Argument(help="A file that does not exist yet, or a folder.")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="The store of this configuration.")
-    ] = None,
-    keep: Annotated[
-        int, typer.Option(min=0, help="In a folder: delete all but the newest N; 0: none.")
-    ] = 0,
+    to: Path | None = typer.Argument(None, help="A file that does not exist yet, or a folder."),
+    config: Path | None = typer.Option(
+        None, "--config", "-c", help="The store of this configuration."
+    ),
+    keep: int = typer.Option(0, min=0, help="In a folder: delete all but the newest N; 0: none."),
     json: JsonOption = None,
 ) -> None:
     """Copy a store and read the copy again: every row must be as it was written.
@@ -201,19 +187,18 @@ def backup(
     say(f"{document['backup']}: {document['epochs']} epochs, every row verified")
     for path in document["deleted"]:
         say(f"{path}: deleted, {keep} newer ones are kept")
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
 
 
 _NAMES = {"csv": "observations.csv", "parquet": "observations.parquet"}
 
 
 def convert(
-    recording: Annotated[Path, typer.Argument(help="The recording's folder; changed in place.")],
-    to: Annotated[str, typer.Option(help="csv, or parquet (needs pyarrow).")] = "parquet",
-    keep: Annotated[
-        bool, typer.Option("--keep", help="Keep the other file, under its name with `.old`.")
-    ] = False,
+    recording: Path = typer.Argument(..., help="The recording's folder; changed in place."),
+    to: str = typer.Option("parquet", help="csv, or parquet (needs pyarrow)."),
+    keep: bool = typer.Option(
+        False, "--keep", help="Keep the other file, under its name with `.old`."
+    ),
 ) -> None:
     """Rewrite a recording's observations as Parquet, which reads ten times as fast, or as CSV.
 

@@ -1,19 +1,19 @@
-"""`thermocald calibrate`, `camera`, `predict`, `correct`: a camera calibrated, converted, compared.
+"""`thermocald calibrate`, `camera`, `predict`, `correct`, `measure`: a camera and its use.
 
-And at a temperature, with what was measured with it.
+It is calibrated, converted, compared; at a temperature, with what was measured with it; places in
+metres from its image points.
 """
 
 from __future__ import annotations
 
 import collections
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import progress, say, warned, warnings_said, write_parts, write_result
-from thermocald.cli.options import (
+from thermocald.cli.common import (
     DEFAULT_FREE,
     ExtrapolateOption,
     FreeOption,
@@ -22,39 +22,35 @@ from thermocald.cli.options import (
     ModelOption,
     PixelPitchOption,
     TimezoneOption,
+    progress,
+    say,
+    show,
     takes_log_options,
+    warned,
+    warnings_said,
+    write_json,
+    write_parts,
 )
 from thermocald.errors import DataError, UsageError
 
 
 def calibrate(
-    images: Annotated[
-        list[Path],
-        typer.Argument(metavar="IMAGE_OR_FOLDER…", help="Photographs, or folders of them."),
-    ],
-    testfield: Annotated[Path, typer.Option(help="testfield.csv, in mm.")],
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            help="Camera file: width, height, pixel_pitch, principal_distance, interior; or one "
-            "of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON, as initial values.",
-        ),
-    ] = None,
-    pixel_pitch: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-6, help="Size of a pixel in mm, without --camera or where that lacks it."
-        ),
-    ] = None,
-    camera_out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the camera: .json with covariance (what every --camera takes), or .yaml."
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option(help="Write residuals and coverage as one HTML file.")
-    ] = None,
+    images: list[Path] = typer.Argument(
+        ..., metavar="IMAGE_OR_FOLDER…", help="Photographs, or folders of them."
+    ),
+    testfield: Path = typer.Option(..., help="testfield.csv, in mm."),
+    camera: Path | None = typer.Option(
+        None,
+        help="Camera file: width, height, pixel_pitch, principal_distance, interior; or one "
+        "of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON, as initial values.",
+    ),
+    pixel_pitch: float | None = typer.Option(
+        None, min=1e-6, help="Size of a pixel in mm, without --camera or where that lacks it."
+    ),
+    camera_out: Path | None = typer.Option(
+        None, help="Write the camera: .json with covariance (what every --camera takes), or .yaml."
+    ),
+    report: Path | None = typer.Option(None, help="Write residuals and coverage as one HTML file."),
     free: FreeOption = DEFAULT_FREE,
     json: JsonOption = None,
 ) -> None:
@@ -78,13 +74,10 @@ def calibrate(
             images, testfield, camera=camera, pixel_pitch=pixel_pitch, free=free,
             progress=advance,
         )  # fmt: skip
-    written = []
-    if camera_out is not None:
-        written.append(str(result.save(camera_out)))
+    written = [f"written: {result.save(camera_out)}"] if camera_out is not None else []
     if report is not None:
-        written.append(str(result.report(report)))
-    if write_result(result.as_dict(), json):
-        typer.echo("\n".join([str(result), *(f"written: {line}" for line in written)]))
+        written.append(f"written: {result.report(report)}")
+    show(result, json, result, *written)
     if not result.posed:
         raise DataError(f"no photograph has a result: {result.photographs.reason}")
 
@@ -93,15 +86,15 @@ _FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="FILE", help="A camera file.")],
-    to: Annotated[str, typer.Option(help=f"Format to write: {_FORMATS}.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write.")],
-    from_: Annotated[
-        str | None, expert("--from", help="Format of FILE; default: told by its content.")
-    ] = None,
-    pixel_pitch: Annotated[
-        float | None, typer.Option(help="Size of a pixel in mm, where FILE does not say it.")
-    ] = None,
+    source: Path = typer.Argument(..., metavar="FILE", help="A camera file."),
+    to: str = typer.Option(..., help=f"Format to write: {_FORMATS}."),
+    out: Path = typer.Option(..., "--out", "-o", help="The file to write."),
+    from_: str | None = expert(
+        None, "--from", help="Format of FILE; default: told by its content."
+    ),
+    pixel_pitch: float | None = typer.Option(
+        None, help="Size of a pixel in mm, where FILE does not say it."
+    ),
     json: JsonOption = None,
 ) -> None:
     """Convert a camera file, exactly where the conventions allow, else by a fit whose residual is
@@ -112,24 +105,21 @@ def convert(
     import thermocald as tc
 
     found = tc.convert_camera(source, out, to, format=from_, pixel_pitch=pixel_pitch)
-    if write_result(found.as_dict(), json):
-        typer.echo(str(found))
+    show(found, json)
 
 
 def at(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A thermal model, from `fit`.")],
-    temperature: Annotated[float, typer.Option(help="°C: a camera that has long been there.")],
-    to: Annotated[str, typer.Option(help=f"Format to write: {_FORMATS}, pyorc.")] = "json",
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="The file to write.")] = None,
-    renew: Annotated[
-        Path | None, typer.Option(help="With --to pyorc: its camera configuration.")
-    ] = None,
-    reference: Annotated[
-        Path | None, typer.Option(help="With --to pyorc: the image its points were clicked in.")
-    ] = None,
-    frame: Annotated[
-        Path | None, typer.Option(help="With --to pyorc: measure its points in this image.")
-    ] = None,
+    model: Path = typer.Argument(..., metavar="MODEL", help="A thermal model, from `fit`."),
+    temperature: float = typer.Option(..., help="°C: a camera that has long been there."),
+    to: str = typer.Option("json", help=f"Format to write: {_FORMATS}, pyorc."),
+    out: Path | None = typer.Option(None, "--out", "-o", help="The file to write."),
+    renew: Path | None = typer.Option(None, help="With --to pyorc: its camera configuration."),
+    reference: Path | None = typer.Option(
+        None, help="With --to pyorc: the image its points were clicked in."
+    ),
+    frame: Path | None = typer.Option(
+        None, help="With --to pyorc: measure its points in this image."
+    ),
     extrapolate: ExtrapolateOption = False,
     json: JsonOption = None,
 ) -> None:
@@ -163,17 +153,16 @@ def at(
             statement = renewed.write(out)
         document |= {"out": str(out), "out_format": to, "statement": statement}
         lines.append(f"{out} ({to}): {statement}")
-    if write_result(document, json):
-        typer.echo("\n".join(lines))
+    show(document, json, *lines)
 
 
 def diff(
-    cold: Annotated[Path, typer.Argument(help="A camera file of any format.")],
-    warm: Annotated[Path, typer.Argument(help="Another, of the same sensor.")],
+    cold: Path = typer.Argument(..., help="A camera file of any format."),
+    warm: Path = typer.Argument(..., help="Another, of the same sensor."),
     pixel_pitch: PixelPitchOption = None,
-    report: Annotated[
-        Path | None, typer.Option(help="Draw where in the image they differ, one HTML file.")
-    ] = None,
+    report: Path | None = typer.Option(
+        None, help="Draw where in the image they differ, one HTML file."
+    ),
     json: JsonOption = None,
 ) -> None:
     """Compare two cameras: parameters, and by how much the image differs (WARM minus COLD).
@@ -187,8 +176,7 @@ def diff(
     found = tc.compare_cameras(cold, warm, pixel_pitch=pixel_pitch)
     if report is not None:
         found.report(report)
-    if write_result(found.as_dict(), json):
-        typer.echo(str(found))
+    show(found, json)
 
 
 group = subcommands(at=at, convert=convert, diff=diff)
@@ -197,24 +185,18 @@ group = subcommands(at=at, convert=convert, diff=diff)
 @takes_log_options
 def predict(
     model: ModelOption,
-    temperature: Annotated[
-        float | None, typer.Option(help="°C: a camera that has long been there.")
-    ] = None,
-    log: Annotated[
-        Path | None, typer.Option(help="A logger's file, a recording, or a store.")
-    ] = None,
-    test: Annotated[
-        Path | None, typer.Option(help="Recording or store: how well the model predicts it.")
-    ] = None,
-    programme: Annotated[
-        Path | None, typer.Option(help="Warm-up advice for what is done to the camera.")
-    ] = None,
-    camera: Annotated[Path | None, typer.Option(help="Camera file, for --programme.")] = None,
-    channel: Annotated[
-        list[str] | None, expert(help="NAME=°C of another thermometer; repeatable.")
-    ] = None,
-    distance: Annotated[float, expert(min=0.01, help="Of the object, m.")] = 10.0,
-    wanted: Annotated[float, expert("--wanted-mm", min=1e-3, help="Wanted error there, mm.")] = 5.0,
+    temperature: float | None = typer.Option(None, help="°C: a camera that has long been there."),
+    log: Path | None = typer.Option(None, help="A logger's file, a recording, or a store."),
+    test: Path | None = typer.Option(
+        None, help="Recording or store: how well the model predicts it."
+    ),
+    programme: Path | None = typer.Option(
+        None, help="Warm-up advice for what is done to the camera."
+    ),
+    camera: Path | None = typer.Option(None, help="Camera file, for --programme."),
+    channel: list[str] | None = expert(None, help="NAME=°C of another thermometer; repeatable."),
+    distance: float = expert(10.0, min=0.01, help="Of the object, m."),
+    wanted: float = expert(5.0, "--wanted-mm", min=1e-3, help="Wanted error there, mm."),
     extrapolate: ExtrapolateOption = False,
     log_options: Any = None,
     json: JsonOption = None,
@@ -233,8 +215,7 @@ def predict(
             programme=programme, camera=camera, distance_m=distance, wanted_mm=wanted,
             extrapolate=extrapolate, progress=advance,
         )  # fmt: skip
-    if write_result(found.as_dict(), json):
-        typer.echo(str(found))
+    show(found, json)
 
 
 def _channels(given: list[str]) -> dict[str, float]:
@@ -252,26 +233,19 @@ def _channels(given: list[str]) -> dict[str, float]:
 
 @takes_log_options
 def correct(
-    points: Annotated[
-        Path,
-        typer.Argument(
-            metavar="POINTS.csv",
-            help="Columns time, x, y (px) and others; or time, image; - for standard input.",
-        ),
-    ],
     model: ModelOption,
     log: LogOption,
-    out: Annotated[
-        Path | None, typer.Option(help="CSV to write (points), or folder (images).")
-    ] = None,
-    to: Annotated[float | None, expert(help="°C to correct to; default: the model's T0.")] = None,
-    temperature_sd: Annotated[
-        float | None,
-        expert(min=0.0, help="Of a reading of the log, K; default: as the model's fit found it."),
-    ] = None,
-    image_size: Annotated[
-        str | None, expert("--size", help="WIDTHxHEIGHT where images are binned.")
-    ] = None,
+    points: Path = typer.Argument(
+        ...,
+        metavar="POINTS.csv",
+        help="Columns time, x, y (px) and others; or time, image; - for standard input.",
+    ),
+    out: Path | None = typer.Option(None, help="CSV to write (points), or folder (images)."),
+    to: float | None = expert(None, help="°C to correct to; default: the model's T0."),
+    temperature_sd: float | None = expert(
+        None, min=0.0, help="Of a reading of the log, K; default: as the model's fit found it."
+    ),
+    image_size: str | None = expert(None, "--size", help="WIDTHxHEIGHT where images are binned."),
     extrapolate: ExtrapolateOption = False,
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
@@ -302,7 +276,8 @@ def correct(
             collections.deque(done.lines(), 0)
         else:
             write_parts(done.lines(), "-")
-    if write_result(done.as_dict(), json) and out is not None:
+    write_json(done, json)
+    if json != "-" and out is not None:
         typer.echo(f"{out}: {done}")
     done.require_all()
 
@@ -312,3 +287,42 @@ def _size(text: str) -> tuple[int, int]:
     if not width.isdigit() or not height.isdigit() or int(width) * int(height) == 0:
         raise UsageError(f"--size {text}: write WIDTHxHEIGHT in px, such as 1640x1232")
     return int(width), int(height)
+
+
+@takes_log_options
+def measure(
+    model: ModelOption,
+    log: LogOption,
+    points: Path = typer.Argument(
+        ..., metavar="POINTS.csv", help="Columns time, name, x, y, sx, sy (px)."
+    ),
+    control: Path = typer.Option(
+        ..., help="Control points: target, X, Y, Z, sX, sY, sZ and x, y, sx, sy."
+    ),
+    seen: str = typer.Option(..., metavar="TIME", help="When the control points were seen there."),
+    plane: Path = typer.Option(..., help="YAML: level, or plane, or line; and sd."),
+    length_unit: str = typer.Option("mm", help="Of control points and plane: mm or m."),
+    extrapolate: ExtrapolateOption = False,
+    timezone: TimezoneOption = None,
+    ambiguous: str = "order",
+    log_options: Any = None,
+    json: JsonOption = None,
+) -> None:
+    """Measure where image points lie on a water surface, a plane or a staff.
+
+    Each place has its standard deviation, and stands beside what the camera would have given
+    without its thermal model.
+
+    Example: thermocald measure points.csv --model camera.thermal.yaml --log weather.csv
+    --control gcp.csv --seen 2026-05-04T09:00:00Z --plane water.yaml --length-unit m
+    """
+    import thermocald as tc
+
+    thermal = warned(tc.load_camera(model))
+    with warnings_said():
+        found = tc.measure(
+            points, thermal, log=log, control=control, seen=seen, surface=plane, unit=length_unit,
+            log_options=log_options, timezone=timezone, ambiguous=ambiguous,
+            extrapolate=extrapolate, say=say,
+        )  # fmt: skip
+    show(found, json)

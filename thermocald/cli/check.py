@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import say, write_result
-from thermocald.cli.options import JsonOption
+from thermocald.cli.common import JsonOption, say, show
 from thermocald.errors import DataError, DeviceError
 
 
@@ -23,21 +21,14 @@ def devices(json: JsonOption = None) -> None:
     from thermocald.daemon.soundness import attached, stanzas
 
     found, notes = attached()
-    document = {
-        "format": "thermocald-devices/1",
-        "devices": found,
-        "notes": notes,
-    }
-    if write_result(document, json):
-        typer.echo("\n".join(stanzas(found)))
+    document = {"format": "thermocald-devices/1", "devices": found, "notes": notes}
+    show(document, json, "\n".join(stanzas(found)))
     for note in notes:
         say(note)
 
 
 def doctor(
-    root: Annotated[Path, expert(help="The machine's root folder, such as a mounted card.")] = Path(
-        "/"
-    ),
+    root: Path = expert(Path("/"), help="The machine's root folder, such as a mounted card."),
     json: JsonOption = None,
 ) -> None:
     """Say what this machine lacks: camera stack, groups, I2C, clock, power, disk.
@@ -50,20 +41,17 @@ def doctor(
     from thermocald.machine import Machine, finding_lines
 
     findings = Machine.here(root).findings()
-    if write_result({"format": "thermocald-doctor/1", "findings": findings}, json):
-        typer.echo("\n".join(finding_lines(findings)))
+    document = {"format": "thermocald-doctor/1", "findings": findings}
+    show(document, json, *finding_lines(findings))
     if any(finding.state == "missing" for finding in findings):
         raise typer.Exit(1)
 
 
 def check(
-    source: Annotated[Path, typer.Argument(help="A recording, a config.yaml, or a store.")],
-    probe: Annotated[
-        bool,
-        typer.Option(
-            "--probe", help="Take one frame and one reading from every device of a config."
-        ),
-    ] = False,
+    source: Path = typer.Argument(..., help="A recording, a config.yaml, or a store."),
+    probe: bool = typer.Option(
+        False, "--probe", help="Take one frame and one reading from every device of a config."
+    ),
     json: JsonOption = None,
 ) -> None:
     """Read everything and say what it is; the first thing that is wrong ends it.
@@ -75,8 +63,7 @@ def check(
     from thermocald.daemon.soundness import examine
 
     document = examine(source, probe, say)
-    if write_result(document, json):
-        typer.echo("\n".join(document["lines"]))
+    show(document, json, *document["lines"])
     if damaged := document.get("damaged"):
         raise DataError(
             f"{source}: {len(damaged)} places are damaged, the first: {damaged[0]}; restore a "

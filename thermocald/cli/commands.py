@@ -34,9 +34,9 @@ ADVANCED = "Advanced"
 """The section of options that only experts need."""
 
 
-def expert(*names: str, **told: Any) -> Any:
+def expert(default: Any, *names: str, **told: Any) -> Any:
     """Return an option of the advanced ones; arguments as those of `typer.Option`."""
-    return typer.Option(*names, rich_help_panel=ADVANCED, **told)
+    return typer.Option(default, *names, rich_help_panel=ADVANCED, **told)
 
 
 class Entry(NamedTuple):
@@ -71,7 +71,7 @@ PANELS = {
     "Use": {
         "predict": Entry("camera", "Predict the camera at a temperature, or along a log"),
         "correct": Entry("camera", "Correct image points or images for the temperature"),
-        "measure": Entry("measure", "Measure in metres on a water surface, a plane, a staff"),
+        "measure": Entry("camera", "Measure in metres on a water surface, a plane, a staff"),
         "camera": Entry("camera", "Convert and compare cameras; one at a temperature", True),
     },
     "Test field": {

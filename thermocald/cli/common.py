@@ -1,23 +1,121 @@
-"""What all commands share: where output goes, progress, and errors in one line."""
+"""What all commands share: options, where output goes, progress, and errors in one line."""
 
 from __future__ import annotations
 
+import functools
+import inspect
 import json
 import logging
 import sys
 import warnings
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from thermocald import files
 from thermocald.addresses import CleanFormatter, without_secrets
+from thermocald.cli.commands import expert
 from thermocald.result import jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
     from thermocald import ThermalCamera
+
+JsonOption = Annotated[
+    str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
+]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config", "-c", help="The configuration [./config.yaml, /etc/thermocald/config.yaml]."
+    ),
+]
+StoreArgument = Annotated[Path | None, typer.Argument(help="The store; may be in use by a daemon.")]
+PhotosArgument = Annotated[
+    list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of them.")
+]
+PixelPitchOption = Annotated[
+    float | None, typer.Option("--pixel-pitch", help="Size of a pixel in mm.", min=1e-5, max=1.0)
+]
+LogOption = Annotated[Path, typer.Option("--log", help="A logger's file, a recording, or a store.")]
+ModelOption = Annotated[Path, typer.Option("--model", help="The thermal model.")]
+ExtrapolateOption = Annotated[
+    bool, expert(..., "--extrapolate", help="Allow temperatures far outside the fit.")
+]
+SeedOption = Annotated[int, expert(..., "--seed", min=0, help="Of all random numbers.")]
+TimezoneOption = Annotated[
+    str | None,
+    typer.Option("--timezone", help="Of times without a zone: Europe/Berlin, UTC, +02:00."),
+]
+FreeOption = Annotated[
+    str,
+    expert(
+        ...,
+        "--free",
+        help="Interior orientation to estimate, separated by commas; the rest is held.",
+    ),
+]
+DEFAULT_FREE = "c,x0,y0,A1,A2,A3,B1,B2"
+JobsOption = Annotated[
+    int, expert(..., min=1, max=256, help="Processes; the results are the same to the bit.")
+]
+ExteriorOption = Annotated[
+    str,
+    typer.Option(
+        "--exterior",
+        help="per_epoch: every epoch has its own orientation; series: one for all epochs; mount: "
+        "one and movements of the mount, whose size is estimated; auto: what the data show.",
+    ),
+]
+
+
+def _log_signature(
+    timezone: TimezoneOption = None,
+    temperature_column: list[str] | None = typer.Option(
+        None, help="Of the log; the first is the reference; repeatable."
+    ),
+    name: list[str] | None = typer.Option(
+        None, metavar="COLUMN=LABEL", help="What a column of the log is called."
+    ),
+    unit: str | None = typer.Option(None, help="Of the log where it does not say: degC, K, degF."),
+    date_order: str | None = expert(None, help="Of 06/07/2026: dmy or mdy."),
+    time_column: list[str] | None = expert(None, help="Of the log; twice for a date and a time."),
+    log_timezone: str | None = expert(None, help="The logger's own."),
+    log_clock: str = expert("0", help="How far the logger's clock was ahead: +00:03:12."),
+    ambiguous: str = expert(
+        "order",
+        help="The hour that comes twice in autumn: order (of rows), earlier, later, refuse.",
+    ),
+    separator: str | None = expert(None, help="Of the log's columns: ';' ',' tab."),
+    decimal: str | None = expert(None, help="The log's decimal mark: , or ."),
+) -> None:
+    """How a logger's file is to be read, wherever a command reads one."""
+
+
+def takes_log_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `_log_signature`, which it receives as `log_options`.
+
+    Those that its own signature names it receives by themselves too.
+    """
+    own = inspect.signature(command, eval_str=True).parameters
+    asked = inspect.signature(_log_signature, eval_str=True).parameters
+    kept = [p for name, p in own.items() if name not in asked and name != "log_options"]
+    added = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in asked.values()]
+
+    @functools.wraps(command)
+    def called(**given: Any) -> None:
+        from thermocald.store.logger.temperatures import log_options
+
+        said = {name: given[name] if name in own else given.pop(name) for name in asked}
+        command(**given, log_options=log_options(**said))
+
+    last = kept[-1].replace(kind=inspect.Parameter.KEYWORD_ONLY)
+    called.__signature__ = inspect.Signature([*kept[:-1], *added, last])  # type: ignore[attr-defined]
+    called.__annotations__ = {p.name: p.annotation for p in [*kept, *added]}
+    return called
+
 
 CONFIG_PLACES = (Path("config.yaml"), Path("/etc/thermocald/config.yaml"))
 _NOTICES = ("thermocald.output.dashboard", "thermocald.store.database.file")
@@ -109,16 +207,20 @@ def default_config() -> Path | None:
     return next((path for path in CONFIG_PLACES if path.exists()), None)
 
 
-def write_json(document: Any, destination: str) -> None:
-    """Write one JSON document to a file, or to standard output for `-`."""
-    write_text(json.dumps(jsonable(document), indent=1, allow_nan=False) + "\n", destination)
+def write_json(document: Any, destination: str | None) -> None:
+    """Write one JSON document to a file, to standard output for `-`, for None nowhere."""
+    if destination is not None:
+        write_text(json.dumps(jsonable(document), indent=1, allow_nan=False) + "\n", destination)
 
 
-def write_result(document: Any, json: str | None) -> bool:
-    """Write a command's result where `--json` says; whether standard output is free for lines."""
-    if json is not None:
-        write_json(document, json)
-    return json != "-"
+def show(result: Any, json: str | None, *lines: object) -> None:
+    """Write a command's result where `--json` says, and print lines, by default the result itself.
+
+    Nothing is printed where standard output is the document's.
+    """
+    write_json(result, json)
+    if json != "-":
+        typer.echo("\n".join(map(str, lines or [result])))
 
 
 def warned(camera: ThermalCamera) -> ThermalCamera:

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import progress, say, write_json, write_result
-from thermocald.cli.options import JsonOption, SeedOption
+from thermocald.cli.common import JsonOption, SeedOption, progress, say, show, write_json
 from thermocald.errors import UsageError
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the store and the recording.")] = Path(
-        "thermocald-demo"
+    out: Path = typer.Option(
+        Path("thermocald-demo"), help="Folder for the store and the recording."
     ),
-    epochs: Annotated[int, typer.Option(min=10, help="Of 10 s each.")] = 150,
+    epochs: int = typer.Option(150, min=10, help="Of 10 s each."),
     seed: SeedOption = 0,
-    discovery: Annotated[
-        bool, typer.Option("--discovery/--no-discovery", help="End with a hidden effect found.")
-    ] = True,
+    discovery: bool = typer.Option(
+        True, "--discovery/--no-discovery", help="End with a hidden effect found."
+    ),
     json: JsonOption = None,
 ) -> None:
     """Run the main job on a camera that is rendered: 25 minutes of heating and cooling.
@@ -39,8 +38,7 @@ def demo(
         document["discovery"] = discover_hidden_effect(out, seed, say)
         if json != "-":
             _tell_effect(document["discovery"])
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
 
 
 def _tell(document: dict[str, Any]) -> None:
@@ -86,34 +84,24 @@ def _tell_effect(document: dict[str, Any]) -> None:
 
 
 def simulate(
-    preset: Annotated[
-        str | None, typer.Option(help="A camera of the reference study; see --list.")
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="A thermal model (YAML); replaces the preset's.")
-    ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(help="A camera file (YAML): heat, thermometers, noise.")
-    ] = None,
-    testfield: Annotated[
-        str | None, typer.Option(help="A testfield.csv, or markers, circles, plain.")
-    ] = None,
-    programme: Annotated[
-        Path | None, typer.Option(help="What is done to the camera (YAML).")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="The recording to write.")] = None,
-    frames: Annotated[
-        bool, typer.Option("--frames", help="Render frames instead of measured image points.")
-    ] = False,
-    effect: Annotated[
-        list[Path] | None, expert(help="An effect file (YAML) to add, such as a proposal.")
-    ] = None,
+    preset: str | None = typer.Option(None, help="A camera of the reference study; see --list."),
+    model: Path | None = typer.Option(None, help="A thermal model (YAML); replaces the preset's."),
+    camera: Path | None = typer.Option(
+        None, help="A camera file (YAML): heat, thermometers, noise."
+    ),
+    testfield: str | None = typer.Option(None, help="A testfield.csv, or markers, circles, plain."),
+    programme: Path | None = typer.Option(None, help="What is done to the camera (YAML)."),
+    out: Path | None = typer.Option(None, help="The recording to write."),
+    frames: bool = typer.Option(
+        False, "--frames", help="Render frames instead of measured image points."
+    ),
+    effect: list[Path] | None = expert(
+        None, help="An effect file (YAML) to add, such as a proposal."
+    ),
     seed: SeedOption = 0,
-    series: Annotated[str, typer.Option(help="Name of the series (preset).")] = "M1",
-    model_out: Annotated[
-        Path | None, expert(help="Also write the model that was simulated.")
-    ] = None,
-    list_: Annotated[bool, typer.Option("--list", help="List presets and effects.")] = False,
+    series: str = typer.Option("M1", help="Name of the series (preset)."),
+    model_out: Path | None = expert(None, help="Also write the model that was simulated."),
+    list_: bool = typer.Option(False, "--list", help="List presets and effects."),
     json: JsonOption = None,
 ) -> None:
     """Simulate a camera that warms up, and write a recording of it.
@@ -124,8 +112,7 @@ def simulate(
 
     if list_:
         known = tc.catalogue()
-        if write_result(known.as_dict(), json):
-            typer.echo(str(known))
+        show(known, json)
         return
     if out is None:
         raise UsageError("--out is missing: the folder of the recording to write")
@@ -136,5 +123,5 @@ def simulate(
             model_out=model_out, progress=advance,
         )  # fmt: skip
     assert made.simulation is not None
-    if write_result({**made.simulation.as_dict(), "recording": str(out)}, json):
-        typer.echo(f"{out}: {made.simulation.lines()[0]}")
+    document = {**made.simulation.as_dict(), "recording": out}
+    show(document, json, f"{out}: {made.simulation.lines()[0]}")

@@ -3,47 +3,48 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import progress, say, warnings_said, write_parts, write_result
-from thermocald.cli.options import (
+from thermocald.cli.common import (
     DEFAULT_FREE,
     ExteriorOption,
     FreeOption,
     JobsOption,
     JsonOption,
     TimezoneOption,
+    progress,
+    say,
+    show,
+    warnings_said,
+    write_parts,
 )
 from thermocald.errors import DataError, UsageError
 
 
 def replay(
-    recording: Annotated[Path, typer.Argument(help="The recording's folder.")],
-    store: Annotated[
-        Path | None, typer.Option(help="Keep all in this store; an interrupted replay goes on.")
-    ] = None,
+    recording: Path = typer.Argument(..., help="The recording's folder."),
+    store: Path | None = typer.Option(
+        None, help="Keep all in this store; an interrupted replay goes on."
+    ),
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE,
     jobs: JobsOption = 1,
-    model: Annotated[
-        Path | None, typer.Option(help="Of photographs of a scene: the camera's thermal model.")
-    ] = None,
-    log: Annotated[
-        Path | None, typer.Option(help="With --model: a logger's file, a recording, or a store.")
-    ] = None,
-    times: Annotated[
-        str, expert("--times", help="With --model, when each was taken: exif, name, or file.")
-    ] = "exif",
-    recording_out: Annotated[
-        Path | None,
-        typer.Option(
-            "--recording-out",
-            help="With --model: a folder for what does not move, a recording for `discover`.",
-        ),
-    ] = None,
+    model: Path | None = typer.Option(
+        None, help="Of photographs of a scene: the camera's thermal model."
+    ),
+    log: Path | None = typer.Option(
+        None, help="With --model: a logger's file, a recording, or a store."
+    ),
+    times: str = expert(
+        "exif", "--times", help="With --model, when each was taken: exif, name, or file."
+    ),
+    recording_out: Path | None = typer.Option(
+        None,
+        "--recording-out",
+        help="With --model: a folder for what does not move, a recording for `discover`.",
+    ),
     timezone: TimezoneOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -73,8 +74,7 @@ def replay(
                 recording, camera, log=log, times=times, timezone=timezone, progress=advance,
                 recording=recording_out,
             )  # fmt: skip
-        if write_result(found.as_dict(), json):
-            typer.echo(str(found))
+        show(found, json)
         return
     series = tc.open(recording)
     with progress(len(series), "calibrating") as advance:
@@ -83,8 +83,7 @@ def replay(
         )
     doubts = series.doubts(table)
     document = {**table.as_dict(), "recording": recording, "store": store, "doubts": doubts}
-    if write_result(document, json):
-        typer.echo(str(table))
+    show(document, json, table)
     for line in doubt_lines(doubts):
         say(line)
     if not table.ok.any():
@@ -93,38 +92,26 @@ def replay(
 
 
 def export(
-    source: Annotated[Path, typer.Argument(help="A recording (folder) or a store (file).")],
-    format_: Annotated[str, typer.Option("--format", help="csv, json, or parquet.")] = "csv",
-    output: Annotated[
-        str, typer.Option("--output", "-o", help="File; - is standard output.")
-    ] = "-",
-    exterior: Annotated[
-        str,
-        typer.Option(
-            help="stored: a store's epochs as they were stored; the others adjust the series "
-            "again: auto (of a recording), per_epoch, series, mount.",
-        ),
-    ] = "",
+    source: Path = typer.Argument(..., help="A recording (folder) or a store (file)."),
+    format_: str = typer.Option("csv", "--format", help="csv, json, or parquet."),
+    output: str = typer.Option("-", "--output", "-o", help="File; - is standard output."),
+    exterior: str = typer.Option(
+        "",
+        help="stored: a store's epochs as they were stored; the others adjust the series "
+        "again: auto (of a recording), per_epoch, series, mount.",
+    ),
     free: FreeOption = DEFAULT_FREE,
-    series: Annotated[
-        str | None, typer.Option(help="Which of a store: CAMERA/SERIES or SERIES.")
-    ] = None,
-    units: Annotated[
-        str, typer.Option(help="px, um, deg instead of mm and rad; named in the columns.")
-    ] = "",
-    time_: Annotated[
-        str, typer.Option("--time", help="seconds since 1970 UTC, or iso.")
-    ] = "seconds",
-    separator: Annotated[str, typer.Option(help="Of the columns: , ; | tab")] = ",",
-    decimal: Annotated[str, typer.Option(help="The decimal mark: . or ,")] = ".",
-    extra: Annotated[
-        bool,
-        expert(
-            "--extra",
-            help="All thermometers and all else that is stored of an epoch: camera_… settings as "
-            "the camera reported them, light, blur, the online filter.",
-        ),
-    ] = False,
+    series: str | None = typer.Option(None, help="Which of a store: CAMERA/SERIES or SERIES."),
+    units: str = typer.Option("", help="px, um, deg instead of mm and rad; named in the columns."),
+    time_: str = typer.Option("seconds", "--time", help="seconds since 1970 UTC, or iso."),
+    separator: str = typer.Option(",", help="Of the columns: , ; | tab"),
+    decimal: str = typer.Option(".", help="The decimal mark: . or ,"),
+    extra: bool = expert(
+        False,
+        "--extra",
+        help="All thermometers and all else that is stored of an epoch: camera_… settings as "
+        "the camera reported them, light, blur, the online filter.",
+    ),
     jobs: JobsOption = 1,
 ) -> None:
     """One row per epoch: parameters, standard deviations, sigma0, status.

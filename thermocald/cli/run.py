@@ -16,31 +16,26 @@ from typing import Annotated, Any
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import default_config, say, write_result
-from thermocald.cli.options import ConfigOption, JsonOption
+from thermocald.cli.common import ConfigOption, JsonOption, default_config, say, show
 from thermocald.errors import DataError, StoreError, UsageError
 from thermocald.output.status_text import status_lines
 
 
 def run(
     config: ConfigOption = None,
-    mock: Annotated[
-        bool, typer.Option("--mock", help="A rendered camera that warms up, and a thermometer.")
-    ] = False,
-    recording: Annotated[
-        Path | None, typer.Option(help="Play a recording instead of devices.")
-    ] = None,
-    store: Annotated[
-        Path | None, typer.Option(help="The store; overrides the configuration.")
-    ] = None,
-    epochs: Annotated[int, typer.Option(min=0, help="End after so many epochs per camera.")] = 0,
-    fast: Annotated[
-        bool, expert("--fast", help="Play the recording as fast as it can be calibrated.")
-    ] = False,
-    hang_after: Annotated[
-        float, expert(min=0.5, help="A device that does not return for so many s hangs.")
-    ] = 60.0,
-    dashboard: Annotated[bool, typer.Option("--dashboard", help="Show the web page too.")] = False,
+    mock: bool = typer.Option(
+        False, "--mock", help="A rendered camera that warms up, and a thermometer."
+    ),
+    recording: Path | None = typer.Option(None, help="Play a recording instead of devices."),
+    store: Path | None = typer.Option(None, help="The store; overrides the configuration."),
+    epochs: int = typer.Option(0, min=0, help="End after so many epochs per camera."),
+    fast: bool = expert(
+        False, "--fast", help="Play the recording as fast as it can be calibrated."
+    ),
+    hang_after: float = expert(
+        60.0, min=0.5, help="A device that does not return for so many s hangs."
+    ),
+    dashboard: bool = typer.Option(False, "--dashboard", help="Show the web page too."),
 ) -> None:
     """Acquire, calibrate and keep epochs until told to end (Ctrl-C, SIGTERM).
 
@@ -97,17 +92,15 @@ def run(
 
 
 def dashboard(
-    store: Annotated[Path | None, typer.Option(help="The daemon's store.")] = None,
-    live: Annotated[Path | None, expert(help="The folder of the daemon's live state.")] = None,
-    host: Annotated[str, expert(help="Elsewhere than here needs --token-file.")] = "127.0.0.1",
-    port: Annotated[int, expert(min=1, max=65535)] = 8437,
-    token_file: Annotated[Path | None, expert(help="A file that holds the token.")] = None,
-    name: Annotated[
-        list[str] | None, expert(help="A further name of the page; repeatable.")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="All of these from a configuration.")
-    ] = None,
+    store: Path | None = typer.Option(None, help="The daemon's store."),
+    live: Path | None = expert(None, help="The folder of the daemon's live state."),
+    host: str = expert("127.0.0.1", help="Elsewhere than here needs --token-file."),
+    port: int = expert(8437, min=1, max=65535),
+    token_file: Path | None = expert(None, help="A file that holds the token."),
+    name: list[str] | None = expert(None, help="A further name of the page; repeatable."),
+    config: Path | None = typer.Option(
+        None, "--config", "-c", help="All of these from a configuration."
+    ),
 ) -> None:
     """The web page of a daemon, in a process of its own; it only reads.
 
@@ -154,9 +147,7 @@ def status(
     Example: thermocald status --config /etc/thermocald/config.yaml
     """
     document = read_status(config, store)
-    if write_result(document, json):
-        for line in status_lines(document):
-            typer.echo(line)
+    show(document, json, *status_lines(document))
     store_ = document["store"]
     if store_["lost"]:
         raise DataError(f"{store_['lost']} epochs were lost, taken and not kept")
@@ -167,7 +158,7 @@ def status(
 def top(
     config: _DaemonConfig = None,
     store: StoreOption = None,
-    interval: Annotated[float, typer.Option(min=0.2, help="s.")] = 1.0,
+    interval: float = typer.Option(1.0, min=0.2, help="s."),
 ) -> None:
     """The same, always up to date; q or Ctrl-C ends it.
 

@@ -6,17 +6,27 @@ analysed on its own, wherever that is.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import log_to_stderr, progress, say, write_json, write_result, write_text
-from thermocald.cli.options import DEFAULT_FREE, FreeOption, JobsOption, JsonOption, StoreArgument
+from thermocald.cli.common import (
+    DEFAULT_FREE,
+    FreeOption,
+    JobsOption,
+    JsonOption,
+    StoreArgument,
+    log_to_stderr,
+    progress,
+    say,
+    show,
+    write_json,
+    write_text,
+)
 from thermocald.config import Config, load_config
 from thermocald.errors import DataError, OutputError, UsageError
 from thermocald.store.server.connection import ServerAddress, is_server
@@ -46,10 +56,10 @@ def init(address: _Address) -> None:
 
 def grant(
     address: _Address,
-    role: Annotated[str, typer.Argument(help="A role that exists.")],
-    forward: Annotated[
-        bool, typer.Option("--forward/--read", help="It may only insert; or only read.")
-    ] = False,
+    role: str = typer.Argument(..., help="A role that exists."),
+    forward: bool = typer.Option(
+        False, "--forward/--read", help="It may only insert; or only read."
+    ),
 ) -> None:
     """Let a role forward (insert and nothing else) or read.
 
@@ -63,9 +73,9 @@ def grant(
 
 
 def dashboard(
-    output: Annotated[
-        str, typer.Option("-o", "--output", help="The file to write; - for standard output.")
-    ] = "-",
+    output: str = typer.Option(
+        "-", "-o", "--output", help="The file to write; - for standard output."
+    ),
 ) -> None:
     """Write a dashboard for Grafana (import it; its source is the server, PostgreSQL).
 
@@ -81,17 +91,17 @@ group = subcommands(init=init, grant=grant, dashboard=dashboard)
 
 def forward(
     store: StoreArgument = None,
-    to: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="Store and `forward:` of this file.")
-    ] = None,
-    station: Annotated[str | None, expert(help="This station's name; default: the host's.")] = None,
-    once: Annotated[
-        bool, typer.Option("--once", help="Send what waits, then end; else go on for ever.")
-    ] = False,
-    cursor: Annotated[Path | None, expert(help="Where it keeps how far it has sent.")] = None,
+    to: str | None = typer.Option(
+        None, metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…"
+    ),
+    config: Path | None = typer.Option(
+        None, "--config", "-c", help="Store and `forward:` of this file."
+    ),
+    station: str | None = expert(None, help="This station's name; default: the host's."),
+    once: bool = typer.Option(
+        False, "--once", help="Send what waits, then end; else go on for ever."
+    ),
+    cursor: Path | None = expert(None, help="Where it keeps how far it has sent."),
     json: JsonOption = None,
 ) -> None:
     """Send epochs, events, readings and chosen frames to a PostgreSQL server, each of them once.
@@ -121,7 +131,8 @@ def forward(
     forwarder = Forwarder(store, address, station or socket.gethostname(), cursor, frames=rule)
     if once:
         done = forwarder.send_waiting()
-        if write_result({"sent": dict(done.sent), "refused": done.refused}, json):
+        write_json({"sent": dict(done.sent), "refused": done.refused}, json)
+        if json != "-":
             counts = ", ".join(f"{n} {table}s" for table, n in done.sent.items())
             say(f"sent {counts}" + (f"; {done.refused} refused" if done.refused else ""))
         return
@@ -143,11 +154,10 @@ def _configured(config: Config) -> FrameRule | None:
 
 
 def fleet(
-    servers: Annotated[
-        list[str],
-        typer.Argument(metavar="ADDRESS…", help="postgresql://USER@HOST/DATABASE?station=…"),
-    ],
-    report: Annotated[Path | None, typer.Option(help="Write a page, one HTML file.")] = None,
+    servers: list[str] = typer.Argument(
+        ..., metavar="ADDRESS…", help="postgresql://USER@HOST/DATABASE?station=…"
+    ),
+    report: Path | None = typer.Option(None, help="Write a page, one HTML file."),
     json: JsonOption = None,
 ) -> None:
     """Show late and dead stations, sensors and clocks, odd cameras, and what needs calibration.
@@ -161,8 +171,7 @@ def fleet(
         from thermocald.output.fleet import render_fleet
 
         write_text(render_fleet(document), report)
-    if write_result(document, json):
-        typer.echo("\n".join(fleet_lines(document)))
+    show(document, json, *fleet_lines(document))
 
 
 ANALYSES = ("discover", "study")
@@ -186,22 +195,12 @@ def find_series_tasks(sources: list[Path], out: Path, analysis: str, sets: int) 
 
     Raises DataError where there is none, UsageError for an unknown analysis.
     """
+    from thermocald.fleet.reprocess import find_series
+
     if analysis not in ANALYSES:
         raise UsageError(f"--do {analysis}: there are calibrate, {', '.join(ANALYSES)}")
-    found: dict[str, Path] = {}
-    for source in sources:
-        places = _at_server(source) if is_server(source) else _recordings(source)
-        for name, place in places:
-            if name in found:
-                raise DataError(
-                    f"{source_name(place)} and {source_name(found[name])} are the same series "
-                    f"{name}; analyse them into folders of their own"
-                )
-            found[name] = place
-    if not found:
-        raise DataError(f"{', '.join(map(source_name, sources))}: no series is there")
     tasks = [SeriesTask(analysis, place, out / f"{name}.json", sets)
-             for name, place in sorted(found.items())]  # fmt: skip
+             for name, place in sorted(find_series(sources).items())]  # fmt: skip
     return [task for task in tasks if not task.target.exists()]
 
 
@@ -218,46 +217,18 @@ def analyse(task: SeriesTask) -> Outcome:
     return Outcome(task)
 
 
-def _recordings(folder: Path) -> list[tuple[str, Path]]:
-    from thermocald.store.recording.head import read_head
-
-    found = sorted({p.parent for p in folder.rglob("recording.yaml")})
-    heads = [(read_head(path), path) for path in found]
-    return [(_file_name(head.camera.name, head.series), path) for head, path in heads]
-
-
-def _at_server(address: Path) -> list[tuple[str, Path]]:
-    from thermocald.store.server.reader import ServerStore
-
-    with ServerStore.open(address) as store:
-        every = store.all_series()
-    found = []
-    for series in every:
-        chosen = {"station": str(series.identity["station"]), "camera": series.camera,
-                  "series": series.name}  # fmt: skip
-        found.append((_file_name(*chosen.values()), ServerAddress.narrowed(address, **chosen)))
-    return found
-
-
-def _file_name(*parts: str) -> str:
-    return "-".join(parts).replace(os.sep, "_")
-
-
 def reprocess(
-    archives: Annotated[
-        list[str],
-        typer.Argument(metavar="ARCHIVE…", help="Folders that hold recordings, or postgresql://…"),
-    ],
-    out: Annotated[Path, typer.Option(help="Where the files are written.")],
-    do: Annotated[
-        str, typer.Option(help="calibrate every epoch, or discover, study every series.")
-    ] = "calibrate",
-    engine: Annotated[str, expert(help="local, or a Dask scheduler: tcp://HOST:8786.")] = "local",
+    archives: list[str] = typer.Argument(
+        ..., metavar="ARCHIVE…", help="Folders that hold recordings, or postgresql://…"
+    ),
+    out: Path = typer.Option(..., help="Where the files are written."),
+    do: str = typer.Option(
+        "calibrate", help="calibrate every epoch, or discover, study every series."
+    ),
+    engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
     jobs: JobsOption = 1,
     free: FreeOption = DEFAULT_FREE,
-    sets: Annotated[
-        int, expert(min=100, max=10_000_000, help="Of a study's Monte-Carlo.")
-    ] = 100_000,
+    sets: int = expert(100_000, min=100, max=10_000_000, help="Of a study's Monte-Carlo."),
     json: JsonOption = None,
 ) -> None:
     """Calibrate every epoch of every recording again, or analyse every series on its own.
@@ -268,7 +239,7 @@ def reprocess(
 
     Example: thermocald reprocess archive --out again --jobs 2
     """
-    from thermocald.fleet.reprocess import find_blocks, run_blocks, run_tasks
+    from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
     from thermocald.series import free_names
 
     sources = [Path(archive) for archive in archives]
@@ -281,40 +252,32 @@ def reprocess(
                 )
         blocks = find_blocks(sources, out, free_names(free))
         with progress(len(blocks), "blocks") as advance:
-            outcomes = run_blocks(blocks, engine, jobs, lambda _: advance(1))
+            outcomes = run_tasks(calibrate_block, blocks, engine, jobs, lambda _: advance(1))
     else:
         tasks = find_series_tasks(sources, out, do, sets)
         with progress(len(tasks), "series") as advance:
             outcomes = run_tasks(analyse, tasks, engine, jobs, lambda _: advance(1))
     count, failed = len(outcomes), [o for o in outcomes if o.error]
+    document: dict[str, Any]
     if do == "calibrate":
         epochs = sum(o.epochs for o in outcomes)
         calibrated = sum(o.calibrated for o in outcomes)
-        document = {
-            "blocks": count,
-            "epochs": epochs,
-            "calibrated": calibrated,
-            "failed": [
-                {"recording": o.task.recording, "first": o.task.first, "error": o.error}
-                for o in failed
-            ],
-        }
+        document = {"blocks": count, "epochs": epochs, "calibrated": calibrated}
+        places = [{"recording": o.task.recording, "first": o.task.first} for o in failed]
         said = f"{calibrated} of {epochs} epochs calibrated in {count - len(failed)} blocks"
     else:
-        document = {
-            "series": count,
-            "failed": [{"source": source_name(o.task.source), "error": o.error} for o in failed],
-        }
+        document = {"series": count}
+        places = [{"source": source_name(o.task.source)} for o in failed]
         said = f"{count - len(failed)} of {count} series done"
-    if write_result(document, json):
+    errors = [{**place, "error": o.error} for place, o in zip(places, failed, strict=True)]
+    write_json({**document, "failed": errors}, json)
+    if json != "-":
         say(f"{out}: {said}")
     if not failed:
         return
     first = failed[0]
     if first.not_written:
         raise OutputError(first.error, first.not_written)
-    if do == "calibrate":
-        what, where = "blocks", f"{first.task.recording}, epoch {first.task.first + 1} on"
-    else:
-        what, where = "series", source_name(first.task.source)
+    where = places[0].get("source") or f"{first.task.recording}, epoch {first.task.first + 1} on"
+    what = next(iter(document))
     raise DataError(f"{len(failed)} of {count} {what} failed; {where}: {first.error}")

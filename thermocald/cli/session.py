@@ -9,8 +9,7 @@ import numpy as np
 import typer
 
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import default_config, say, write_json
-from thermocald.cli.options import ConfigOption, JsonOption
+from thermocald.cli.common import ConfigOption, JsonOption, default_config, say, write_json
 from thermocald.errors import DataError, UsageError
 from thermocald.files import make_folder
 
@@ -26,47 +25,30 @@ CameraOption = Annotated[
 
 def start(
     camera: CameraOption = None,
-    series: Annotated[str, typer.Option(help="Name of the series; resumes it.")] = "M1",
-    condition: Annotated[
-        str, typer.Option("--start", help="Start condition, such as cold or warm.")
-    ] = "",
-    epochs: Annotated[int, typer.Option(min=1, help="How many epochs.")] = 150,
+    series: str = typer.Option("M1", help="Name of the series; resumes it."),
+    condition: str = typer.Option("", "--start", help="Start condition, such as cold or warm."),
+    epochs: int = typer.Option(150, min=1, help="How many epochs."),
     config: ConfigOption = None,
-    mock: Annotated[bool, typer.Option("--mock", help="Without hardware.")] = False,
-    programme: Annotated[
-        Path | None, typer.Option(help="Steps of a heating output: YAML list.")
-    ] = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for recording and report.")
-    ] = Path(),
-    check: Annotated[
-        bool, typer.Option("--check/--no-check", help="Look at light, focus, geometry first.")
-    ] = True,
-    report: Annotated[
-        bool, typer.Option("--report/--no-report", help="End with the study's report.")
-    ] = True,
-    wait: Annotated[
-        bool, typer.Option("--wait/--no-wait", help="Wait for a daemon to take all epochs.")
-    ] = True,
-    until_separated: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A,B", help="Heat so that two effects separate, and stop when they are."
-        ),
-    ] = None,
-    evidence: Annotated[
-        Path | None, expert(help="A recording that could not separate them.")
-    ] = None,
-    max_temperature: Annotated[
-        float | None, expert(help="Highest °C of a planned programme [the output's].")
-    ] = None,
-    max_rate: Annotated[
-        float, expert(min=0.1, max=60.0, help="Fastest planned rise, K/min.")
-    ] = 3.0,
-    max_duty: Annotated[float, expert(min=0.05, max=1.0, help="Share of time with heat.")] = 0.8,
-    dry_run: Annotated[
-        bool, expert("--dry-run", help="Print the planned programme and end.")
-    ] = False,
+    mock: bool = typer.Option(False, "--mock", help="Without hardware."),
+    programme: Path | None = typer.Option(None, help="Steps of a heating output: YAML list."),
+    output: Path = typer.Option(Path(), "--output", "-o", help="Folder for recording and report."),
+    check: bool = typer.Option(
+        True, "--check/--no-check", help="Look at light, focus, geometry first."
+    ),
+    report: bool = typer.Option(True, "--report/--no-report", help="End with the study's report."),
+    wait: bool = typer.Option(
+        True, "--wait/--no-wait", help="Wait for a daemon to take all epochs."
+    ),
+    until_separated: str | None = typer.Option(
+        None, metavar="A,B", help="Heat so that two effects separate, and stop when they are."
+    ),
+    evidence: Path | None = expert(None, help="A recording that could not separate them."),
+    max_temperature: float | None = expert(
+        None, help="Highest °C of a planned programme [the output's]."
+    ),
+    max_rate: float = expert(3.0, min=0.1, max=60.0, help="Fastest planned rise, K/min."),
+    max_duty: float = expert(0.8, min=0.05, max=1.0, help="Share of time with heat."),
+    dry_run: bool = expert(False, "--dry-run", help="Print the planned programme and end."),
 ) -> None:
     """Take a series of epochs with progress, then write its recording and its report.
 
@@ -116,8 +98,7 @@ def status(config: ConfigOption = None, json: JsonOption = None) -> None:
     Example: thermocald session status --config /etc/thermocald/config.yaml
     """
     sessions = _ask(config, "session status")["sessions"]
-    if json is not None:
-        write_json({"format": "thermocald-sessions/1", "sessions": sessions}, json)
+    write_json({"format": "thermocald-sessions/1", "sessions": sessions}, json)
     if json == "-":
         return
     for name, one in sessions.items():

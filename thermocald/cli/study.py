@@ -7,13 +7,12 @@ proof; one thermal model from all series of a camera.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import progress, say, write_result
-from thermocald.cli.options import (
+from thermocald.cli.common import (
     DEFAULT_FREE,
     ExteriorOption,
     FreeOption,
@@ -21,6 +20,9 @@ from thermocald.cli.options import (
     JsonOption,
     SeedOption,
     TimezoneOption,
+    progress,
+    say,
+    show,
     takes_log_options,
 )
 from thermocald.errors import UsageError
@@ -33,43 +35,35 @@ if TYPE_CHECKING:
 
 
 def study(
-    inputs: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[LABEL=]RECORDING_OR_STORE…",
-            help="Recordings (folders) and stores (files). Series with one label are one camera; "
-            "the label is the camera's name unless given.",
-        ),
-    ] = None,
+    inputs: list[str] | None = typer.Argument(
+        None,
+        metavar="[LABEL=]RECORDING_OR_STORE…",
+        help="Recordings (folders) and stores (files). Series with one label are one camera; "
+        "the label is the camera's name unless given.",
+    ),
     json: JsonOption = None,
-    report: Annotated[Path | None, typer.Option(help="Write the report, one HTML file.")] = None,
-    figures: Annotated[
-        Path | None, typer.Option(help="Write all figures as SVG and PNG here.")
-    ] = None,
-    window: Annotated[int, expert(min=3, help="Epochs in the F-test's window, odd.")] = 31,
-    alpha: Annotated[float, expert(min=1e-6, max=0.5, help="Level of the F-test.")] = 0.05,
-    sets: Annotated[int, expert(min=2, help="Interior orientations drawn (Monte-Carlo).")] = 50_000,
+    report: Path | None = typer.Option(None, help="Write the report, one HTML file."),
+    figures: Path | None = typer.Option(None, help="Write all figures as SVG and PNG here."),
+    window: int = expert(31, min=3, help="Epochs in the F-test's window, odd."),
+    alpha: float = expert(0.05, min=1e-6, max=0.5, help="Level of the F-test."),
+    sets: int = expert(50_000, min=2, help="Interior orientations drawn (Monte-Carlo)."),
     seed: SeedOption = 0,
-    distance: Annotated[float, expert(min=0.01, help="Of the object plane, m.")] = 10.0,
-    grid: Annotated[
-        int, expert("--grid", min=2, max=9, help="Image points per row and column.")
-    ] = 3,
-    focus: Annotated[
-        float, expert(min=0.01, help="Focus distance for the depth of field, m.")
-    ] = 1.0,
-    f_number: Annotated[float, expert(min=0.1, help="Of the lens.")] = 2.0,
-    confusion: Annotated[
-        float | None, expert(min=1e-6, help="Circle of confusion, mm [diagonal/2000].")
-    ] = None,
-    thermometer_sd: Annotated[
-        float | None, expert(min=0.0, help="Noise of the thermometers, K [estimated].")
-    ] = None,
+    distance: float = expert(10.0, min=0.01, help="Of the object plane, m."),
+    grid: int = expert(3, "--grid", min=2, max=9, help="Image points per row and column."),
+    focus: float = expert(1.0, min=0.01, help="Focus distance for the depth of field, m."),
+    f_number: float = expert(2.0, min=0.1, help="Of the lens."),
+    confusion: float | None = expert(
+        None, min=1e-6, help="Circle of confusion, mm [diagonal/2000]."
+    ),
+    thermometer_sd: float | None = expert(
+        None, min=0.0, help="Noise of the thermometers, K [estimated]."
+    ),
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE,
     jobs: JobsOption = 1,
-    reference: Annotated[
-        bool, expert("--reference", help="Study the presets instead, next to the reference study.")
-    ] = False,
+    reference: bool = expert(
+        False, "--reference", help="Study the presets instead, next to the reference study."
+    ),
 ) -> None:
     """How the camera changes with its temperature, whether that is significant, what it does.
 
@@ -103,13 +97,10 @@ def study(
             result = tc.reference_study(progress=advance, **settings)
     else:
         result = _study(inputs or [], settings, exterior, free)
-    written = []
-    if report is not None:
-        written.append(str(result.report(report)))
+    written = [f"written: {result.report(report)}"] if report is not None else []
     if figures is not None:
-        written.append(f"{len(result.save_figures(figures))} figures in {figures}")
-    if write_result(result.as_dict(), json):
-        typer.echo("\n".join([str(result), *(f"written: {line}" for line in written)]))
+        written.append(f"written: {len(result.save_figures(figures))} figures in {figures}")
+    show(result, json, result, *written)
 
 
 def _study(inputs: list[str], settings: dict[str, Any], exterior: str, free: str) -> Study:
@@ -138,39 +129,26 @@ def _labelled(text: str) -> tuple[str | None, Path]:
 
 
 def discover(
-    recording: Annotated[
-        Path | None,
-        typer.Argument(metavar="M1", help="What to explain: a recording, a store, postgresql://…"),
-    ] = None,
-    verify: Annotated[
-        list[Path] | None,
-        typer.Option(help="M2: another recording of this camera, to prove it on; repeatable."),
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="The model so far (YAML) [base model].")
-    ] = None,
+    recording: Path | None = typer.Argument(
+        None, metavar="M1", help="What to explain: a recording, a store, postgresql://…"
+    ),
+    verify: list[Path] | None = typer.Option(
+        None, help="M2: another recording of this camera, to prove it on; repeatable."
+    ),
+    model: Path | None = typer.Option(None, help="The model so far (YAML) [base model]."),
     json: JsonOption = None,
-    model_out: Annotated[
-        Path | None, typer.Option(help="Write the model with what was found.")
-    ] = None,
-    effect_out: Annotated[
-        Path | None, expert(help="Write what was found as an effect file (YAML).")
-    ] = None,
-    report: Annotated[Path | None, typer.Option(help="Write a report, one HTML file.")] = None,
+    model_out: Path | None = typer.Option(None, help="Write the model with what was found."),
+    effect_out: Path | None = expert(None, help="Write what was found as an effect file (YAML)."),
+    report: Path | None = typer.Option(None, help="Write a report, one HTML file."),
     jobs: JobsOption = 1,
-    plan: Annotated[
-        bool,
-        typer.Option("--plan", help="Which effects a set-up would show, before heating anything."),
-    ] = False,
-    preset: Annotated[
-        str | None, typer.Option(help="With --plan: a camera of the reference study.")
-    ] = None,
-    testfield: Annotated[str | None, typer.Option(help="With --plan: a testfield.csv.")] = None,
-    programme: Annotated[
-        Path | None, typer.Option(help="With --plan: what is done to the camera.")
-    ] = None,
-    strength: Annotated[float, expert(min=0.001, help="With --plan: size of an effect, px.")] = 0.1,
-    seeds: Annotated[int, expert(min=1, max=50, help="With --plan: repetitions.")] = 2,
+    plan: bool = typer.Option(
+        False, "--plan", help="Which effects a set-up would show, before heating anything."
+    ),
+    preset: str | None = typer.Option(None, help="With --plan: a camera of the reference study."),
+    testfield: str | None = typer.Option(None, help="With --plan: a testfield.csv."),
+    programme: Path | None = typer.Option(None, help="With --plan: what is done to the camera."),
+    strength: float = expert(0.1, min=0.001, help="With --plan: size of an effect, px."),
+    seeds: int = expert(2, min=1, max=50, help="With --plan: repetitions."),
 ) -> None:
     """Find where simulation and measurement disagree, name the missing effect, prove it.
 
@@ -185,8 +163,7 @@ def discover(
                 testfield=testfield, programme=programme, strength_px=strength, seeds=seeds,
                 progress=advance,
             )  # fmt: skip
-        if write_result(planned.as_dict(), json):
-            typer.echo(str(planned))
+        show(planned, json)
         return
     if recording is None:
         raise UsageError("M1 is missing: the folder of the recording to explain")
@@ -199,53 +176,40 @@ def discover(
         say(f"{effect_out} is not written: nothing was found that another recording would show too")
     if report is not None:
         found.report(report)
-    if write_result(document, json):
-        typer.echo(str(found))
+    show(document, json, found)
 
 
 @takes_log_options
 def fit(
-    inputs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RECORDING_OR_STORE…",
-            help="Recordings and stores; or JSON files of `calibrate`, each with its °C: "
-            "21.5=cold.json.",
-        ),
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The model file to write.")],
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME[:PARAMETER=VALUE,…] to fit alongside the base model; repeatable."),
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="Fit the effects of this model, such as discovery wrote it.")
-    ] = None,
-    reference_temperature: Annotated[
-        float | None, expert("--t0", help="Reference temperature °C; default: the mean.")
-    ] = None,
-    type_name: Annotated[
-        str | None,
-        typer.Option(
-            "--type",
-            metavar="NAME|MODEL",
-            help="Several cameras: fit each, write the type NAME. One: its type's MODEL file helps "
-            "where it was measured at few temperatures.",
-        ),
-    ] = None,
-    code: Annotated[
-        Path | None, expert(help="Write the model as FILE.h (C, C++) and FILE.py too.")
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option(help="Write the model's certificate, one HTML file.")
-    ] = None,
-    log: Annotated[
-        Path | None,
-        typer.Option(help="Temperatures of calibrations, at their photographs' times."),
-    ] = None,
-    temperature_sd: Annotated[
-        float, expert(min=0.0, help="Of the temperature of a calibration, K.")
-    ] = 0.1,
+    inputs: list[str] = typer.Argument(
+        ...,
+        metavar="RECORDING_OR_STORE…",
+        help="Recordings and stores; or JSON files of `calibrate`, each with its °C: "
+        "21.5=cold.json.",
+    ),
+    output: Path = typer.Option(..., "-o", "--output", help="The model file to write."),
+    effect: list[str] | None = typer.Option(
+        None, help="NAME[:PARAMETER=VALUE,…] to fit alongside the base model; repeatable."
+    ),
+    model: Path | None = typer.Option(
+        None, help="Fit the effects of this model, such as discovery wrote it."
+    ),
+    reference_temperature: float | None = expert(
+        None, "--t0", help="Reference temperature °C; default: the mean."
+    ),
+    type_name: str | None = typer.Option(
+        None,
+        "--type",
+        metavar="NAME|MODEL",
+        help="Several cameras: fit each, write the type NAME. One: its type's MODEL file helps "
+        "where it was measured at few temperatures.",
+    ),
+    code: Path | None = expert(None, help="Write the model as FILE.h (C, C++) and FILE.py too."),
+    report: Path | None = typer.Option(None, help="Write the model's certificate, one HTML file."),
+    log: Path | None = typer.Option(
+        None, help="Temperatures of calibrations, at their photographs' times."
+    ),
+    temperature_sd: float = expert(0.1, min=0.0, help="Of the temperature of a calibration, K."),
     jobs: JobsOption = 1,
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
@@ -292,8 +256,7 @@ def fit(
         from thermocald.output.certificate import render_certificate
 
         write_text(report, render_certificate(camera))
-    if write_result(document, json):
-        typer.echo(f"{output}: {camera}")
+    show(document, json, f"{output}: {camera}")
 
 
 def _temperatures(inputs: list[str]) -> dict[str, float | None]:

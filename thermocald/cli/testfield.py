@@ -9,8 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import say, write_result
-from thermocald.cli.options import JsonOption, PhotosArgument, PixelPitchOption
+from thermocald.cli.common import (
+    JsonOption,
+    PhotosArgument,
+    PixelPitchOption,
+    say,
+    show,
+)
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
@@ -55,21 +60,17 @@ Point = tuple[float, float, float]
 
 
 def print_(
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write into.")],
+    out: Path = typer.Option(..., "--out", "-o", help="The folder to write into."),
     paper: Paper = "A3",
     flat: Flat = False,
     landscape: Landscape = None,
     diameter: Diameter = None,
-    bits: Annotated[int | None, expert(help="Of the ring codes: 12, 14, or 0 for none.")] = None,
-    plain: Annotated[
-        bool, expert("--plain/--no-plain", help="Plain circles between the coded ones.")
-    ] = True,
-    markers: Annotated[
-        str | None, expert(help="Markers too, of a dictionary: DICT_APRILTAG_36h11.")
-    ] = None,
-    light: Annotated[bool, expert("--light", help="White targets on black.")] = False,
-    first_code: Annotated[int, expert(min=0, help="Skip so many codes: for a second field.")] = 0,
-    pitch: Annotated[float | None, expert(help="Distance of the coded targets, mm.")] = None,
+    bits: int | None = expert(None, help="Of the ring codes: 12, 14, or 0 for none."),
+    plain: bool = expert(True, "--plain/--no-plain", help="Plain circles between the coded ones."),
+    markers: str | None = expert(None, help="Markers too, of a dictionary: DICT_APRILTAG_36h11."),
+    light: bool = expert(False, "--light", help="White targets on black."),
+    first_code: int = expert(0, min=0, help="Skip so many codes: for a second field."),
+    pitch: float | None = expert(None, help="Distance of the coded targets, mm."),
     charuco: Charuco = None,
     chessboard: Chessboard = None,
     aprilgrid: AprilGrid = None,
@@ -78,9 +79,9 @@ def print_(
     spacing: Spacing = 0.3,
     dictionary: Dictionary = "DICT_5X5_1000",
     legacy: Legacy = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace a test field that was printed before.")
-    ] = False,
+    force: bool = typer.Option(
+        False, "--force", help="Replace a test field that was printed before."
+    ),
     json: JsonOption = None,
 ) -> None:
     """Draw a test field: a PDF, an SVG per sheet, and the testfield.csv that belongs to it.
@@ -109,41 +110,32 @@ def print_(
             pitch=pitch,
         )  # fmt: skip
         printed = sheets.print_testfield(design, out, replace_printed=force)
-    if write_result(printed.as_dict(), json):
-        typer.echo("\n".join(printed.lines()))
-        if printed.is_flat:
-            say(sheets.ONE_PLANE)
+    show(printed, json, *printed.lines())
+    if printed.is_flat and json != "-":
+        say(sheets.ONE_PLANE)
 
 
 def import_(
-    source: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[FILE]",
-            help="Kalibr's target.yaml, OpenCV's parameters, a file of calib.io's, or a list.",
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The testfield.csv to write.")] = Path(
-        "testfield.csv"
+    source: Path | None = typer.Argument(
+        None,
+        metavar="[FILE]",
+        help="Kalibr's target.yaml, OpenCV's parameters, a file of calib.io's, or a list.",
+    ),
+    out: Path = typer.Option(
+        Path("testfield.csv"), "--out", "-o", help="The testfield.csv to write."
     ),
     charuco: Charuco = None,
     chessboard: Chessboard = None,
     aprilgrid: AprilGrid = None,
-    rings: Annotated[
-        int | None, expert(help="FILE lists targets with ring codes of 12 or 14 bits.")
-    ] = None,
+    rings: int | None = expert(None, help="FILE lists targets with ring codes of 12 or 14 bits."),
     square: Square = None,
     marker: MarkerSide = None,
     spacing: Spacing = 0.3,
     dictionary: Dictionary = "DICT_5X5_1000",
     legacy: Legacy = False,
-    diameter: Annotated[
-        float | None, typer.Option(min=0.1, help="Of ring-coded discs, mm.")
-    ] = None,
-    sigma: Annotated[
-        float | None, typer.Option(min=1e-4, help="Of a coordinate, mm, if measured.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    diameter: float | None = typer.Option(None, min=0.1, help="Of ring-coded discs, mm."),
+    sigma: float | None = typer.Option(None, min=1e-4, help="Of a coordinate, mm, if measured."),
+    force: bool = typer.Option(False, "--force", help="Replace an existing file."),
     json: JsonOption = None,
 ) -> None:
     """Make a testfield.csv of a board that you own: ChArUco, chessboard, AprilGrid, coded rings.
@@ -187,32 +179,28 @@ def import_(
         "format": "thermocald-testfield-import/1", "testfield": out, "what": said,
         "targets": len(field), "extent": extent,
     }  # fmt: skip
-    if write_result(document, json):
-        typer.echo(f"{out}: {said}, {len(field)} targets, {extent[0]:.1f} × {extent[1]:.1f} mm")
+    show(
+        document, json, f"{out}: {said}, {len(field)} targets, {extent[0]:.1f} × {extent[1]:.1f} mm"
+    )
 
 
 def survey(
     photos: PhotosArgument,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The testfield.csv to write.")],
-    scale: Annotated[
-        tuple[str, str, float] | None,
-        typer.Option(metavar="A B MM", help="Two targets and their measured distance."),
-    ] = None,
-    scale_sd: Annotated[float, expert(min=1e-6, help="Its standard deviation, mm.")] = 0.1,
-    distances: Annotated[
-        Path | None, expert(help="More of them, a CSV: a, b, length, sigma in mm.")
-    ] = None,
-    field: Annotated[
-        Path | None, typer.Option(help="The nominal testfield.csv, as printed; for plain circles.")
-    ] = None,
+    out: Path = typer.Option(..., "--out", "-o", help="The testfield.csv to write."),
+    scale: tuple[str, str, float] | None = typer.Option(
+        None, metavar="A B MM", help="Two targets and their measured distance."
+    ),
+    scale_sd: float = expert(0.1, min=1e-6, help="Its standard deviation, mm."),
+    distances: Path | None = expert(None, help="More of them, a CSV: a, b, length, sigma in mm."),
+    field: Path | None = typer.Option(
+        None, help="The nominal testfield.csv, as printed; for plain circles."
+    ),
     camera: CameraFile = None,
-    hold_camera: Annotated[
-        bool, expert("--hold-camera", help="Trust --camera and do not calibrate it again.")
-    ] = False,
+    hold_camera: bool = expert(
+        False, "--hold-camera", help="Trust --camera and do not calibrate it again."
+    ),
     pixel_pitch: PixelPitchOption = None,
-    camera_out: Annotated[
-        Path | None, typer.Option(help="Write the camera that was found (JSON).")
-    ] = None,
+    camera_out: Path | None = typer.Option(None, help="Write the camera that was found (JSON)."),
     json: JsonOption = None,
 ) -> None:
     """Measure a test field from photographs of it: coordinates and their standard deviations.
@@ -229,34 +217,29 @@ def survey(
         photos, scale=scale, scale_sd=scale_sd, distances=distances, field=field, camera=camera,
         hold_camera=hold_camera, pixel_pitch=pixel_pitch, out=out, camera_out=camera_out, say=say,
     )  # fmt: skip
-    if write_result({**result.as_dict(), "testfield": str(out)}, json):
-        typer.echo(f"{out}: " + "\n".join(result.lines()))
+    lines = "\n".join(result.lines())
+    show({**result.as_dict(), "testfield": out}, json, f"{out}: {lines}")
 
 
 def check(
-    field: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[FIELD]", help="A testfield.csv; without it what `print` would draw."
-        ),
-    ] = None,
+    field: Path | None = typer.Argument(
+        None, metavar="[FIELD]", help="A testfield.csv; without it what `print` would draw."
+    ),
     paper: Paper = "A3",
     flat: Flat = False,
     landscape: Landscape = None,
     diameter: Diameter = None,
     camera: CameraFile = None,
     pixel_pitch: PixelPitchOption = None,
-    place: Annotated[
-        Point | None,
-        typer.Option("--from", metavar="X Y Z", help="Where the camera stands, mm."),
-    ] = None,
-    at: Annotated[
-        Point | None,
-        expert(metavar="X Y Z", help="What it looks at; default the field's middle."),
-    ] = None,
-    roll: Annotated[float, expert(help="Turned about its axis, degrees.")] = 0.0,
-    sigma: Annotated[float, expert(min=1e-4, help="Of an image coordinate, px.")] = 0.03,
-    report: Annotated[Path | None, typer.Option(help="Write a report, one HTML file.")] = None,
+    place: Point | None = typer.Option(
+        None, "--from", metavar="X Y Z", help="Where the camera stands, mm."
+    ),
+    at: Point | None = expert(
+        None, metavar="X Y Z", help="What it looks at; default the field's middle."
+    ),
+    roll: float = expert(0.0, help="Turned about its axis, degrees."),
+    sigma: float = expert(0.03, min=1e-4, help="Of an image coordinate, px."),
+    report: Path | None = typer.Option(None, help="Write a report, one HTML file."),
     json: JsonOption = None,
 ) -> None:
     """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
@@ -287,8 +270,7 @@ def check(
         from thermocald.output.calibration import render_field_check
 
         write_text(report, render_field_check(found))
-    if write_result(found.as_dict(), json):
-        typer.echo("\n".join(found.lines()))
+    show(found, json, *found.lines())
 
 
 def _board(

@@ -26,9 +26,13 @@ from thermocald.errors import DataError, OutputError, ServerGone, ThermocaldErro
 from thermocald.parallel import processes
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.store.recording.head import read_head
 from thermocald.store.recording.parquet_table import write_parquet
 from thermocald.store.recording.reader import open_recording
 from thermocald.store.series import EpochResult
+from thermocald.store.server.connection import ServerAddress, is_server
+from thermocald.store.server.reader import ServerStore
+from thermocald.store.sources import source_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -156,32 +160,53 @@ class Block:
     free: tuple[str, ...]
 
 
+def find_series(sources: Sequence[Path]) -> dict[str, Path]:
+    """Find {name of a file: place} of every series below some folders, or at some addresses.
+
+    Raises DataError where there is none, or where two would be written to one place.
+    """
+    found: dict[str, Path] = {}
+    for source in sources:
+        for parts, place in _at_server(source) if is_server(source) else _recordings(source):
+            name = "-".join(parts).replace(os.sep, "_")
+            if found.setdefault(name, place) != place:
+                raise DataError(
+                    f"{source_name(place)} and {source_name(found[name])} are the same series "
+                    f"{name}; reprocess them into folders of their own"
+                )
+    if not found:
+        raise DataError(f"{', '.join(map(source_name, sources))}: no recording or series is there")
+    return found
+
+
+def _recordings(folder: Path) -> Iterator[tuple[tuple[str, str], Path]]:
+    for path in sorted({p.parent for p in folder.rglob("recording.yaml")}):
+        head = read_head(path)
+        yield (head.camera.name, head.series), path
+
+
+def _at_server(address: Path) -> Iterator[tuple[tuple[str, str, str], Path]]:
+    with ServerStore.open(address) as store:
+        every = store.all_series()
+    for one in every:
+        parts = str(one.identity["station"]), one.camera, one.name
+        yield parts, ServerAddress.narrowed(address, *parts)
+
+
 def find_blocks(
     archives: Sequence[Path], out: Path, free: tuple[str, ...], size: int = BLOCK
 ) -> list[Block]:
-    """The blocks of all recordings at or below some folders, but those that are done.
+    """Find the blocks of all recordings at or below some folders, but those that are done.
 
-    Raises DataError where there is no recording, or two would be written to one place.
+    Raises DataError as `find_series`.
     """
-    found = sorted({p.parent for a in archives for p in a.rglob("recording.yaml")})
-    if not found:
-        raise DataError(f"{', '.join(map(str, archives))}: no recording is there")
     blocks: list[Block] = []
-    taken: dict[Path, Path] = {}
-    for path in found:
-        recording = open_recording(path)
-        folder = out / f"{recording.camera.name}-{recording.series}".replace(os.sep, "_")
-        if other := taken.get(folder):
-            raise DataError(
-                f"{path} and {other} are the same series {recording.camera.name}/"
-                f"{recording.series}; reprocess them into folders of their own"
-            )
-        taken[folder] = path
-        for first in range(0, len(recording.columns), size):
-            target = folder / f"part-{first:08d}.parquet"
+    for name, path in find_series(archives).items():
+        epochs = len(open_recording(path))
+        for first in range(0, epochs, size):
+            target = out / name / f"part-{first:08d}.parquet"
             if not target.exists():
-                stop = min(first + size, len(recording.columns))
-                blocks.append(Block(path, first, stop, target, free))
+                blocks.append(Block(path, first, min(first + size, epochs), target, free))
     return blocks
 
 
@@ -190,16 +215,6 @@ def calibrate_block(block: Block) -> Outcome:
     columns, calibrated = _columns(block)
     write_parquet(block.target, columns)
     return Outcome(block, block.stop - block.first, calibrated)
-
-
-def run_blocks(
-    blocks: Sequence[Block],
-    engine: str = "local",
-    jobs: int = 1,
-    report: Callable[[Outcome], None] = lambda _: None,
-) -> list[Outcome]:
-    """Calibrate blocks; arguments as those of `run_tasks`."""
-    return run_tasks(calibrate_block, blocks, engine, jobs, report)
 
 
 def _columns(block: Block) -> tuple[dict[str, Any], int]:

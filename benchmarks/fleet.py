@@ -36,7 +36,7 @@ from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.epoch import Epoch
 from thermocald.fleet.forward import Forwarder
-from thermocald.fleet.overview import fleet_document
+from thermocald.fleet.page import fleet_document
 from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
 from thermocald.physics.presets import preset_simulation

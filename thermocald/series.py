@@ -24,8 +24,7 @@ from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
 from thermocald.store.recording.reader import Recording, open_recording
 from thermocald.store.recording.sense import interior_doubts
 from thermocald.store.server.connection import is_server
-from thermocald.store.sources import open_source, require_source, source_name
-from thermocald.store.stored_recording import StoredRecording
+from thermocald.store.sources import StoredRecording, open_source, require_source, source_name
 from thermocald.thermal.source import series_input
 
 if TYPE_CHECKING:

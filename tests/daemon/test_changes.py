@@ -19,7 +19,7 @@ from thermocald.physics.testfields import demonstration_field, demonstration_mod
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
-from thermocald.store.stored_recording import StoredRecording
+from thermocald.store.sources import StoredRecording
 
 EPOCHS, WHEN = 44, 27
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")

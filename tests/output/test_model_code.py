@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-from thermocald.output.model_code import c_header, python_module, write_code
+from thermocald.output.thermal_model import c_header, python_module, write_code
 from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
     InteriorOrientation,

@@ -23,9 +23,9 @@ from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.recorded import recorded_table
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.discovery.result import discover_series
+from thermocald.fleet.page import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
-from thermocald.output.fleet import render_fleet
 from thermocald.output.study.report import render_study
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor, project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -182,7 +182,7 @@ def _fleet(**_):
                 "ok": None if k == 5 else 0.99, "temperature": 20.0 + k,
                 "temperature_range": None if k == 5 else [5.0, 40.0], "rates": rates,
                 "findings": [{"kind": "odd", "text": f"c follows {LONG} unlike the others"}]
-                if k in (2, 7) else [],
+                if k in (2, 7) else [{"kind": "twins", "text": "two stores"}] if k == 4 else [],
             }
         )  # fmt: skip
     of_type = {
@@ -190,7 +190,7 @@ def _fleet(**_):
         for name in ("c", "x0", "y0")
     }
     names = [f"{c['station']}/{c['camera']}" for c in cameras]
-    summary = {"cameras": 12, "stations": 12, "epochs": 9, "sound": 10, "odd": 2}
+    summary = {"cameras": 12, "stations": 12, "epochs": 9, "sound": 9, "odd": 2, "twins": 1}
     return render_fleet(
         {
             "summary": dict.fromkeys(("late", "sensor", "calibrate", "clock", "refused"), 0)

@@ -11,8 +11,7 @@ from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.series import EpochResult
-from thermocald.store.sources import open_source
-from thermocald.store.stored_recording import StoredRecording
+from thermocald.store.sources import StoredRecording, open_source
 
 EPOCHS, TARGETS = 40, 75  # more than one row of details an epoch
 

@@ -12,7 +12,7 @@ import pytest
 import thermocald as tc
 from tests.commands import call
 from thermocald.errors import RecordingError, TestFieldError
-from thermocald.output.certificate import render_certificate
+from thermocald.output.thermal_model import render_certificate
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.sense import find_spikes, find_unit_change, interior_doubts
 

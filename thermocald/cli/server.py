@@ -164,12 +164,10 @@ def fleet(
 
     Example: thermocald fleet postgresql://reader@db.example/thermocald --report fleet.html
     """
-    from thermocald.fleet.overview import fleet_document, fleet_lines
+    from thermocald.fleet.page import fleet_document, fleet_lines, render_fleet
 
     document = fleet_document([Path(server) for server in servers])
     if report is not None:
-        from thermocald.output.fleet import render_fleet
-
         write_text(render_fleet(document), report)
     show(document, json, *fleet_lines(document))
 

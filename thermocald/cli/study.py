@@ -249,11 +249,11 @@ def fit(
             )  # fmt: skip
     document = {**camera.as_dict(), "model": str(camera.save(output))}
     if code is not None:
-        from thermocald.output.model_code import write_code
+        from thermocald.output.thermal_model import write_code
 
         document["code"] = [str(file) for file in write_code(camera, code)]
     if report is not None:
-        from thermocald.output.certificate import render_certificate
+        from thermocald.output.thermal_model import render_certificate
 
         write_text(report, render_certificate(camera))
     show(document, json, f"{output}: {camera}")

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from thermocald.store.database.examination import KeptFrame
+    from thermocald.store.database.epochs import KeptFrame
     from thermocald.store.series import StoredSeries
     from thermocald.store.server.connection import ServerAddress
 

@@ -16,20 +16,17 @@ stations of one name, or with copies of one store.
 from __future__ import annotations
 
 import math
-import textwrap
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from thermocald.analysis.statistics.dependence import dependence
 from thermocald.analysis.statistics.random_effects import odd_specimens, population
 from thermocald.names import WITH_VALUES
-from thermocald.numbers import percent, short_duration, shortened
+from thermocald.numbers import short_duration
 from thermocald.photogrammetry.linalg import mad_sd
-from thermocald.result import document_of
-from thermocald.store.server.connection import ServerAddress
 from thermocald.store.server.fleet_reader import Finding, FleetCamera, FleetReader, Rate
 
 if TYPE_CHECKING:
@@ -37,6 +34,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.arrays import Array
+    from thermocald.store.server.connection import ServerAddress
     from thermocald.store.server.fleet_reader import StationState
 
 
@@ -349,99 +347,3 @@ def _clock(camera: FleetCamera) -> Iterator[Finding]:
         )
     elif camera.lag_s < -_FUTURE_S:
         yield Finding("clock", f"its last epoch is {short_duration(-camera.lag_s)} in the future")
-
-
-_WIDTH = 80
-_MOST_SOUND = 40
-_LONGEST_NAME = 34
-_KINDS = ("late", "sensor", "calibrate", "odd", "clock", "refused", "twins")
-
-
-def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
-    """Everything about the cameras that some addresses select; several servers are one fleet.
-
-    Raises UsageError, ServerGone, ServerError, StoreVersionError.
-    """
-    cameras: list[FleetCamera] = []
-    now = 0.0
-    addresses = [ServerAddress.parse(source) for source in sources]
-    for address, source in zip(addresses, sources, strict=True):
-        now, found = read_overview(address, source)
-        cameras += found
-    types = camera_types(cameras)
-    add_findings(cameras, types, now)
-    counts = Counter(kind for c in cameras for kind in {f.kind for f in c.findings})
-    document: dict[str, Any] = {
-        "format": "thermocald-fleet/1",
-        "servers": [str(address) for address in addresses],
-        "time": now,
-        "cameras": [document_of(camera) for camera in cameras],
-        "types": [document_of(kind) for kind in types],
-        "summary": {
-            "cameras": len(cameras),
-            "stations": len({c.station for c in cameras}),
-            "epochs": sum(c.epochs for c in cameras),
-            "sound": sum(not c.findings for c in cameras),
-            **{kind: counts[kind] for kind in _KINDS},
-        },
-    }
-    return document
-
-
-def fleet_lines(document: dict[str, Any]) -> list[str]:
-    """Return the lines that `fleet` prints of a document."""
-    cameras = document["cameras"]
-    if not cameras:
-        return ["no epochs there yet; stations send theirs with `thermocald forward`"]
-    summary = document["summary"]
-    words = {
-        "late": "late", "sensor": "with a dead sensor", "calibrate": "need calibration",
-        "odd": "unlike their type", "clock": "with a wrong clock", "refused": "with refused rows",
-    }  # fmt: skip
-    parts = [f"{summary[kind]} {text}" for kind, text in words.items() if summary[kind]]
-    head = (
-        f"{summary['cameras']} cameras at {summary['stations']} stations: {summary['sound']} sound"
-    )
-    lines = textwrap.wrap(", ".join([head, *parts]), _WIDTH)
-    shown = [c for c in cameras if c["findings"]]
-    shown += [c for c in cameras if not c["findings"]][:_MOST_SOUND]
-    name = min(_LONGEST_NAME, max(14, *(len(_name(c)) for c in shown)))
-    heads = f"{'last':>7} {'waiting':>7} {'ok':>6} {'°C':>6} {'c µm/K':>16}"
-    lines += ["", f"{'station/camera':<{name}} {heads}"]
-    for camera in shown:
-        lines.append(_row(camera, name))
-        for finding in camera["findings"]:
-            lines += textwrap.wrap(
-                finding["text"],
-                _WIDTH,
-                initial_indent=f"  {finding['kind']}: ",
-                subsequent_indent="      ",
-            )
-    if hidden := len(cameras) - len(shown):
-        lines.append(f"and {hidden} more without a finding (--json has them all)")
-    for kind in document["types"]:
-        rate = kind["rates"]["c"]
-        lines += textwrap.wrap(
-            f"type {kind['type']}: {len(kind['cameras'])} cameras, c {rate['value'] * 1e3:+.3f} ± "
-            f"{rate['sd'] * 1e3:.3f} µm/K, between cameras ± {rate['sd_between'] * 1e3:.3f}",
-            _WIDTH,
-            subsequent_indent="  ",
-        )
-    return lines
-
-
-def _row(camera: dict[str, Any], width: int) -> str:
-    rate = camera["rates"].get("c")
-    text = "–" if rate is None else f"{rate['value'] * 1e3:+.3f} ± {rate['sd'] * 1e3:.3f}"
-    waiting = "–" if camera["waiting"] is None else str(camera["waiting"])
-    ok = "–" if camera["ok"] is None else percent(camera["ok"])
-    degrees = camera["temperature"]
-    return (
-        f"{shortened(_name(camera), width):<{width}} {short_duration(camera['lag_s']):>7} "
-        f"{waiting:>7} {ok:>6} {'–' if degrees is None else f'{degrees:.1f}':>6} "
-        f"{text:>16}"
-    )
-
-
-def _name(camera: dict[str, Any]) -> str:
-    return f"{camera['station']}/{camera['camera']}"

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.readings import Readings
-    from thermocald.store.stored_recording import StoredRecording
+    from thermocald.store.sources import StoredRecording
 
 _POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
 _FEWEST, _MOST = 2_000, 10_000  # rows

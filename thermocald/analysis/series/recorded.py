@@ -23,7 +23,7 @@ from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.store.database.store import Store
 from thermocald.store.series import EpochResult
-from thermocald.store.stored_recording import StoredRecording
+from thermocald.store.sources import StoredRecording
 
 if TYPE_CHECKING:
     from collections.abc import Callable

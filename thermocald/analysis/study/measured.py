@@ -21,7 +21,7 @@ from thermocald.analysis.statistics.significance import correlations_of
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.store.recording.readings import interpolate_readings
-from thermocald.store.stored_recording import StoredRecording
+from thermocald.store.sources import StoredRecording
 from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:

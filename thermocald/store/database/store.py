@@ -34,21 +34,19 @@ from thermocald.store.database.columns import (
     select_rows,
 )
 from thermocald.store.database.epochs import (
+    Examination,
+    KeptFrame,
+    examine,
+    frames_after,
     insert_epoch,
     insert_series,
     read_details,
+    rows_after,
     select_epochs,
     select_observations,
     select_series,
     to_json,
     unpack_covariance,
-)
-from thermocald.store.database.examination import (
-    Examination,
-    KeptFrame,
-    examine,
-    frames_after,
-    rows_after,
 )
 from thermocald.store.database.file import (
     Mode,
@@ -282,12 +280,12 @@ class Store(SeriesReader):
         return [event for event in self.events() if event.kind == "clock_step"]
 
     def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
-        """Rows of a growing table as they were kept, see `examination`: for a forwarder."""
+        """Rows of a growing table as they were kept, see `database.epochs`: for a forwarder."""
         with self._reads(f"{table}s") as connection:
             return list(rows_after(connection, table, after, limit))
 
     def frames_after(self, after: int, limit: int) -> list[KeptFrame]:
-        """Epochs' frames as they were kept, see `examination`: for a forwarder."""
+        """Epochs' frames as they were kept, see `database.epochs`: for a forwarder."""
         with self._reads("frames") as connection:
             return list(frames_after(connection, after, limit))
 

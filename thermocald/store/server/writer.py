@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from psycopg import Connection
 
-    from thermocald.store.database.examination import KeptFrame
+    from thermocald.store.database.epochs import KeptFrame
     from thermocald.store.series import StoredSeries
     from thermocald.store.server.connection import ServerAddress
 

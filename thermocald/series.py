@@ -271,9 +271,8 @@ def open_series(source: Path, name: str | None = None) -> Series:
         if name not in (None, series.name, f"{series.camera}/{series.name}"):
             raise DataError(f"{source}: is {series.camera}/{series.name}, not {name}")
         return series
-    camera, _, series_name = (name or "").rpartition("/")
     with open_source(source) as store:
-        return Series(store.find_series(camera or None, series_name or None), source)
+        return Series(store.only_series(name), source)
 
 
 def open_every_series(source: Path) -> list[Series]:

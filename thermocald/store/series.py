@@ -322,7 +322,14 @@ def clock_corrections(
     corrections = np.zeros(len(frame_time))
     tolerance = max(_CLOCK_TOLERANCE_S, 3.0 * interval)
     for step in steps:
-        _learned(frame_time + corrections, interval, trusted, step, tolerance, corrections)
+        if trusted is None or step < tolerance:
+            continue
+        times = frame_time + corrections
+        fits = np.abs(np.diff(times) - interval - step) < tolerance
+        for i in np.flatnonzero(fits & (trusted[:-1] == 0)) + 1:
+            if times[i] - times[i - 1] > tolerance:
+                known = np.flatnonzero(trusted[:i] != 0)
+                corrections[int(known[-1]) + 1 if known.size else 0 : i] += step
     for j in np.flatnonzero(np.diff(frame_time + corrections) < 0) + 1:
         leaps = np.diff(frame_time + corrections) - interval
         back = -float(leaps[j - 1])
@@ -333,22 +340,3 @@ def clock_corrections(
     for last in np.flatnonzero(np.diff(times) < 0)[::-1]:
         corrections[: last + 1] += times[last + 1] - interval - times[last]
     return corrections
-
-
-def _learned(
-    times: Array,
-    interval: float,
-    trusted: Array | None,
-    step: float,
-    tolerance: float,
-    corrections: Array,
-) -> None:
-    """Move the epochs before a step forwards that were taken without a synchronised clock."""
-    if trusted is None or step < tolerance:
-        return
-    fits = np.abs(np.diff(times) - interval - step) < tolerance
-    for i in np.flatnonzero(fits & (trusted[:-1] == 0)) + 1:
-        known = np.flatnonzero(trusted[:i] != 0)
-        first = int(known[-1]) + 1 if known.size else 0
-        if times[i] - times[i - 1] > tolerance:
-            corrections[first:i] += step

@@ -108,7 +108,8 @@ class DeviceClock:
                     raise DataError(
                         f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} does not exist in {self.zone}: "
                         "clocks were put forward. A device that does not change its clock has a "
-                        f"fixed zone: {self.option} {_offset_before(local)}"
+                        # fold 0 has the offset from before the change
+                        f"fixed zone: {self.option} {local.isoformat()[-6:]}"
                     )
                 twice.append(i)
         if twice:
@@ -168,15 +169,6 @@ def device_clock(
         forced=own is not None,
         option=option if own is not None else "--timezone",
     )
-
-
-def _offset_before(local: datetime) -> str:
-    """The offset before the change, as it is written in a zone."""
-    # in a gap, fold 0 has the offset that was valid before
-    offset = local.utcoffset() or timedelta()
-    minutes = int(offset.total_seconds() // 60)
-    sign = "-" if minutes < 0 else "+"
-    return f"{sign}{abs(minutes) // 60:02d}:{abs(minutes) % 60:02d}"
 
 
 _DATE = r"(?P<a>\d{1,4})(?P<mark>[-./:])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4})\.?"

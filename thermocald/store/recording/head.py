@@ -132,29 +132,22 @@ def _channels(top: _Reader) -> dict[str, Channel]:
 
 def head_document(head: Head) -> dict[str, Any]:
     """The mapping that `recording.yaml` holds; JSON-able where `extra` is."""
-    sensor = head.camera.sensor
-    camera: dict[str, Any] = {
-        "name": head.camera.name,
-        "width": sensor.width,
-        "height": sensor.height,
-        "pixel_pitch": sensor.pixel_pitch,
-    }
-    if head.camera.principal_distance is not None:
-        camera["principal_distance"] = head.camera.principal_distance
-    if head.camera.interior is not None:
-        camera["interior"] = asdict(head.camera.interior)
+    sensor, interior = head.camera.sensor, head.camera.interior
+    camera = {
+        "name": head.camera.name, "width": sensor.width, "height": sensor.height,
+        "pixel_pitch": sensor.pixel_pitch, "principal_distance": head.camera.principal_distance,
+        "interior": interior and asdict(interior),
+    }  # fmt: skip
     temperatures = {
-        name: {"unit": channel.unit}
-        | ({} if channel.resolution is None else {"resolution": channel.resolution})
+        name: _known({"unit": channel.unit, "resolution": channel.resolution})
         for name, channel in head.channels.items()
     }
-    document: dict[str, Any] = {
-        "format": FORMAT,
-        "name": head.name,
-        "series": head.series,
-        "interval": head.interval,
-        "camera": camera,
-    }
-    if temperatures:
-        document["temperatures"] = temperatures
-    return {**document, **head.extra}
+    document = {
+        "format": FORMAT, "name": head.name, "series": head.series, "interval": head.interval,
+        "camera": _known(camera), "temperatures": temperatures or None,
+    }  # fmt: skip
+    return {**_known(document), **head.extra}
+
+
+def _known(mapping: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in mapping.items() if value is not None}

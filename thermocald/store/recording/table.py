@@ -104,12 +104,16 @@ class Table:
         }
 
     def check(
-        self, name: str, wrong: NDArray[np.bool_], message: Callable[[int], str] | str
+        self,
+        name: str,
+        wrong: NDArray[np.bool_],
+        message: Callable[[int], str] | str,
+        first: int = 0,
     ) -> None:
-        """Raise for the first row that is wrong; `message` may be a function of the row."""
+        """Raise for the first row, from row `first` on, that is wrong; `message`: may be of it."""
         if wrong.any():
             row = int(np.argmax(wrong))
-            self.fail(row, name, message if isinstance(message, str) else message(row))
+            self.fail(first + row, name, message if isinstance(message, str) else message(row))
 
     def fail(self, row: int, column: str | None, message: str) -> NoReturn:
         """Raise the error for one row (counted from 0 below the header) and column."""
@@ -251,9 +255,7 @@ class Chunk:
         self, name: str, wrong: NDArray[np.bool_], message: Callable[[int], str] | str
     ) -> None:
         """Raise for the first row of this chunk that is wrong, as `Table.check` does."""
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            self.fail(row, name, message if isinstance(message, str) else message(row))
+        self.table.check(name, wrong, message, self.first)
 
     def fail(self, row: int, column: str | None, message: str) -> NoReturn:
         """Raise the table's error for a row of this chunk."""

@@ -122,10 +122,8 @@ class ServerAddress:
     @property
     def place(self) -> str:
         """The whole of the address but its password: which server, database and user."""
-        parts = urlsplit(self.url)
-        user, _, host = parts.netloc.rpartition("@")
-        options = sorted((n, v) for n, v in parse_qsl(parts.query) if n != "password")
-        return f"postgresql://{user.split(':')[0]}@{host}{parts.path}?{urlencode(options)}"
+        options = sorted((n, v) for n, v in parse_qsl(urlsplit(self.url).query) if n != "password")
+        return f"{self}?{urlencode(options)}"
 
     def __str__(self) -> str:
         """The address for messages: without a password."""

@@ -85,23 +85,20 @@ def import_photographs(
     6
     """
     from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.photographs import SOURCES, find_photographs, read_photograph
-    from thermocald.store.logger.series import (
-        camera_of,
-        in_memory,
-        put_together,
-        write_photographs,
-    )
+    from thermocald.store.logger.photographs import read_photographs
+    from thermocald.store.logger.series import read_series, write_photographs
     from thermocald.store.logger.temperatures import log_options
 
-    if times not in SOURCES:
-        raise UsageError(f"times {times!r}: must be one of {', '.join(SOURCES)}")
-    pictures = [read_photograph(path, times) for path in find_photographs(_paths(photographs))]
-    clock = device_clock(timezone, None, "0", "refuse", "timezone")
-    placed = put_together(pictures, clock, source_of(log), log_options(timezone=timezone))
-    known = None if camera is None else source_of(camera)
-    spec, _ = camera_of(pictures[0], known, pixel_pitch)
-    recording = in_memory(placed, spec, read_testfield(testfield), series)
+    recording, _ = read_series(
+        read_photographs(_paths(photographs), times),
+        device_clock(timezone, ambiguous="refuse"),
+        source_of(log),
+        log_options(timezone=timezone),
+        testfield=read_testfield(testfield),
+        series=series,
+        camera=None if camera is None else source_of(camera),
+        pitch=pixel_pitch,
+    )
     if out is None:
         return Series(recording)
     write_photographs(source_of(out), recording)

@@ -242,17 +242,15 @@ def follow_scene(
     """
     from thermocald.analysis.thermal import scene
     from thermocald.analysis.thermal.model_log import read_model_log
-    from thermocald.store.logger.photographs import SOURCES, find_photographs, read_photograph
+    from thermocald.store.logger.photographs import read_photographs
 
-    if times not in SOURCES:
-        raise UsageError(f"--times {times}: must be one of {', '.join(SOURCES)}")
     thermal = _thermal(model)
-    found = find_photographs([source_of(photographs)])
-    moments = [read_photograph(path, times).moment for path in found]
-    taken = device_clock(timezone).utc(moments, lambda i: str(found[i])).tolist()
+    found = read_photographs([source_of(photographs)], times)
+    moments = [photograph.moment for photograph in found]
+    taken = device_clock(timezone).utc(moments, lambda i: str(found[i].path)).tolist()
     options = _log_options(log_options or {"timezone": timezone})
     table = read_model_log(thermal, source_of(log), options, (min(taken), max(taken)))
-    frames = list(zip(found, taken, strict=True))
+    frames = list(zip([photograph.path for photograph in found], taken, strict=True))
     kept = None if recording is None else Path(recording)
     return scene.follow_scene(
         thermal, table, frames, advance=progress or (lambda _: None), recording=kept

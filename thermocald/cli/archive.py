@@ -58,58 +58,51 @@ def import_(
     """
     from thermocald.daemon.soundness import calibration_doubts
     from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.photographs import SOURCES, find_photographs, read_photograph
-    from thermocald.store.logger.series import (
-        camera_of,
-        in_memory,
-        put_together,
-        write_photographs,
-    )
+    from thermocald.store.logger.photographs import read_photographs
+    from thermocald.store.logger.series import read_series, write_photographs
     from thermocald.store.recording.reader import read_recording
     from thermocald.store.recording.sense import doubt_lines
     from thermocald.store.recording.testfield_file import read_testfield
 
-    if times not in SOURCES:
-        raise UsageError(f"--times {times}: must be one of {', '.join(SOURCES)}")
-    if not dry_run and (testfield is None or out is None):
+    field = None if testfield is None else read_testfield(testfield)
+    if not dry_run and (field is None or out is None):
         missing = "--testfield" if testfield is None else "--out"
         raise UsageError(
             f"{missing} is missing: give it, or --dry-run to see what is understood of the files"
         )
-    field = None if testfield is None else read_testfield(testfield)
-    clock = device_clock(timezone, camera_timezone, camera_clock, ambiguous, "--camera-timezone")
-    pictures = [read_photograph(path, times) for path in find_photographs(photos)]
-    placed = put_together(pictures, clock, log, log_options)
-    spec, notes = camera_of(pictures[0], camera, pixel_pitch, principal_distance, dry_run)
-    notes = [*placed.preview(), *notes]
+    recording, notes = read_series(
+        read_photographs(photos, times),
+        device_clock(timezone, camera_timezone, camera_clock, ambiguous, "--camera-timezone"),
+        log, log_options, testfield=None if dry_run else field, series=series,
+        camera=camera, pitch=pixel_pitch, distance=principal_distance,
+    )  # fmt: skip
     for line in notes:
         say(line)
-    if not dry_run and out is not None and field is not None:
-        write_photographs(out, in_memory(placed, spec, field, series))
+    if not dry_run and out is not None:
+        write_photographs(out, recording)
         # what EXIF does not tell of the pixels, the camera that some photographs give does
         doubts = doubt_lines(calibration_doubts(read_recording(out)))
         for line in doubts:
             say(line)
         notes += doubts
+    columns, spec = recording.columns, recording.head.camera
+    at_frame = columns.at_frame(next(iter(columns.temperatures)))
     document = {
         "format": "thermocald-import/1",
         "recording": None if dry_run else out,
-        "epochs": len(placed.times),
-        "with_temperature": int((placed.at_frame == placed.at_frame).sum()),
-        "first": float(placed.times[0]),
-        "last": float(placed.times[-1]),
-        "channels": list(placed.log.channels),
+        "epochs": len(columns),
+        "with_temperature": int((at_frame == at_frame).sum()),
+        "first": float(columns.frame_time[0]),
+        "last": float(columns.frame_time[-1]),
+        "channels": list(columns.temperatures),
         "camera": {
             "width": spec.sensor.width, "height": spec.sensor.height,
             "pixel_pitch": spec.sensor.pixel_pitch, "principal_distance": spec.principal_distance,
         },
         "notes": notes,
     }  # fmt: skip
-    show(
-        document, json,
-            "nothing was written (--dry-run)" if dry_run
-            else f"{out}: {len(placed.times)} epochs; next: thermocald replay {out}"
-    )  # fmt: skip
+    said = f"{out}: {len(columns)} epochs; next: thermocald replay {out}"
+    show(document, json, "nothing was written (--dry-run)" if dry_run else said)
 
 
 def archive(

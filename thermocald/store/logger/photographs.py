@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import DataError, DriverMissing, ImageError
+from thermocald.errors import DataError, DriverMissing, ImageError, UsageError
 from thermocald.store.logger.clock import parse_moment
 
 if TYPE_CHECKING:
@@ -68,6 +68,16 @@ def find_photographs(paths: list[Path]) -> list[Path]:
     if not found:
         raise DataError(f"{paths[0]}: holds no photographs ({', '.join(sorted(SUFFIXES))})")
     return list(dict.fromkeys(found))
+
+
+def read_photographs(paths: list[Path], source: str = "exif") -> list[Photograph]:
+    """All photographs among files and in folders; errors as `find_photographs`, `read_photograph`.
+
+    Raises UsageError for a source of their times that there is not.
+    """
+    if source not in SOURCES:
+        raise UsageError(f"--times {source}: must be one of {', '.join(SOURCES)}")
+    return [read_photograph(path, source) for path in find_photographs(paths)]
 
 
 def read_photograph(path: Path, source: str = "exif") -> Photograph:

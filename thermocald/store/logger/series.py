@@ -6,7 +6,7 @@ keeps every reading: the temperature at a photograph's time is interpolated from
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,11 +16,12 @@ import numpy as np
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files import read_camera
+from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.logger.photographs import find_copies, other_camera
-from thermocald.store.logger.temperatures import LogOptions, TemperatureLog, read_log
+from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import EpochColumns, Recording
-from thermocald.store.recording.readings import Readings, interpolate_readings
+from thermocald.store.recording.readings import Readings
 from thermocald.store.recording.sense import doubt_lines, pitch_doubts
 from thermocald.store.recording.writer import RecordingWriter
 
@@ -30,54 +31,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.logger.clock import DeviceClock
     from thermocald.store.logger.photographs import Photograph
+    from thermocald.store.logger.temperatures import LogOptions
 
 _LARGEST_GAP_IN_INTERVALS = 10.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PhotographSeries:
-    """Photographs in the order of time, times (n,) s UTC, and the log they were paired with.
-
-    reading (n,): the row of the log next to each, -1 where there is none near; at_frame (n,) °C of
-    the first channel, NaN where the log does not say; notes: what was left out, for people.
-    """
-
-    photographs: tuple[Photograph, ...]
-    times: Array
-    log: TemperatureLog
-    reading: NDArray[np.int64]
-    at_frame: Array
-    notes: tuple[str, ...] = ()
-
-    @property
-    def interval(self) -> float:
-        """The median time between photographs, s; 1 for a single one."""
-        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
-
-    def preview(self) -> list[str]:
-        """Lines for a person: what would be written."""
-        first = next(iter(self.log.channels))
-        known = np.isfinite(self.at_frame)
-        head = self.photographs[0]
-        span = f"{iso(self.times[0])} to {iso(self.times[-1])}, every {self.interval:.4g} s"
-        step = float(np.median(np.diff(self.log.times)))
-        low, high = np.nanmin(self.at_frame), np.nanmax(self.at_frame)
-        lines = [f"photographs: {len(self.times)}, {head.width} × {head.height} px, {span}"]
-        lines += [*self.notes, *self.log.notes]
-        lines.append(
-            f"log: {iso(self.log.times[0])} to {iso(self.log.times[-1])}, every {step:.4g} s"
-        )
-        lines.append(
-            f"temperature ({first}): known for {known.sum()} of {len(known)} photographs, "
-            f"{low:.2f} to {high:.2f} °C"
-        )
-        for i in sorted({0, len(self.times) // 2, len(self.times) - 1}):
-            reading = f"{self.at_frame[i]:.3f} °C" if known[i] else "no temperature"
-            lines.append(f"  {self.photographs[i].path.name}  {iso(self.times[i])}  {reading}")
-        return lines
 
 
 def iso(seconds: float) -> str:
@@ -86,21 +44,33 @@ def iso(seconds: float) -> str:
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def put_together(
-    photographs: Sequence[Photograph], camera_clock: DeviceClock, log: Path, options: LogOptions
-) -> PhotographSeries:
-    """Photographs and a logger's file on one clock.
+def read_series(
+    photographs: Sequence[Photograph],
+    clock: DeviceClock,
+    log: Path,
+    options: LogOptions,
+    *,
+    testfield: TestField | None = None,
+    series: str = "M1",
+    camera: Path | None = None,
+    pitch: float | None = None,
+    distance: float | None = None,
+) -> tuple[Recording, list[str]]:
+    """Put photographs and a logger's file on one clock: a recording that lies in no folder of its
+    own, and what was understood of both, for people.
 
-    Copies of one photograph are left out. Raises DataError for photographs of different sizes or
-    cameras, for times that do not say their zone, and where log and photographs do not overlap.
+    Copies of one photograph are left out. testfield: None to see what is understood, which a pixel
+    pitch that nobody knows does not prevent; camera: a camera file, which then says it all; pitch,
+    distance mm: instead of EXIF's. Raises DataError for photographs of different sizes or cameras,
+    for times that do not say their zone, and where log and photographs do not overlap.
     """
     sizes = {(p.width, p.height) for p in photographs}
     if len(sizes) > 1:
-        head = photographs[0]
-        other = next(p for p in photographs if (p.width, p.height) != (head.width, head.height))
+        one = photographs[0]
+        other = next(p for p in photographs if (p.width, p.height) != (one.width, one.height))
         raise DataError(
-            f"{other.path}: has {other.width} × {other.height} px, {head.path.name} "
-            f"{head.width} × {head.height}: one recording is of one camera in one position; "
+            f"{other.path}: has {other.width} × {other.height} px, {one.path.name} "
+            f"{one.width} × {one.height}: one recording is of one camera in one position; "
             "import them apart"
         )
     if strange := other_camera(photographs):
@@ -115,7 +85,7 @@ def put_together(
     photographs = [p for i, p in enumerate(photographs) if i not in copies]
     # by name first: within a second it is the order in which they were taken
     named = sorted(photographs, key=lambda p: p.path.name)
-    times = camera_clock.utc([p.moment for p in named], lambda i: str(named[i].path))
+    times = clock.utc([p.moment for p in named], lambda i: str(named[i].path))
     order = np.argsort(times, kind="stable")
     times = times[order]
     placed = tuple(named[i] for i in order.tolist())
@@ -127,15 +97,42 @@ def put_together(
         )
     logged = read_log(log, options, (float(times[0]), float(times[-1])))
     _overlap(times, logged.times)
-    reading = _next_to(times, logged.times)
-    first = next(iter(logged.channels.values()))
-    at_frame = interpolate_readings(times, logged.times, first)
-    if not np.isfinite(at_frame).any():
+    row = _next_to(times, logged.times)
+    near, row = row >= 0, np.maximum(row, 0)
+    channels = {n: np.where(near, values[row], np.nan) for n, values in logged.channels.items()}
+    columns = EpochColumns(
+        np.arange(1, len(times) + 1), times, np.where(near, logged.times[row], np.nan), channels,
+        tuple(str(p.path.absolute()) for p in placed), {}, Readings(logged.times, logged.channels),
+    )  # fmt: skip
+    reference = next(iter(channels))
+    at_frame = columns.at_frame(reference)
+    known = np.isfinite(at_frame)
+    if not known.any():
         raise DataError(
             "no photograph has a temperature: the log has gaps wherever photographs were taken "
             f"({iso(times[0])} to {iso(times[-1])})"
         )
-    return PhotographSeries(placed, times, logged, reading, at_frame, tuple(notes))
+    spec, about_camera = _camera_of(photographs[0], camera, pitch, distance, testfield is None)
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    span = f"{iso(times[0])} to {iso(times[-1])}, every {interval:.4g} s"
+    step = float(np.median(np.diff(logged.times)))
+    temperatures = f"{np.nanmin(at_frame):.2f} to {np.nanmax(at_frame):.2f} °C"
+    notes = [
+        f"photographs: {len(times)}, {placed[0].width} × {placed[0].height} px, {span}",
+        *notes, *logged.notes,
+        f"log: {iso(logged.times[0])} to {iso(logged.times[-1])}, every {step:.4g} s",
+        (f"temperature ({reference}): known for {known.sum()} of {len(known)} photographs, "
+         f"{temperatures}"),
+    ]  # fmt: skip
+    for i in sorted({0, len(times) // 2, len(times) - 1}):
+        reading = f"{at_frame[i]:.3f} °C" if known[i] else "no temperature"
+        notes.append(f"  {placed[i].path.name}  {iso(times[i])}  {reading}")
+    thermometers = dict.fromkeys(channels, Channel())
+    head = Head(f"{spec.name}-{series}", series, max(interval, 0.001), spec, thermometers)
+    none = np.empty((0, 3))
+    field = TestField.build((), none, none, (), (), ()) if testfield is None else testfield
+    recording = Recording(Path(), head, field, columns, has_observations=False)
+    return recording, [*notes, *about_camera]
 
 
 def _overlap(frames: Array, log: Array) -> None:
@@ -158,12 +155,12 @@ def _next_to(frames: Array, log: Array) -> NDArray[np.int64]:
     return np.where(far, -1, row).astype(np.int64)
 
 
-def camera_of(
+def _camera_of(
     photograph: Photograph,
     file: Path | None,
     pitch: float | None,
-    distance: float | None = None,
-    dry_run: bool = False,
+    distance: float | None,
+    dry_run: bool,
 ) -> tuple[CameraSpec, list[str]]:
     """Return the camera of photographs, what of it was taken from EXIF, and what EXIF denies.
 
@@ -200,31 +197,8 @@ def camera_of(
     return CameraSpec(photograph.camera or "camera", sensor, distance), notes
 
 
-def in_memory(
-    placed: PhotographSeries, camera: CameraSpec, testfield: TestField, series: str
-) -> Recording:
-    """Return photographs and a log as a recording that lies in no folder of its own."""
-    log, row = placed.log, placed.reading
-    channels = {
-        n: np.where(row >= 0, v[np.maximum(row, 0)], np.nan) for n, v in log.channels.items()
-    }
-    columns = EpochColumns(
-        np.arange(1, len(placed.times) + 1),
-        placed.times,
-        np.where(row >= 0, log.times[np.maximum(row, 0)], np.nan),
-        channels,
-        tuple(str(p.path.absolute()) for p in placed.photographs),
-        {},
-        Readings(log.times, log.channels),
-    )
-    interval = max(placed.interval, 0.001)
-    thermometers = dict.fromkeys(channels, Channel())
-    head = Head(f"{camera.name}-{series}", series, interval, camera, thermometers)
-    return Recording(Path(), head, testfield, columns, has_observations=False)
-
-
 def write_photographs(folder: Path, recording: Recording) -> None:
-    """Write what `in_memory` returned, in a new folder."""
+    """Write what `read_series` returned, in a new folder."""
     head = replace(recording.head, name=folder.name)
     with RecordingWriter(folder, head, recording.testfield) as writer:
         for epoch in recording.iter_epochs():

@@ -8,8 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from thermocald.analysis.thermal.model_log import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
+from thermocald.photogrammetry import camera_files
 from thermocald.series import Series, source_of
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.temperatures import LogOptions, log_options
@@ -50,8 +52,6 @@ def convert_camera(
     >>> print(tc.convert_camera("cold.json", "cold.xml", "metashape").statement)
     exact: both models give the same pixels
     """
-    from thermocald.photogrammetry import camera_files
-
     return camera_files.convert(source_of(source), source_of(out), to, format, pixel_pitch)
 
 
@@ -68,7 +68,6 @@ def compare_cameras(
     (True, True)
     """
     from thermocald.analysis.camera.difference import CameraDifference
-    from thermocald.photogrammetry import camera_files
 
     a, b = (camera_files.read(source_of(p), pixel_pitch=pixel_pitch) for p in (first, second))
     names = str(first), str(second)
@@ -102,7 +101,6 @@ def predict(
     35.0
     """
     from thermocald.analysis.thermal import predictions
-    from thermocald.analysis.thermal.model_log import read_model_log
 
     if sum((temperature is not None, log is not None, bool(test), programme is not None)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
@@ -148,7 +146,6 @@ def correct(
     >>> done.points
     2
     """
-    from thermocald.analysis.thermal.model_log import read_model_log
     from thermocald.analysis.thermal.timed_rows import first_times
     from thermocald.output.corrected import Correction
 
@@ -196,7 +193,6 @@ def measure(
     thermocald.errors.UsageError: --length-unit km: mm or m
     """
     from thermocald.analysis.thermal.control_points import UNITS, ControlPoints
-    from thermocald.analysis.thermal.model_log import read_model_log
     from thermocald.analysis.thermal.places import measure_places, read_surface
     from thermocald.analysis.thermal.timed_rows import first_times, row_blocks, seconds_of
 
@@ -241,7 +237,6 @@ def follow_scene(
     thermocald.errors.UsageError: --times sun: must be one of exif, name, file
     """
     from thermocald.analysis.thermal import scene
-    from thermocald.analysis.thermal.model_log import read_model_log
     from thermocald.store.logger.photographs import read_photographs
 
     thermal = _thermal(model)
@@ -328,7 +323,6 @@ def survey_testfield(
     """
     from thermocald.analysis.camera.photographs import images_of
     from thermocald.api import read_testfield
-    from thermocald.photogrammetry import camera_files
     from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
     from thermocald.photogrammetry.network.datum import Distance
     from thermocald.photogrammetry.survey import picture_of, survey
@@ -396,7 +390,6 @@ def check_testfield(
     from thermocald.analysis.camera.camera import Camera
     from thermocald.analysis.field import assess_field
     from thermocald.api import read_testfield
-    from thermocald.photogrammetry import camera_files
     from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
 
     if camera is None:

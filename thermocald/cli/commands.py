@@ -75,7 +75,7 @@ PANELS = {
         "camera": Entry("camera", "Convert and compare cameras; one at a temperature", True),
     },
     "Test field": {
-        "testfield": Entry("testfield", "Print, import, survey and check a test field", True),
+        "testfield": Entry("testfield", "Print, import, survey and check a test field", True)
     },
     "Many cameras": {
         "forward": Entry("server", "Send a store's rows to a server"),

@@ -124,6 +124,7 @@ def export(
     """
     import thermocald as tc
     from thermocald.output import series_export
+    from thermocald.store.recording.parquet_table import write_parquet
 
     folder = source.is_dir()
     exterior = exterior or ("auto" if folder else "stored")
@@ -143,7 +144,7 @@ def export(
     pitch = opened.head.camera.sensor.pixel_pitch
     parts = series_export.column_parts(table, style, pitch, known)
     if format_ == "parquet":
-        series_export.write_parquet(parts, Path(output))
+        write_parquet(Path(output), parts)
     elif format_ == "json":
         write_parts(series_export.as_json(parts), output)
     else:

@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import (
-    JsonOption,
-    PhotosArgument,
-    PixelPitchOption,
-    say,
-    show,
-)
+from thermocald.cli.common import JsonOption, PhotosArgument, PixelPitchOption, say, show
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:

@@ -213,7 +213,7 @@ def find_blocks(
 def calibrate_block(block: Block) -> Outcome:
     """Calibrate one block and write its file, whole or not at all."""
     columns, calibrated = _columns(block)
-    write_parquet(block.target, columns)
+    write_parquet(block.target, [columns], nan_is_null=True)
     return Outcome(block, block.stop - block.first, calibrated)
 
 

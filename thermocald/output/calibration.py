@@ -15,14 +15,7 @@ import numpy as np
 
 from thermocald.analysis.field import CELLS, FieldCheck
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel
-from thermocald.numbers import (
-    UNITS,
-    coefficient,
-    parameter_label,
-    percent,
-    plain,
-    with_sd,
-)
+from thermocald.numbers import UNITS, coefficient, parameter_label, percent, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, render_report
 

@@ -160,8 +160,7 @@ class Correction:
         step = float(np.median(np.diff(log))) if len(log) > 1 else 0.0
         within = (block.times >= log[0] - step) & (block.times <= log[-1] + step)
         possible = block.kept(
-            within,
-            f"was measured outside the temperature log ({iso(log[0])} to {iso(log[-1])})",
+            within, f"was measured outside the temperature log ({iso(log[0])} to {iso(log[-1])})"
         )
         if possible.values.shape[1]:
             sensor = self.thermal.model.sensor

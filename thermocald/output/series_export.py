@@ -6,7 +6,6 @@ The columns of CONVENTIONS §4 with other units have them in their names (`c_px`
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -15,13 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.series.epochs import csv_text
-from thermocald.errors import DriverMissing, UsageError
-from thermocald.files import make_folder, new_file
+from thermocald.errors import UsageError
 from thermocald.result import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
-    from pathlib import Path
 
     from thermocald.analysis.series.epochs import Columns, Epochs
 
@@ -123,22 +120,3 @@ def as_json(parts: Iterable[Columns]) -> Iterator[str]:
             yield start + " " + said.replace("\n", "\n ")
             start = ",\n"
     yield "\n]\n" if start != "[\n" else "[]\n"
-
-
-def write_parquet(parts: Iterable[Columns], path: Path) -> None:
-    """The columns as a Parquet file, whole or not at all; numbers bit for bit."""
-    if importlib.util.find_spec("pyarrow") is None:
-        raise DriverMissing("writing Parquet needs pyarrow: pip install 'thermocald[parquet]'")
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    make_folder(path.absolute().parent)
-    with new_file(path) as partial:
-        writer = None
-        for columns in parts:
-            table = pa.table({name: pa.array(v if isinstance(v, np.ndarray) else list(v))
-                              for name, v in columns.items()})  # fmt: skip
-            writer = writer or parquet.ParquetWriter(partial, table.schema)
-            writer.write_table(table)
-        if writer is not None:
-            writer.close()

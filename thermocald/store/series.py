@@ -196,12 +196,7 @@ class SeriesReader(ABC):
         self.close()
 
     def epochs(
-        self,
-        series: StoredSeries,
-        first: int = 0,
-        last: int | None = None,
-        *,
-        details: bool = True,
+        self, series: StoredSeries, first: int = 0, last: int | None = None, *, details: bool = True
     ) -> Iterator[StoredEpoch]:
         """The epochs numbered `first` to `last`, one after the other, in constant memory.
 

@@ -81,11 +81,7 @@ def row_checksum(numbers: Sequence[Any], texts: Iterable[str] = (), data: bytes 
 
 
 def require_checksum(
-    kept: int,
-    what: str,
-    numbers: Sequence[Any],
-    texts: Iterable[str] = (),
-    data: bytes = b"",
+    kept: int, what: str, numbers: Sequence[Any], texts: Iterable[str] = (), data: bytes = b""
 ) -> None:
     """Raise DamageError naming `what` if a row is not as it was written."""
     try:

@@ -20,34 +20,7 @@ import numpy as np
 from thermocald.errors import StoreError, StoreFullError
 from thermocald.files import cannot_write
 from thermocald.names import file_name, require_channels
-from thermocald.store.database import columns
-from thermocald.store.database.columns import (
-    KEPT,
-    ROW,
-    SeriesColumns,
-    insert_row,
-    next_id,
-    read_columns,
-    read_epochs,
-    read_page,
-    require_sound,
-    select_rows,
-)
-from thermocald.store.database.epochs import (
-    Examination,
-    KeptFrame,
-    examine,
-    frames_after,
-    insert_epoch,
-    insert_series,
-    read_details,
-    rows_after,
-    select_epochs,
-    select_observations,
-    select_series,
-    to_json,
-    unpack_covariance,
-)
+from thermocald.store.database import columns, epochs
 from thermocald.store.database.file import (
     Mode,
     StoreFile,
@@ -144,7 +117,7 @@ class Store(SeriesReader):
     def all_series(self) -> list[StoredSeries]:
         """All series, in the order in which they were begun."""
         with self._reads("the series") as connection:
-            return select_series(connection, self.path)
+            return epochs.select_series(connection, self.path)
 
     def last_epoch(self, series: StoredSeries) -> int | None:
         """The number of the last epoch kept, None if there is none: where to resume."""
@@ -180,7 +153,9 @@ class Store(SeriesReader):
             failed: StoreError | None = None
             try:
                 with self._reads("epochs") as connection:
-                    found = select_epochs(connection, series.id, first, last, details=details)
+                    found = epochs.select_epochs(
+                        connection, series.id, first, last, details=details
+                    )
                     page.extend(islice(found, _EPOCHS_AT_ONCE))
                     del found
             except StoreError as error:
@@ -195,16 +170,16 @@ class Store(SeriesReader):
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
         """The observations of the epochs numbered `first` to `last`, without their quality."""
         with self._reads("observations") as connection:
-            return select_observations(connection, series.id, first, last)
+            return epochs.select_observations(connection, series.id, first, last)
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
         """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
         result = np.full((len(numbers), 16, 16), np.nan)
         with self._reads("covariances") as connection:
             for i, number in enumerate(map(int, numbers)):
-                for row in read_epochs(connection, series.id, number, number):
-                    covariance, _ = read_details(connection, row)
-                    result[i] = unpack_covariance(covariance) if covariance else np.nan
+                for row in columns.read_epochs(connection, series.id, number, number):
+                    covariance, _ = epochs.read_details(connection, row)
+                    result[i] = epochs.unpack_covariance(covariance) if covariance else np.nan
         return result
 
     def stamped_columns(
@@ -213,8 +188,8 @@ class Store(SeriesReader):
         """Columns (E,) over all epochs by name, with times as they were stamped."""
         source = {name: _source(name, series) for name in names}
         with self._reads("columns") as connection:
-            columns = read_columns(connection, series.id, list(dict.fromkeys(source.values())))
-        return {name: columns[source[name]] for name in names}
+            found = columns.read_columns(connection, series.id, [*dict.fromkeys(source.values())])
+        return {name: found[source[name]] for name in names}
 
     def column_pages(
         self, series: StoredSeries, names: Sequence[str], rows: int = 1000
@@ -229,11 +204,11 @@ class Store(SeriesReader):
         after = -1
         while True:
             with self._reads("columns") as connection:
-                columns = read_page(connection, series.id, wanted, after, rows)
-            if not len(columns["number"]):
+                found = columns.read_page(connection, series.id, wanted, after, rows)
+            if not len(found["number"]):
                 return
-            after = int(columns["number"][-1])
-            yield {name: columns[source[name]] for name in names}
+            after = int(found["number"][-1])
+            yield {name: found[source[name]] for name in names}
 
     def readings(
         self, thermometer: str | None = None, since_utc: float = 0.0
@@ -242,7 +217,7 @@ class Store(SeriesReader):
         after = -1
         while True:
             with self._reads("readings") as connection:
-                page = select_rows(
+                page = columns.select_rows(
                     connection,
                     "reading",
                     "WHERE id > ? AND utc >= ? AND thermometer = ifnull(?, thermometer) "
@@ -260,7 +235,7 @@ class Store(SeriesReader):
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or all."""
         with self._reads("events") as connection:
-            rows = select_rows(
+            rows = columns.select_rows(
                 connection,
                 "event",
                 "WHERE utc >= ? AND series_id IS ifnull(?, series_id) ORDER BY id",
@@ -282,27 +257,27 @@ class Store(SeriesReader):
     def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
         """Rows of a growing table as they were kept, see `database.epochs`: for a forwarder."""
         with self._reads(f"{table}s") as connection:
-            return list(rows_after(connection, table, after, limit))
+            return list(epochs.rows_after(connection, table, after, limit))
 
-    def frames_after(self, after: int, limit: int) -> list[KeptFrame]:
+    def frames_after(self, after: int, limit: int) -> list[epochs.KeptFrame]:
         """Epochs' frames as they were kept, see `database.epochs`: for a forwarder."""
         with self._reads("frames") as connection:
-            return list(frames_after(connection, after, limit))
+            return list(epochs.frames_after(connection, after, limit))
 
     def rows_waiting(self, after: Mapping[str, int]) -> int:
         """How many rows of the growing tables have ids above those given, by table."""
         return sum(
             int(self._value(f"SELECT count(*) FROM {table} WHERE id > ?", after[table]))
-            for table in KEPT
+            for table in columns.KEPT
         )
 
-    def examine(self) -> Examination:
+    def examine(self) -> epochs.Examination:
         """Read the whole file: what is damaged, and which epochs are missing.
 
         Raises StoreError where it cannot be read as a store at all.
         """
         with self._reads("the store") as connection:
-            found = examine(connection)
+            found = epochs.examine(connection)
         tail = read_wal_tail(helper(self.path, "wal"))
         if tail.lost:
             many = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
@@ -361,7 +336,7 @@ class Store(SeriesReader):
                     f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
                     "already; choose another name"
                 )
-            insert_series(
+            epochs.insert_series(
                 self._db, head, testfield, start, identity or {}, settings or {}, created_utc
             )
         return self.find_series(head.camera.name, head.series)
@@ -399,14 +374,14 @@ class Store(SeriesReader):
         epoch = stored.epoch
         with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not kept"):
             last, loose = self._ends.get(series.id) or (
-                self.last_epoch(series), SeriesColumns(self._db, series.id).count_loose()
+                self.last_epoch(series), columns.SeriesColumns(self._db, series.id).count_loose()
             )  # fmt: skip
             if last is not None and epoch.number <= last:
                 raise StoreError(
                     f"{self.path}: epoch {epoch.number} of series {series.name!r} comes after "
                     f"epoch {last}; numbers must increase"
                 )
-            insert_epoch(self._db, series.id, stored)
+            epochs.insert_epoch(self._db, series.id, stored)
             for event in events:
                 self._insert_event(event)
             full = loose + 1 >= columns.CHUNK
@@ -418,7 +393,7 @@ class Store(SeriesReader):
         """Damage in an old row must not stop new ones: then columns are read from the rows."""
         self._db.execute("SAVEPOINT chunks")
         try:
-            SeriesColumns(self._db, series.id).build()
+            columns.SeriesColumns(self._db, series.id).build()
         except StoreError as error:
             self._db.execute("ROLLBACK TO chunks")
             self._unchunked.add(series.id)
@@ -436,7 +411,9 @@ class Store(SeriesReader):
     ) -> None:
         """Keep a later calibration of an epoch; observations None: as before; extra: added."""
         with self._transaction(f"the calibration of epoch {number} was not kept"):
-            then = next(select_epochs(self._db, series.id, number, number, details=False), None)
+            then = next(
+                epochs.select_epochs(self._db, series.id, number, number, details=False), None
+            )
             if then is None:
                 raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
             stored = StoredEpoch(
@@ -446,7 +423,7 @@ class Store(SeriesReader):
                 then.clock_trusted,
                 then.revision + 1,
             )
-            insert_epoch(self._db, series.id, stored)
+            epochs.insert_epoch(self._db, series.id, stored)
 
     def add_event(self, event: Event) -> None:
         """Log something that happened apart from an epoch."""
@@ -455,22 +432,23 @@ class Store(SeriesReader):
 
     def _insert_event(self, event: Event) -> None:
         row = {
-            "id": next_id(self._db, "event"), "utc": event.utc, "series_id": event.series,
+            "id": columns.next_id(self._db, "event"), "utc": event.utc, "series_id": event.series,
             "epoch": event.epoch, "kind": event.kind, "text": event.text,
-            "data": to_json(event.data),
+            "data": epochs.to_json(event.data),
         }  # fmt: skip
-        insert_row(self._db, "event", row)
+        columns.insert_row(self._db, "event", row)
 
     def add_readings(self, readings: Sequence[LoggedReading]) -> None:
         """Keep what thermometers said apart from epochs, in one transaction."""
         with self._transaction("readings were not kept"):
             for reading in readings:
                 row = {
-                    "id": next_id(self._db, "reading"), "utc": reading.utc,
+                    "id": columns.next_id(self._db, "reading"), "utc": reading.utc,
                     "clock_trusted": int(reading.clock_trusted),
-                    "thermometer": reading.thermometer, "temperatures": to_json(reading.values),
+                    "thermometer": reading.thermometer,
+                    "temperatures": epochs.to_json(reading.values),
                 }  # fmt: skip
-                insert_row(self._db, "reading", row)
+                columns.insert_row(self._db, "reading", row)
 
     def checkpoint(self) -> bool:
         """Move what is in the -wal file into the store; False if a reader or the disk forbids."""
@@ -499,11 +477,11 @@ def _sound_rows(table: str, rows: Iterable[tuple[Any, ...]]) -> Iterator[dict[st
     """Yield rows by column; leave out what is damaged, with a warning: no result depends on it."""
     for values in rows:
         try:
-            require_sound(table, values)
+            columns.require_sound(table, values)
         except StoreError as error:
             log.warning("%s; it is left out", error)
         else:
-            yield dict(zip(ROW[table], values, strict=True))
+            yield dict(zip(columns.ROW[table], values, strict=True))
 
 
 def _source(name: str, series: StoredSeries) -> str:

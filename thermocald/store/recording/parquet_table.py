@@ -248,15 +248,23 @@ def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
             writer.write_table(batch)
 
 
-def write_parquet(path: Path, columns: Mapping[str, Any]) -> None:
-    """Write columns {name: (n,)} as one Parquet file, whole or not at all; NaN becomes null."""
+def write_parquet(
+    path: Path, parts: Iterable[Mapping[str, Any]], *, nan_is_null: bool = False
+) -> None:
+    """Write columns {name: (n,)}, which come in parts, as one Parquet file, whole or not at all.
+
+    Numbers are kept bit for bit; nan_is_null: NaN becomes null. UsageError without pyarrow.
+    """
     pyarrow = _pyarrow()
-    arrays = {
-        name: pyarrow.array(values, from_pandas=isinstance(values, np.ndarray))
-        for name, values in columns.items()
-    }
+    arrays = (
+        {
+            name: pyarrow.array(values, from_pandas=nan_is_null and isinstance(values, np.ndarray))
+            for name, values in columns.items()
+        }
+        for columns in parts
+    )
     with new_file(path) as partial:
-        _write(partial, [arrays])
+        _write(partial, arrays)
 
 
 def csv_to_parquet(source: Path, target: Path, advance: Any = lambda _: None) -> None:
@@ -337,7 +345,7 @@ def _pyarrow() -> Any:
         import pyarrow.parquet
     except ImportError as cause:
         raise UsageError(
-            "Parquet needs pyarrow: pip install 'thermocald[parquet]', or convert the recording "
-            "to CSV where it is installed"
+            "Parquet needs pyarrow: pip install 'thermocald[parquet]' (where it is installed, a "
+            "recording can be converted to CSV)"
         ) from cause
     return pa

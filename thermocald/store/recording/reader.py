@@ -15,22 +15,14 @@ from thermocald.errors import RecordingError
 from thermocald.names import FileFolder
 from thermocald.photogrammetry.series.normals import runs
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
-from thermocald.store.recording.observation_file import (
-    LONG_FROM_BYTES,
-    ObservationFile,
-)
+from thermocald.store.recording.observation_file import LONG_FROM_BYTES, ObservationFile
 from thermocald.store.recording.readings import (
     READINGS,
     Readings,
     interpolate_readings,
     read_readings,
 )
-from thermocald.store.recording.sense import (
-    pairing_doubts,
-    reading_doubts,
-    time_doubts,
-    time_fault,
-)
+from thermocald.store.recording.sense import pairing_doubts, reading_doubts, time_doubts, time_fault
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import (
     read_testfield,

@@ -58,9 +58,7 @@ def read_readings(path: Path, channels: Sequence[str]) -> Readings:
 
 
 def interpolate_readings(
-    frame_times: ArrayLike,
-    reading_times: ArrayLike,
-    readings: ArrayLike,
+    frame_times: ArrayLike, reading_times: ArrayLike, readings: ArrayLike
 ) -> Array:
     """Readings (R,) °C at `reading_times` (R,) s → temperatures (E,) °C at `frame_times` (E,) s.
 

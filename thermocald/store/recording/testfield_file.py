@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 _MOST_TARGETS = 4000
 _LARGEST_MM = 1e9  # a thousand kilometres
 _SIGMAS_MM = (1e-9, 1e4)
-_REQUIRED = ("target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ")
+_NUMBERS = ("X", "Y", "Z", "diameter", "sX", "sY", "sZ")
+_REQUIRED = ("target", *_NUMBERS)
 
 # No camera of ours can look at a field smaller than this; one in metres is (a room: 6 "mm").
 _SMALLEST_FIELD_MM = 25.0
@@ -49,54 +50,47 @@ def parse_testfield(text: str, path: Path) -> TestField:
 
 
 def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
-    names: list[str] = []
-    columns: dict[str, list[float]] = {name: [] for name in _REQUIRED[1:]}
-    kinds: list[str] = []
-    codes: list[str] = []
-    lines: dict[str, int] = {}
-    for chunk in table.chunks():
-        for row, text in enumerate(chunk.text("target")):
-            name = text.strip()
-            if not name:
-                chunk.fail(row, "target", "is empty; every target needs a name")
-            if not " ".join(name.splitlines()).isprintable():
-                chunk.fail(row, "target", f"{name[:40]!r} must be printable")
-            if name in lines:
-                chunk.fail(row, "target", f"target {name!r} is duplicated")
-            lines[name] = row
-            names.append(name)
-        for column, values in columns.items():
-            numbers = chunk.numbers(column, empty_is_nan=column == "diameter")
-            chunk.check(column, abs(numbers) > _LARGEST_MM, f"must be within {_LARGEST_MM:g} mm")
-            if column == "diameter":
-                chunk.check(column, numbers <= 0, "a diameter must be above 0 mm, or left empty")
-            if column.startswith("s"):
-                chunk.check(column, numbers < 0, "a standard deviation must not be negative")
-                odd = (numbers > 0) & ((numbers < _SIGMAS_MM[0]) | (numbers > _SIGMAS_MM[1]))
-                chunk.check(column, odd, "is no standard deviation; 0 holds a coordinate fixed")
-            values.extend(numbers.tolist())
-        empty = ("",) * len(chunk)
-        for row, text in enumerate(chunk.text("kind") if "kind" in table.columns else empty):
-            kind = text.strip() or KINDS[0]
-            if kind not in KINDS:
-                chunk.fail(row, "kind", f"{kind!r} is unknown; it is one of {', '.join(KINDS)}")
-            kinds.append(kind)
-        found = chunk.text("code") if "code" in table.columns else empty
-        codes.extend(code.strip() for code in found)
-        if len(names) > _MOST_TARGETS:
-            raise TestFieldError(
-                f"{table.path}: holds more than {_MOST_TARGETS} targets; leave out what no camera "
-                "of yours sees"
-            )
+    given = [name for name in ("kind", "code") if name in table.columns]
+    found = table.read(
+        (), [n for n in _NUMBERS if n != "diameter"], ["diameter"], ["target", *given]
+    )
+    names = [text.strip() for text in found.get("target", ())]
+    first: dict[str, int] = {}
+    for row, name in enumerate(names):
+        if not name:
+            table.fail(row, "target", "is empty; every target needs a name")
+        if not " ".join(name.splitlines()).isprintable():
+            table.fail(row, "target", f"{name[:40]!r} must be printable")
+        if first.setdefault(name, row) != row:
+            table.fail(row, "target", f"target {name!r} is duplicated")
+    columns = {name: found.get(name, np.empty(0)) for name in _NUMBERS}
+    for column, numbers in columns.items():
+        table.check(column, abs(numbers) > _LARGEST_MM, f"must be within {_LARGEST_MM:g} mm")
+        if column == "diameter":
+            table.check(column, numbers <= 0, "a diameter must be above 0 mm, or left empty")
+        if column.startswith("s"):
+            table.check(column, numbers < 0, "a standard deviation must not be negative")
+            odd = (numbers > 0) & ((numbers < _SIGMAS_MM[0]) | (numbers > _SIGMAS_MM[1]))
+            table.check(column, odd, "is no standard deviation; 0 holds a coordinate fixed")
+    empty = ("",) * len(names)
+    kinds = [text.strip() or KINDS[0] for text in found.get("kind", empty)]
+    for row, kind in enumerate(kinds):
+        if kind not in KINDS:
+            table.fail(row, "kind", f"{kind!r} is unknown; it is one of {', '.join(KINDS)}")
+    if len(names) > _MOST_TARGETS:
+        raise TestFieldError(
+            f"{table.path}: holds more than {_MOST_TARGETS} targets; leave out what no camera "
+            "of yours sees"
+        )
     if not names and not may_be_empty:
         raise TestFieldError(f"{table.path}: holds no targets")
     return TestField.build(
         names,
         np.array([columns["X"], columns["Y"], columns["Z"]]).T,
         np.array([columns["sX"], columns["sY"], columns["sZ"]]).T,
-        columns["diameter"],
+        columns["diameter"].tolist(),
         kinds,
-        codes,
+        [code.strip() for code in found.get("code", empty)],
     )
 
 

@@ -67,9 +67,7 @@ class RecordingWriter:
         return self
 
     def append(
-        self,
-        epoch: Epoch,
-        image: bytes | NDArray[np.uint8] | NDArray[np.uint16] | None = None,
+        self, epoch: Epoch, image: bytes | NDArray[np.uint8] | NDArray[np.uint16] | None = None
     ) -> None:
         """Add one epoch; `image` is its frame as JPEG bytes or as grey values (kept as PNG).
 

@@ -169,7 +169,7 @@ class Calibration(Result):
             return []
         nominal = self.file.principal_distance or focal_length(Path(found.photographs[0].path))
         c, x0, y0 = found.interior.as_array()[:3].tolist()
-        return interior_doubts(CameraSpec(self.file.name, self.file.sensor, nominal), c, x0, y0)
+        return interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
 
     @property
     def status(self) -> str:

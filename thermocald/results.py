@@ -23,7 +23,6 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.model_file import write_effects, write_model
 from thermocald.result import Result, document_of, jsonable
 from thermocald.store.logger.photographs import focal_length
-from thermocald.store.recording.head import CameraSpec
 from thermocald.store.recording.sense import doubt_lines, interior_doubts
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.study.reference import Comparison
     from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
     from thermocald.physics.model import ThermalModel
+    from thermocald.store.recording.head import CameraSpec
 
 
 _Kind = TypeVar("_Kind")

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import tempfile
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -142,8 +143,9 @@ def server(cluster, template):
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory):
-    """Two recordings of one camera."""
+    """Two recordings of one camera, 80 epochs each."""
     folder = tmp_path_factory.mktemp("archive")
     for name in ("M1", "M2"):
-        preset_simulation("rpi-v2.1-heating", 1, name).write(folder / name)
+        whole = preset_simulation("rpi-v2.1-heating", 1, name)
+        replace(whole, programme=replace(whole.programme, epochs=80)).write(folder / name)
     return folder

@@ -62,7 +62,6 @@ def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, dask):
 
 def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archive, tmp_path, dask):
     """One after every few blocks, and another takes its place, as on machines that are lent."""
-    archive = archive / "M1"
     run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10))
     out = tmp_path / "many"
     client = start_client(archive, out, dask)

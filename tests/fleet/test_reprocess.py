@@ -25,13 +25,20 @@ def blocks_of(archive, out, size=40):
     return find_blocks([archive], out, tuple(DEFAULT_FREE), size)
 
 
-def test_processes_give_the_bits_of_one(archive, tmp_path):
-    run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one"))
-    done = run_tasks(calibrate_block, blocks_of(archive, tmp_path / "two"), jobs=2)
-    assert sum(o.calibrated for o in done) == 300
-    assert files(tmp_path / "one") == files(tmp_path / "two")
-    table = parquet.read_table(tmp_path / "one")
-    assert table.num_rows == 300
+@pytest.fixture(scope="module")
+def calibrated(archive, tmp_path_factory):
+    """All blocks, in this process."""
+    out = tmp_path_factory.mktemp("calibrated")
+    run_tasks(calibrate_block, blocks_of(archive, out))
+    return out
+
+
+def test_processes_give_the_bits_of_one(archive, calibrated, tmp_path):
+    done = run_tasks(calibrate_block, blocks_of(archive, tmp_path), jobs=2)
+    assert sum(o.calibrated for o in done) == 160
+    assert files(calibrated) == files(tmp_path)
+    table = parquet.read_table(calibrated)
+    assert table.num_rows == 160
     assert table.column("sd_x0").null_count == 0
 
 
@@ -42,7 +49,7 @@ def test_an_interrupted_run_goes_on(archive, tmp_path):
 
 
 def test_what_fails_costs_itself(archive, tmp_path):
-    blocks = blocks_of(archive, tmp_path, 75)
+    blocks = blocks_of(archive, tmp_path)
     blocks[1] = replace(blocks[1], recording=tmp_path / "gone")
     done = run_tasks(calibrate_block, blocks, jobs=2)
     assert sorted(bool(o.error) for o in done) == [False, False, False, True]
@@ -50,7 +57,7 @@ def test_what_fails_costs_itself(archive, tmp_path):
 
 
 def test_a_block_that_kills_its_process_costs_itself(archive, tmp_path):
-    done = run_tasks(die, blocks_of(archive, tmp_path, 75), jobs=2)
+    done = run_tasks(die, blocks_of(archive, tmp_path), jobs=2)
     assert sorted(o.error for o in done) == ["", "", "", "its process died twice"]
 
 
@@ -97,15 +104,14 @@ def test_a_scheduler_that_is_not_there_is_said(archive, tmp_path):
 
 
 @pytest.mark.parametrize("reader", ["pandas", "duckdb"])
-def test_the_files_are_read_without_us(archive, tmp_path, reader):
-    run_tasks(calibrate_block, blocks_of(archive, tmp_path, 75)[:2])
+def test_the_files_are_read_without_us(calibrated, reader):
     if reader == "pandas":
         pandas = pytest.importorskip("pandas", reason="pip install pandas")
-        table = pandas.read_parquet(tmp_path / "rpi-v2.1-M1")
+        table = pandas.read_parquet(calibrated)
         rows, good = len(table), int((table.status == "ok").sum())
     else:
         duckdb = pytest.importorskip("duckdb", reason="pip install duckdb")
         rows, good = duckdb.execute(
-            f"SELECT count(*), count(*) FILTER (status = 'ok') FROM '{tmp_path}/*/*.parquet'"
+            f"SELECT count(*), count(*) FILTER (status = 'ok') FROM '{calibrated}/*/*.parquet'"
         ).fetchone()
-    assert (rows, good) == (150, 150)
+    assert (rows, good) == (160, 160)

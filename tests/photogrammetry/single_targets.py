@@ -8,6 +8,7 @@ operator that estimates more can reach it quite.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -55,6 +56,7 @@ class SingleTargets:
         return image
 
 
+@cache
 def single_targets(
     diameters=(12, 16, 20, 28, 40),
     tilts=(0, 30, 45, 60),
@@ -66,6 +68,7 @@ def single_targets(
 ) -> SingleTargets:
     """Discs on a raster over the Pi camera's frame, each tilted about a random axis.
 
+    Drawn once for all tests, which change nothing in it.
     bits: with a code ring of so many bits (up to 30 px then); ink: DN of the discs on PAPER.
     """
     rng = np.random.default_rng(seed)

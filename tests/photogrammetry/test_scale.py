@@ -43,8 +43,13 @@ def found_at(frame, field, scale):
     return len(measure(frame if scale == 1 else small, field).observations)
 
 
-def test_a_tilted_sheet_is_found_whole_at_every_scale(sheet):
-    frame, seen = frame_from(sheet, "near and aslant")
+@pytest.fixture(scope="module")
+def aslant(sheet):
+    return frame_from(sheet, "near and aslant")
+
+
+def test_a_tilted_sheet_is_found_whole_at_every_scale(sheet, aslant):
+    frame, seen = aslant
     found = [found_at(frame, sheet[0], scale) for scale in (1.0, 0.9, 0.75, 0.5, 0.25)]
     assert min(found) >= 0.97 * seen >= 50
 
@@ -61,9 +66,8 @@ def test_fifty_scales(sheet, stand, noise):
     assert seen >= 50
 
 
-def test_a_saturated_sheet_says_so(sheet):
-    frame, _ = frame_from(sheet, "straight")
-    bright = np.clip(frame.astype(float) * 1.6, 0, 255).astype(np.uint8)
+def test_a_saturated_sheet_says_so(sheet, aslant):
+    bright = np.clip(aslant[0].astype(float) * 1.6, 0, 255).astype(np.uint8)
     status = measure(bright, sheet[0]).status
     assert status.word == "nothing_found"
     assert "saturated" in status.reason

@@ -26,6 +26,9 @@ _Record = TypeVar("_Record")
 _TEMPLATES = Path(__file__).parent / "templates"
 _A_YEAR = 31_557_600.0
 _RIGHT_TO_LEFT = "\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc"
+# no line ends between a number, its standard deviation and their unit
+_PROSE = re.compile(r"<(p|li|figcaption)\b[^>]*>.*?</\1>", re.DOTALL)
+_BEFORE_UNIT = re.compile(r"(?<=[\d)]) (?=±|%|°|(?:px|mm|µm|cm|m|K|s|min|h|σ)\b)|(?<=±) ")
 _WORDS_TO_LEFT = re.compile(
     f"[{_RIGHT_TO_LEFT}](?:[{_RIGHT_TO_LEFT}\\s\u200c\u200d-]*[{_RIGHT_TO_LEFT}])?"
 )
@@ -105,7 +108,7 @@ def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> st
     environment.filters["powers"] = typeset_powers
     at = datetime.now(tz=UTC)
     versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy"))
-    return environment.get_template("report.html.j2").render(
+    page = environment.get_template("report.html.j2").render(
         title=title,
         lead=lead,
         chapters=chapters,
@@ -114,6 +117,7 @@ def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> st
         style=(_TEMPLATES / "report.css").read_text(encoding="utf-8"),
         script=(_TEMPLATES / "report.js").read_text(encoding="utf-8"),
     )
+    return _PROSE.sub(lambda m: _BEFORE_UNIT.sub("\u00a0", m[0]), page)
 
 
 def as_sentence(text: str) -> str:

@@ -29,7 +29,7 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     assert "<svg" in page
     assert re.search(r"Made on \d{4}-\d\d-\d\d at \d\d:\d\d UTC with thermocald", page)
     source = evidence[0].source
-    assert f"{source.camera}, {source.sensor.width} × {source.sensor.height} px of" in page
+    assert f"{source.camera}, {source.sensor.width} × {source.sensor.height}\xa0px of" in page
     links = re.findall(r'href="#(chapter-1-\d)"', page)
     assert links == re.findall(r'<details id="(chapter-1-\d)"', page)
     assert len(links) >= 4

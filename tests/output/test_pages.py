@@ -324,7 +324,7 @@ def test_a_candidate_is_blue_only_where_it_is_named(name, bars, page_text, open_
 
 def test_the_epochs_report_opens_with_the_drift(page_text, open_page):
     page = open_page(page_text("epochs"), 794)
-    sentence = page.text_content(".answer .sentence")
+    sentence = page.text_content(".answer .sentence").replace("\xa0", " ")
     assert re.search(r"°C .*x₀ moves by −0\.4\d+ ± 0\.0\d+ µm/K; y₀ moves by −0\.\d+ ±", sentence)
     page.emulate_media(media="print")
     wide = "[...document.querySelectorAll('pre')].map(e => e.scrollWidth - e.clientWidth)"

@@ -146,14 +146,15 @@ def _origin(d: Discovery) -> list[str]:
 
 def _sections(d: Discovery) -> list[Section]:
     tested = d.verdict == "effects_found" and bool(d.examination.surrogates)
+    left = "Before and after" if d.effects else "What the model leaves"
     return [
-        Section("Before and after", figures=(_movement(d), gap_figure(d)), tables=(_gap_table(d),)),
+        Section(left, figures=(_movement(d), gap_figure(d)), tables=(_gap_table(d),)),
         *(_effect(e) for e in d.effects),
         *([_noise_test(d)] if tested else []),
         _candidates(d),
         Section(
-            "Where the base model fails, in numbers",
-            ("What the base model leaves of M1, against everything that was recorded.",),
+            "What the base model leaves, in numbers",
+            ("What it leaves of M1, against everything that was recorded.",),
             (_misfit_matrix(d),),
             (_misfit_table(d),),
             folded=True,
@@ -254,7 +255,8 @@ def _movement(d: Discovery) -> Figure:
             arrows=Arrows(places, vectors, frame, colour, longest),
         )
         for (misfit, vectors), title, colour in zip(
-            drawn, ("Before", "After"), (_BASE, _FOUND), strict=False
+            drawn, ("Before", "After") if len(drawn) > 1 else ("Left over",), (_BASE, _FOUND),
+            strict=False,
         )
     )  # fmt: skip
     return Figure(
@@ -324,7 +326,7 @@ def gap_figure(d: Discovery) -> Figure:
 
 def _gap_table(d: Discovery) -> Table:
     gaps = [
-        (f"{name}, {f'with {stage.added}' if stage.added else 'base model'}", gap)
+        (f"{name}, {f'+ {stage.added}' if stage.added else 'base model'}", gap)
         for stage in d.stages
         for name, gap in zip(_names(d), stage.gaps, strict=True)
     ]
@@ -374,7 +376,7 @@ def _effect(effect: EffectFound) -> Section:
          f"{a['experiment']}."))
         for a in excluded
     ]  # fmt: skip
-    if alike := [a["effect"] for a in effect.alternatives if a.get("resembles")]:
+    if alike := dict.fromkeys(a["effect"] for a in effect.alternatives if a.get("resembles")):
         text.append(
             f"Effects that merely resemble it: {', '.join(alike)}. Not one passes the absolute "
             "test."
@@ -452,8 +454,9 @@ def _candidates(d: Discovery) -> Section:
     for s in sorted(x.ranking, key=lambda s: s.score):
         singles.setdefault(_candidate_name(s), s)
     noise = _noise_px(d, 0)
-    rows = [(name, s, _left_px(d, s.fit)) for name, s in singles.items()]
     best = x.best.names[len(x.base.terms) :] if x.adequate else ()
+    rows = [(name, s, _left_px(d, s.fit)) for name, s in singles.items()]
+    rows.sort(key=lambda row: (row[0].split(" ")[0] not in best, row[2]))
     bars = [(name, left, _FOUND if name.split(" ")[0] in best else PALE) for name, _, left in rows]
     if len(best) > 1:
         bars.insert(0, (" + ".join(best), _left_px(d, x.best.fit), _FOUND))
@@ -509,7 +512,7 @@ def _misfit_table(d: Discovery) -> Table:
     def number(value: Any, decimals: int) -> str:
         if not isinstance(value, float):
             return str(value)
-        return f"{value:.{decimals}f}".replace("-", "−") if math.isfinite(value) else "–"
+        return f"{value:z.{decimals}f}".replace("-", "−") if math.isfinite(value) else "–"
 
     return Table.of(
         "Misfit of the base model",

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 _DRAWN = 400  # points of a cloud
+_ALIKE = 0.005  # correlations that differ by less do not differ when written
 _CLUSTERS = ("#1b7837", "#7fbf7b", "#e6a800", "#d6278a", "#7b3294", "#000000")
 
 
@@ -367,11 +368,11 @@ def _matrices(camera: CameraStudy) -> Iterator[Figure]:
     if camera.correlations is not None and free:
         noise = float(np.max(camera.correlations.noise[free][:, free]))
         names = [parameter_label(IOP_NAMES[k]) for k in free]
+        scatter = f"scatter by {plain(noise, digits=2)} at most" if noise > _ALIKE else "agree"
         yield Figure(
             "iop-correlations", "Correlations within the adjustments",
             "Correlation of the estimated parameters within an epoch's adjustment: median over "
-            f"{camera.correlations.epochs} epochs, of which the noise (sd) is "
-            f"{plain(noise, digits=2)} at most. High values belong to the "
+            f"{camera.correlations.epochs} epochs, which {scatter}. High values belong to the "
             "geometry of the calibration, not to the temperature.",
             drawing=draw_matrix(
                 camera.correlations.median[free][:, free], names, "Within the adjustments"

@@ -251,7 +251,10 @@ def _dependence(study: SeriesStudy) -> str:
     name = parameter_label(channel.thermometer.name)
     if not significant:
         return f"{study.series.name}: no parameter depends significantly on {name}."
-    text = f"{study.series.name}: {', '.join(significant)} depend significantly on {name}"
+    depends = "depends" if len(significant) == 1 else "depend"
+    text = f"{study.series.name}: {', '.join(significant)} {depends} significantly on {name}"
+    if close == significant:
+        return f"{text}, and closely (|r| ≥ {_CLOSE})."
     return text + (f", {', '.join(close)} closely (|r| ≥ {_CLOSE})." if close else ".")
 
 

@@ -278,7 +278,7 @@ def fit_calibrations(
 
     for name in calibrations:
         if not calibrated.is_calibration(source_of(name)):
-            raise UsageError(f"{name}: is no calibration; fit series and calibrations apart")
+            raise UsageError(f"{name}: is not a calibration; fit series and calibrations apart")
     given = [calibrated.read_calibration(source_of(name), T) for name, T in calibrations.items()]
     channel = "temperature"
     if log is not None:

@@ -159,7 +159,10 @@ def test_what_is_decided_follows_the_data_and_is_said():
         "the camera stands still: one orientation for 24 epochs"
     )
     running, results, _, _ = take(Scene(5), 12)
-    assert "12 of the 20 good epochs" in running.report()["orientation"]
+    assert (
+        "until 20 good epochs show whether the camera stands still; 12 so far"
+        in running.report()["orientation"]
+    )
     running, results, _, _ = take(Scene(5, tremble_px=0.2), 24)
     assert results[-1][1]["mount_px"] > 0.05
     assert "the mount moves by 0." in running.report()["orientation"]

@@ -98,7 +98,7 @@ def main() -> None:
         if error.encoding != "utf-8":
             raise
         # bytes of a file's name, which neither a server nor a library of C++ can be given
-        say(f"error: {error.object[:200]}: is no UTF-8 text; choose another name")
+        say(f"error: {error.object[:200]}: is not UTF-8 text; choose another name")
         sys.exit(2)
     except BrokenPipeError:
         # The reader of our output has gone, as `head` does.

@@ -37,11 +37,15 @@ def import_(
     dry_run: bool = typer.Option(
         False, "--dry-run", help="Show what would be written, and write nothing."
     ),
-    camera_timezone: str | None = expert(None, help="The camera's own, whatever EXIF says of it."),
+    camera_timezone: str | None = expert(
+        None, help="The camera's time zone, whatever EXIF says of it."
+    ),
     camera_clock: str = expert("0", help="How far the camera's clock was ahead: +00:03:12."),
-    times: str = expert("exif", help="Of photographs: exif, name (of the file), file (date)."),
+    times: str = expert(
+        "exif", help="Where the photographs' times are: exif, name (of the file), file (its date)."
+    ),
     principal_distance: float | None = expert(
-        None, help="Of the lens, mm; EXIF's by default.", min=0.1
+        None, help="Principal distance, mm; by default EXIF's focal length.", min=0.1
     ),
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
@@ -117,7 +121,7 @@ def archive(
         False, "--skip-existing", help="Pass over recordings that are there already."
     ),
     finished: bool = expert(
-        False, "--finished", help="Only series after which the camera began another."
+        False, "--finished", help="Only series that have ended, since the camera began another."
     ),
     retention: bool = expert(
         False, "--retention", help="Then delete frames as the configuration's limits say."

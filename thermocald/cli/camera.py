@@ -126,6 +126,7 @@ def at(
     """Give the camera at one temperature, as a file of any program.
 
     Example: thermocald camera at camera.thermal.yaml --temperature 35 --to ros -o cam.yaml
+
     Example: thermocald camera at camera.thermal.yaml --temperature 35 --to pyorc --renew site.json
     --reference clicked.jpg --frame now.jpg -o warm.json
     """
@@ -195,8 +196,8 @@ def predict(
     ),
     camera: Path | None = typer.Option(None, help="Camera file, for --programme."),
     channel: list[str] | None = expert(None, help="NAME=°C of another thermometer; repeatable."),
-    distance: float = expert(10.0, min=0.01, help="Of the object, m."),
-    wanted: float = expert(5.0, "--wanted-mm", min=1e-3, help="Wanted error there, mm."),
+    distance: float = expert(10.0, min=0.01, help="Distance of the object, m."),
+    wanted: float = expert(5.0, "--wanted-mm", min=1e-3, help="Wanted error on the object, mm."),
     extrapolate: ExtrapolateOption = False,
     log_options: Any = None,
     json: JsonOption = None,
@@ -243,7 +244,9 @@ def correct(
     out: Path | None = typer.Option(None, help="CSV to write (points), or folder (images)."),
     to: float | None = expert(None, help="°C to correct to; default: the model's T0."),
     temperature_sd: float | None = expert(
-        None, min=0.0, help="Of a reading of the log, K; default: as the model's fit found it."
+        None,
+        min=0.0,
+        help="Standard deviation of a reading, K; default: what the model's fit found.",
     ),
     image_size: str | None = expert(None, "--size", help="WIDTHxHEIGHT where images are binned."),
     extrapolate: ExtrapolateOption = False,
@@ -301,7 +304,7 @@ def measure(
     ),
     seen: str = typer.Option(..., metavar="TIME", help="When the control points were seen there."),
     plane: Path = typer.Option(..., help="YAML: level, or plane, or line; and sd."),
-    length_unit: str = typer.Option("mm", help="Of control points and plane: mm or m."),
+    length_unit: str = typer.Option("mm", help="Unit of control points and plane: mm or m."),
     extrapolate: ExtrapolateOption = False,
     timezone: TimezoneOption = None,
     ambiguous: str = "order",

@@ -14,7 +14,7 @@ from thermocald.errors import DataError, DeviceError
 def devices(json: JsonOption = None) -> None:
     """List attached cameras, thermometers and outputs, as they are written in config.yaml.
 
-    What is not certain (a serial port, an I2C bus: nobody knows what is on it) is a comment.
+    What is not certain (what is on a serial port, on an I2C bus) is a comment.
 
     Example: thermocald devices >> config.yaml
     """
@@ -54,7 +54,7 @@ def check(
     ),
     json: JsonOption = None,
 ) -> None:
-    """Read everything and say what it is; the first thing that is wrong ends it.
+    """Read everything and say what it is; stop at the first thing that is wrong.
 
     With --probe every device is tried, whatever the others did: exit status 3 where one failed.
 
@@ -73,6 +73,6 @@ def check(
     failed = [probe.name for probe in probes if probe.error]
     if failed:
         raise DeviceError(
-            f"{len(failed)} of {len(probes)} devices gave nothing: {', '.join(failed)}; why stands "
-            "in their lines"
+            f"{len(failed)} of {len(probes)} devices gave nothing: {', '.join(failed)}; "
+            "see their lines"
         )

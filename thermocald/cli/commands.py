@@ -55,7 +55,7 @@ PANELS = {
         "session": Entry("session", "Take one measurement series, from check to report", True),
         "run": Entry("run", "Acquire, calibrate and keep epochs until told to end"),
         "status": Entry("run", "Say how the daemon is doing"),
-        "top": Entry("run", "Say so again every second"),
+        "top": Entry("run", "Show that, always up to date"),
         "dashboard": Entry("run", "Serve the daemon's web page"),
         "import": Entry("archive", "Make a recording from photographs and a logger's file"),
         "simulate": Entry("demo", "Make a recording of a simulated camera that warms up"),

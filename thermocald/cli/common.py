@@ -44,10 +44,10 @@ ModelOption = Annotated[Path, typer.Option("--model", help="The thermal model.")
 ExtrapolateOption = Annotated[
     bool, expert(..., "--extrapolate", help="Allow temperatures far outside the fit.")
 ]
-SeedOption = Annotated[int, expert(..., "--seed", min=0, help="Of all random numbers.")]
+SeedOption = Annotated[int, expert(..., "--seed", min=0, help="Seed of all random numbers.")]
 TimezoneOption = Annotated[
     str | None,
-    typer.Option("--timezone", help="Of times without a zone: Europe/Berlin, UTC, +02:00."),
+    typer.Option("--timezone", help="Time zone of times without one: Europe/Berlin, UTC, +02:00."),
 ]
 FreeOption = Annotated[
     str,
@@ -59,7 +59,8 @@ FreeOption = Annotated[
 ]
 DEFAULT_FREE = "c,x0,y0,A1,A2,A3,B1,B2"
 JobsOption = Annotated[
-    int, expert(..., min=1, max=256, help="Processes; the results are the same to the bit.")
+    int,
+    expert(..., min=1, max=256, help="Number of processes; the results are the same to the bit."),
 ]
 ExteriorOption = Annotated[
     str,
@@ -74,21 +75,25 @@ ExteriorOption = Annotated[
 def _log_signature(
     timezone: TimezoneOption = None,
     temperature_column: list[str] | None = typer.Option(
-        None, help="Of the log; the first is the reference; repeatable."
+        None, help="Column of a temperature; the first is the reference; repeatable."
     ),
     name: list[str] | None = typer.Option(
-        None, metavar="COLUMN=LABEL", help="What a column of the log is called."
+        None, metavar="COLUMN=LABEL", help="A label for a column of the log."
     ),
-    unit: str | None = typer.Option(None, help="Of the log where it does not say: degC, K, degF."),
-    date_order: str | None = expert(None, help="Of 06/07/2026: dmy or mdy."),
-    time_column: list[str] | None = expert(None, help="Of the log; twice for a date and a time."),
-    log_timezone: str | None = expert(None, help="The logger's own."),
+    unit: str | None = typer.Option(
+        None, help="The log's unit where it does not say: degC, K, degF."
+    ),
+    date_order: str | None = expert(None, help="Which of 06/07/2026 is the day: dmy or mdy."),
+    time_column: list[str] | None = expert(
+        None, help="The log's column of times; twice for a date and a time."
+    ),
+    log_timezone: str | None = expert(None, help="The logger's time zone."),
     log_clock: str = expert("0", help="How far the logger's clock was ahead: +00:03:12."),
     ambiguous: str = expert(
         "order",
         help="The hour that comes twice in autumn: order (of rows), earlier, later, refuse.",
     ),
-    separator: str | None = expert(None, help="Of the log's columns: ';' ',' tab."),
+    separator: str | None = expert(None, help="Between the log's columns: ';' ',' tab."),
     decimal: str | None = expert(None, help="The log's decimal mark: , or ."),
 ) -> None:
     """How a logger's file is to be read, wherever a command reads one."""

@@ -16,7 +16,7 @@ def demo(
     out: Path = typer.Option(
         Path("thermocald-demo"), help="Folder for the store and the recording."
     ),
-    epochs: int = typer.Option(150, min=10, help="Of 10 s each."),
+    epochs: int = typer.Option(150, min=10, help="Number of epochs, of 10 s each."),
     seed: SeedOption = 0,
     discovery: bool = typer.Option(
         True, "--discovery/--no-discovery", help="End with a hidden effect found."

@@ -54,6 +54,7 @@ def replay(
     not move in it is compared with what the thermal model predicts.
 
     Example: thermocald replay rpi-heating-M1 --store thermocald.db
+
     Example: thermocald replay photos --model camera.thermal.yaml --log weather.csv --timezone UTC
     """
     import thermocald as tc
@@ -104,7 +105,7 @@ def export(
     series: str | None = typer.Option(None, help="Which of a store: CAMERA/SERIES or SERIES."),
     units: str = typer.Option("", help="px, um, deg instead of mm and rad; named in the columns."),
     time_: str = typer.Option("seconds", "--time", help="seconds since 1970 UTC, or iso."),
-    separator: str = typer.Option(",", help="Of the columns: , ; | tab"),
+    separator: str = typer.Option(",", help="Between the columns: , ; | tab"),
     decimal: str = typer.Option(".", help="The decimal mark: . or ,"),
     extra: bool = expert(
         False,
@@ -114,12 +115,13 @@ def export(
     ),
     jobs: JobsOption = 1,
 ) -> None:
-    """One row per epoch: parameters, standard deviations, sigma0, status.
+    """Write one row per epoch: parameters, standard deviations, sigma0, status.
 
     With one of --units, --time, --separator, --decimal, --extra, and as Parquet, the temperatures
     of all thermometers follow.
 
     Example: thermocald export rpi-heating-M1 --format csv > M1.csv
+
     Example: thermocald export M1 --units px,deg --time iso --separator ';' --decimal ',' -o M1.csv
     """
     import thermocald as tc

@@ -28,12 +28,12 @@ def run(
     ),
     recording: Path | None = typer.Option(None, help="Play a recording instead of devices."),
     store: Path | None = typer.Option(None, help="The store; overrides the configuration."),
-    epochs: int = typer.Option(0, min=0, help="End after so many epochs per camera."),
+    epochs: int = typer.Option(0, min=0, help="End after so many epochs per camera; 0: never."),
     fast: bool = expert(
         False, "--fast", help="Play the recording as fast as it can be calibrated."
     ),
     hang_after: float = expert(
-        60.0, min=0.5, help="A device that does not return for so many s hangs."
+        60.0, min=0.5, help="Seconds after which a device that does not return hangs."
     ),
     dashboard: bool = typer.Option(False, "--dashboard", help="Show the web page too."),
 ) -> None:
@@ -102,7 +102,7 @@ def dashboard(
         None, "--config", "-c", help="All of these from a configuration."
     ),
 ) -> None:
-    """The web page of a daemon, in a process of its own; it only reads.
+    """Serve a daemon's web page, in a process of its own that only reads.
 
     With --config it ends at once where the configuration has `dashboard: {enabled: false}`.
 
@@ -139,7 +139,7 @@ StoreOption = Annotated[Path | None, typer.Option("--store", help="The daemon's 
 def status(
     config: _DaemonConfig = None, store: StoreOption = None, json: JsonOption = None
 ) -> None:
-    """How the daemon is doing: cameras, thermometers, store.
+    """Say how the daemon is doing: cameras, thermometers, store.
 
     Exit status 1 if it does not run, if its store cannot be written, or if an epoch that it took is
     lost.
@@ -158,9 +158,9 @@ def status(
 def top(
     config: _DaemonConfig = None,
     store: StoreOption = None,
-    interval: float = typer.Option(1.0, min=0.2, help="s."),
+    interval: float = typer.Option(1.0, min=0.2, help="Seconds between two updates."),
 ) -> None:
-    """The same, always up to date; q or Ctrl-C ends it.
+    """Show how the daemon is doing, always up to date; q or Ctrl-C ends it.
 
     Example: thermocald top --store thermocald.db
     """

@@ -99,9 +99,9 @@ def forward(
     ),
     station: str | None = expert(None, help="This station's name; default: the host's."),
     once: bool = typer.Option(
-        False, "--once", help="Send what waits, then end; else go on for ever."
+        False, "--once", help="Send what waits, then end; else run until stopped."
     ),
-    cursor: Path | None = expert(None, help="Where it keeps how far it has sent."),
+    cursor: Path | None = expert(None, help="The file that says how far it has sent."),
     json: JsonOption = None,
 ) -> None:
     """Send epochs, events, readings and chosen frames to a PostgreSQL server, each of them once.
@@ -226,7 +226,7 @@ def reprocess(
     engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
     jobs: JobsOption = 1,
     free: FreeOption = DEFAULT_FREE,
-    sets: int = expert(100_000, min=100, max=10_000_000, help="Of a study's Monte-Carlo."),
+    sets: int = expert(100_000, min=100, max=10_000_000, help="Draws of a study's Monte-Carlo."),
     json: JsonOption = None,
 ) -> None:
     """Calibrate every epoch of every recording again, or analyse every series on its own.

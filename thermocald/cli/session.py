@@ -29,7 +29,7 @@ def start(
     condition: str = typer.Option("", "--start", help="Start condition, such as cold or warm."),
     epochs: int = typer.Option(150, min=1, help="How many epochs."),
     config: ConfigOption = None,
-    mock: bool = typer.Option(False, "--mock", help="Without hardware."),
+    mock: bool = typer.Option(False, "--mock", help="A rendered camera, without hardware."),
     programme: Path | None = typer.Option(None, help="Steps of a heating output: YAML list."),
     output: Path = typer.Option(Path(), "--output", "-o", help="Folder for recording and report."),
     check: bool = typer.Option(
@@ -93,7 +93,7 @@ def start(
 
 
 def status(config: ConfigOption = None, json: JsonOption = None) -> None:
-    """The sessions of a running daemon: under way, or the last that ended.
+    """Show the sessions of a running daemon: under way, or the last that ended.
 
     Example: thermocald session status --config /etc/thermocald/config.yaml
     """

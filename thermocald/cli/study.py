@@ -48,10 +48,10 @@ def study(
     alpha: float = expert(0.05, min=1e-6, max=0.5, help="Level of the F-test."),
     sets: int = expert(50_000, min=2, help="Interior orientations drawn (Monte-Carlo)."),
     seed: SeedOption = 0,
-    distance: float = expert(10.0, min=0.01, help="Of the object plane, m."),
+    distance: float = expert(10.0, min=0.01, help="Distance of the object plane, m."),
     grid: int = expert(3, "--grid", min=2, max=9, help="Image points per row and column."),
     focus: float = expert(1.0, min=0.01, help="Focus distance for the depth of field, m."),
-    f_number: float = expert(2.0, min=0.1, help="Of the lens."),
+    f_number: float = expert(2.0, min=0.1, help="f-number of the lens."),
     confusion: float | None = expert(
         None, min=1e-6, help="Circle of confusion, mm [diagonal/2000]."
     ),
@@ -65,7 +65,7 @@ def study(
         False, "--reference", help="Study the presets instead, next to the reference study."
     ),
 ) -> None:
-    """How the camera changes with its temperature, whether that is significant, what it does.
+    """Study how a camera changes with its temperature, whether that is significant, what it costs.
 
     Example: thermocald study M1 M2 --report study.html --json study.json
     """
@@ -209,7 +209,9 @@ def fit(
     log: Path | None = typer.Option(
         None, help="Temperatures of calibrations, at their photographs' times."
     ),
-    temperature_sd: float = expert(0.1, min=0.0, help="Of the temperature of a calibration, K."),
+    temperature_sd: float = expert(
+        0.1, min=0.0, help="Standard deviation of a calibration's temperature, K."
+    ),
     jobs: JobsOption = 1,
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
@@ -218,9 +220,10 @@ def fit(
 ) -> None:
     """Fit a thermal model to all series of a camera, in one adjustment over all image points.
 
-    Of photographs that were calibrated at two temperatures or more it is fitted to the results.
+    Photographs that were calibrated at two temperatures or more do instead of recordings.
 
     Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
+
     Example: thermocald fit 21.5=cold.json 48=warm.json -o camera.thermal.yaml
     """
     import thermocald as tc

@@ -34,7 +34,8 @@ Landscape = Annotated[
     expert("--landscape/--portrait", help="Default: landscape for a corner, else portrait."),
 ]
 Diameter = Annotated[
-    float | None, typer.Option("--diameter", help="Of the discs, mm; default by paper size.")
+    float | None,
+    typer.Option("--diameter", help="Diameter of the discs, mm; default by paper size."),
 ]
 Charuco = Annotated[str | None, typer.Option("--charuco", help="A ChArUco board: 11x8 squares.")]
 Chessboard = Annotated[
@@ -42,13 +43,17 @@ Chessboard = Annotated[
 ]
 AprilGrid = Annotated[str | None, typer.Option("--aprilgrid", help="Kalibr's AprilGrid: 6x6 tags.")]
 Square = Annotated[
-    float | None, typer.Option("--square", min=0.1, help="Of a board: side of a square, mm.")
+    float | None, typer.Option("--square", min=0.1, help="Side of a board's square, mm.")
 ]
 MarkerSide = Annotated[
-    float | None, typer.Option("--marker", min=0.1, help="Of a board: side of a marker or tag, mm.")
+    float | None, typer.Option("--marker", min=0.1, help="Side of a board's marker or tag, mm.")
 ]
-Spacing = Annotated[float, expert("--spacing", help="Of an AprilGrid, over the side of a tag.")]
-Dictionary = Annotated[str, expert("--dictionary", help="Of a ChArUco board: OpenCV's name.")]
+Spacing = Annotated[
+    float, expert("--spacing", help="Gap between an AprilGrid's tags, over a tag's side.")
+]
+Dictionary = Annotated[
+    str, expert("--dictionary", help="A ChArUco board's dictionary, by OpenCV's name.")
+]
 Legacy = Annotated[bool, expert("--legacy", help="ChArUco as OpenCV drew it before 4.6.")]
 Point = tuple[float, float, float]
 
@@ -59,7 +64,7 @@ def print_(
     flat: Flat = False,
     landscape: Landscape = None,
     diameter: Diameter = None,
-    bits: int | None = expert(None, help="Of the ring codes: 12, 14, or 0 for none."),
+    bits: int | None = expert(None, help="Bits of the ring codes: 12, 14, or 0 for none."),
     plain: bool = expert(True, "--plain/--no-plain", help="Plain circles between the coded ones."),
     markers: str | None = expert(None, help="Markers too, of a dictionary: DICT_APRILTAG_36h11."),
     light: bool = expert(False, "--light", help="White targets on black."),
@@ -87,6 +92,7 @@ def print_(
     allows unless sizes are given.
 
     Example: thermocald testfield print --paper A3 --out field
+
     Example: thermocald testfield print --aprilgrid 6x6 --paper A2 --out board
     """
     from thermocald.output.testfield import print as sheets
@@ -127,8 +133,10 @@ def import_(
     spacing: Spacing = 0.3,
     dictionary: Dictionary = "DICT_5X5_1000",
     legacy: Legacy = False,
-    diameter: float | None = typer.Option(None, min=0.1, help="Of ring-coded discs, mm."),
-    sigma: float | None = typer.Option(None, min=1e-4, help="Of a coordinate, mm, if measured."),
+    diameter: float | None = typer.Option(None, min=0.1, help="Diameter of ring-coded discs, mm."),
+    sigma: float | None = typer.Option(
+        None, min=1e-4, help="Standard deviation of a coordinate, mm, if measured."
+    ),
     force: bool = typer.Option(False, "--force", help="Replace an existing file."),
     json: JsonOption = None,
 ) -> None:
@@ -138,6 +146,7 @@ def import_(
     a camera that stands still put several boards at an angle and survey them together.
 
     Example: thermocald testfield import april_6x6.yaml --out aprilgrid.csv
+
     Example: thermocald testfield import --charuco 11x8 --square 30 --marker 22 --dictionary
     DICT_5X5_250 --out charuco.csv
     """
@@ -184,8 +193,10 @@ def survey(
     scale: tuple[str, str, float] | None = typer.Option(
         None, metavar="A B MM", help="Two targets and their measured distance."
     ),
-    scale_sd: float = expert(0.1, min=1e-6, help="Its standard deviation, mm."),
-    distances: Path | None = expert(None, help="More of them, a CSV: a, b, length, sigma in mm."),
+    scale_sd: float = expert(0.1, min=1e-6, help="Standard deviation of the --scale distance, mm."),
+    distances: Path | None = expert(
+        None, help="More measured distances, a CSV: a, b, length, sigma in mm."
+    ),
     field: Path | None = typer.Option(
         None, help="The nominal testfield.csv, as printed; for plain circles."
     ),
@@ -231,8 +242,8 @@ def check(
     at: Point | None = expert(
         None, metavar="X Y Z", help="What it looks at; default the field's middle."
     ),
-    roll: float = expert(0.0, help="Turned about its axis, degrees."),
-    sigma: float = expert(0.03, min=1e-4, help="Of an image coordinate, px."),
+    roll: float = expert(0.0, help="Rotation about its axis, degrees."),
+    sigma: float = expert(0.03, min=1e-4, help="Standard deviation of an image coordinate, px."),
     report: Path | None = typer.Option(None, help="Write a report, one HTML file."),
     json: JsonOption = None,
 ) -> None:
@@ -243,6 +254,7 @@ def check(
     where the field just fills its image; without --camera it is a Raspberry Pi camera v2.1.
 
     Example: thermocald testfield check --paper A4
+
     Example: thermocald testfield check field/testfield.csv --from 900 900 700
     """
     import thermocald as tc

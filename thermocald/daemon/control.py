@@ -191,7 +191,7 @@ def _parse(line: bytes) -> Request:
         where = ".".join(str(part) for part in first["loc"])
         raise UsageError(f"the request is refused: {where or 'it'}: {first['msg']}") from error
     except (ValueError, RecursionError) as error:
-        raise UsageError("the request is refused: it is no JSON object in one line") from error
+        raise UsageError("the request is refused: it is not a JSON object in one line") from error
 
 
 def _line(channel: socket.socket, longest: int, within_s: float) -> bytes:

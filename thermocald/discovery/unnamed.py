@@ -136,7 +136,7 @@ def _choose_movers(metric: Array, moved: Array) -> list[str]:
 
 NO_PROPOSAL = {
     True: "no formula over what was recorded explains it on both recordings: its cause was not "
-    "recorded, or it is none that the operators describe",
+    "recorded, or the operators do not describe it",
     False: "a formula is proposed only where a second recording can test it: give --verify",
 }
 """Why there is no proposal, by whether there is a second recording."""

@@ -262,7 +262,7 @@ def _movement(d: Discovery) -> Figure:
     return Figure(
         "movement",
         "Image movement that the model leaves",
-        "Each target of M1 with the strongest pattern of what is measured less what the model says"
+        "Each target of M1 with the strongest pattern of what is measured minus what the model says"
         + (
             ", before and after what was found, with its root-mean-square; one scale for both."
             if len(drawn) > 1
@@ -318,7 +318,7 @@ def gap_figure(d: Discovery) -> Figure:
     return Figure(
         "gaps",
         "The gap",
-        "Image points measured less simulated, with and without what was found, against the noise "
+        "Measured minus simulated image points, with and without what was found, against the noise "
         "of an image coordinate (dashed). The constants are those of M1 throughout.",
         drawing=_bars(groups, "gap between model and measurement in px RMS"),
     )
@@ -378,7 +378,7 @@ def _effect(effect: EffectFound) -> Section:
     ]  # fmt: skip
     if alike := dict.fromkeys(a["effect"] for a in effect.alternatives if a.get("resembles")):
         text.append(
-            f"Effects that merely resemble it: {', '.join(alike)}. Not one passes the absolute "
+            f"Effects that merely resemble it: {', '.join(alike)}. None passes the absolute "
             "test."
             + ("" if effect.term else " The smooth bridge in M1 does not transfer to another "
                "series.")
@@ -461,7 +461,9 @@ def _candidates(d: Discovery) -> Section:
     if len(best) > 1:
         bars.insert(0, (" + ".join(best), _left_px(d, x.best.fit), _FOUND))
     if not bars:
-        return Section("The candidates", ("No effect of the catalogue promised anything.",))
+        return Section(
+            "The candidates", ("No effect of the catalogue explains more than noise would.",)
+        )
     figure = Figure(
         "candidates",
         "The candidates, each alone",

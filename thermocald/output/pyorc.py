@@ -134,5 +134,5 @@ def _document(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as JSON: {error}") from error
     if not isinstance(document, dict) or not isinstance(document.get("gcps"), dict):
-        raise DataError(f"{path}: is no camera configuration of pyorc: it has no gcps")
+        raise DataError(f"{path}: is not a camera configuration of pyorc: it has no gcps")
     return document

@@ -69,7 +69,7 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
             lines += _wrapped(f"  {last.get('status', '')}: {last.get('reason', '')}")
     late = 1000 * camera["late_p99_s"]
     count = f"  {camera['lost']} lost, {camera['skipped']} skipped"
-    return [*lines, f"{count}; 99 of 100 less than {late:.0f} ms late", ""]
+    return [*lines, f"{count}; 99 % at most {late:.0f} ms late", ""]
 
 
 def _orientation(last: dict[str, Any]) -> list[str]:

@@ -293,8 +293,8 @@ class RunningSeries:
         elif asked == "auto":
             good = int(series.found.estimate.system.good.sum())
             said = (
-                f"each epoch has its own orientation: {good} of the {FEWEST_EPOCHS} good epochs "
-                "that show whether the camera stands still"
+                f"each epoch has its own orientation until {FEWEST_EPOCHS} good epochs show "
+                f"whether the camera stands still; {good} so far"
             )
         else:
             said = "each epoch has its own orientation, as configured"

@@ -313,9 +313,9 @@ class Epochs(Result):
             )
         if document["exterior_choice"]:
             out.append(f"--exterior {self.exterior}: {document['exterior_choice']}")
-        out += [f"{moved.sentence}; this is taken off" for moved in self.field_movements]
+        out += [f"{moved.sentence}; corrected for" for moved in self.field_movements]
         out += [
-            f"left out: target {name} and what belongs to it moves by itself"
+            f"left out: target {name}, which moves by itself, and what belongs to it"
             for name in self.left_out
         ]
         out += _table_of(self.drifts)
@@ -323,7 +323,8 @@ class Epochs(Result):
             sds = ", ".join(f"{c.name} ± {1e3 * c.sd_by_perspective:.3f}" for c in limits)
             out.append(
                 f"a mount that moves more slowly than in {FASTEST_DRIFT_S / 60:.0f} min looks like "
-                f"the camera; by the perspective alone last - first is {sds} µm"
+                "the camera; last - first by the perspective alone, whatever the mount does: "
+                f"{sds} µm"
             )
         reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
         out += [f"{reasons.count(text)} × {text}" for text in sorted(set(reasons))]

@@ -209,8 +209,8 @@ def simulate_errors(
     used = sets - folded
     if used < 2:
         raise GeometryError(
-            f"{folded} of {sets} drawn sets of IOP fold the image over itself: the standard "
-            "deviations of the distortion parameters are too large to simulate with"
+            f"{folded} of {sets} drawn interior orientations fold the image over itself: the "
+            "standard deviations of the distortion parameters are too large to simulate with"
         )
     means = sums / used
     mean_error = means[:, 1:3]

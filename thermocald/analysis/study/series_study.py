@@ -293,7 +293,7 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
             notes.append(
                 f"The series has {count} gap{'s' if count > 1 else ''}, the longest of "
                 f"{float(steps.max()):.3g} s at an interval of {series.interval_s:.3g} s; windows "
-                "across them are not tested, and the noise forgets in them as between epochs."
+                "across them are not tested; in them the noise loses its memory as between epochs."
             )
     held = [name for name in IOP_NAMES if name not in series.free]
     if held:
@@ -303,7 +303,7 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
         )
     if series.choice:
         notes.append(f"Exterior orientation: {series.exterior} ({series.choice}).")
-    notes += [f"The test field moved: {m.sentence}; taken off." for m in series.field_movements]
+    notes += [f"The test field moved: {m.sentence}; corrected for." for m in series.field_movements]
     if series.exterior == "per_epoch":
         notes.append(
             "Every epoch has an exterior orientation of its own: its movements and the principal "

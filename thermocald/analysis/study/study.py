@@ -107,7 +107,9 @@ def study_camera(
     if any(len(one.correlations) for one in series):
         correlations = median_correlations([one.correlations for one in series])
     else:
-        notes.append("No epoch has a covariance matrix: correlations of the IOP are not known.")
+        notes.append(
+            "No epoch has a covariance matrix: correlations within the adjustments are not known."
+        )
     montecarlo = first_order = None
     if correlations is None or not (sds > 0).any():
         notes.append(
@@ -123,8 +125,8 @@ def study_camera(
             notes.append(f"No Monte-Carlo: {error}.")
     if montecarlo is not None and montecarlo.folded:
         notes.append(
-            f"{montecarlo.folded} of {montecarlo.sets} drawn sets of IOP fold the image over "
-            "itself and were left out."
+            f"{montecarlo.folded} of {montecarlo.sets} drawn interior orientations fold the image "
+            "over itself and were left out."
         )
     try:
         paths = trajectories(series, settings.distance_mm, settings.grid, settings.clusters_mm)

@@ -145,7 +145,7 @@ function showDevices() {
       state.append(element("span", device.device, good ? "ready" : "failed"),
         (device.since ? ` since ${time(device.since)} UTC` : "") + (device.why ? `: ${device.why}` : ""));
       const rhythm = kind === "cameras" ?
-        `every ${device.period_s} s, 99 of 100 less than ${fixed(1000 * device.late_p99_s, 1)} ms late, ` +
+        `every ${device.period_s} s, 99 % at most ${fixed(1000 * device.late_p99_s, 0)} ms late, ` +
         `${device.skipped} skipped, ${device.lost} lost, ${device.deferred - device.caught_up} to catch up` : "";
       const first = element("th", name);
       first.scope = "row";

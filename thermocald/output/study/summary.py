@@ -35,6 +35,11 @@ _TOGETHER = 0.9
 _NOISE_AGREES = 1.15
 _SIGNIFICANT = 0.05
 _DISTANCE_MM = 10_000.0
+_OF_SERIES = (
+    "name", "camera", "source", "without_result", "image_noise_ratio", "field_movements",
+    "exterior", "free", "doubts",
+)  # fmt: skip
+_OF_STUDY = ("noise_ratio", "deviations", "significance", "notes")
 _FIXED = {
     "first": "the first epoch's interior orientation",
     "mean": "the mean",
@@ -296,32 +301,19 @@ def _camera(camera: CameraStudy, distance_mm: float) -> dict[str, Any]:
 
 def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
     s = study.series
-    return {
-        "name": s.name,
-        "camera": s.camera,
-        "source": s.source,
+    moved = {"points": study.grid, "displacement": study.displacement}
+    return {name: getattr(s, name) for name in _OF_SERIES} | {
+        **{name: getattr(study, name) for name in _OF_STUDY},
         "epochs": len(s),
-        "without_result": dict(s.without_result),
         "sigma0": float(np.sqrt(np.mean(np.square(s.sigma0)))),
-        "noise_ratio": study.noise_ratio,
-        "image_noise_ratio": s.image_noise_ratio,
         "exterior_choice": s.choice or None,
-        "field_movements": list(s.field_movements),
-        "exterior": s.exterior,
-        "free": list(s.free),
-        "deviations": study.deviations,
         "depth_of_field": study.focus,
-        "image_displacement_px": None
-        if study.displacement is None
-        else {"points": study.grid, "displacement": study.displacement},
-        "significance": study.significance,
+        "image_displacement_px": None if study.displacement is None else moved,
         "temperature_dependence": {
             channel.thermometer.name: _channel(study, channel, distance_mm)
             for channel in study.channels
         },
         "correlation_matrix": {"columns": study.columns, "r": study.matrix},
-        "notes": list(study.notes),
-        "doubts": list(s.doubts),
     }
 
 
@@ -351,19 +343,18 @@ def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
         return None
-    drawn = {
-        "image_point_px": mc.image_points, "expected_mm": mc.expected, "counts": mc.counts,
-        "mean_mm": mc.mean, "largest_mm": mc.largest, "bias_mm": mc.mean_error,
-        "covariance_mm2": mc.covariance,
-    }  # fmt: skip
-    linear = {
-        "mean_mm": first.mean, "expected_largest_mm": first.expected_largest,
-        "covariance_mm2": first.covariance,
-    }  # fmt: skip
-
-    def at(columns: dict[str, Any], k: int) -> dict[str, Any]:
-        return {name: column[k] for name, column in columns.items()}
-
+    points = [
+        {
+            "image_point_px": mc.image_points[k], "expected_mm": mc.expected[k],
+            "counts": mc.counts[k], "mean_mm": mc.mean[k], "largest_mm": mc.largest[k],
+            "bias_mm": mc.mean_error[k], "covariance_mm2": mc.covariance[k],
+            "first_order": {
+                "mean_mm": first.mean[k], "expected_largest_mm": first.expected_largest[k],
+                "covariance_mm2": first.covariance[k],
+            },
+        }
+        for k in range(len(mc.image_points))
+    ]  # fmt: skip
     return {
         "sets": mc.sets,
         "seed": mc.seed,
@@ -373,9 +364,7 @@ def _object_space(camera: CameraStudy) -> dict[str, Any] | None:
         "mean_mm": mc.overall_mean,
         "mean_of_maxima_mm": mc.mean_largest,
         "folded_sets": mc.folded,
-        "points": [
-            {**at(drawn, k), "first_order": at(linear, k)} for k in range(len(mc.image_points))
-        ],
+        "points": points,
         "first_order": {
             "fractions": first.fractions,
             "mean_mm": first.mean.mean(),

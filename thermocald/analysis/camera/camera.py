@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import image_grid, undistorted_points
+from thermocald.analysis.camera.undistortion import ideal_points, image_grid
 from thermocald.errors import UsageError
 from thermocald.numbers import with_sd
 from thermocald.photogrammetry.camera.camera_model import (
@@ -100,7 +100,9 @@ class Camera(Result):
         (1, 2)
         """
         target = to or InteriorOrientation(self.interior.c)
-        return undistorted_points(self.sensor, self.values, image_points, target)
+        (x, y), pitch = self.sensor.centre, self.sensor.pixel_pitch
+        scale, shift = target.c / pitch, (x + target.x0 / pitch, y - target.y0 / pitch)
+        return ideal_points(self.sensor, self.values, image_points, (scale, -scale), shift)
 
     def as_seen_by(self, image_points: ArrayLike, other: InteriorOrientation) -> Array:
         """Image points (n, 2) px as this camera would have seen them with another IOP."""

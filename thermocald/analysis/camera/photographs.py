@@ -33,7 +33,7 @@ from thermocald.result import with_sds
 from thermocald.store.logger.photographs import moment_taken
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -282,15 +282,15 @@ class _Given:
     def estimated(self, rows: Sequence[int], together: CommonInterior) -> Photographs:
         """Return the camera that the photographs have in common."""
         results = []
-        for k, name in enumerate(self.names):
+        for k in range(len(self.names)):
             if k in self.failures or k not in rows:
                 why = self.failures.get(k, ("no_orientation", "no pose explains its targets"))
                 results.append(self._failed(k, *why))
                 continue
-            i, o = rows.index(k), self.seen[k]
-            pose, sd = together.exteriors[i], np.sqrt(np.diag(together.exterior_covariances[i]))
-            used, residuals = together.used[i], together.residuals[i]
-            results.append(self._posed(name, o, o.targets[~used], used, residuals, pose, sd))
+            i = rows.index(k)
+            sd = np.sqrt(np.diag(together.exterior_covariances[i]))
+            adjusted = together.used[i], together.residuals[i], together.exteriors[i], sd
+            results.append(self._posed(k, *adjusted))
         return Photographs(
             "ok", "", together.interior, True, together.covariance, together.sigma0,
             together.redundancy, tuple(results),
@@ -298,51 +298,41 @@ class _Given:
 
     def held(self, reason: str) -> Photographs:
         """Return poses with the camera as it was given, and why it was not estimated."""
-        results = []
-        for k, name in enumerate(self.names):
+        results, camera = [], self.camera
+        for k in range(len(self.names)):
             if k in self.failures:
                 results.append(self._failed(k, *self.failures[k]))
-            elif self.camera.interior is None:
+            elif camera.interior is None:
                 why = f"without an interior orientation there is no pose: {reason}"
                 results.append(self._failed(k, "weak_geometry", why))
             else:
-                o = self.seen[k]
                 pose = pose_only(
-                    self.camera.sensor, self.testfield, o, self.camera.interior, self.settings
+                    camera.sensor, self.testfield, self.seen[k], camera.interior, self.settings
                 )
                 if not pose.ok:
                     results.append(self._failed(k, pose.status, pose.reason))
                     continue
                 used = ~np.isin(pose.targets, pose.rejected)
-                results.append(
-                    self._posed(
-                        name, o, pose.rejected, used, pose.residuals, pose.exterior, pose.sd[10:]
-                    )
-                )
+                results.append(self._posed(k, used, pose.residuals, pose.exterior, pose.sd[10:]))
         status = "weak_geometry" if self.settings.free else "held"
-        nothing = np.zeros((16, 16))
         return Photographs(
-            status, reason, self.camera.interior, False, nothing, float("nan"), 0, tuple(results)
-        )
+            status, reason, camera.interior, False, np.zeros((16, 16)), float("nan"), 0,
+            tuple(results),
+        )  # fmt: skip
 
     def _failed(self, k: int, status: str, reason: str) -> PhotographResult:
         n = len(self.seen[k]) if k in self.seen else 0
         return PhotographResult(self.names[k], status, reason, n)
 
     def _posed(
-        self,
-        name: str,
-        o: Observations,
-        rejected: Iterable[int],
-        used: NDArray[np.bool_],
-        residuals: Array,
-        exterior: ExteriorOrientation | None,
-        sd: Array,
-    ) -> PhotographResult:
+        self, k: int, used: NDArray[np.bool_], residuals: Array,
+        exterior: ExteriorOrientation | None, sd: Array,
+    ) -> PhotographResult:  # fmt: skip
+        o = self.seen[k]
         rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
-        names = tuple(self.testfield.names[t] for t in rejected)
+        rejected = tuple(self.testfield.names[t] for t in o.targets[~used])
         return PhotographResult(
-            name, "ok", "", len(o), names, rms, exterior, sd, o.points, residuals, used
+            self.names[k], "ok", "", len(o), rejected, rms, exterior, sd, o.points, residuals, used
         )
 
 

@@ -16,11 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, project, rays
+from thermocald.photogrammetry.camera.camera_model import Sensor, project, rays
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
@@ -38,46 +36,27 @@ _DEGREE = 6
 _STEP_PX = 3e-6  # a second Newton step below this leaves less than 1e-9 px
 
 
-def ideal_points(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
-    """Image points (n, 2) px → x̄/c, ȳ/c (n, 2): tangents of the angles to the optical axis.
+def ideal_points(
+    sensor: Sensor, iop: ArrayLike, image_points: ArrayLike,
+    scale: tuple[float, float] = (1.0, 1.0), shift: tuple[float, float] = (0.0, 0.0),
+) -> Array:  # fmt: skip
+    """Image points (n, 2) px → x̄/c, ȳ/c (n, 2): tangents of the angles to the optical axis, scaled
+    and shifted.
 
     Raises GeometryError for points beyond the radius at which the distortion folds back.
     """
-    points = np.asarray(image_points, dtype=float)
-    out = np.empty_like(points)
-    for part, x, y in _blocks(sensor, np.asarray(iop, dtype=float), points):
-        out[part, 0], out[part, 1] = x, y
-    return out
-
-
-def undistorted_points(
-    sensor: Sensor, iop: ArrayLike, image_points: ArrayLike, target: InteriorOrientation
-) -> Array:
-    """Image points (n, 2) px → as a camera without distortion saw them, with c, x0, y0 of target.
-
-    Raises GeometryError as `ideal_points`.
-    """
-    points = np.asarray(image_points, dtype=float)
-    (cx, cy), p = sensor.centre, sensor.pixel_pitch
-    cx, cy, scale = cx + target.x0 / p, cy - target.y0 / p, target.c / p
-    out = np.empty_like(points)
-    for part, x, y in _blocks(sensor, np.asarray(iop, dtype=float), points):
-        x *= scale
-        y *= -scale
-        out[part, 0], out[part, 1] = x + cx, y + cy
-    return out
-
-
-def _blocks(sensor: Sensor, i: Array, points: Array) -> Iterator[tuple[slice, Array, Array]]:
-    """Blocks of points, and their x̄/c and ȳ/c."""
-    inverse = _inverse_radial(sensor, i)
+    i, points = np.asarray(iop, dtype=float), np.asarray(image_points, dtype=float)
+    out, inverse = np.empty_like(points), _inverse_radial(sensor, i)
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
         found = None if inverse is None else _newton(sensor, i, points[part], inverse)
         if found is None:
             r = rays(sensor, i, points[part])
             found = r[:, 0] / -r[:, 2], r[:, 1] / -r[:, 2]
-        yield part, *found
+        for k, ideal in enumerate(found):
+            ideal *= scale[k]
+            np.add(ideal, shift[k], out=out[part, k])
+    return out
 
 
 def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:

@@ -253,7 +253,13 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     significance = _significance(series, settings, notes)
     channels = tuple(_channel(series, t) for t in series.thermometers)
     notes += [c.reason for c in channels if c.reason]
-    notes += [note for c in channels if (note := _memory_note(c))]
+    notes += [
+        f"Slopes of {', '.join(short)} on {c.thermometer.name}: the noise remembers more than a "
+        "seventh of the series, which is too short for their standard deviations; take those as an "
+        "order of magnitude."
+        for c in channels
+        if (short := [name for name, d in c.dependences.items() if d.too_short])
+    ]
     grid = image_grid(series.sensor)
     displacement = None
     if len(series) > 1:
@@ -394,18 +400,6 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
         found,
         dict(zip(found, holm([d.p_value for d in found.values()]), strict=True)),
         dict(zip(found, holm([d.p_naive for d in found.values()]), strict=True)),
-    )
-
-
-def _memory_note(channel: ChannelStudy) -> str:
-    """The slopes whose standard deviations a series of this length cannot give, or ""."""
-    names = [name for name, d in channel.dependences.items() if d.too_short]
-    if not names:
-        return ""
-    return (
-        f"Slopes of {', '.join(names)} on {channel.thermometer.name}: the noise remembers more "
-        "than a seventh of the series, which is too short for their standard deviations; take "
-        "those as an order of magnitude."
     )
 
 

@@ -46,19 +46,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    rows: NDArray[np.int64]
-    pixel: NDArray[np.int64]
-    value: Single
-    weight: Single
-    weighted_partials: Single
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class GradientWeights:
     """Weights for n targets, made from their parameters (n, 10) and the frame's noise.
 
-    maps, coded (n,): the targets' outlines, and which have a code ring; inverse (n, 10, 10): of the
+    maps, coded (n,): the targets' outlines, and which have a code ring; parts: of targets in like
+    windows their rows, pixels, values, weights and weighted partials; inverse (n, 10, 10): of the
     normal matrices; freedom (n,): pixels beyond the parameters.
     """
 
@@ -66,7 +58,7 @@ class GradientWeights:
     coded: NDArray[np.bool_]
     parameters: Array
     noise: NoiseModel
-    parts: tuple[_Part, ...]
+    parts: tuple[tuple[NDArray[np.int64], NDArray[np.int64], Single, Single, Single], ...]
     inverse: Array
     freedom: Array
 
@@ -94,7 +86,7 @@ class GradientWeights:
             N = (jw @ j.transpose(1, 2, 0)).astype(float)
             inverse[w.rows] = scaled_solve(N, np.eye(10)[None], 1e-10)
             freedom[w.rows] = np.maximum(w.weight.sum(axis=1) - 10, 1)
-            parts.append(_Part(w.rows, w.pixel, value, weight, jw))
+            parts.append((w.rows, w.pixel, value, weight, jw))
         return cls(maps, coded, parameters, noise, tuple(parts), inverse, freedom)
 
     def apply(self, image: Image) -> CircleFit:
@@ -105,13 +97,13 @@ class GradientWeights:
         n = len(self.parameters)
         rhs, square = np.zeros((n, 10)), np.zeros(n)
         flat = image.ravel()
-        for part in self.parts:
-            r = flat.take(part.pixel, mode="clip").astype(np.float32)
-            r -= part.value
-            rhs[part.rows] = (part.weighted_partials @ r[..., None])[..., 0]
+        for rows, pixel, value, weight, weighted_partials in self.parts:
+            r = flat.take(pixel, mode="clip").astype(np.float32)
+            r -= value
+            rhs[rows] = (weighted_partials @ r[..., None])[..., 0]
             r *= r
-            r *= part.weight
-            square[part.rows] = r.sum(axis=1)
+            r *= weight
+            square[rows] = r.sum(axis=1)
         delta = (self.inverse @ rhs[..., None])[..., 0]
         square -= np.sum(rhs * delta, axis=1)
         contrast = self.parameters[:, 7]

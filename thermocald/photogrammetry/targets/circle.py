@@ -74,77 +74,63 @@ def first_reasons(tests: Sequence[tuple[NDArray[np.bool_], str]]) -> NDArray[Any
     return reasons
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Plane:
-    """Pixels in their targets' planes (n, k): radius ρ, |∇ρ|, unit normal in the image, det ∂q/∂p,
-    the plane coordinates s, t before the shape's correction, and the unit radius vector u, v.
+def _in_plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ...]:
+    """Pixels in their targets' planes (n, k): radius ρ, |∇ρ|, unit normal in the image (x, y),
+    det ∂q/∂p, the plane coordinates s, t before the shape's correction, and the unit radius vector
+    u, v.
+
+    For corrections m (n, 3) of the shapes, at pixels relative to the centres (n, k).
+    q = (I + m)(J⁻¹e − ½ J⁻¹ H[J⁻¹e, J⁻¹e]) = L e − P[e, e]; what is left out is of third order,
+    and moves no centre. A = ∂q/∂e = L − 2 P[e, ·], and q = ½ (L + A) e.
     """
-
-    rho: Single
-    slope: Single
-    nx: Single
-    ny: Single
-    determinant: Single
-    s: Single
-    t: Single
-    u: Single
-    v: Single
-
-    @classmethod
-    def build(cls, maps: LocalMap, m: Array, ex: Single, ey: Single) -> _Plane:
-        """For corrections m (n, 3) of the shapes, at pixels relative to the centres (n, k).
-
-        q = (I + m)(J⁻¹e − ½ J⁻¹ H[J⁻¹e, J⁻¹e]) = L e − P[e, e]; what is left out is of third order,
-        and moves no centre. A = ∂q/∂e = L − 2 P[e, ·], and q = ½ (L + A) e.
-        """
-        inverse = maps.inverse
-        shape = m[:, [[0, 1], [1, 2]]]
-        shape[:, [0, 1], [0, 1]] += 1.0
-        L = shape @ inverse
-        bend = (L @ maps.second)[:, :, [[0, 1], [1, 2]]]
-        twice = np.swapaxes(inverse, 1, 2)[:, None] @ bend @ inverse[:, None]  # 2 P
-        # A and ½ (L + A) by their elements, linear in 1, ex, ey
-        linear = np.empty((len(m), 2, 2, 2, 3), dtype=np.float32)
-        linear[..., 0] = L[:, None]
-        linear[:, 0, ..., 1:] = -twice
-        linear[:, 1, ..., 1:] = -0.5 * twice
-        e = scratch("positions", (3, *ex.shape), np.float32)
-        e[0], e[1], e[2] = 1.0, ex, ey
-        elements = scratch("elements", (8, *ex.shape), np.float32)
-        np.matmul(linear.reshape(-1, 8, 3), e.transpose(1, 0, 2), out=elements.transpose(1, 0, 2))
-        a11, a12, a21, a22, u, u2, v, v2 = elements
-        u *= ex
-        u += np.multiply(u2, ey, out=u2)
-        v *= ex
-        v += np.multiply(v2, ey, out=v2)
-        if m.any():
-            back = inverse_2x2(shape).astype(np.float32)[..., None]
-            s, t = back[:, 0, 0] * u, back[:, 1, 1] * v
-            s += np.multiply(back[:, 0, 1], v, out=v2)
-            t += np.multiply(back[:, 1, 0], u, out=v2)
-        else:
-            s, t = u.copy(), v.copy()
-        rho = u * u
-        rho += np.multiply(v, v, out=v2)
-        np.sqrt(rho, out=rho)
-        np.maximum(rho, np.float32(1e-6), out=rho)
-        u /= rho
-        v /= rho
-        determinant = a11 * a22
-        determinant -= np.multiply(a12, a21, out=v2)
-        # ∇ρ = Aᵀ(u, v)
-        a11 *= u
-        a11 += np.multiply(a21, v, out=v2)
-        a12 *= u
-        a12 += np.multiply(a22, v, out=v2)
-        nx, ny = a11, a12
-        slope = nx * nx
-        slope += np.multiply(ny, ny, out=v2)
-        np.sqrt(slope, out=slope)
-        np.maximum(slope, np.float32(1e-9), out=slope)
-        nx /= slope
-        ny /= slope
-        return cls(rho, slope, nx, ny, determinant, s, t, u, v)
+    inverse = maps.inverse
+    shape = m[:, [[0, 1], [1, 2]]]
+    shape[:, [0, 1], [0, 1]] += 1.0
+    L = shape @ inverse
+    bend = (L @ maps.second)[:, :, [[0, 1], [1, 2]]]
+    twice = np.swapaxes(inverse, 1, 2)[:, None] @ bend @ inverse[:, None]  # 2 P
+    # A and ½ (L + A) by their elements, linear in 1, ex, ey
+    linear = np.empty((len(m), 2, 2, 2, 3), dtype=np.float32)
+    linear[..., 0] = L[:, None]
+    linear[:, 0, ..., 1:] = -twice
+    linear[:, 1, ..., 1:] = -0.5 * twice
+    e = scratch("positions", (3, *ex.shape), np.float32)
+    e[0], e[1], e[2] = 1.0, ex, ey
+    elements = scratch("elements", (8, *ex.shape), np.float32)
+    np.matmul(linear.reshape(-1, 8, 3), e.transpose(1, 0, 2), out=elements.transpose(1, 0, 2))
+    a11, a12, a21, a22, u, u2, v, v2 = elements
+    u *= ex
+    u += np.multiply(u2, ey, out=u2)
+    v *= ex
+    v += np.multiply(v2, ey, out=v2)
+    if m.any():
+        back = inverse_2x2(shape).astype(np.float32)[..., None]
+        s, t = back[:, 0, 0] * u, back[:, 1, 1] * v
+        s += np.multiply(back[:, 0, 1], v, out=v2)
+        t += np.multiply(back[:, 1, 0], u, out=v2)
+    else:
+        s, t = u.copy(), v.copy()
+    rho = u * u
+    rho += np.multiply(v, v, out=v2)
+    np.sqrt(rho, out=rho)
+    np.maximum(rho, np.float32(1e-6), out=rho)
+    u /= rho
+    v /= rho
+    determinant = a11 * a22
+    determinant -= np.multiply(a12, a21, out=v2)
+    # ∇ρ = Aᵀ(u, v)
+    a11 *= u
+    a11 += np.multiply(a21, v, out=v2)
+    a12 *= u
+    a12 += np.multiply(a22, v, out=v2)
+    nx, ny = a11, a12
+    slope = nx * nx
+    slope += np.multiply(ny, ny, out=v2)
+    np.sqrt(slope, out=slope)
+    np.maximum(slope, np.float32(1e-9), out=slope)
+    nx /= slope
+    ny /= slope
+    return rho, slope, nx, ny, determinant, s, t, u, v
 
 
 def blurred_disc(
@@ -158,17 +144,17 @@ def blurred_disc(
     """
     p = parameters.astype(np.float32)
     ex, ey = x - p[:, 0, None], y - p[:, 1, None]
-    q = _Plane.build(maps, parameters[:, 2:5], ex, ey)
+    rho, slope, nx, ny, determinant, s, t, u, v = _in_plane(maps, parameters[:, 2:5], ex, ey)
     blur = p[:, 5, None]
     width = np.sqrt(blur * blur + np.float32(_PIXEL_VARIANCE))
     # Curvature of the outline: tangentᵀ AᵀA tangent/|∇ρ| = (det A)²/|∇ρ|³, the tangent being what
     # A maps to a vector of length det A/|∇ρ| across the radius; here half of it.
-    other = np.divide(q.determinant, q.slope)
-    kappa = np.multiply(other, other, out=q.determinant)
-    kappa /= q.slope
+    other = np.divide(determinant, slope)
+    kappa = np.multiply(other, other, out=determinant)
+    kappa /= slope
     kappa *= _HALF
-    d = np.subtract(_ONE, q.rho, out=q.rho)
-    d /= q.slope
+    d = np.subtract(_ONE, rho, out=rho)
+    d /= slope
     z: Single = np.divide(d, width)
     z -= np.multiply(kappa, width, out=other)
     phi = normal_cdf(z)
@@ -190,16 +176,15 @@ def blurred_disc(
     d *= edge
     np.multiply(d, -blur / width, out=j[5])
     edge /= width
-    np.multiply(edge, q.nx, out=j[0])
-    np.multiply(edge, q.ny, out=j[1])
-    edge /= q.slope
-    u, v = q.u, q.v
+    np.multiply(edge, nx, out=j[0])
+    np.multiply(edge, ny, out=j[1])
+    edge /= slope
     u *= edge
     v *= edge
-    np.multiply(u, np.negative(q.s, out=q.s), out=j[2])
-    np.multiply(v, np.negative(q.t, out=q.t), out=j[4])
-    u *= q.t
-    v *= q.s
+    np.multiply(u, np.negative(s, out=s), out=j[2])
+    np.multiply(v, np.negative(t, out=t), out=j[4])
+    u *= t
+    v *= s
     np.add(u, v, out=j[3])
     j[6] = light
     np.multiply(phi, light, out=j[7])

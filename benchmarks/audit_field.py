@@ -15,7 +15,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.network.adjustment import Photo, adjust_network
+from thermocald.photogrammetry.network.adjustment import adjust_network
 from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.survey import surveyed_field
 
@@ -62,12 +62,12 @@ def survey(draws: int, rng: np.random.Generator) -> list[Row]:
     length = float(np.linalg.norm(field[-1] - field[0]))
     points, camera = [], []
     for _ in range(draws):
-        photos = []
+        photos = {}
         for k, station in enumerate(stations):
             image = project(SENSOR, INTERIOR.as_array(), station.as_array(), field)
             rows = np.flatnonzero(SENSOR.contains(image, 20.0))
             seen = image[rows] + rng.normal(0, NOISE_PX, (len(rows), 2))
-            photos.append(Photo(f"p{k}", Observations(rows, seen, np.full(seen.shape, NOISE_PX))))
+            photos[f"p{k}"] = Observations(rows, seen, np.full(seen.shape, NOISE_PX))
         taped = length + float(rng.normal(0, TAPE_MM))
         network = adjust_network(
             SENSOR, photos, nominal.names, [Distance("t0", f"t{len(field) - 1}", taped, TAPE_MM)],

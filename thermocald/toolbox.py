@@ -5,6 +5,7 @@ Each function is what a command does, as in `thermocald.api`; units and errors a
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -325,7 +326,8 @@ def survey_testfield(
     from thermocald.api import read_testfield
     from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
     from thermocald.photogrammetry.network.datum import Distance
-    from thermocald.photogrammetry.survey import picture_of, survey
+    from thermocald.photogrammetry.survey import survey
+    from thermocald.photogrammetry.targets.image_file import decode_grey
     from thermocald.store.recording.board_file import read_distances
     from thermocald.store.recording.testfield_file import write_testfield
 
@@ -339,7 +341,7 @@ def survey_testfield(
             raise UsageError(f"{d.a} to {d.b}, {d.length:g} ± {d.sigma:g} mm, is not a distance")
     if hold_camera and camera is None:
         raise UsageError("--hold-camera needs --camera")
-    pictures = [picture_of(path) for path in images_of([source_of(p) for p in photographs])]
+    paths = images_of([source_of(p) for p in photographs])
     tell = say or (lambda _: None)
     known = None
     if camera is not None:
@@ -349,7 +351,7 @@ def survey_testfield(
         pixel_pitch = 0.001
         tell("pixel pitch not given: 0.001 mm assumed, the camera's mm are only as good")
     found = survey(
-        pictures,
+        {str(path): partial(decode_grey, path) for path in paths},
         measured,
         pixel_pitch,
         nominal=None if field is None else read_testfield(field),

@@ -237,11 +237,11 @@ def test_camera_convert(tmp_path):
         run("camera", "convert", tmp_path / "none.xml", "--to", "ros", "--out", tmp_path / "y")
 
 
-def test_a_turned_camera_does_not_turn_itspicture_of(tmp_path):
+def test_a_turned_camera_does_not_turn_its_picture(tmp_path):
     """The orientation that cameras write into EXIF says how to show a picture, not how the sensor
     saw it: OpenCV would turn it, and with it the principal point.
     """
-    from thermocald.photogrammetry.survey import picture_of
+    from thermocald.photogrammetry.targets.image_file import decode_grey
 
     grey = np.arange(48 * 64, dtype=np.uint32).reshape(48, 64) % 251
     encoded = cv2.imencode(".jpg", grey.astype(np.uint8))[1].tobytes()
@@ -251,4 +251,4 @@ def test_a_turned_camera_does_not_turn_itspicture_of(tmp_path):
     path = tmp_path / "turned.jpg"
     path.write_bytes(marked)
     assert cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).shape == (64, 48)  # the block is understood
-    assert picture_of(path).load().shape == (48, 64)
+    assert decode_grey(path).shape == (48, 64)

@@ -11,7 +11,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.photogrammetry.network.adjustment import Photo
 
 SENSOR = Sensor(3280, 2464, 0.00112)
 INTERIOR = InteriorOrientation(
@@ -51,7 +50,7 @@ def convergent_stations(field, n=12, distance=950.0, tilt=0.66, rolled=True):
 
 def photographs(field, stations, sigma, rng, camera=CAMERA, loss=0.03, gross=0.0):
     """Noisy photographs: inside the image only, some targets missed, some grossly wrong."""
-    photos, wrong = [], []
+    photos, wrong = {}, []
     for i, station in enumerate(stations):
         image = camera.project(station, field)
         seen = camera.sensor.contains(image, 20.0) & (rng.random(len(field)) > loss)
@@ -60,9 +59,7 @@ def photographs(field, stations, sigma, rng, camera=CAMERA, loss=0.03, gross=0.0
         bad = rng.random(len(rows)) < gross
         points[bad] += rng.choice([-1, 1], (bad.sum(), 2)) * rng.uniform(0.5, 60, (bad.sum(), 2))
         wrong += [(f"photo{i}", int(t)) for t in rows[bad]]
-        photos.append(
-            Photo(f"photo{i}", Observations(rows, points, np.full((len(rows), 2), sigma)))
-        )
+        photos[f"photo{i}"] = Observations(rows, points, np.full((len(rows), 2), sigma))
     return photos, wrong
 
 

@@ -8,7 +8,7 @@ import pytest
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import CameraModel
-from thermocald.photogrammetry.network.adjustment import Photo, adjust_network, advice
+from thermocald.photogrammetry.network.adjustment import adjust_network, advice
 from thermocald.photogrammetry.network.datum import Distance
 
 
@@ -205,12 +205,12 @@ def test_wrong_sigmas_show_in_sigma0_and_twenty_fold_ones_are_refused():
     photos, _ = cases.photographs(_BENT, stations, 0.05, np.random.default_rng(0))
     names = [f"t{i}" for i in range(len(_BENT))]
     scale = [Distance("t0", "t47", float(np.linalg.norm(_BENT[47] - _BENT[0])), 0.01)]
-    for photo in photos:
-        photo.observations.sigmas[:] = 0.05 / 20
+    for seen in photos.values():
+        seen.sigmas[:] = 0.05 / 20
     with pytest.raises(GeometryError, match="times their stated sigmas"):
         adjust_network(cases.SENSOR, photos, names, scale)
-    for photo in photos:
-        photo.observations.sigmas[:] = 0.05 / 2
+    for seen in photos.values():
+        seen.sigmas[:] = 0.05 / 2
     assert adjust_network(cases.SENSOR, photos, names, scale).sigma0 == pytest.approx(2.0, rel=0.1)
 
 
@@ -228,7 +228,7 @@ def test_a_foreign_photograph_is_left_out_and_named():
     field = _BENT
     rng = np.random.default_rng(5)
     photos, _ = cases.photographs(field, cases.convergent_stations(field), 0.05, rng)
-    photos[4].observations.points[:] = rng.uniform(0, 2400, photos[4].observations.points.shape)
+    photos["photo4"].points[:] = rng.uniform(0, 2400, photos["photo4"].points.shape)
     length = float(np.linalg.norm(field[47] - field[0]))
     network = adjust_network(
         cases.SENSOR, photos, [f"t{i}" for i in range(48)], [Distance("t0", "t47", length, 0.01)]
@@ -245,8 +245,9 @@ def test_a_photograph_of_another_focus_is_left_out_and_named():
     stations = cases.convergent_stations(field)
     photos, _ = cases.photographs(field, stations, 0.05, rng)
     zoomed = CameraModel(cases.SENSOR, cases.INTERIOR.with_values(c=cases.INTERIOR.c * 1.03))
-    (photos[7],), _ = cases.photographs(field, stations[7:8], 0.05, rng, camera=zoomed)
-    photos[7] = Photo("zoomed", photos[7].observations)
+    other, _ = cases.photographs(field, stations[7:8], 0.05, rng, camera=zoomed)
+    del photos["photo7"]
+    photos["zoomed"] = other["photo0"]
     length = float(np.linalg.norm(field[47] - field[0]))
     network = adjust_network(
         cases.SENSOR, photos, [f"t{i}" for i in range(48)], [Distance("t0", "t47", length, 0.01)]
@@ -262,11 +263,10 @@ def test_photographs_of_a_field_that_moves_are_refused():
     """Every photograph shows another random field: whatever fits together by chance is refused."""
     rng = np.random.default_rng(8)
     stations = cases.convergent_stations(_BENT)
-    photos = []
+    photos = {}
     for i, station in enumerate(stations):
         moved = _BENT + rng.normal(0, 30, _BENT.shape)
-        (photo,), _ = cases.photographs(moved, [station], 0.05, rng)
-        photos.append(Photo(f"photo{i}", photo.observations))
+        photos[f"photo{i}"] = cases.photographs(moved, [station], 0.05, rng)[0]["photo0"]
     with pytest.raises(GeometryError):
         adjust_network(
             cases.SENSOR, photos, [f"t{i}" for i in range(48)],

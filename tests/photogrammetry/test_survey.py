@@ -12,7 +12,7 @@ from thermocald.output.testfield.layout import TRIM, Design, field_of, lay_out, 
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.network.datum import Distance
-from thermocald.photogrammetry.survey import Picture, survey
+from thermocald.photogrammetry.survey import survey
 from thermocald.physics.scene import Scene
 
 # The binned mode of a Raspberry Pi camera v2.1.
@@ -36,10 +36,10 @@ def bent(field, size, sag=5.0):
 def photograph(truth, stations, camera=CAMERA):
     """Pictures of a field by the program's own renderer."""
     scene = Scene(camera.sensor, truth)
-    pictures = []
+    pictures = {}
     for i, station in enumerate(stations):
         frame = scene.render(camera.interior.as_array(), station.as_array(), seed=i)
-        pictures.append(Picture(f"photo{i}.png", lambda frame=frame: frame))
+        pictures[f"photo{i}.png"] = lambda frame=frame: frame
     return pictures
 
 
@@ -100,15 +100,13 @@ def test_bent_sheet_of_which_nothing_is_known(sheet):
 
 def test_a_black_and_a_foreign_photograph_are_named_and_do_no_harm(sheet):
     nominal, truth, pictures, distance = sheet
-    shape = pictures[0].load().shape
+    shape = pictures["photo0.png"]().shape
     rng = np.random.default_rng(0)
     noise = rng.integers(60, 180, (77, 103), dtype=np.uint8)
     clutter = cv2.resize(noise, shape[::-1], interpolation=cv2.INTER_CUBIC)
-    extra = [
-        Picture("black.png", lambda: np.zeros(shape, dtype=np.uint8)),
-        Picture("wall.png", lambda: clutter),
-    ]
-    result = survey([*pictures, *extra], [distance], CAMERA.sensor.pixel_pitch, nominal=nominal)
+    black = np.zeros(shape, dtype=np.uint8)
+    photographs = {**pictures, "black.png": lambda: black, "wall.png": lambda: clutter}
+    result = survey(photographs, [distance], CAMERA.sensor.pixel_pitch, nominal=nominal)
     assert_true(result, truth)
     assert "black.png" not in {s.photo for s in result.network.stations}
     assert "wall.png" not in {s.photo for s in result.network.stations}
@@ -118,14 +116,14 @@ def test_a_black_and_a_foreign_photograph_are_named_and_do_no_harm(sheet):
 
 def test_pictures_that_do_not_belong_together_are_refused(sheet):
     nominal, _, pictures, distance = sheet
-    turned = Picture("portrait.png", lambda: np.ascontiguousarray(pictures[1].load().T))
+    turned = {"portrait.png": lambda: np.ascontiguousarray(pictures["photo1.png"]().T)}
     with pytest.raises(ImageError, match=r"portrait\.png.*1232×1640"):
-        survey([*pictures, turned], [distance], 0.00224, nominal=nominal)
-    black = Picture("night.png", lambda: np.zeros((1232, 1640), dtype=np.uint8))
+        survey(pictures | turned, [distance], 0.00224, nominal=nominal)
+    black = {"night.png": lambda: np.zeros((1232, 1640), dtype=np.uint8)}
     with pytest.raises(ImageError, match="no photograph shows a coded target"):
-        survey([black], [distance], 0.00224, nominal=nominal)
+        survey(black, [distance], 0.00224, nominal=nominal)
     with pytest.raises(GeometryError, match="2 photographs"):
-        survey(pictures[:2], [distance], 0.00224, nominal=nominal)
+        survey(dict([*pictures.items()][:2]), [distance], 0.00224, nominal=nominal)
     nowhere = Distance("R65", "P9999", 100.0, 0.1)
     with pytest.raises(GeometryError, match="P9999"):
         survey(pictures, [nowhere], 0.00224, nominal=nominal)
@@ -235,10 +233,10 @@ def test_photographs_of_a_printed_pdf(tmp_path):
     truth = TestField.build(
         nominal.names, points, 0.0, nominal.diameters, nominal.kinds, nominal.codes
     )
-    pictures = []
+    pictures = {}
     for i, station in enumerate(cases.convergent_stations(points, 12, distance=430.0)):
         frame = _photograph_of_paper(raster, scale, page, surface, station, i)
-        pictures.append(Picture(f"photo{i}", lambda frame=frame: frame))
+        pictures[f"photo{i}"] = lambda frame=frame: frame
     a, b = (target.name for target in printed.sheets[0].scale_bar)
     distance = measured_distance(truth, a, b, 0.02)
     result = survey(pictures, [distance], CAMERA.sensor.pixel_pitch, nominal=nominal)

@@ -9,6 +9,7 @@ bend by millimetres or were put up askew are what a survey is for.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -26,21 +27,19 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.field.planes import field_sheets, sheet_normals, target_normals
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.measurement import predict_circles
-from thermocald.photogrammetry.network.adjustment import Network, Photo, adjust_network, advice
+from thermocald.photogrammetry.network.adjustment import Network, adjust_network, advice
 from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.frame_status import inspect_frame
-from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.photogrammetry.targets.markers import locate_markers, to_8_bit
 from thermocald.photogrammetry.targets.outline import LocalMap, find_circles, local_maps
 from thermocald.photogrammetry.targets.ring_code import SEARCHES, have_rings, is_ring, read_codes
 from thermocald.result import with_sds
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Sequence
 
     from thermocald.arrays import Array, Image
 
@@ -193,17 +192,8 @@ def surveyed_field(network: Network, template: TestField) -> TestField:
 _PASSES = 2
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A photograph that can be loaded: `load()` gives its grey values (H, W), 8 or 16 bit."""
-
-    name: str
-    load: Callable[[], Image]
-
-
-def picture_of(path: Path) -> Picture:
-    """Return a picture that is read when it is needed, as the sensor saw it."""
-    return Picture(str(path), lambda: decode_grey(path))
+Pictures = Mapping[str, "Callable[[], Image]"]
+"""Photographs by name that can be loaded: grey values (H, W), 8 or 16 bit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -278,7 +268,7 @@ class Survey:
 
 
 def survey(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     distances: Sequence[Distance],
     pixel_pitch: float,
     *,
@@ -327,7 +317,7 @@ def survey(
 
 def _provisional(
     distances: Sequence[Distance],
-    photos: Sequence[Photo],
+    photos: Mapping[str, Observations],
     names: Sequence[str],
     nominal: TestField | None,
 ) -> Sequence[Distance]:
@@ -336,8 +326,8 @@ def _provisional(
     A plain circle or a code that was not read turns up only when it is known where to look.
     """
     seen = np.zeros(len(names), dtype=int)
-    for photo in photos:
-        seen[photo.observations.targets] += 1
+    for shown in photos.values():
+        seen[shown.targets] += 1
     often = {names[int(row)] for row in np.flatnonzero(seen > 2)}
     found = [d for d in distances if d.a in often and d.b in often]
     if found or nominal is None or len(often) < 2 or not distances:
@@ -354,11 +344,13 @@ def _provisional(
 
 
 def _first_look(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     pixel_pitch: float,
     nominal: TestField | None,
     progress: Callable[[str], None],
-) -> tuple[Sensor, tuple[str, ...], list[Photo], dict[tuple[str, str], float], dict[str, str]]:
+) -> tuple[
+    Sensor, tuple[str, ...], dict[str, Observations], dict[tuple[str, str], float], dict[str, str]
+]:
     """Measure codes and markers in every photograph; return the names that the targets' rows count,
     the targets' sizes in px, and what went wrong.
     """
@@ -369,24 +361,24 @@ def _first_look(
     rows: dict[RingCode, int] = {}
     if nominal is not None:
         rows = {ring_code.parse(c): row for row, c in enumerate(nominal.codes) if is_ring(c)}
-    for picture in pictures:
-        progress(f"codes in {picture.name}")
-        image = picture.load()
+    for name, load in pictures.items():
+        progress(f"codes in {name}")
+        image = load()
         expected = None if sensor is None else (sensor.width, sensor.height)
         status = inspect_frame(image, expected)
         if status.word in ("wrong_size", "not_grey", "no_image"):
-            raise ImageError(f"{picture.name}: {status.reason}")
+            raise ImageError(f"{name}: {status.reason}")
         if not status.ok:
-            said[picture.name] = status.reason
+            said[name] = status.reason
             continue
         sensor = sensor or Sensor(image.shape[1], image.shape[0], pixel_pitch)
         found, radii = codes_in(image, rows, grows=nominal is None)
-        sizes.update({(picture.name, row): radius for row, radius in radii.items()})
+        sizes.update({(name, row): radius for row, radius in radii.items()})
         if nominal is not None:
             found = measure_corners(image, locate_markers(image, nominal)).joined(found)
-        said[picture.name] = f"{len(found)} coded targets"
+        said[name] = f"{len(found)} coded targets"
         if len(found):
-            seen[picture.name] = found
+            seen[name] = found
     if sensor is None or not seen:
         raise ImageError(
             "no photograph shows a coded target: "
@@ -394,28 +386,25 @@ def _first_look(
         )
     names = tuple(map(_name_of, rows)) if nominal is None else nominal.names
     named = {(photo, names[row]): radius for (photo, row), radius in sizes.items()}
-    return sensor, names, [Photo(name, o) for name, o in seen.items()], named, said
+    return sensor, names, seen, named, said
 
 
 def _look_again(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     network: Network,
     expected: TestField,
     normals: Array,
     said: dict[str, str],
     progress: Callable[[str], None],
-) -> list[Photo]:
+) -> dict[str, Observations]:
     """Every oriented photograph measured with what is known of it."""
-    stations = {s.photo: s for s in network.stations}
-    photos = []
-    for picture in pictures:
-        if picture.name not in stations:
+    stations, photos = {s.photo: s for s in network.stations}, {}
+    for name, load in pictures.items():
+        if name not in stations:
             continue
-        progress(f"targets in {picture.name}")
-        seen = targets_in(
-            picture.load(), expected, normals, network.camera, stations[picture.name].exterior
-        )
-        said[picture.name] = f"{len(seen)} targets"
+        progress(f"targets in {name}")
+        seen = targets_in(load(), expected, normals, network.camera, stations[name].exterior)
+        said[name] = f"{len(seen)} targets"
         if len(seen):
-            photos.append(Photo(picture.name, seen))
+            photos[name] = seen
     return photos

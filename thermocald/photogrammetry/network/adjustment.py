@@ -38,7 +38,7 @@ from thermocald.photogrammetry.network.datum import Distance, bring_to_datum
 from thermocald.photogrammetry.network.start import approximate
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -294,17 +294,9 @@ def _in_use(
     return part, used, photos, targets
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Photo:
-    """One photograph: its name and what was measured in it; targets are rows of the names."""
-
-    name: str
-    observations: Observations
-
-
 def adjust_network(
     sensor: Sensor,
-    photos: Sequence[Photo],
+    photos: Mapping[str, Observations],
     names: Sequence[str],
     distances: Sequence[Distance],
     *,
@@ -315,13 +307,14 @@ def adjust_network(
 ) -> Network:
     """Adjust a free network of photographs taken by one camera with unchanged focus.
 
-    names: the m targets that the observations' rows count; distances: measured ones between
-    targets, they give the scale; interior: approximate values, searched for if None; nominal:
-    approximate coordinates (m, 3) mm, NaN where unknown; free: the interior parameters to be
-    determined; start: an earlier result for the same photographs, whose orientation is begun with.
+    photos: what was measured, by photograph; names: the m targets that its rows count; distances:
+    measured ones between targets, they give the scale; interior: approximate values, searched for
+    if None; nominal: approximate coordinates (m, 3) mm, NaN where unknown; free: the interior
+    parameters to be determined; start: an earlier result for the same photographs, whose
+    orientation is begun with.
     Raises GeometryError where the network cannot carry it, with the reasons.
     """
-    rays = ImageRays.collect([p.observations for p in photos])
+    rays, shown = ImageRays.collect(list(photos.values())), list(photos)
     seen = np.bincount(rays.target, minlength=len(names))
     left_out = {
         names[int(t)]: "fewer than three photographs show it"
@@ -333,17 +326,15 @@ def adjust_network(
     bundle, kept, used = (
         approximate(sensor, rays, len(names), interior, nominal, free_rows)
         if start is None
-        else _resume(start, photos, names, rays)
+        else _resume(start, shown, names, rays)
     )
     for i in sorted(set(range(len(photos))) - set(kept)):
-        left_out[photos[i].name] = "could not be oriented: too few targets in common with others"
+        left_out[shown[i]] = "could not be oriented: too few targets in common with others"
 
     whole, rejected, tests = snoop(sensor, bundle, used, free_rows)
     bundle, final, in_use, targets = _in_use(whole, used, ~rejected)
     for i in sorted(set(range(len(kept))) - set(in_use.tolist())):
-        left_out[photos[kept[i]].name] = (
-            "contradicts the others: another focus, or a field that moved"
-        )
+        left_out[shown[kept[i]]] = "contradicts the others: another focus, or a field that moved"
     for t in np.setdiff1d(rays.target, targets):
         left_out[names[int(t)]] = "fewer than three photographs agree on it"
     kept_names = tuple(names[int(t)] for t in targets)
@@ -374,13 +365,13 @@ def adjust_network(
         x, y, z = np.sqrt(np.diag(to_datum @ of_centres[i] @ to_datum.T) * variance).tolist()
         exterior = ExteriorOrientation.from_rotation(placed.rotations[i], placed.centres[i])
         n = int(np.count_nonzero(final.photo == i))
-        stations.append(Station(photos[kept[int(row)]].name, exterior, n, (x, y, z)))
+        stations.append(Station(shown[kept[int(row)]], exterior, n, (x, y, z)))
     sizes = np.linalg.norm(
         BundleAdjustment(sensor, used.in_pixels(), free_rows).residuals(whole), axis=1
     )
     rejections = [
         Rejection(
-            photos[kept[used.photo[i]]].name, names[used.target[i]],
+            shown[kept[used.photo[i]]], names[used.target[i]],
             float(sizes[i]), float(tests[i]),
         )
         for i in np.flatnonzero(rejected)
@@ -407,10 +398,10 @@ def adjust_network(
 
 
 def _resume(
-    start: Network, photos: Sequence[Photo], names: Sequence[str], rays: ImageRays
+    start: Network, photos: Sequence[str], names: Sequence[str], rays: ImageRays
 ) -> tuple[Bundle, list[int], ImageRays]:
     """The bundle of an earlier result, for the rays of its photographs and targets."""
-    rows = {p.name: i for i, p in enumerate(photos)}
+    rows = {name: i for i, name in enumerate(photos)}
     kept = [rows[s.photo] for s in start.stations]
     number = np.full(len(photos), -1)
     number[kept] = np.arange(len(kept))

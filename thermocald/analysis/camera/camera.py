@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import ideal_points, image_grid
+from thermocald.analysis.camera.undistortion import directions, ideal_points, image_grid
 from thermocald.errors import UsageError
 from thermocald.numbers import with_sd
 from thermocald.photogrammetry.camera.camera_model import (
@@ -106,15 +106,13 @@ class Camera(Result):
 
     def as_seen_by(self, image_points: ArrayLike, other: InteriorOrientation) -> Array:
         """Image points (n, 2) px as this camera would have seen them with another IOP."""
-        r = self.rays(image_points)
-        points = r / -r[..., 2:]
-        return project(self.sensor, other.as_array(), np.zeros(6), points)
+        seen = directions(self.sensor, self.values, image_points)
+        return project(self.sensor, other.as_array(), np.zeros(6), seen)
 
     def point_covariance(self, image_points: ArrayLike) -> Array:
         """Covariance (n, 2, 2) px² of where a fixed direction is seen, from this IOP's."""
-        r = self.rays(image_points)
-        _, J, _ = partials(self.sensor, self.values, np.zeros(6), r / -r[..., 2:])
-        J = J[..., :10]
+        seen = directions(self.sensor, self.values, image_points)
+        J = partials(self.sensor, self.values, np.zeros(6), seen)[1][..., :10]
         result: Array = np.einsum("ncp,pq,ndq->ncd", J, self.covariance, J)
         return result
 
@@ -167,11 +165,8 @@ class Camera(Result):
     def object_distance(self, other: Camera, distance_mm: float) -> Array:
         """Distances (9,) mm on a plane between where this and another state puts the grid."""
         grid = image_grid(self.sensor)
-        places = []
-        for state in (self, other):
-            r = state.rays(grid)
-            places.append(distance_mm * r[..., :2] / -r[..., 2:])
-        result: Array = np.linalg.norm(places[0] - places[1], axis=1)
+        ours, theirs = (ideal_points(s.sensor, s.values, grid) for s in (self, other))
+        result: Array = distance_mm * np.linalg.norm(ours - theirs, axis=1)
         return result
 
     def opencv(self) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.camera.undistortion import directions, image_grid
 from thermocald.errors import ConfigurationError
 from thermocald.numbers import plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, partials, project
@@ -158,14 +158,11 @@ class CameraDifference(Result):
 
     @cached_property
     def _directions(self) -> Array:
-        r = self.first.rays(self._grid)
-        return np.asarray(r / -r[..., 2:])
+        return directions(self.first.sensor, self.first.interior.as_array(), self._grid)
 
     @staticmethod
-    def _seen(camera: CameraModel, directions: Array) -> Array:
-        return np.asarray(
-            project(camera.sensor, camera.interior.as_array(), np.zeros(6), directions)
-        )
+    def _seen(camera: CameraModel, seen: Array) -> Array:
+        return project(camera.sensor, camera.interior.as_array(), np.zeros(6), seen)
 
     def _sds(self) -> Array | None:
         a, b = self.covariances
@@ -173,16 +170,15 @@ class CameraDifference(Result):
 
     def _image_sds(self, worst: int) -> tuple[float, float]:
         """Standard deviations px of the largest shift's length, and of the RMS."""
-        directions = self.shifts / np.linalg.norm(self.shifts, axis=1)[:, None].clip(1e-300)
+        along_shifts = self.shifts / np.linalg.norm(self.shifts, axis=1)[:, None].clip(1e-300)
         weights = self.shifts / (len(self.shifts) * max(_rms(self.shifts), 1e-300))
         largest = rms = 0.0
         cameras = (self.first, self.second)
         for camera, covariance in zip(cameras, self.covariances, strict=True):
             assert covariance is not None
             values = camera.interior.as_array()
-            _, J, _ = partials(camera.sensor, values, np.zeros(6), self._directions)
-            J = J[..., :10]
-            along = directions[worst] @ J[worst]
+            J = partials(camera.sensor, values, np.zeros(6), self._directions)[1][..., :10]
+            along = along_shifts[worst] @ J[worst]
             total = np.einsum("nc,ncp->p", weights, J)
             largest += float(along @ covariance @ along)
             rms += float(total @ covariance @ total)

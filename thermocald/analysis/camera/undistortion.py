@@ -59,6 +59,12 @@ def ideal_points(
     return out
 
 
+def directions(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
+    """Image points (n, 2) px → where they look, (n, 3) in the camera frame, 1 in front of it."""
+    ideal = ideal_points(sensor, iop, image_points)
+    return np.column_stack([ideal, np.full(len(ideal), -1.0)])
+
+
 def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
     """Coefficients of r̄ = r (1 + a₁ r² + …), highest first; None where the distortion folds."""
     corner = np.hypot(sensor.width, sensor.height) * sensor.pixel_pitch / 2
@@ -143,8 +149,8 @@ class Maps:
         self._shape = (-(-sensor.height // _CELL) + 2, -(-sensor.width // _CELL) + 2)
         v, u = (_CELL * np.arange(n) - (_CELL + 1) / 2.0 for n in self._shape)
         self._nodes = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-        self._directions = _directions(sensor, steady, self._nodes)
-        self._checked = _directions(sensor, steady, image_grid(sensor, _CHECKED))
+        self._directions = directions(sensor, steady, self._nodes)
+        self._checked = directions(sensor, steady, image_grid(sensor, _CHECKED))
         self._seen: Array | None = None
         self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
 
@@ -190,8 +196,3 @@ class Maps:
         u = np.arange(self.sensor.width, dtype=np.float32)
         v = np.arange(top, bottom, dtype=np.float32)
         return large[..., 0] + u, large[..., 1] + v[:, None]
-
-
-def _directions(sensor: Sensor, values: Array, points: Array) -> Array:
-    ideal = ideal_points(sensor, values, points)
-    return np.concatenate([ideal, np.full((len(ideal), 1), -1.0)], axis=1)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.camera.undistortion import ideal_points, image_grid
 from thermocald.analysis.statistics.dependence import correlation_matrix
 from thermocald.errors import GeometryError
 from thermocald.parallel import in_order
@@ -33,7 +33,6 @@ from thermocald.photogrammetry.camera.camera_model import (
     distortion_jacobian,
     image_to_mm,
     partials,
-    rays,
 )
 
 if TYPE_CHECKING:
@@ -91,8 +90,7 @@ class DistanceLaw:
 
 def on_plane(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: float) -> Array:
     """Image points (k, 2) px → points (k, 2) mm on the plane; GeometryError where no ray exists."""
-    direction = rays(sensor, iop, points)
-    return np.asarray(-distance_mm * direction[:, :2] / direction[:, 2:])
+    return distance_mm * ideal_points(sensor, iop, points)
 
 
 def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: float) -> Array:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.camera.undistortion import directions, image_grid
 from thermocald.analysis.statistics.dependence import (
     Dependence,
     correlation_matrix,
@@ -29,7 +29,7 @@ from thermocald.analysis.statistics.dependence import (
 from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.analysis.statistics.significance import moving_f_test, unbroken_windows
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project, rays
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
 from thermocald.result import document_of
 
 if TYPE_CHECKING:
@@ -95,9 +95,7 @@ def image_displacement(sensor: Sensor, first: Array, later: Array, points: Array
     first (10,), later (10,) or (n, 10); returns px (k, 2) or (n, k, 2), y down. Raises
     GeometryError where the first IOP have no ray for a point.
     """
-    direction = rays(sensor, first, points)
-    # The same rays seen again: a camera at the origin before points 1 m away along them.
-    scene = direction / -direction[:, 2:] * 1000.0
+    scene = directions(sensor, first, points)
     seen = project(sensor, later, np.zeros((*later.shape[:-1], 6)), scene)
     return np.asarray(seen - points)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,14 +12,13 @@ from thermocald.analysis.thermal.camera_fit import type_model
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.errors import ConfigurationError, DataError, ThermocaldError, UsageError
+from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.presets import preset_simulation
-from thermocald.store.recording.reader import read_recording
 from thermocald.thermal.reduce import reduce_series
-from thermocald.thermal.source import epochs_input, series_input
+from thermocald.thermal.source import epochs_input
 
 LAG = ModelEffect("thermal_lag", {"tau": 70.0})
 START = ModelEffect("thermal_lag", {"tau": 10.0})
@@ -199,43 +197,6 @@ def folder(tmp_path_factory, pair):
     return path
 
 
-def test_fit_command(folder):
-    document = json.loads((folder / "fit.json").read_text())
-    tau = document["effects"][0]["parameters"]["tau"]
-    assert abs(tau["value"] - 70.0) < 3 * tau["sd"]
-    camera = ThermalCamera.load(folder / "cam.yaml")
-    assert camera.model.covariance is not None
-    same = fit_thermal_model([for_fit(series_input(read_recording(folder / "M1")))], [LAG])
-    assert same.model.effects[0].values["tau"] == pytest.approx(tau["value"], abs=0.05)
-
-
-def test_predict_command(folder):
-    result = run("predict", "--model", folder / "cam.yaml", "--temperature", 35, "--json", "-")
-    document = json.loads(result.stdout)
-    expected = ThermalCamera.load(folder / "cam.yaml").at(35.0)
-    assert document["x0"] == pytest.approx(expected.interior.x0)
-    assert document["sd_x0"] == pytest.approx(expected.sd["x0"])
-    log = run("predict", "--model", folder / "cam.yaml", "--log", folder / "M2" / "epochs.csv")
-    lines = log.stdout.splitlines()
-    assert len(lines) == 121
-    assert lines[0].startswith("time,temperature,c,x0,y0,A1")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--temperature", 95], "looks like fahrenheit"),
-        (["--temperature", -30], "extrapolation"),
-        ([], "give one of"),
-        (["--temperature", 30, "--channel", "board"], "write NAME=°C"),
-    ],
-)
-def test_predict_refuses(folder, arguments, says):
-    result = run("predict", "--model", folder / "cam.yaml", *arguments)
-    assert isinstance(result.exception, UsageError)
-    assert says in str(result.exception)
-
-
 def test_correct_points_command(folder, pair):
     """M2's own measurements, corrected: they stand still to the noise, and the bands are true."""
     second = pair[1]
@@ -294,27 +255,3 @@ def test_correct_images_command(folder, pair):
     difference = corrected[40:-40, 40:-40] - expected[40:-40, 40:-40]
     raw = cv2.imread(str(folder / "hot.png"), cv2.IMREAD_GRAYSCALE)[40:-40, 40:-40]
     assert difference.std() < 0.1 * (raw - expected[40:-40, 40:-40]).std()
-
-
-@pytest.mark.parametrize(
-    ("points", "log", "says"),
-    [
-        ("time,x,y\n0,5,5\n", None, "outside the temperature log"),
-        ("time,x,y\n1600000100,5000,5\n", None, "of another camera, or binned"),
-        ("time,x\n1600000100,5\n", None, "no column 'y'"),
-        ("time,x,y\n1600000100,five,5\n", None, "line 2: column x: 'five' is not a number"),
-        ("time,x,y\n1600000100,5,5\n", "time,t\n1600000000,20\n", "1 reading"),
-        ("time,x,y\n1600000100,5,5\n", "time,t\n9,20\n5,20\n", "outside the temperature log"),
-        ("time,x,y\n1600000100,5,5\n", "when,t\n9,20\n", "rows with a time"),
-        ("time,x,y\n1600000100,5,5\n", "time,t\n1600000000,95\n1600009000,99\n", "fahrenheit"),
-    ],
-)
-def test_correct_refuses(folder, points, log, says):
-    (folder / "bad.csv").write_text(points)
-    source = folder / "M2" / "epochs.csv"
-    if log is not None:
-        source = folder / "log.csv"
-        source.write_text(log)
-    result = run("correct", folder / "bad.csv", "--model", folder / "cam.yaml", "--log", source)
-    assert isinstance(result.exception, ThermocaldError), result.exception
-    assert says in str(result.exception)

@@ -123,12 +123,6 @@ def test_export_of_several_series_names_the_option(recording, tmp_path):
     assert run("export", tmp_path / "t.db", "--series", "M2").returncode == 0
 
 
-def test_check_says_what_a_recording_is(recording):
-    done = run("check", recording)
-    assert done.returncode == 0
-    assert "40 epochs" in done.stdout
-
-
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [

@@ -72,34 +72,6 @@ def test_with_the_model_found_nothing_is_missing(recordings, found):
     assert json.loads(result.stdout)["verdict"] == "adequate"
 
 
-def test_simulate_runs_the_new_model(recordings, found):
-    import numpy as np
-
-    from thermocald.physics.history import History
-    from thermocald.physics.model_file import read_model
-    from thermocald.store.recording.reader import read_recording
-    from thermocald.thermal.source import series_input
-
-    recording = read_recording(recordings / "M1")
-    thermal = read_model(recordings / "model.yaml")
-    frames, (times, readings) = (
-        recording.columns.frame_time, recording.columns.readings_of("temperature")
-    )  # fmt: skip
-    history = History(
-        frames - frames[0], times - frames[0], {"temperature": readings}, "temperature", thermal.T0
-    )
-    predicted = thermal.predict(history)
-
-    from thermocald.photogrammetry.camera.camera_model import project
-
-    source = series_input(recording)
-    uv = project(source.sensor, predicted.iop, predicted.eop, source.field.points)
-    misfit = source.grid.points - uv
-    good = np.abs(misfit) < 0.5  # gross errors
-    # image noise and what the thermometer's noise of 0.044 K makes of up to 1 px/K
-    assert np.sqrt(np.mean(misfit[good] ** 2)) < 0.07
-
-
 def test_another_camera_is_refused(recordings, tmp_path):
     other = ["nexus5", "rpi-v2.1", "galaxy-s8"]
     own = yaml.safe_load((recordings / "M1" / "recording.yaml").read_text())["camera"]["name"]

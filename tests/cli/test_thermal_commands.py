@@ -25,8 +25,6 @@ from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.recording.testfield_file import write_testfield
 
-FORMATS = tuple(camera_files.FORMATS)
-
 
 def simulated(seed=1, effect=None, epochs=90, interval=20.0, series="M1", kind="plain", name="rpi"):
     """A camera heated by a lamp for a quarter of an hour, its board now and then."""
@@ -198,6 +196,14 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
         (("correct", "{points}", "--log", "{fahrenheit}"), "looks like fahrenheit"),
         (("correct", "{points}", "--log", "{hot}"), "ask for extrapolation by name"),
         (("correct", "{images}", "--log", "{hot}", "--out", "{new}"), "extrapolation by name"),
+        (("correct", "{elsewhere}", "--log", "{M1}/epochs.csv"), "of another camera, or binned"),
+        (("correct", "{no_y}", "--log", "{M1}/epochs.csv"), "no column 'y'"),
+        (("correct", "{five}", "--log", "{M1}/epochs.csv"), "line 2: column x: 'five' is not a n"),
+        (("correct", "{points}", "--log", "{one_reading}"), "1 reading"),
+        (("correct", "{points}", "--log", "{backwards}"), "outside the temperature log"),
+        (("correct", "{points}", "--log", "{no_time}"), "rows with a time"),
+        (("predict",), "give one of"),
+        (("predict", "--temperature", "30", "--channel", "board"), "write NAME=°C"),
         (("predict", "--temperature", "88"), "looks like fahrenheit"),
         (("predict", "--temperature", "-40"), "ask for extrapolation by name"),
         (("predict", "--log", "{fahrenheit}"), "looks like fahrenheit"),
@@ -211,6 +217,12 @@ def test_wrong_use_is_refused(folder, tmp_path, arguments, says):
         "points": f"time,x,y\n{begin + 60:.1f},500,400\n",
         "images": f"time,image\n{begin + 60:.1f},small.png\n",
         "late": f"time,image\n{end + 9e4:.1f},small.png\n",
+        "elsewhere": f"time,x,y\n{begin + 60:.1f},5000,5\n",
+        "no_y": f"time,x\n{begin + 60:.1f},5\n",
+        "five": f"time,x,y\n{begin + 60:.1f},five,5\n",
+        "one_reading": f"time,t\n{begin:.1f},20\n",
+        "backwards": "time,t\n9,20\n5,20\n",
+        "no_time": "when,t\n9,20\n",
         "fahrenheit": f"time,air\n{begin:.1f},86\n{end:.1f},92\n",
         "hot": f"time,air\n{begin:.1f},160\n{end:.1f},170\n",
     }
@@ -227,19 +239,17 @@ def test_wrong_use_is_refused(folder, tmp_path, arguments, says):
     assert says in str(result.exception)
 
 
-def test_two_cameras_are_no_series_of_one(folder, tmp_path):
-    result = run("fit", folder / "M1", folder / "other", "-o", tmp_path / "no.yaml")
-    assert "belongs to one camera" in str(result.exception)
-
-
-def test_two_references_are_no_series_of_one(folder, tmp_path):
-    result = run("fit", folder / "M1", folder / "swapped", "-o", tmp_path / "no.yaml")
-    assert "put the same one first" in str(result.exception)
-
-
-def test_two_resolutions_are_no_series_of_one(folder, tmp_path):
-    result = run("fit", folder / "M1", folder / "binned", "-o", tmp_path / "no.yaml")
-    assert "fit series of one resolution" in str(result.exception)
+@pytest.mark.parametrize(
+    ("second", "says"),
+    [
+        ("other", "belongs to one camera"),
+        ("swapped", "put the same one first"),  # another thermometer is the reference
+        ("binned", "fit series of one resolution"),
+    ],
+)
+def test_what_is_no_series_of_one_camera_is_not_fitted_together(folder, tmp_path, second, says):
+    result = run("fit", folder / "M1", folder / second, "-o", tmp_path / "no.yaml")
+    assert says in str(result.exception)
 
 
 def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
@@ -429,16 +439,6 @@ def camera():
     field = demonstration_field("markers")
     model = demonstration_model(field)
     return CameraModel(model.sensor, model.interior.with_values(A3=0.0, C1=0.0, C2=0.0))
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_camera_of_any_format_is_an_initial_value(tmp_path, camera, name):
-    path = tmp_path / f"camera{camera_files.FORMATS[name].suffix}"
-    camera_files.write(camera, path, name)
-    read = read_camera(path)
-    assert read.sensor.pixel_pitch == pytest.approx(camera.sensor.pixel_pitch)
-    assert read.interior.as_array() == pytest.approx(camera.interior.as_array(), abs=1e-9)
-    assert read.principal_distance == pytest.approx(camera.interior.c)
 
 
 def test_the_program_s_own_description_stays_one(tmp_path):

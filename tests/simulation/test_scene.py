@@ -18,7 +18,7 @@ from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.markers import locate_markers
 from thermocald.physics import shapes as portable
-from thermocald.physics.scene import Look, Scene, coverage, windows_around
+from thermocald.physics.scene import Look, Scene, coverage_steps, fill, windows_around
 from thermocald.physics.shapes import surface_normals
 from thermocald.physics.testfields import (
     corner_field,
@@ -80,6 +80,25 @@ def test_corners_agree_with_the_projected_truth():
     assert np.sqrt(np.mean(error**2)) < 0.01
 
 
+def test_corners_err_as_stated_wherever_in_a_pixel():
+    """Blurred on the pixel grid, corners would err by 1.16 times their sds, in step with the phase.
+
+    6 frames of 190 corners tell the ratio to 2 %.
+    """
+    field = demonstration_field("markers")
+    eop = corner_view(field, 1330.0).as_array()
+    scene, normed = Scene(SENSOR, field), []
+    for k in range(6):
+        x0, y0 = np.array([k / 6, k / 5]) * SENSOR.pixel_pitch
+        iop = InteriorOrientation(c=3.04, x0=x0, y0=y0).as_array()
+        image = scene.render(iop, eop, seed=k)
+        seen = measure_corners(image, locate_markers(image, field))
+        error = seen.points - project(SENSOR, iop, eop, field.points)[seen.targets]
+        normed.append(error / seen.sigmas)
+    ratio = np.sqrt(np.mean(np.concatenate(normed) ** 2, axis=0))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.06)
+
+
 def test_drift_moves_the_image():
     """The same target half a pixel on: centroids move by what the camera model says."""
     field = demonstration_field("plain")
@@ -107,7 +126,8 @@ def test_coverage_is_exact():
     corners = np.array([[3.2, 4.1], [9.7, 5.3], [8.5, 11.8], [2.0, 10.6]])
     (windows,) = windows_around(corners.min(0)[None], corners.max(0)[None], 2)
     zeros = np.zeros(4, dtype=np.int64)
-    share = coverage(corners, np.roll(corners, -1, axis=0), np.ones(4), zeros, windows)
+    steps = coverage_steps(corners, np.roll(corners, -1, axis=0), np.ones(4), zeros, windows)
+    share = fill(steps).reshape(windows.rows, 2, windows.width, 2).mean(axis=(1, 3))
     x, y = corners.T
     area = 0.5 * abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
     assert abs(share.sum() - area) < 1e-5
@@ -177,7 +197,7 @@ def test_same_frame_from_the_same_seed():
     assert np.array_equal(frames[0], frames[1])
     assert not np.array_equal(frames[0], frames[2])
     digest = hashlib.sha256(frames[0].tobytes()).hexdigest()
-    assert digest[:16] == "0dc0ce6a9cf03c95"
+    assert digest[:16] == "82c1002b94349c6e"
 
 
 def test_portable_arithmetic_is_right():

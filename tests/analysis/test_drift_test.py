@@ -27,27 +27,19 @@ def noise(rng, coloured, phi, n=N):
     return np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * white
 
 
-@pytest.mark.parametrize("size", mostly_slow([1.0, 3.0], 3.0))
+@pytest.mark.parametrize("size", mostly_slow([1.0, 3.0], 1.0))
 @pytest.mark.parametrize(("coloured", "phi"), NOISES)
-def test_at_most_one_in_twenty_driftless_series_drifts(coloured, phi, size):
+def test_at_most_one_in_twenty_driftless_series_drifts_or_exceeds_its_sds(coloured, phi, size):
     """Noise of any memory, as large as stated or three times that; 200 series each.
 
     The 99.9 % point of a binomial share of 5 % is 0.105. Comparing with the stated sds alone
-    claimed drift of 91 to 100 % of series whose noise exceeds them.
+    claimed drift of 91 to 100 % of series whose noise exceeds them; of AR(1) of 0.97 on top of
+    white noise of equal size 9.5 % exceeded what they were within.
     """
-    rng = np.random.default_rng(4)
-    found = [
-        drift_test(size * noise(rng, coloured, phi), ONES, REDUNDANCY).p_value for _ in range(200)
-    ]
-    assert np.mean(np.array(found) <= 0.05) <= 0.105
-
-
-@pytest.mark.parametrize(("coloured", "phi"), NOISES)
-def test_at_most_one_in_twenty_series_within_its_sds_exceeds_them(coloured, phi):
-    """AR(1) of 0.97 on top of white noise of equal size used to be claimed in 9.5 %."""
     rng = np.random.default_rng(5)
-    found = [drift_test(noise(rng, coloured, phi), ONES, REDUNDANCY).p_excess for _ in range(200)]
-    assert np.mean(np.array(found) <= 0.05) <= 0.105
+    found = [drift_test(size * noise(rng, coloured, phi), ONES, REDUNDANCY) for _ in range(200)]
+    assert np.mean([one.p_value <= 0.05 for one in found]) <= 0.105
+    assert size > 1 or np.mean([one.p_excess <= 0.05 for one in found]) <= 0.105
 
 
 def flicker(rng, exponent, n):

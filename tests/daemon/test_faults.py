@@ -207,17 +207,6 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
     assert daemon.events().count("reload_failed") == 1
 
 
-def test_sigterm_finishes_the_epoch_in_hand(daemon, devices):
-    daemon.configure(**devices())
-    daemon.start()
-    daemon.until(lambda: len(daemon.results()) > 3)
-    assert daemon.stop() == 0
-    numbers, _ = daemon.stored()
-    assert numbers == [r["epoch"] for r in daemon.results()]
-    assert "started" in daemon.events()
-    assert daemon.events()[-1] == "stopped"
-
-
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
 def test_garbage_frames_are_epochs_with_a_reason(daemon, recording, tmp_path, count):
     garbage = tmp_path / "garbage"

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import re
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
 from tests.docs.blocks import NOTEBOOKS, ROOT
 
@@ -68,6 +66,9 @@ def test_it_is_small_and_was_run_from_top_to_bottom(path):
 def test_it_runs_to_what_is_stored(path, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    import nbformat  # half a second, in every process that collects this file
+    from nbclient import NotebookClient
+
     stored = nbformat.read(path, as_version=4)
     notebook = nbformat.read(path, as_version=4)
     notebook.cells.insert(0, nbformat.v4.new_code_cell(WATCH))

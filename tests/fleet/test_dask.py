@@ -13,7 +13,6 @@ from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
-pytest.importorskip("distributed", reason="pip install thermocald[dask]")
 pytestmark = pytest.mark.slow
 
 RUN_BLOCKS = (
@@ -28,6 +27,7 @@ EVERY_S = 20.0
 
 @pytest.fixture
 def dask(tmp_path):
+    pytest.importorskip("distributed", reason="pip install thermocald[dask]")
     with DaskCluster(tmp_path, 2) as found:
         yield found
 

@@ -90,6 +90,32 @@ Proxy-Authorization: Digest username="a", response="{SECRET}"
 curl -H 'Authorization: Bearer {SECRET}' failed
 Bearer {SECRET}
 -----BEGIN PRIVATE KEY-----{SECRET}-----END PRIVATE KEY-----
+user=a pass={SECRET} host=b
+psk={SECRET}
+otp={SECRET}
+jwt={SECRET}
+MY_SECRET_KEY={SECRET}
+client-key={SECRET}
+session_id={SECRET}; Path=/
+signature={SECRET}
+https://a.example/x?X-Amz-Signature={SECRET}&x=1
+Set-Cookie: a=1; session={SECRET}; Path=/
+'Cookie': 'a=1; s={SECRET}'
+bearer={SECRET}
+the wifi password is {SECRET}
+password -> {SECRET}
+:password=>"{SECRET}"
+password == '{SECRET}'
+<password>{SECRET}</password>
+password%3D{SECRET}
+password%3A%20{SECRET}
+{{'passwords': ['a', '{SECRET}']}}
+credentials=('u', '{SECRET}')
+tokens: ("{SECRET}", "b")
+https://hooks.slack.com/services/T000/B000/{SECRET}
+https://api.telegram.org/bot123456:{SECRET}/sendMessage
+https://discord.com/api/webhooks/123/{SECRET}: refused
+https://a.webhook.office.com/webhookb2/{SECRET}@b/x
 """.strip().splitlines()
 LINES = [f'password: "a\n{SECRET}" x', f"password:\n  {SECRET}\nx: 1"]
 
@@ -173,6 +199,14 @@ def test_an_address_is_cleaned_and_still_says_where(address):
         "the token has 5 characters; at least 16 are needed",
         "secret: 16 bytes are needed",
         "unexpected token '('",
+        "session: M1",
+        "pass 3 of 4: 12 targets",
+        "pass: band of the filter",
+        "signature: 3 values (°C)",
+        "token > 5 of 7",
+        "3 secrets are hidden",
+        "a cookie is set",
+        "https://discord.com/channels/1/2",
         'password authentication failed for user "owner"',
     ],
 )

@@ -31,11 +31,17 @@ _KEYS = (
     r"|(?:api|access|private|shared|account)[_-]?key)"
 )
 _KEY = re.compile(_KEYS, re.IGNORECASE)
-_BEFORE = re.compile(  # a key of a query, of an option or a mapping, or a word before its value
-    rf"(?i)([?&#](?:[\w-]*{_KEYS}|sig|key|auth)=)|{_KEYS}\\*['\"]?(?:(\s*=\s*)|\s*:\s*"
-    r"|\s+(?:is\s+|was\s+)?(?=\\*['\"][^'\"]{3})|\s+(?=[a-z]\S*\d|\d\S*[a-z]))"
-    rf"|--?[\w-]*{_KEYS}\s+"
+_SHORT_KEYS = (  # words of other things too, without their `=`
+    r"(?:(?<![^\W_])(?:pass|passcode|psk|otp|jwt|bearer)|session[_-]?id|signature"
+    r"|(?:secret|client)[_-]key)"
 )
+_BEFORE = re.compile(  # a key of a query, of an option or a mapping, or a word before its value
+    rf"(?i)([?&#](?:[\w-]*(?:{_KEYS}|signature)|sig|key|auth)=)"
+    rf"|(?:{_KEYS}s?\\*['\"]?(?:(\s*[=-]?=>?\s*|\s*->\s*)|\s*:\s*|%3[AaDd](?:%20)?|>"
+    r"|\s+(?:is\s+|was\s+)?(?=\\*['\"][^'\"]{3}|[a-z]\S*\d|\d\S*[a-z]))"
+    rf"|{_SHORT_KEYS}\\*['\"]?=)|--?[\w-]*{_KEYS}\s+"
+)
+_GROUP = re.compile(r"(?s)[\[({]\s*[bru]?\\*['\"][^\])}]*")
 _QUOTED = re.compile(r"(?is)[bru]?(\\*(['\"])(?:\2\2)?)(?:(?!\1)(?:\\.|[^\\]))*(?:\1|\Z|\\\Z)")
 _OF_QUERY = re.compile(r"[^\s&'\"]*")
 # without quotes a value ends with its line, at the next option, and where a sentence goes on
@@ -50,6 +56,11 @@ _HEADER = re.compile(
     r"(?i)(authorization\\*['\"]?\s*[:=]\s*(?:[bru](?=\\*['\"]))?\\*['\"]?)"
     r"(?:(?:digest|aws4-\S+|oauth)\s[^\r\n]*|(?:[a-z]+\s+)?[^\s'\"\\]+)"
     r"|(\bbearer\s+|\bbasic\s+(?=\S*[\d=+/]))[\w.~+/=-]{6,}"
+    r"|(\bcookie\\*['\"]?\s*[:=]\s*\\*['\"]?)[^\r\n'\"\\]+"
+)
+_HOOK = re.compile(  # whoever knows the address may send
+    r"(?i)((?:hooks\.slack\.com/services|api\.telegram\.org/bot|discord(?:app)?\.com/api/webhooks"
+    r"|[\w.]*webhook\.office\.com/\w+|maker\.ifttt\.com/\S+/key)/?)[^\s'\"<>?]+"
 )
 _PEM = re.compile(r"(?s)(-----BEGIN [\w ]*PRIVATE KEY-----).*?(?=-----END|\Z)")
 _SHORTEST = 4  # a shorter one is part of too many words
@@ -103,7 +114,8 @@ def without_secrets(text: str) -> str:
     for value in sorted(_known, key=len, reverse=True):
         text = text.replace(value, "…")
     text = _PLAIN_USER.sub("", _without_users(text))
-    return _without_values(_HEADER.sub(r"\1\2…", _PEM.sub(r"\1…", text)))
+    text = _HOOK.sub(r"\1…", _HEADER.sub(r"\1\2\3…", _PEM.sub(r"\1…", text)))
+    return _without_values(text)
 
 
 def _without_users(text: str) -> str:
@@ -130,7 +142,7 @@ def _without_values(text: str) -> str:
         if key.start() < at:
             continue
         end = key.end()
-        kinds = (_QUOTED, _OF_QUERY if key[1] else _PHRASE if key[2] else _WORD)
+        kinds = (_QUOTED, _GROUP, _OF_QUERY if key[1] else _PHRASE if key[2] else _WORD)
         value = next((found for kind in kinds if (found := kind.match(text, end))), None)
         if value is not None and value[0].strip("…"):
             parts += [text[at:end], "…"]

@@ -13,15 +13,17 @@ import re
 from dataclasses import dataclass
 
 # words of any chip: no conversion yet, a bus that is held low, a bus that nothing drives
-# (all ones in 12 to 24 bits, with status bits masked), the ends of a converter's scale
+# (all ones in 8 to 24 bits, with status bits masked), the ends of a converter's scale
 ANY_WORDS = frozenset(
-    [0, -1, 0x0FFF, 0x3FFF, 0x7FFF, -0x8000, 0x8000, 0x80000, 0xFFFFF, 0x7FFFFF, 0xFFFFFF]
+    [0, -1, 0x8000, 0x80000]
+    + [2**bits - 1 for bits in range(8, 25)]
+    + [-(2**bits) for bits in range(7, 24)]
     + [0xFFFF & ~low for low in (0, 1, 3, 7, 15, 63)]
 )
 # °C of any input of the kernel: not connected, and the ends of the commonest scale
 ANY_C = (0.0, -40.0, 125.0)
-ALL_ONES_C = (-0.5, -0.25, -0.125, -0.0625, -0.03125, -0.015625, -0.0078125)
-"""What 9 to 15 bits that nothing drives mean."""
+ALL_ONES_C = (-1.0, -0.5, -0.25, -0.125, -0.0625, -0.03125, -0.015625, -0.0078125, -0.00390625)
+"""What 8 to 16 bits that nothing drives mean."""
 ENDS_C = (-99.0, -99.9, -99.99, -100.0, 99.9, 199.9, 999.9, -200.0, 850.0, -270.0, 1372.0)
 """What displays, transmitters (PT100, type K) and loggers give beyond their ends."""
 
@@ -49,9 +51,11 @@ CHIPS = (
     Chip("max31850", (85.0, -0.0625), (0x0550,), "Maxim 19-6171"),
     # humidity and temperature
     Chip("sht3x sts3x sht30 sht31 sht35 sht85 scd30 scd4x scd40 scd41 sht4x sht40 sht41 sht45 "
-         "shtc1 shtc3 shtw1 sts4x hdc3020 hdc3021 hdc3022", (-45.0, 130.0), (),
+         "sht43 sts30 sts31 sts35 sts40 shtc1 shtc3 shtw1 sts4x hdc3020 hdc3021 hdc3022",
+         (-45.0, 130.0), (),
          f"{_S} SHT3x-DIS 4.13, SHT4x 4.6, SHTC3 5.11, SCD4x 3.6; TI SNAS778: −45 + 175 S/65535"),
-    Chip("sht2x sht20 sht21 sht25 htu20 htu21 htu21d tsys02d ms8607 si7006 si7013 si7020 si7021",
+    Chip("sht2x sht20 sht21 sht25 htu20 htu21 htu21d tsys02d ms8607 si7006 si7013 si7020 si7021 "
+         "si7050 si7051 si7053 si7054 si7055",
          (-46.85, 128.86, 128.87), (),
          f"{_S} SHT21 6.2; TE HTU21D; Silicon Labs Si7021-A20 5.1.2: −46.85 + 175.72 S/65536"),
     Chip("sht10 sht11 sht15 sht71 sht75", (-39.4, -39.6, -39.65, -39.7, -39.8, -40.1, 123.8), (),
@@ -85,6 +89,7 @@ CHIPS = (
     Chip("ds3231 ds3232 ds3234", (-0.25,), (0xFFC0,), "Maxim 19-5170: 0 at power-up"),
     Chip("stts22h stts751", (-0.01, -0.0625), (), "ST DS12606, DocID018178"),
     Chip("max30205 max30208", (-0.00390625, -0.005), (), "Maxim 19-8544"),
+    Chip("max31760 corsaircpro corsairpsu nzxt", (-0.125,), (), "Maxim 19-7493; Corsair: °C/100"),
     # thermocouples, resistances, infra-red
     Chip("max6675 max31855", (-0.25, -0.0625, 1023.75), (), "Maxim 19-2235, 19-5793"),
     Chip("max31856 mcp9600 mcp9601", (-0.0078125, -0.0625), (), "Maxim 19-7534; DS20005426"),
@@ -116,8 +121,22 @@ CHIPS = (
     Chip("bmi088 bmi160 bmi260 bmi270 bmi323", (23.0, -41.0), (), "Bosch BST-BMI160-DS000 2.11.8"),
     Chip("ccs811", (-25.0,), (), "ams CCS811 application note 000373"),
     Chip("itg3200", (82.14,), (), "InvenSense PS-ITG-3200A: 35 + (T + 13200)/280"),
+    Chip("bma250 bma250e bma253 bma254 bma255 bma280 bmc150 bmc156 bmi055", (24.0, -40.0), (),
+         "Bosch BST-BMA253-DS000: 0 is 24 °C"),
+    Chip("bma400 bmg160", (23.0, -41.0), (), "Bosch BST-BMA400-DS000, BST-BMG160-DS000"),
+    Chip("lis2dw12 lis3mdl lsm303d lis2mdl iis2mdc iis3dwb icm42670 fxls8962af", (25.0,), (),
+         "ST DocID030071, TDK DS-000451, NXP FXLS8962AF: 0 is 25 °C"),
+    Chip("tsic506 tsic516 tsic716", (-10.0, 60.0), (), "IST TSic 506F: −10 + 70 S/2047"),
+    Chip("tsic206 tsic306", (-50.0, 150.0), (), "IST TSic 306: −50 + 200 S/2047"),
+    Chip("lmt01", (-50.0,), (), "TI SNIS189: no pulse is −50 °C"),
+    # monitors of currents
+    Chip("ltc2947", (5.5, 5.296), (), "Linux ltc2947-core.c: 0.204 T + 5.5"),
     # boards
     Chip("acpitz", (27.8, 29.8, 16.8, 8.3), (), "lm-sensors FAQ: constants of ACPI tables"),
+    Chip("int3400", (20.0,), (), "Linux int3400_thermal.c: a constant"),
+    Chip("pmic max77620", (100.0, 120.0, 140.0), (), "Linux max77620_thermal.c: two alarms"),
+    Chip("coretemp", (100.0, 105.0), (), "Linux coretemp.c: T_jmax less 0, of a virtual machine"),
+    Chip("lm64", (16.0, 15.875, -1.0), (), "Linux lm63.c: an offset of 16 °C"),
     Chip("k10temp zenpower", (-49.0,), (), "AMD PPR 55803: CUR_TEMP 0 with CUR_TEMP_RANGE_SEL"),
     Chip("it87 it8603 it8613 it8620 it8628 it8686 it8688 it8721 it8728 it8771 w83627hf w83627ehf "
          "w83781d nct6775 nct6776 nct6779 nct6791 nct6798 f71882fg lm78 lm83 lm85 lm87 adm1021 "
@@ -129,6 +148,7 @@ CHIPS = (
     Chip("imx219 imx296 imx477 imx500 imx519 imx708 ov5647 ov64a40", (-20.0, 80.0, 0.0), (),
          "libcamera cam_helper_imx477: the register is clamped"),
 )  # fmt: skip
+_ALARM = Chip("", (37.0,), (), "Linux qcom-spmi-temp-alarm.c: DEFAULT_TEMP of a PMIC")
 _BY_NAME = {name: chip for chip in CHIPS for name in chip.names.split()}
 
 LOWEST_LIKELY_C, HIGHEST_LIKELY_C, HIGHEST_OF_A_PROCESSOR_C = -39.0, 84.0, 110.0
@@ -154,7 +174,9 @@ def idle_celsius(name: str) -> tuple[float, ...]:
 
 def _chip(name: str) -> Chip | None:
     """A chip by its name, or the kernel's, which may go on (ms8607-temppressure, bq27541_0)."""
-    return _BY_NAME.get(name.lower()) or _BY_NAME.get(re.split("[-_]", name.lower())[0])
+    first = re.split("[-_ ]", name.lower())[0]
+    known = _BY_NAME.get(name.lower()) or _BY_NAME.get(first)
+    return known or (_ALARM if re.fullmatch(r"pmi?\d{2,4}\w{0,2}", first) else None)
 
 
 def is_idle(name: str, celsius: float) -> bool:

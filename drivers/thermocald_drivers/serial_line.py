@@ -416,9 +416,10 @@ class SerialThermometer(Thermometer):
         """In words, if this is a number that a chip gives without having measured."""
         idle = (0.0, *chips.ENDS_C, *chips.idle_celsius(self.options.chip or ""))
         if decimals >= 2:
-            idle += chips.ALL_ONES_C[3::3]
+            idle += (-0.0625, -0.0078125)
         if (
             number == 0.0
+            or (number == -1.0 and not decimals)  # of a library that failed
             or round(abs(number) * 10**decimals) in ENDS_OF_WORDS
             or any(self._printed(number, decimals, one) for one in idle)
             or (not self._corrects and number in FULL_SCALE)

@@ -12,9 +12,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-HEADER = (
-    "| section | printed by | cases | error / sd, or share of false alarms |\n|---|---|---|---|"
-)
+HEADER = "| section | printed by | error / sd, or share of false alarms |\n|---|---|---|"
 _FAR = 0.1  # from 1: the case is named
 
 
@@ -60,7 +58,7 @@ def table(section: str, rows: list[Row]) -> str:
         far = max(of_command, key=lambda r: abs(r.value - 1))
         if far.level is None and abs(far.value - 1) > _FAR:
             cell += f" ({far.what})"
-        lines.append(f"| {section} | {kind[0]} | {len(of_command)} | {cell} |")
+        lines.append(f"| {section} | {kind[0]} | {cell} |")
     return "\n".join(lines)
 
 

@@ -29,6 +29,7 @@ from thermocald.analysis.statistics.dependence import (
 from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.analysis.statistics.significance import moving_f_test, unbroken_windows
 from thermocald.errors import GeometryError
+from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
 from thermocald.result import document_of
 
@@ -256,7 +257,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
         "seventh of the series, which is too short for their standard deviations; take those as an "
         "order of magnitude."
         for c in channels
-        if (short := [name for name, d in c.dependences.items() if d.too_short])
+        if (short := [parameter_label(n) for n, d in c.dependences.items() if d.too_short])
     ]
     grid = image_grid(series.sensor)
     displacement = None

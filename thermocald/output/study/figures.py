@@ -90,8 +90,8 @@ def deviation_figure(camera: CameraStudy) -> Figure:
                 curve = Curve(s.name, t, celsius, "line", colour)
                 temperatures.setdefault(thermometer.name, []).append(curve)
         if "x0" in d and "y0" in d:
-            moved = float(np.hypot(d["x0"].change, d["y0"].change)) / s.sensor.pixel_pitch
-            words.append(f"in {s.name} by {plain(moved, 'px', 3)}")
+            way = np.hypot(*(s.values[:, 1:3] - s.values[0, 1:3]).T) / s.sensor.pixel_pitch
+            words.append(f"in {s.name} by up to {plain(float(way.max()), 'px', 3)}")
     panels.append(Panel("σ₀ / first σ₀", "time in min", "ratio (no unit)", tuple(ratios)))
     panels += [
         Panel(parameter_label(name), "time in min", "temperature in °C", tuple(curves))

@@ -227,11 +227,12 @@ def _warmed(study: SeriesStudy) -> str:
     d = study.deviations[reference.name]
     name = parameter_label(reference.name)
     if d.returned:
-        rose = "rose" if d.largest > 0 else "fell"
-        return (
-            f" while {name} {rose} by up to {plain(abs(d.largest), 'K', 3)} (range "
-            f"{plain(d.range, 'K', 3)}) and ended {plain(d.change, 'K', 3)} from where it started"
-        )
+        rose, largest = "rose" if d.largest > 0 else "fell", plain(abs(d.largest), "K", 3)
+        within = plain(d.range, "K", 3)
+        over = "" if within == largest else f" (range {within})"
+        back = abs(d.change) < 3 * d.sd_change
+        end = "" if back else f"{plain(abs(d.change), 'K', 3)} from "
+        return f" while {name} {rose} by up to {largest}{over} and ended {end}where it started"
     return f" while {name} changed by {plain(d.change, 'K', 3)}"
 
 

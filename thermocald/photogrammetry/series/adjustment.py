@@ -93,7 +93,7 @@ def choose(
     good = int(estimate.system.good.sum())
     if asked == "auto" and good < FEWEST_EPOCHS:
         own = replace(series, s=replace(series.s, exterior="per_epoch"), bound=None)
-        return own, f"{good} epochs do not show how the mount moves ({FEWEST_EPOCHS} would)"
+        return own, f"{good} epochs do not show how the mount moves, {FEWEST_EPOCHS} would"
     movement = observed_movement(series, estimate)
     px = movement.image_px(estimate.system.design.at.A)
     noise = movement.noise_px(estimate.system.design.at.A)

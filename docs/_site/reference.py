@@ -74,10 +74,10 @@ def _command_page() -> str:
     parts = [" · ".join(f"[{name.split(' ', 1)[1]}](#{_anchor(name)})" for name, _ in found)]
     for name, function in found:
         text = inspect.getdoc(function) or ""
-        text, _, example = text.partition("Example: ")
+        text, *examples = text.split("Example: ")
         parts.append(f"## {name}\n\n{text.strip()}")
-        if example:
-            parts.append(f"```text\n{' '.join(example.split())}\n```")
+        if examples:
+            parts.append("\n".join(["```text", *(" ".join(e.split()) for e in examples), "```"]))
         parts.append(_table(("argument or option", "value", "default", "meaning"), _rows(function)))
     return "\n\n".join(parts)
 
@@ -89,12 +89,15 @@ def _anchor(name: str) -> str:
 def _rows(function: Callable[..., Any]) -> Iterator[tuple[str, ...]]:
     hints = typing.get_type_hints(function, include_extras=True)
     for parameter in inspect.signature(function).parameters.values():
-        kind, info = typing.get_args(hints[parameter.name])[:2]
-        default = parameter.default
-        required = default is inspect.Parameter.empty
-        shown = "required" if required else "" if default in (None, False) else f"`{default}`"
-        # within Annotated the first name of an option stands where a default would
-        names = (info.default, *(info.param_decls or ()))
+        kind, info, default = hints[parameter.name], parameter.default, parameter.default
+        if typing.get_origin(kind) is typing.Annotated:
+            kind, info = typing.get_args(kind)[:2]
+            # the first name of an option stands where a default would
+            names = (info.default, *(info.param_decls or ()))
+        else:
+            default, names = info.default, info.param_decls or ()
+        required = default in (inspect.Parameter.empty, ...)
+        shown = "required" if required else f"`{default}`" if default else ""
         declared = [d for d in names if isinstance(d, str) and d.startswith("-")]
         if type(info).__name__ == "ArgumentInfo":
             declared = [info.metavar or parameter.name.upper()]

@@ -11,7 +11,7 @@ import pytest
 from tests.commands import succeed as run
 from thermocald.cli import common
 from thermocald.daemon.desk import Progress
-from thermocald.errors import ThermocaldError
+from thermocald.errors import ThermocaldError, UsageError
 from thermocald.numbers import duration, with_sd
 from thermocald.physics.presets import preset_simulation
 from thermocald.physics.testfields import corner_field
@@ -104,15 +104,16 @@ def test_the_line_of_a_session_stays_one_line(monkeypatch):
 def test_the_configuration_is_looked_for_here_then_in_etc(monkeypatch, tmp_path):
     places = (tmp_path / "config.yaml", tmp_path / "etc.yaml")
     monkeypatch.setattr(common, "CONFIG_PLACES", places)
-    assert common.default_config() is None
+    with pytest.raises(UsageError, match=r"neither \./config\.yaml nor .*; give --store FILE"):
+        common.require_config(None, "--store FILE")
     with pytest.raises(ThermocaldError, match=r"neither ./config.yaml nor /etc/thermocald"):
         run("status")
     with pytest.raises(ThermocaldError, match=r"neither ./config.yaml nor /etc/thermocald"):
         run("run")
     places[1].write_text("store: {path: there.db}\nthermometers: [{name: h, driver: mock}]\n")
-    assert common.default_config() == places[1]
+    assert common.require_config(None, "") == places[1]
     places[0].write_text("store: {path: here.db}\nthermometers: [{name: h, driver: mock}]\n")
-    assert common.default_config() == places[0]
+    assert common.require_config(None, "") == places[0]
     with pytest.raises(ThermocaldError, match=r"no daemon runs for .*here\.db"):
         run("status")
 

@@ -185,9 +185,9 @@ def test_wrong_surveys_are_refused_and_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_wrong_distances_file_names_the_row(photographs, tmp_path):
+def test_a_wrong_file_of_distances_is_named_by_its_line(photographs, tmp_path):
     (tmp_path / "d.csv").write_text("a,b,length,sigma\nR65,R71,100,0.1\nR65,R75,much,0.1\n")
-    with pytest.raises(UsageError, match=r"d\.csv, row 3"):
+    with pytest.raises(UsageError, match=r"d\.csv, line 3, column length"):
         run("testfield", "survey", photographs[0] / "photos", "--distances", tmp_path / "d.csv",
             "--out", tmp_path / "o.csv")  # fmt: skip
 

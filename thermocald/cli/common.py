@@ -18,6 +18,7 @@ import typer
 from thermocald import files
 from thermocald.addresses import CleanFormatter, without_secrets
 from thermocald.cli.commands import expert
+from thermocald.errors import UsageError
 from thermocald.result import jsonable
 
 if TYPE_CHECKING:
@@ -207,9 +208,16 @@ def warnings_said() -> Iterator[None]:
         say(f"warning: {text}")
 
 
-def default_config() -> Path | None:
-    """The configuration where none is named: ./config.yaml, else the system's, None without."""
-    return next((path for path in CONFIG_PLACES if path.exists()), None)
+def require_config(given: Path | None, instead: str) -> Path:
+    """The configuration that is named, else ./config.yaml, else the system's; UsageError for none.
+
+    instead: what else may be given, for the message.
+    """
+    found = given or next((path for path in CONFIG_PLACES if path.exists()), None)
+    if found is None:
+        there = "there is neither ./config.yaml nor /etc/thermocald/config.yaml"
+        raise UsageError(f"{there}; give {instead}")
+    return found
 
 
 def write_json(document: Any, destination: str | None) -> None:

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import ConfigOption, JsonOption, default_config, say, show
+from thermocald.cli.common import ConfigOption, JsonOption, require_config, say, show
 from thermocald.errors import DataError, StoreError, UsageError
 from thermocald.output.status_text import status_lines
 
@@ -50,12 +50,7 @@ def run(
     if sum([config is not None, mock, recording is not None]) > 1:
         raise UsageError("give one of --config FILE, --mock, --recording FOLDER")
     if not mock and recording is None:
-        config = config or default_config()
-        if config is None:
-            raise UsageError(
-                "there is neither ./config.yaml nor /etc/thermocald/config.yaml; give one of "
-                "--config FILE, --mock, --recording FOLDER"
-            )
+        config = require_config(config, "one of --config FILE, --mock, --recording FOLDER")
     if fast and recording is None:
         raise UsageError("--fast is for --recording: devices have their own pace")
     if config is not None:
@@ -229,12 +224,6 @@ def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
 def _store(config: Path | None, store: Path | None) -> Path:
     if store is not None:
         return store
-    config = config or default_config()
-    if config is None:
-        raise DataError(
-            "which daemon? there is neither ./config.yaml nor /etc/thermocald/config.yaml; give "
-            "--config FILE or --store FILE"
-        )
     from thermocald.config import load_config
 
-    return load_config(config).store.path
+    return load_config(require_config(config, "--config FILE or --store FILE")).store.path

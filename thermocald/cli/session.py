@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import ConfigOption, JsonOption, default_config, say, write_json
+from thermocald.cli.common import ConfigOption, JsonOption, require_config, say, write_json
 from thermocald.errors import DataError, UsageError
 from thermocald.files import make_folder
 
@@ -132,12 +132,7 @@ def _configuration(config: Path | None, mock: bool) -> Config:
         if config is not None:
             raise UsageError("give --config or --mock, not both")
         return mock_config()
-    path = config or default_config()
-    if path is None or not path.exists():
-        raise UsageError(
-            f"{path or 'config.yaml'}: there is no configuration; give --config FILE, or --mock"
-        )
-    return load_config(path, option_names)
+    return load_config(require_config(config, "--config FILE, or --mock"), option_names)
 
 
 def _ask(config: Path | None, do: str, **values: Any) -> dict[str, Any]:

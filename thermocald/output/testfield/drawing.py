@@ -20,7 +20,6 @@ from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Curve
 from matplotlib.transforms import Affine2D
 
-from thermocald.files import cannot_write
 from thermocald.output.testfield.layout import STRIP, TRIM, Sheet, Target
 from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import marker_cells
@@ -331,19 +330,13 @@ def draw_sheets(sheets: Sequence[Sheet]) -> list[Any]:
 def write_pdf(pages: Sequence[Any], path: Path) -> None:
     """Figures as the pages of one PDF."""
     about = {"Title": "thermocald test field", "Creator": "thermocald", "CreationDate": None}
-    try:
-        with rc_context({"pdf.fonttype": 42}), PdfPages(path, metadata=about) as document:
-            for page in pages:
-                document.savefig(page)
-    except OSError as cause:
-        raise cannot_write(path, cause) from cause
+    with rc_context({"pdf.fonttype": 42}), PdfPages(path, metadata=about) as document:
+        for page in pages:
+            document.savefig(page)
 
 
 def write_svg(page: Any, path: Path) -> None:
     """One Figure as SVG."""
     about = {"Title": "thermocald test field", "Creator": "thermocald", "Date": None}
-    try:
-        with rc_context({"svg.hashsalt": "thermocald"}):
-            page.savefig(path, format="svg", metadata=about)
-    except OSError as cause:
-        raise cannot_write(path, cause) from cause
+    with rc_context({"svg.hashsalt": "thermocald"}):
+        page.savefig(path, format="svg", metadata=about)

@@ -9,25 +9,23 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
-import shutil
-import tempfile
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import DriverMissing, UsageError
-from thermocald.files import cannot_write, new_file
+from thermocald.files import new_file
 from thermocald.output.testfield.layout import STRIP, TRIM, Design, Sheet, field_of, lay_out
 from thermocald.photogrammetry.targets import boards
 from thermocald.photogrammetry.targets.markers import marker_cells
-from thermocald.store.recording.testfield_file import write_testfield
+from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
     from types import ModuleType
 
     from numpy.typing import NDArray
@@ -323,28 +321,14 @@ def _publish(
             f"{folder}: holds a printed test field already, whose coordinates would be lost: give "
             "another folder with --out, or --force to replace it"
         )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=".testfield-", dir=folder))
-    except OSError as cause:
-        raise cannot_write(folder, cause) from cause
-    try:
-        names = ["testfield.pdf"]
-        _drawing().write_pdf(pages, work / "testfield.pdf")
-        for i in range(sheets):
-            name = "testfield.svg" if sheets == 1 else f"testfield-{i + 1}.svg"
-            _drawing().write_svg(pages[i], work / name)
-            names.append(name)
-        write_testfield(work / "testfield.csv", field)
-        names.append("testfield.csv")
-        for name in names:
-            if not os.path.lexists(folder / name):
-                os.replace(work / name, folder / name)
-                continue
-            with new_file(folder / name) as file:
-                shutil.copyfile(work / name, file)
-    except OSError as cause:
-        raise cannot_write(folder, cause) from cause
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    drawings = (
+        ["testfield.svg"] if sheets == 1 else [f"testfield-{i + 1}.svg" for i in range(sheets)]
+    )
+    names = ["testfield.pdf", *drawings, "testfield.csv"]
+    with ExitStack() as opened:
+        partial = {name: opened.enter_context(new_file(folder / name)) for name in names}
+        _drawing().write_pdf(pages, partial["testfield.pdf"])
+        for page, name in zip(pages, drawings, strict=False):  # the plan is in the PDF alone
+            _drawing().write_svg(page, partial[name])
+        partial["testfield.csv"].write_text(testfield_csv(field), encoding="utf-8")
     return tuple(folder / name for name in names)

@@ -19,6 +19,7 @@ import logging
 import math
 import struct
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -50,7 +51,7 @@ from thermocald.store.series import NOT_CALIBRATED, EpochResult, StoredEpoch, St
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from thermocald.arrays import Array
@@ -250,16 +251,27 @@ def select_epochs(
     details: False leaves out observations and covariances. Raises StoreError for damage.
     """
     rows = read_epochs(connection, series, first, last)
+    return latest_epochs(rows, partial(read_details, connection) if details else None)
+
+
+def latest_epochs(
+    rows: Iterable[Mapping[str, Any]],
+    details: Callable[[Mapping[str, Any]], tuple[bytes, bytes]] | None,
+) -> Iterator[StoredEpoch]:
+    """Each epoch in its latest revision, of rows by number and revision, of a file or of a server.
+
+    details: gives the covariance and the observations of a row, packed; None leaves them out.
+    """
     for _, revisions in groupby(rows, key=itemgetter("number")):
-        covariance = seen = None
+        covariance = seen = b""
         every = list(revisions)
-        if details:
+        if details is not None:
             # a later calibration of observations that stay the same does not keep them again
             measured = next((r for r in every[::-1] if r["measured"] is not None), every[-1])
-            covariance, seen = read_details(connection, every[-1])
+            covariance, seen = details(every[-1])
             if measured is not every[-1]:
-                _, seen = read_details(connection, measured)
-        yield stored_epoch(
+                _, seen = details(measured)
+        yield _stored_epoch(
             every[-1],
             unpack_covariance(covariance) if covariance else None,
             unpack_observations(seen) if seen else None,
@@ -313,10 +325,10 @@ def _joined(number: int, kept: int, parts: list[tuple[int, bytes]]) -> tuple[byt
     return covariance, seen
 
 
-def stored_epoch(
+def _stored_epoch(
     row: Mapping[str, Any], covariance: Array | None, seen: Observations | None
 ) -> StoredEpoch:
-    """An epoch from a row by column names, of this file or of a server."""
+    """An epoch from a row by column names."""
     epoch = Epoch(
         number=row["number"],
         frame_time=row["frame_time"],

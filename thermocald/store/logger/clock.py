@@ -87,8 +87,6 @@ class DeviceClock:
         where: names the place of moment i. Raises DataError for a time without a zone, for one that
         does not exist, and for one that exists twice where the order does not tell which.
         """
-        if self.ambiguous not in AMBIGUOUS:
-            raise UsageError(f"{self.ambiguous!r} is not one of {', '.join(AMBIGUOUS)}")
         seconds = np.empty(len(moments))
         twice: list[int] = []
         for i, moment in enumerate(moments):

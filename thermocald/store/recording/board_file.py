@@ -4,7 +4,6 @@ ring-coded targets.
 
 from __future__ import annotations
 
-import csv
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from thermocald.errors import TestFieldError, UsageError
 from thermocald.files import QuantityReader, read_yaml
 from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.targets import boards
+from thermocald.store.recording.table import Table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -198,19 +198,8 @@ def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = Non
 
 
 def read_distances(path: Path) -> list[Distance]:
-    """Read measured distances, a CSV with a, b, length, sigma mm; UsageError names the row."""
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.DictReader(stream, skipinitialspace=True))
-    except (OSError, UnicodeDecodeError) as cause:
-        raise UsageError(f"{path}: cannot be read: {cause}") from cause
-    found = []
-    for number, row in enumerate(rows, start=2):
-        try:
-            found.append(Distance(row["a"], row["b"], float(row["length"]), float(row["sigma"])))
-        except (KeyError, TypeError, ValueError):
-            raise UsageError(
-                f"{path}, row {number}: a, b, length, sigma (mm) are needed, it has "
-                f"{', '.join(str(v) for v in row.values())}"
-            ) from None
-    return found
+    """Read measured distances, a CSV with a, b, length, sigma mm; UsageError names the line."""
+    names = ("a", "b", "length", "sigma")
+    found = Table(path, names, UsageError).read(numbers=names[2:], texts=names[:2])
+    rows = zip(*(found.get(name, ()) for name in names), strict=True)
+    return [Distance(a.strip(), b.strip(), float(mm), float(sd)) for a, b, mm, sd in rows]

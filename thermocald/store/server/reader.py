@@ -7,7 +7,6 @@ neither of them holds the series as rows.
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from uuid import UUID
@@ -15,9 +14,8 @@ from uuid import UUID
 import numpy as np
 
 from thermocald.store.database.epochs import (
-    stored_epoch,
+    latest_epochs,
     unpack_covariance,
-    unpack_observations,
     unpack_rows,
 )
 from thermocald.store.recording.head import parse_head
@@ -27,7 +25,7 @@ from thermocald.store.series import Event, SeriesReader, StoredEpoch, StoredSeri
 from thermocald.store.server.connection import Connected, ServerAddress
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
     from psycopg.sql import Composable
@@ -122,25 +120,11 @@ class ServerStore(Connected, SeriesReader):
             f"SELECT {quoted} FROM epoch WHERE series = %s AND number >= %s "
             "AND number <= coalesce(%s, number) ORDER BY number, revision"
         )
-        latest: StoredEpoch | None = None
-        for values in self._stream(statement, (_key(series), first, last)):
-            row = dict(zip(names, values, strict=True))
-            covariance, seen = row.get("covariance"), row.get("observations")
-            stored = stored_epoch(
-                row,
-                unpack_covariance(bytes(covariance)) if covariance else None,
-                unpack_observations(bytes(seen)) if seen else None,
-            )
-            if latest is not None and latest.epoch.number == stored.epoch.number:
-                # a later calibration of observations that stay the same does not hold them again
-                if stored.epoch.observations is None:
-                    seen = latest.epoch.observations
-                    stored = replace(stored, epoch=replace(stored.epoch, observations=seen))
-            elif latest is not None:
-                yield latest
-            latest = stored
-        if latest is not None:
-            yield latest
+        rows = self._stream(statement, (_key(series), first, last))
+        return latest_epochs(
+            (dict(zip(names, values, strict=True)) for values in rows),
+            _details if details else None,
+        )
 
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
         """The observations of the epochs numbered `first` to `last`, without their quality."""
@@ -172,6 +156,10 @@ class ServerStore(Connected, SeriesReader):
             cursor.itersize = _EPOCHS
             cursor.execute(statement, values)
             yield from cursor
+
+
+def _details(row: Mapping[str, Any]) -> tuple[bytes, bytes]:
+    return bytes(row["covariance"] or b""), bytes(row["observations"] or b"")
 
 
 def _key(series: StoredSeries) -> UUID:

@@ -80,18 +80,11 @@ def study(
     if window % 2 == 0:
         raise UsageError(f"--window is {window}; it must be odd, so that it has a centre")
     settings: dict[str, Any] = {
-        "window": window,
-        "alpha": alpha,
-        "sets": sets,
-        "seed": seed,
-        "distance_mm": 1000 * distance,
-        "grid": grid,
-        "focus_mm": 1000 * focus,
-        "f_number": f_number,
-        "confusion_mm": confusion,
-        "thermometer_sd": thermometer_sd,
+        "window": window, "alpha": alpha, "sets": sets, "seed": seed,
+        "distance_mm": 1000 * distance, "grid": grid, "focus_mm": 1000 * focus,
+        "f_number": f_number, "confusion_mm": confusion, "thermometer_sd": thermometer_sd,
         "jobs": jobs,
-    }
+    }  # fmt: skip
     if reference:
         with progress(None, "simulating, adjusting, studying") as advance:
             result = tc.reference_study(progress=advance, **settings)

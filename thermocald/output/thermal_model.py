@@ -239,24 +239,15 @@ def _filled(file: str, camera: ThermalCamera, name: str, follow: str, knees: str
     c0 = repr(float(model.interior.c))
     exact = "C1 or C2 are not zero: OpenCV's parameters are then not exact, the projection is."
     fields = {
-        "name": _plain(model.name or model.camera),
-        "id": identifier,
-        "guard": f"THERMOCALD_{identifier.upper()}_H",
-        "reference": _plain(reference),
-        "low": repr(float(limits[0])),
-        "high": repr(float(limits[1])),
-        "width": sensor.width,
-        "height": sensor.height,
-        "pitch": repr(float(sensor.pixel_pitch)),
-        "T0": repr(float(model.T0)),
-        "p0": _row(p[0]),
-        "p1": _row(p[1]),
-        "p2": _row(p[2]),
-        "n": len(camera.steady_knees()),
-        "knees": knees,
+        "name": _plain(model.name or model.camera), "id": identifier,
+        "guard": f"THERMOCALD_{identifier.upper()}_H", "reference": _plain(reference),
+        "low": repr(float(limits[0])), "high": repr(float(limits[1])), "width": sensor.width,
+        "height": sensor.height, "pitch": repr(float(sensor.pixel_pitch)),
+        "T0": repr(float(model.T0)), "p0": _row(p[0]), "p1": _row(p[1]), "p2": _row(p[2]),
+        "n": len(camera.steady_knees()), "knees": knees,
         "follow": follow.format(c0=c0) if model.distortion == "angle" else "",
         "exact": exact if affine else "OpenCV's parameters are exact.",
-    }
+    }  # fmt: skip
     return Template((_TEMPLATES / file).read_text(encoding="utf-8")).substitute(fields)
 
 

@@ -61,15 +61,10 @@ class EpochResult:
             values[10:] = adjustment.exterior.as_array()
         solved = adjustment.interior is not None or adjustment.exterior is not None
         return cls(
-            adjustment.status,
-            adjustment.reason,
-            values,
-            adjustment.covariance if solved else None,
-            float(adjustment.sigma0),
-            int(adjustment.redundancy),
-            int(adjustment.n_observations),
+            adjustment.status, adjustment.reason, values, adjustment.covariance if solved else None,
+            float(adjustment.sigma0), int(adjustment.redundancy), int(adjustment.n_observations),
             tuple(int(row) for row in adjustment.rejected),
-        )
+        )  # fmt: skip
 
     @property
     def sd(self) -> Array:

@@ -66,17 +66,10 @@ def bind(host: str, port: int) -> socket.socket:
 def run_server(application: Starlette, listening: socket.socket) -> None:
     """Serve until ended by a signal; what is being answered has a second to come to its end."""
     config = uvicorn.Config(
-        application,
-        http=_Connection,
-        ws="none",
-        log_level="warning",
-        access_log=False,
-        lifespan="off",
-        server_header=False,
-        backlog=64,
-        limit_concurrency=_CONNECTIONS,
+        application, http=_Connection, ws="none", log_level="warning", access_log=False,
+        lifespan="off", server_header=False, backlog=64, limit_concurrency=_CONNECTIONS,
         timeout_graceful_shutdown=2,
-    )
+    )  # fmt: skip
     server = _Server(config)
     application.state.ends = lambda: server.should_exit
     server.run(sockets=[listening])

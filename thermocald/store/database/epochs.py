@@ -423,14 +423,9 @@ def _series(
     if (parsed.camera.name, parsed.series) != (camera, name):
         raise StoreError(f"{what}: its head is of {parsed.camera.name!r}/{parsed.series!r}")
     return StoredSeries(
-        number,
-        parsed,
-        parse_testfield(csv, path),
-        start,
-        json.loads(identity),
-        json.loads(settings),
-        created,
-    )
+        number, parsed, parse_testfield(csv, path), start, json.loads(identity),
+        json.loads(settings), created,
+    )  # fmt: skip
 
 
 def to_json(mapping: Mapping[str, Any]) -> str:

@@ -42,19 +42,10 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.normals import ObservationGrid
 
 __all__ = [
-    "CameraSpec",
-    "Channel",
-    "EpochColumns",
-    "Head",
-    "Recording",
-    "RecordingWriter",
-    "interpolate_readings",
-    "open_recording",
-    "read_recording",
-    "read_testfield",
-    "write_recording",
+    "CameraSpec", "Channel", "EpochColumns", "Head", "Recording", "RecordingWriter",
+    "interpolate_readings", "open_recording", "read_recording", "read_testfield", "write_recording",
     "write_testfield",
-]
+]  # fmt: skip
 
 _KELVIN_FROM = 220.0  # hotter than any camera, and a cold day in kelvin
 _STRETCH = 8192  # readings: a part of a log in kelvin

@@ -43,7 +43,7 @@ from thermocald.store.database.columns import (
     row_checksum,
     select_rows,
 )
-from thermocald.store.recording.head import Head, head_document, parse_head
+from thermocald.store.recording.head import head_document, parse_head
 from thermocald.store.recording.observation_file import ObservationRows
 from thermocald.store.recording.testfield_file import parse_testfield, testfield_csv
 from thermocald.store.schema import sql_name
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
 
 
 log = logging.getLogger(__name__)
@@ -368,31 +367,30 @@ def _nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def insert_series(
-    connection: sqlite3.Connection,
-    head: Head,
-    testfield: TestField,
-    start: str,
-    identity: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    created_utc: float,
-) -> None:
+def series_row(series: StoredSeries) -> tuple[dict[str, Any], str]:
+    """Return a series as file and server keep it, with its test field's digest; and the field."""
+    csv = testfield_csv(series.testfield)
+    row = {
+        "camera": series.camera, "name": series.name, "start": series.start,
+        "head": to_json(head_document(series.head)), "identity": to_json(series.identity),
+        "settings": to_json(series.settings), "digest": hashlib.sha256(csv.encode()).hexdigest(),
+        "created_utc": series.created_utc,
+    }  # fmt: skip
+    return row, csv
+
+
+def insert_series(connection: sqlite3.Connection, series: StoredSeries) -> None:
     """Insert a series, and its test field if it is a new one; within the caller's transaction."""
-    csv = testfield_csv(testfield)
-    digest = hashlib.sha256(csv.encode()).hexdigest()
-    connection.execute("INSERT OR IGNORE INTO testfield (digest, csv) VALUES (?, ?)", (digest, csv))
-    texts = (
-        head.camera.name,
-        head.series,
-        start,
-        to_json(head_document(head)),
-        to_json(identity),
-        to_json(settings),
+    row, csv = series_row(series)
+    *texts, created = row.values()
+    connection.execute(
+        "INSERT OR IGNORE INTO testfield (digest, csv) VALUES (?, ?)", (row["digest"], csv)
     )
     connection.execute(
         "INSERT INTO series (camera, name, start, head, identity, settings, created_utc, checksum, "
-        "testfield_id) SELECT ?, ?, ?, ?, ?, ?, ?, ?, id FROM testfield WHERE digest = ?",
-        (*texts, created_utc, row_checksum((created_utc,), (*texts, digest)), digest),
+        "testfield_id) SELECT :camera, :name, :start, :head, :identity, :settings, :created_utc, "
+        ":checksum, id FROM testfield WHERE digest = :digest",
+        {**row, "checksum": row_checksum((created,), texts)},
     )
 
 

@@ -337,7 +337,10 @@ class Store(SeriesReader):
                     "already; choose another name"
                 )
             epochs.insert_series(
-                self._db, head, testfield, start, identity or {}, settings or {}, created_utc
+                self._db,
+                StoredSeries(
+                    0, head, testfield, start, identity or {}, settings or {}, created_utc
+                ),
             )
         return self.find_series(head.camera.name, head.series)
 

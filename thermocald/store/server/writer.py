@@ -13,8 +13,7 @@ from uuid import UUID, uuid5
 
 from thermocald import __version__
 from thermocald.errors import StoreVersionError
-from thermocald.store.recording.head import head_document
-from thermocald.store.recording.testfield_file import testfield_csv
+from thermocald.store.database.epochs import series_row
 from thermocald.store.server.connection import Connected
 
 if TYPE_CHECKING:
@@ -136,23 +135,10 @@ class ServerWriter(Connected):
         return ready
 
     def _insert_series(self, connection: Connection[Any], key: UUID, series: StoredSeries) -> None:
-        csv = testfield_csv(series.testfield)
-        digest = hashlib.sha256(csv.encode()).hexdigest()
-        self._insert(connection, "testfield", [{"digest": digest, "csv": csv}])
-        row = {
-            "key": key,
-            "station": self.station,
-            "store": self.store,
-            "camera": series.camera,
-            "name": series.name,
-            "start": series.start,
-            "created_utc": series.created_utc,
-            "digest": digest,
-            "head": json.dumps(head_document(series.head), default=str),
-            "identity": json.dumps(dict(series.identity), default=str),
-            "settings": json.dumps(dict(series.settings), default=str),
-        }
-        self._insert(connection, "series", [row])
+        row, csv = series_row(series)
+        self._insert(connection, "testfield", [{"digest": row["digest"], "csv": csv}])
+        whose = {"key": key, "station": self.station, "store": self.store}
+        self._insert(connection, "series", [whose | row])
 
     def _insert(
         self, connection: Connection[Any], table: str, rows: Sequence[Mapping[str, Any]]

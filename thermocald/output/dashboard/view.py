@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.errors import DataError, StoreError, ThermocaldError
+from thermocald.errors import DataError, ThermocaldError
 from thermocald.files import read_json
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -45,13 +45,9 @@ class View:
 
     def status(self) -> dict[str, Any]:
         """status.json with its age in s; empty if no daemon runs."""
-        path = self._live / "status.json"
-        try:
-            age_s = time.time() - path.stat().st_mtime
-        except OSError:
-            return {}
-        document = read_json(path)
-        return document and {**document, "age_s": max(0.0, age_s)}
+        written = self.changed()
+        document = read_json(self._live / "status.json") if written else {}
+        return document and {**document, "age_s": max(0.0, time.time() - written)}
 
     def shown(self) -> dict[str, Any]:
         """The status; without a daemon only `stopped`, when the last one ended, where known."""
@@ -73,11 +69,11 @@ class View:
             return False, f"the daemon has not answered for {status['age_s']:.0f} s"
         if status.get("stalled"):
             return False, "; ".join(status["stalled"])
-        if status.get("store", {}).get("state") == "out":
+        store = status.get("store", {})
+        if store.get("state") == "out":
             return False, "the store cannot be written"
-        ago = status.get("store", {}).get("lost_s_ago")
-        if ago is not None and ago < _LOST_S:
-            return False, "an epoch was lost: " + status["store"]["lost_why"]
+        if (ago := store.get("lost_s_ago")) is not None and ago < _LOST_S:
+            return False, f"an epoch was lost: {store['lost_why']}"
         return True, ""
 
     def changed(self) -> float:
@@ -214,8 +210,6 @@ class View:
     def require(self, camera: str, series: str) -> None:
         """Raise StoreError if there is no such series."""
         with Store.open(self._store) as store:
-            if not camera or not series:
-                raise StoreError("camera and series must both be given")
             store.find_series(camera, series)
 
     def _path(self, camera: str, suffix: str) -> Path:
@@ -247,9 +241,5 @@ def _cell(value: Any) -> Any:
 
 
 def _means(values: NDArray[Any], bins: list[NDArray[np.int64]]) -> list[float | None]:
-    result: list[float | None] = []
-    for rows in bins:
-        part = values[rows]
-        good = part[np.isfinite(part)]
-        result.append(float(good.mean()) if len(good) else None)
-    return result
+    finite = (part[np.isfinite(part)] for part in (values[rows] for rows in bins))
+    return [float(good.mean()) if len(good) else None for good in finite]

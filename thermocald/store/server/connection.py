@@ -59,6 +59,12 @@ _ADVICE = {
     "22": "the server refused a value",
     "23": "the server refused a row",
 }
+_REFUSED = {
+    "password authentication|no pg_hba": _ADVICE["28"],
+    "certificate": "the certificate is not accepted; is it expired, or of another authority?",
+    "database.*does not exist": _ADVICE["3D"],
+}
+"""What libpq says where the server itself did not → what to do."""
 _PASSES = ("08", "40", "53", "55", "57", "58")
 """Classes of errors that may pass by themselves: the same batch is tried again."""
 _LOCK = 7496051  # of `server init`: two at a time would each make the tables
@@ -152,16 +158,9 @@ def _told(address: ServerAddress | str, doing: str, cause: Any) -> StoreError:
     advice = _ADVICE.get(state) or _ADVICE.get(state[:2], "")
     if not state:
         # libpq failed before the server spoke: name resolution, refusal, TLS, a dead connection
-        lower = text.lower()
-        if "password authentication" in lower or "no pg_hba" in lower:
-            return ServerError(f"{address}: {doing}: {_ADVICE['28']} ({text})")
-        if "certificate" in lower:
-            return ServerError(
-                f"{address}: {doing}: the certificate is not accepted; is it expired, or of "
-                f"another authority? ({text})"
-            )
-        if "does not exist" in lower and "database" in lower:
-            return ServerError(f"{address}: {doing}: {_ADVICE['3D']} ({text})")
+        for said, advice in _REFUSED.items():
+            if re.search(said, text, re.IGNORECASE):
+                return ServerError(f"{address}: {doing}: {advice} ({text})")
         return ServerGone(f"{address}: {doing}: the server cannot be reached ({text})")
     message = f"{address}: {doing}: {advice + ' ' if advice else ''}({text})"
     if state[:2] in _PASSES:

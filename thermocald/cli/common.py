@@ -73,7 +73,7 @@ ExteriorOption = Annotated[
 ]
 
 
-def _log_signature(
+def _log_options(
     timezone: TimezoneOption = None,
     temperature_column: list[str] | None = typer.Option(
         None, help="Column of a temperature; the first is the reference; repeatable."
@@ -96,33 +96,40 @@ def _log_signature(
     ),
     separator: str | None = expert(None, help="Between the log's columns: ';' ',' tab."),
     decimal: str | None = expert(None, help="The log's decimal mark: , or ."),
-) -> None:
+) -> Any:
     """How a logger's file is to be read, wherever a command reads one."""
+    said = locals()
+    from thermocald.store.logger.temperatures import log_options
+
+    return log_options(**said)
 
 
-def takes_log_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of `_log_signature`, which it receives as `log_options`.
+def takes(name: str, asked: Callable[..., Any]) -> Callable[[Callable[..., None]], Any]:
+    """Give a command the options that a function asks for; it receives its result as `name`.
 
     Those that its own signature names it receives by themselves too.
     """
-    own = inspect.signature(command, eval_str=True).parameters
-    asked = inspect.signature(_log_signature, eval_str=True).parameters
-    kept = [p for name, p in own.items() if name not in asked and name != "log_options"]
-    added = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in asked.values()]
+    more = inspect.signature(asked, eval_str=True).parameters
 
-    @functools.wraps(command)
-    def called(**given: Any) -> None:
-        from thermocald.store.logger.temperatures import log_options
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command, eval_str=True).parameters
+        kept = [p for key, p in own.items() if key not in more and key != name]
+        added = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in more.values()]
 
-        said = {name: given[name] if name in own else given.pop(name) for name in asked}
-        command(**given, log_options=log_options(**said))
+        @functools.wraps(command)
+        def called(**given: Any) -> None:
+            said = {key: given[key] if key in own else given.pop(key) for key in more}
+            command(**given, **{name: asked(**said)})
 
-    last = kept[-1].replace(kind=inspect.Parameter.KEYWORD_ONLY)
-    called.__signature__ = inspect.Signature([*kept[:-1], *added, last])  # type: ignore[attr-defined]
-    called.__annotations__ = {p.name: p.annotation for p in [*kept, *added]}
-    return called
+        last = kept[-1].replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        called.__signature__ = inspect.Signature([*kept[:-1], *added, last])  # type: ignore[attr-defined]
+        called.__annotations__ = {p.name: p.annotation for p in [*kept, *added]}
+        return called
+
+    return decorate
 
 
+takes_log_options = takes("log_options", _log_options)
 CONFIG_PLACES = (Path("config.yaml"), Path("/etc/thermocald/config.yaml"))
 _NOTICES = ("thermocald.output.dashboard", "thermocald.store.database.file")
 _LINES = 10  # progress lines where there is no terminal

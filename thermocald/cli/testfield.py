@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import JsonOption, PhotosArgument, PixelPitchOption, say, show
+from thermocald.cli.common import JsonOption, PhotosArgument, PixelPitchOption, say, show, takes
 from thermocald.errors import UsageError
 
 if TYPE_CHECKING:
     from thermocald.output.testfield.layout import Design
-    from thermocald.output.testfield.print import Board
 
 CameraFile = Annotated[
     Path | None,
@@ -37,27 +36,40 @@ Diameter = Annotated[
     float | None,
     typer.Option("--diameter", help="Diameter of the discs, mm; default by paper size."),
 ]
-Charuco = Annotated[str | None, typer.Option("--charuco", help="A ChArUco board: 11x8 squares.")]
-Chessboard = Annotated[
-    str | None, typer.Option("--chessboard", help="A chessboard: 9x6 inner corners.")
-]
-AprilGrid = Annotated[str | None, typer.Option("--aprilgrid", help="Kalibr's AprilGrid: 6x6 tags.")]
-Square = Annotated[
-    float | None, typer.Option("--square", min=0.1, help="Side of a board's square, mm.")
-]
-MarkerSide = Annotated[
-    float | None, typer.Option("--marker", min=0.1, help="Side of a board's marker or tag, mm.")
-]
-Spacing = Annotated[
-    float, expert("--spacing", help="Gap between an AprilGrid's tags, over a tag's side.")
-]
-Dictionary = Annotated[
-    str, expert("--dictionary", help="A ChArUco board's dictionary, by OpenCV's name.")
-]
-Legacy = Annotated[bool, expert("--legacy", help="ChArUco as OpenCV drew it before 4.6.")]
 Point = tuple[float, float, float]
 
 
+def _board(
+    charuco: str | None = typer.Option(None, help="A ChArUco board: 11x8 squares."),
+    chessboard: str | None = typer.Option(None, help="A chessboard: 9x6 inner corners."),
+    aprilgrid: str | None = typer.Option(None, help="Kalibr's AprilGrid: 6x6 tags."),
+    square: float | None = typer.Option(None, min=0.1, help="Side of a board's square, mm."),
+    marker: float | None = typer.Option(None, min=0.1, help="Side of a board's marker or tag, mm."),
+    spacing: float = expert(0.3, help="Gap between an AprilGrid's tags, over a tag's side."),
+    dictionary: str = expert(
+        "DICT_5X5_1000", help="A ChArUco board's dictionary, by OpenCV's name."
+    ),
+    legacy: bool = expert(False, "--legacy", help="ChArUco as OpenCV drew it before 4.6."),
+) -> Any:
+    """The board that these options describe, None where none does; its sizes are 0 where they are
+    not given. UsageError for two boards, or counts that are none.
+    """
+    from thermocald.output.testfield.print import KINDS, Board, counts_of
+
+    given = [(k, n) for k, n in zip(KINDS, (charuco, chessboard, aprilgrid), strict=True) if n]
+    if len(given) > 1:
+        raise UsageError(f"--{given[0][0]} and --{given[1][0]}: one board at a time")
+    if not given:
+        return None
+    kind, counts = given[0]
+    columns, rows = counts_of(f"--{kind}", counts)
+    return Board(kind, columns, rows, square or 0.0, marker or 0.0, spacing, dictionary, legacy)
+
+
+takes_board = takes("board", _board)
+
+
+@takes_board
 def print_(
     out: Path = typer.Option(..., "--out", "-o", help="The folder to write into."),
     paper: Paper = "A3",
@@ -70,17 +82,10 @@ def print_(
     light: bool = expert(False, "--light", help="White targets on black."),
     first_code: int = expert(0, min=0, help="Skip so many codes: for a second field."),
     pitch: float | None = expert(None, help="Distance of the coded targets, mm."),
-    charuco: Charuco = None,
-    chessboard: Chessboard = None,
-    aprilgrid: AprilGrid = None,
-    square: Square = None,
-    marker: MarkerSide = None,
-    spacing: Spacing = 0.3,
-    dictionary: Dictionary = "DICT_5X5_1000",
-    legacy: Legacy = False,
     force: bool = typer.Option(
         False, "--force", help="Replace a test field that was printed before."
     ),
+    board: Any = None,
     json: JsonOption = None,
 ) -> None:
     """Draw a test field: a PDF, an SVG per sheet, and the testfield.csv that belongs to it.
@@ -98,7 +103,6 @@ def print_(
     from thermocald.output.testfield import print as sheets
     from thermocald.output.testfield.layout import PAPERS, paper_size
 
-    board = _board(charuco, chessboard, aprilgrid, square, marker, spacing, dictionary, legacy)
     if board is not None:  # the page lies as the board does unless it is said how
         wide = board.columns > board.rows and paper.strip().upper() in PAPERS
         page = paper_size(paper, landscape=wide if landscape is None else landscape)
@@ -115,6 +119,7 @@ def print_(
         say(sheets.ONE_PLANE)
 
 
+@takes_board
 def import_(
     source: Path | None = typer.Argument(
         None,
@@ -124,20 +129,13 @@ def import_(
     out: Path = typer.Option(
         Path("testfield.csv"), "--out", "-o", help="The testfield.csv to write."
     ),
-    charuco: Charuco = None,
-    chessboard: Chessboard = None,
-    aprilgrid: AprilGrid = None,
     rings: int | None = expert(None, help="FILE lists targets with ring codes of 12 or 14 bits."),
-    square: Square = None,
-    marker: MarkerSide = None,
-    spacing: Spacing = 0.3,
-    dictionary: Dictionary = "DICT_5X5_1000",
-    legacy: Legacy = False,
     diameter: float | None = typer.Option(None, min=0.1, help="Diameter of ring-coded discs, mm."),
     sigma: float | None = typer.Option(
         None, min=1e-4, help="Standard deviation of a coordinate, mm, if measured."
     ),
     force: bool = typer.Option(False, "--force", help="Replace an existing file."),
+    board: Any = None,
     json: JsonOption = None,
 ) -> None:
     """Make a testfield.csv of a board that you own: ChArUco, chessboard, AprilGrid, coded rings.
@@ -153,7 +151,6 @@ def import_(
     from thermocald.store.recording.board_file import read_board, read_rings
     from thermocald.store.recording.testfield_file import write_testfield
 
-    board = _board(charuco, chessboard, aprilgrid, square, marker, spacing, dictionary, legacy)
     if (source is None) == (board is None):
         raise UsageError(
             "give a file, or one of --charuco, --chessboard, --aprilgrid with its sizes"
@@ -169,10 +166,10 @@ def import_(
     elif source is not None:
         field, said = read_board(source, sigma)
     else:
-        assert board is not None
-        for option, size in (("--square", square), ("--marker", marker)):
-            needless = {"--square": "aprilgrid", "--marker": "chessboard"}[option]
-            if size is None and board.kind != needless:
+        for option, size, needless in (
+            ("--square", board.square, "aprilgrid"), ("--marker", board.marker, "chessboard"),
+        ):  # fmt: skip
+            if not size and board.kind != needless:
                 raise UsageError(f"{option} is missing (mm)")
         field, said = board.field(sigma), board.name
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
@@ -277,25 +274,6 @@ def check(
 
         write_text(report, render_field_check(found))
     show(found, json, *found.lines())
-
-
-def _board(
-    charuco: str | None, chessboard: str | None, aprilgrid: str | None, square: float | None,
-    marker: float | None, spacing: float, dictionary: str, legacy: bool,
-) -> Board | None:  # fmt: skip
-    """The board that these options describe, None where none does; its sizes are 0 where they are
-    not given. UsageError for two boards, or counts that are none.
-    """
-    from thermocald.output.testfield.print import KINDS, Board, counts_of
-
-    given = [(k, n) for k, n in zip(KINDS, (charuco, chessboard, aprilgrid), strict=True) if n]
-    if len(given) > 1:
-        raise UsageError(f"--{given[0][0]} and --{given[1][0]}: one board at a time")
-    if not given:
-        return None
-    kind, counts = given[0]
-    columns, rows = counts_of(f"--{kind}", counts)
-    return Board(kind, columns, rows, square or 0.0, marker or 0.0, spacing, dictionary, legacy)
 
 
 def _design(paper: str, flat: bool, landscape: bool | None, diameter: float | None) -> Design:

@@ -204,8 +204,8 @@ def _front(field: TestField) -> Array:
     normals = field_normals(field)
     known = np.isfinite(normals[:, 0])
     if not known.any():
-        _, _, Vt = np.linalg.svd(field.points - field.points.mean(axis=0))
-        normals, known = np.broadcast_to(Vt[2], field.points.shape), np.ones(len(field), bool)
+        normal = plane_fit(field.points)[1][2]
+        normals, known = np.broadcast_to(normal, field.points.shape), np.ones(len(field), bool)
     n, p = normals[known], field.points[known]
     side = np.sum((field.points.mean(axis=0) - p) * n, axis=1)
     flat = np.abs(side) < 0.02 * _extent(field)
@@ -275,7 +275,7 @@ def _weak(
 ) -> list[str]:
     """The reasons for which `adjust` would give an image of these points no result."""
     A, _ = _partials(camera, station, points)
-    N = _normal_matrix(A, _noise(points, sigma_px))
+    N = _normal_matrix(A, np.eye(2) * sigma_px**2)
     covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
     # what nothing determines gets a variance that is large, and correlations that are 1
     covariance[np.ix_(_USED, _USED)] = scaled_inverse(N, 1e-13)
@@ -323,7 +323,7 @@ def precision(
 ) -> Precision:
     """The standard deviations that targets at points (n, 3) mm with sigmas (n, 3) mm give."""
     A, by_point = _partials(camera, station, points)
-    k, noise = len(FREE), _noise(points, sigma_px)
+    k, noise = len(FREE), np.eye(2) * sigma_px**2
     of_field = (by_point * sigmas[:, None, :] ** 2) @ np.swapaxes(by_point, 1, 2)
     N = _normal_matrix(A, noise)
     return Precision(
@@ -342,12 +342,8 @@ def _partials(
     return by_parameter[:, :, _USED], by_point
 
 
-def _noise(points: Array, sigma_px: float) -> Array:
-    return np.broadcast_to(np.eye(2) * sigma_px**2, (len(points), 2, 2))
-
-
 def _normal_matrix(A: Array, covariance: Array) -> Array:
-    N: Array = np.einsum("nia,nij,njb->ab", A, np.linalg.inv(covariance), A)
+    N: Array = np.sum(A.mT @ np.linalg.inv(covariance) @ A, axis=0)
     return N
 
 

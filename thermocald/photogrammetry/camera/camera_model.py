@@ -269,17 +269,6 @@ def image_to_px(sensor: Sensor, points_mm: ArrayLike) -> Array:
     return np.asarray(points_mm, dtype=float) / (sensor.pixel_pitch * _UPWARDS) + sensor.centre
 
 
-def _as_px(sensor: Sensor, x: Array, y: Array) -> Array:
-    """Coordinates in mm about the image centre as image points (..., 2) px."""
-    out = np.empty((2, *x.shape))
-    scale = 1.0 / sensor.pixel_pitch
-    np.multiply(x, scale, out=out[0])
-    np.multiply(y, -scale, out=out[1])
-    out[0] += (sensor.width - 1) / 2
-    out[1] += (sensor.height - 1) / 2
-    return out.transpose(*range(1, out.ndim), 0)
-
-
 def distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Ideal points (mm, about the principal point) → measured points (mm, about the centre).
 
@@ -323,7 +312,12 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
         z = np.where(z < 0, z, np.nan)
     scale = -i[..., 0, None] / z
     x, y = distort(i, scale * x, scale * y)
-    return _as_px(sensor, x, y)
+    out, px_per_mm = np.empty((2, *x.shape)), 1.0 / sensor.pixel_pitch
+    np.multiply(x, px_per_mm, out=out[0])
+    np.multiply(y, -px_per_mm, out=out[1])
+    out[0] += (sensor.width - 1) / 2
+    out[1] += (sensor.height - 1) / 2
+    return out.transpose(*range(1, out.ndim), 0)
 
 
 def distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:

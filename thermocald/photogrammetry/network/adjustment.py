@@ -148,8 +148,6 @@ def refuse_before(
             reasons.append(
                 f"the scale needs target {' and '.join(missing)} in at least {MIN_RAYS} photographs"
             )
-        if not d.length > 0:
-            reasons.append(f"the distance {d.a}–{d.b} is {d.length:g} mm, it must be positive")
     _refuse(reasons)
 
 

@@ -245,7 +245,19 @@ def test_a_moved_camera_is_reported_with_time_turn_and_shift():
         if events:
             found += events[0] == 32
             assert "turned by 0.0" in told[0][1]
+            assert "looks alike" not in told[0][1]
     assert found == 10
+
+
+def test_what_a_model_lacks_is_told_from_a_knock():
+    """A quadratic in c that the model has not, a degree an epoch: no frame shows it at once."""
+    world = World(700)
+    plain = world.interior
+    world.interior = lambda T: plain(T) | {"c": plain(T)["c"] + 3e-5 * (T - 20.0) ** 2}
+    gauge = GaugeCalibrator(thermal_camera(), world.field)
+    _, told = followed(gauge, [world.epoch(k, 20.0 + 0.5 * k) for k in range(1, 50)])
+    assert {kind for kind, _ in told} == {"camera_moved"}
+    assert all("a model that lacks an effect looks alike" in text for _, text in told)
 
 
 def test_a_camera_that_stands_still_in_changing_heat_is_not_moved():

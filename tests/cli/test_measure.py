@@ -191,6 +191,7 @@ def test_what_is_printed(tmp_path):
      ("water.yaml", "profile: [[1, 2, 3], [1, 2, 3]]\n", "twice in a row"),
      ("water.yaml", "profile: [[192000, 313012, 138], [192000.1, 313012, 138]]\n", "beyond the p"),
      ("water.yaml", "level: deep\n", "level must be a number"),
+     ("water.yaml", "line: {point: [2, 13, 138], direction: [0, 0, 1]}", "same coordinates"),
      ("water.yaml", "line: {point: [1, 2], direction: [0, 0, 1]}\n", "must be three numbers"),
      ("gcp.csv", "target,X,Y,Z\na,1,2,3\n", "column sX is missing"),
      ("points.csv", "time,name,x,y,sx,sy\n1700021600,sky,1640,-900,0.2,0.2\n", "above the horizon"),
@@ -203,3 +204,54 @@ def test_what_cannot_be_measured_is_one_line(tmp_path, file, content, words):
     done = called(tmp_path)
     assert done.returncode in (1, 2)
     assert words in " ".join(done.stderr.split())
+
+
+def changed(folder, change) -> str:
+    """Standard error of `measure` after a change {column: text} of each row of gcp.csv."""
+    write_model(folder / "model.yaml")
+    world(folder, 1)
+    with (folder / "gcp.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    with (folder / "gcp.csv").open("w", newline="") as out:
+        writer = csv.DictWriter(out, list(rows[0]))
+        writer.writeheader()
+        writer.writerows({**row, **change(i, row)} for i, row in enumerate(rows))
+    done = called(folder)
+    assert done.returncode == 1
+    (line,) = done.stderr.strip().splitlines()
+    return line
+
+
+def degrees(_, row):
+    return {"X": 5.9 + 1.4e-5 * (float(row["X"]) - 192e3), "Y": 50.8 + 9e-6 * float(row["Y"]) - 2.8}
+
+
+def beyond_the_camera(_, row):
+    """Behind it: its centre is at Y = 312999 m."""
+    return {"Y": 2 * 312_999.0 - float(row["Y"])}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(degrees, "do X and Y hold degrees?"),
+     (lambda _, r: {"X": float(r["X"]) / 1000, "Y": float(r["Y"]) / 1000}, "are they in m?"),
+     (lambda _, r: {"x": 4 * float(r["x"])}, "px, outside the camera's 3280 × 2464 px"),
+     (lambda _, r: {"x": r["y"], "y": r["x"]}, "X and Y, or x and y, are exchanged"),
+     (beyond_the_camera, "or a sign is wrong"),
+     (lambda i, _: {"X": 192_000 + i, "Y": 313_020, "Z": 138}, "lie in one line"),
+     (lambda i, r: {} if i < 3 else {"x": "", "y": ""}, "3 control points; a pose needs at least"),
+     (lambda i, r: {"y": float(r["y"]) + (0, 90, -50, 0, 70, -30)[i % 6]}, "contradict the ot")],
+)  # fmt: skip
+def test_control_points_that_cannot_be_are_one_line_that_says_why(tmp_path, change, words):
+    assert words in changed(tmp_path, change)
+
+
+def test_heights_of_one_time_that_contradict_each_other_are_said(tmp_path):
+    level(tmp_path, 1)
+    points = (tmp_path / "points.csv").read_text().splitlines()
+    moved = points[1].split(",")
+    moved[3] = f"{float(moved[3]) + 30:.1f}"
+    (tmp_path / "points.csv").write_text(
+        "\n".join([points[0], ",".join(moved), *points[2:]]) + "\n"
+    )
+    assert "the places contradict each other" in measured(tmp_path).stdout

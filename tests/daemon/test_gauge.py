@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -162,3 +164,44 @@ def refused(daemon, words: str) -> None:
 def test_corrected_frames_need_a_thermal_model(daemon, devices):
     daemon.configure(**devices() | {"frames": {"corrected": True}})
     refused(daemon, "frames.corrected needs a camera with a thermal_model")
+
+
+RIVER = Path(__file__).resolve().parents[2] / "examples" / "river"
+
+
+@pytest.fixture
+def river(tmp_path):
+    """The example's gauge under a bridge, in a folder where its files can be spoilt."""
+    shutil.copytree(RIVER, tmp_path / "river")
+    return tmp_path / "river"
+
+
+def test_check_says_what_the_control_points_are_worth(river):
+    done = call("check", river / "bridge.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "camera bridge: 10 control points, 10 within the reference frame, sigma0" in done.stdout
+    assert "the interior orientation alone" in call("check", river / "bank.yaml").stdout
+
+
+def test_a_reference_frame_of_another_size_and_clicks_of_another_image_are_said(river):
+    frame = river / "photographs/20240506-060000.jpg"
+    Image.open(frame).resize((410, 308)).save(frame)
+    done = call("check", river / "bridge.yaml")
+    assert done.returncode == 2
+    assert "has 410×308 px, the camera's frames 820×616 px" in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("rows", "scale", "words"),
+    [(slice(0, 10), 10.0, "0 control points have x, y within the frame"),
+     (slice(0, 2), 1.0, "2 control points have x, y within the frame"),
+     (slice(0, 3), 1.0, "warning: the control points give no pose")],
+)  # fmt: skip
+def test_control_points_that_give_no_pose_are_said_before_the_start(river, rows, scale, words):
+    head, *lines = (river / "gcp.csv").read_text().splitlines()
+    kept = [line.split(",") for line in lines[rows]]
+    kept = [[*one[:7], *(str(scale * float(v)) for v in one[7:9]), *one[9:]] for one in kept]
+    (river / "gcp.csv").write_text("\n".join([head, *map(",".join, kept)]) + "\n")
+    done = call("check", river / "bridge.yaml")
+    assert "Traceback" not in done.stderr
+    assert words in " ".join((done.stdout + done.stderr).split())

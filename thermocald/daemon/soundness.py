@@ -248,12 +248,14 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
             if not probe or kind == "output":
                 lines.append(f"  {kind} {entry.name}: driver {entry.driver}")
             lines += [f"  {kind} {entry.name}: warning: {text}" for text in device.warnings()]
+    from thermocald.acquisition.calibrator import Calibrator
+
     Thermometers(config, clock)  # whose channels must fit together
-    lines += [
-        f"  test field of {plan.name}: {len(plan.testfield)} targets"
-        for plan in plan_cameras(config, clock)
-        if plan.testfield is not None
-    ]
+    for plan in plan_cameras(config, clock):
+        if plan.calibrator is not None and not isinstance(plan.calibrator, Calibrator):
+            lines.append(f"  camera {plan.name}: {plan.calibrator.outlook()}")
+        elif plan.testfield is not None:
+            lines.append(f"  test field of {plan.name}: {len(plan.testfield)} targets")
     document: dict[str, Any] = {"devices": devices, "lines": lines}
     if probe:
         document["probes"] = answers = probe_devices(config)

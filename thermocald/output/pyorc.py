@@ -84,9 +84,11 @@ def renew_configuration(
             raise DataError(f"{frame}: {found.status.reason}")
         control = replace(control, seen=found.observations)
     # sigmas that nobody stated cannot tell a gross error; sigma0 then says what they are worth
-    pose = camera.resect(control.field, control.seen, 0.0 if control.assumed else 0.001)
-    if pose.exterior is None or not pose.ok:
-        raise DataError(f"{path}: the control points give no pose ({pose.status}): {pose.reason}")
+    try:
+        pose = control.pose(camera, 0.0 if control.assumed else 0.001)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+    assert pose.exterior is not None
     # pose and camera are correlated: the pose goes with the camera that it was estimated with
     now = replace(camera, values=pose.values[IOP], covariance=pose.covariance[IOP, IOP])
     K, distortion = _opencv(now)

@@ -8,7 +8,7 @@ before anything is computed, and kept.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,11 +22,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from thermocald.analysis.camera.camera import Camera
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.epoch.adjustment import Adjustment
 
 UNITS = {"mm": 1.0, "m": 1000.0}
 """Lengths that control points and planes may be given in, in mm."""
 
+_LEAST_EXTENT_MM = 50.0  # of a gauge's points: metres read as mm, or degrees, lie nearer together
+_FITS = 3.0  # sigma0 of points that were mirrored back
 _ROUND_MM = 1e6  # coordinates count from a round number near the points
 _SURVEYED_MM = 20.0  # a GNSS receiver with corrections, where nothing is said
 _CLICKED_PX = 1.0
@@ -83,6 +87,15 @@ class ControlPoints:
         if not np.isfinite(points).all():
             row = int(np.argmin(np.isfinite(points).all(axis=1)))
             raise DataError(f"{where}, {names[row]}: a control point needs X, Y and Z")
+        extent = scale * float(np.ptp(points[:, :2], axis=0).max())
+        if 0 < extent < _LEAST_EXTENT_MM:
+            degrees = (np.abs(points[:, :2]) <= (180, 90)).all()
+            raise DataError(
+                f"{where}: in {unit}, all control points lie within {extent:.2g} mm: "
+                + ("do X and Y hold degrees? " if degrees else "are they in m? ")
+                + "Metres of UTM or a national grid are needed"
+                + ("" if degrees else ", and the unit m")
+            )
         origin = np.round(scale * points.mean(axis=0) / _ROUND_MM) * _ROUND_MM
         try:
             field = TestField.build(
@@ -95,6 +108,28 @@ class ControlPoints:
             rows = np.flatnonzero(np.isfinite(seen[0]).all(axis=1))
             image = Observations(rows, seen[0][rows], seen[1][rows])
         return cls(field, image, origin, unit, assumed)
+
+    def pose(self, camera: Camera, snooping_alpha: float = 0.001) -> Adjustment:
+        """Return the pose of a camera by where the points were seen; DataError says why not."""
+        seen, sensor = self.seen, camera.sensor
+        pose = camera.resect(self.field, seen, snooping_alpha)
+        why = f"the control points give no pose ({pose.status}): {pose.reason}"
+        outside = ~sensor.contains(seen.points)
+        if outside.any():
+            row = int(np.argmax(outside))
+            x, y = seen.points[row]
+            why = (
+                f"control point {self.field.names[seen.targets[row]]} was seen at {x:.0f}, {y:.0f} "
+                f"px, outside the camera's {sensor.width} × {sensor.height} px"
+            )
+        elif pose.ok:
+            return pose
+        field = replace(self.field, points=self.field.points[:, [1, 0, 2]])
+        turned = replace(seen, points=seen.points[:, ::-1])
+        mirrored = (camera.resect(field, seen, 0.0), camera.resect(self.field, turned, 0.0))
+        if any(other.ok and other.sigma0 < _FITS for other in mirrored):
+            why += "; mirrored they fit: X and Y, or x and y, are exchanged, or a sign is wrong"
+        raise DataError(why)
 
 
 def _from_table(path: Path, unit: str) -> ControlPoints:

@@ -16,6 +16,7 @@ import numpy as np
 from thermocald.analysis.camera.undistortion import Maps, ideal_points
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import partials, project, rays
+from thermocald.store.logger.series import iso
 
 if TYPE_CHECKING:
     from thermocald.analysis.thermal.thermal_camera import Along, ThermalCamera
@@ -70,8 +71,8 @@ def require_inside(log: TemperatureLog, times: Array) -> None:
     outside = (times < begin - step) | (times > end + step)
     if outside.any():
         raise DataError(
-            f"{int(outside.sum())} of {len(times)} rows were measured outside the temperature log "
-            f"({begin:.0f} to {end:.0f} s), the first at {times[outside][0]:.0f} s"
+            f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
+            f"({iso(begin)} to {iso(end)}), the first is {iso(times[outside][0])}"
         )
 
 

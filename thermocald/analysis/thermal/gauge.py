@@ -26,7 +26,7 @@ import numpy as np
 from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.analysis.thermal.predictor import Predictor
-from thermocald.errors import ConfigurationError, ImageError
+from thermocald.errors import ConfigurationError, DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     IOP,
@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 _FEWEST = 3  # control points, with an earlier pose
 _CONFIRMED = 2  # epochs in a row that show another pose
 _MOVED_CHI2 = 38.3  # six degrees of freedom, one in a million
+_SUDDEN_K = 2.0  # between two frames: by less a model that lacks an effect is not off by much
 _UNMODELLED_PX = 0.05  # of a control point from frame to frame: light, air, the template
 
 
@@ -78,11 +79,15 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class Movement:
-    """A turn (3,) rad about the camera's axes and a shift (3,) mm since a time, with covariance."""
+    """A turn (3,) rad about the camera's axes and a shift (3,) mm since a time, with covariance.
+
+    sudden: whether it came from one frame to the next, at one temperature.
+    """
 
     since: float
     values: Array
     covariance: Array
+    sudden: bool = True
 
     @property
     def chi2(self) -> float:
@@ -98,6 +103,7 @@ class Movement:
             f"the camera was moved: it turned by {math.degrees(turn):.4f} ± "
             f"{math.degrees(sd_turn):.4f}° and shifted by {shift:.1f} ± {sd_shift:.1f} mm"
             + ("; turn and shift can hardly be separated here" if sd_shift > shift else "")
+            + ("" if self.sudden else "; not at once: a model that lacks an effect looks alike")
         )
 
 
@@ -126,10 +132,30 @@ class GaugeCalibrator:
         self.pose: Pose | None = None
         """The last one that control points gave."""
         self._reference: Pose | None = None
+        self._still: Pose | None = None
         self._moved: list[Pose] = []
         self._number = 0
         self.movement: Movement | None = None
         """What the last epoch showed, where that was a movement of the camera."""
+
+    def outlook(self) -> str:
+        """Return in words what the control points promise, of the reference frame."""
+        if not len(self.testfield):
+            return "no control points: the interior orientation alone"
+        text = f"{len(self.testfield)} control points"
+        if not isinstance(self._finder, Templates):
+            return text
+        seen = self._finder.reference
+        text += f", {len(seen)} within the reference frame"
+        known = ControlPoints(self.testfield, seen, np.zeros(3), "mm")
+        try:
+            pose = known.pose(self.predictor.settled(), self._alpha)
+        except DataError as error:
+            return f"{text}: warning: {error}"
+        rejected = ", ".join(self.testfield.names[row] for row in pose.rejected)
+        return f"{text}, sigma0 of their pose {pose.sigma0:.2f}" + (
+            f"; left out: {rejected}" if rejected else ""
+        )
 
     def reset(self) -> None:
         """Look for the control points anew."""
@@ -276,17 +302,25 @@ class GaugeCalibrator:
     def _watch(self, pose: Pose) -> None:
         """Compare with the reference; two epochs in a row that moved make it a movement."""
         if self._reference is None:
-            self._reference = pose
+            self._reference = self._still = pose
             return
         found = self.compare(self._reference, pose)
         if found is None or found.chi2 <= _MOVED_CHI2:
+            self._still = pose
             self._moved.clear()
             return
         self._moved.append(pose)
         if len(self._moved) >= _CONFIRMED:
-            self.movement = replace(found, since=self._moved[0].time)
-            self._reference = pose
+            sudden = self._is_step(self._still or self._reference, self._moved[0])
+            self.movement = replace(found, since=self._moved[0].time, sudden=sudden)
+            self._reference = self._still = pose
             self._moved.clear()
+
+    def _is_step(self, then: Pose, now: Pose) -> bool:
+        """Return whether two frames, one after the other, show a movement that is not of heat."""
+        step = self.compare(then, now)
+        warmer = now.predicted.camera.temperature - then.predicted.camera.temperature
+        return step is not None and step.chi2 > _MOVED_CHI2 and abs(warmer) < _SUDDEN_K
 
     def compare(self, then: Pose, now: Pose) -> Movement | None:
         """Return how the camera moved between two poses, None where too few points are in both.
@@ -381,6 +415,12 @@ def plan_gauge(
         finder = Tracker(given.field, prior)
     else:
         finder = Templates.read(reference, given.field, given.seen)
+        size, sensor = finder.image_size, thermal.model.sensor
+        if size != (sensor.width, sensor.height):
+            raise ConfigurationError(
+                f"control_reference {reference}: has {size[0]}×{size[1]} px, the camera's frames "
+                f"{sensor.width}×{sensor.height} px"
+            )
     return GaugeCalibrator(thermal, given.field, finder, mount, snooping_alpha), [
         float(v) for v in given.origin
     ]

@@ -16,14 +16,15 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 from thermocald.analysis.thermal.control_points import UNITS
 from thermocald.analysis.thermal.correction import require_inside
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.figures import BAND
 from thermocald.files import read_yaml
-from thermocald.photogrammetry.camera.camera_model import EOP, InteriorOrientation
-from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on, resect
+from thermocald.photogrammetry.camera.camera_model import EOP
+from thermocald.photogrammetry.epoch.measuring import Line, Plane, Profile, place_on
 from thermocald.result import Result, jsonable, new_figure, with_sds
 
 if TYPE_CHECKING:
@@ -41,11 +42,30 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 
+_FARTHEST = 100.0  # extents of the control points, to the surface
+_CONTRADICTED = 1e-3  # probability of heights that differ so much
+
+
 def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     """Read where the points lie: `level` (and `sd`) of a water, `plane`, `line`, or `profile`.
 
     In the unit and the coordinates of the control points. Raises ConfigurationError.
     """
+    surface = _read_surface(path, control)
+    points = control.field.points
+    middle, extent = points.mean(axis=0), np.linalg.norm(np.ptp(points, axis=0))
+    places = surface.points if isinstance(surface, Profile) else surface.point
+    away = float(np.linalg.norm(places - middle, axis=-1).min())
+    if away > _FARTHEST * extent:
+        unit = UNITS[control.unit]
+        raise ConfigurationError(
+            f"{path}: lies {away / unit:.0f} {control.unit} from control points that extend over "
+            f"{extent / unit:.0f} {control.unit}: both need the same coordinates and unit"
+        )
+    return surface
+
+
+def _read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     document = read_yaml(path)
     kinds = [k for k in ("level", "plane", "line", "profile") if k in document]
     if len(kinds) != 1 or set(document) - {*kinds, "sd", "sd_tilt_deg"}:
@@ -119,6 +139,12 @@ class Level:
     places: int
     sigma0: float
 
+    @property
+    def contradicted(self) -> bool:
+        """Return whether the heights differ by more than their standard deviations explain."""
+        freedom = self.places - 1
+        return freedom > 0 and float(chdtrc(freedom, freedom * self.sigma0**2)) < _CONTRADICTED
+
 
 @dataclass(frozen=True, eq=False)
 class Places(Result):
@@ -178,22 +204,29 @@ class Places(Result):
 
     def lines(self) -> list[str]:
         digits = 1 if self.unit == "mm" else 4
+        count = len(self.names)
         pose = (
-            f"{len(self.names)} places; pose from {self.pose.n_observations} control points, "
-            f"sigma0 {self.pose.sigma0:.2f}"
+            f"{count} place{'s' if count > 1 else ''}; pose from {self.pose.n_observations} "
+            f"control points, sigma0 {self.pose.sigma0:.2f}"
         )
         if self.rejected:
-            pose += f", {', '.join(self.rejected)} contradict the others and are left out"
-        wide = max(map(len, self.names), default=4)
+            single = len(self.rejected) == 1
+            words = "contradicts the others and is" if single else "contradict the others and are"
+            pose += f", {', '.join(self.rejected)} {words} left out"
+        names = list(self.names)
+        if np.ptp(self.times):
+            names = [f"{n} {_utc(t):%H:%M:%S}" for n, t in zip(names, self.times, strict=True)]
+        wide = max(map(len, names), default=4)
         lines = [pose, f"{'':{wide}}  X ± sd, Y ± sd, Z ± sd in {self.unit}; thermal correction mm"]
-        for name, p, sd, shift in zip(self.names, self.points, self.sd, self.shift_mm, strict=True):
+        for name, p, sd, shift in zip(names, self.points, self.sd, self.shift_mm, strict=True):
             at = ", ".join(f"{v:.{digits}f} ± {s:.{digits}f}" for v, s in zip(p, sd, strict=True))
             lines.append(f"{name:{wide}}  {at}; {shift:.1f}")
         for one in self.levels:
             said = f"level of {one.places} places: {one.level:.{digits}f} ± {one.sd:.{digits}f}"
             lines.append(
-                f"{datetime.fromtimestamp(one.time, UTC):%Y-%m-%d %H:%M:%S} UTC, {said} {self.unit}"
+                f"{_utc(one.time):%Y-%m-%d %H:%M:%S} UTC, {said} {self.unit}"
                 + (f", sigma0 {one.sigma0:.2f}" if one.places > 1 else "")
+                + (": the places contradict each other" if one.contradicted else "")
             )
         return lines
 
@@ -237,10 +270,7 @@ def measure_places(
     moments, member = np.unique(times, return_inverse=True)
     now = camera.along(log.times, log.channels, moments, extrapolate, seen_at, noise)
     sensor = camera.model.sensor
-    interior = InteriorOrientation.from_array(then.values[0])
-    pose = resect(sensor, interior, then.covariance[0], control.field, control.seen)
-    if not pose.ok:
-        raise DataError(f"the control points give no pose ({pose.status}): {pose.reason}")
+    pose = control.pose(then[0])
     image, sigmas = observed[:, :2], observed[:, 2:]
     without, _ = place_on(sensor, pose.values, pose.covariance, image, sigmas, surface)
     states = pose.values + np.pad(now.values - then.values, ((0, 0), (0, 6)))
@@ -255,6 +285,10 @@ def measure_places(
         tuple(control.field.names[r] for r in pose.rejected), now.temperatures[member], times,
         levels,
     )  # fmt: skip
+
+
+def _utc(time: float) -> datetime:
+    return datetime.fromtimestamp(time, UTC)
 
 
 def _levels(

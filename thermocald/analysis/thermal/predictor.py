@@ -17,6 +17,7 @@ import numpy as np
 
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.photogrammetry.camera.camera_model import IOP, partials, rays
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -70,6 +71,7 @@ class Predictor:
         self._now: tuple[Camera, Camera] | None = None
         self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)
         self._since_begin = 0
+        self._across: Array | None = None
 
     def take(self, time: float, readings: Mapping[str, float]) -> None:
         """Take readings {channel: °C}, the first is the reference; failed ones are NaN or missing.
@@ -115,9 +117,14 @@ class Predictor:
             covariance = covariance + np.diag((rates * beyond) ** 2)
         model = self.thermal.model
         now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
-        shift = _largest_px(now, unknown)
+        shift = self._largest_px(camera.values, unknown)
         spread = math.hypot(drifted, beyond)
         return PredictedCamera(now, age, spread, unknown, shift, beyond, far)
+
+    def settled(self) -> Camera:
+        """Return the camera of a temperature that nothing is known of, with its covariance."""
+        T = self.thermal.model.T0
+        return self._free.at(T, self._change(math.inf), dict.fromkeys(self._channels, T) or None)
 
     def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
         """The reference and the channels that the model names; None where one was not read yet."""
@@ -171,11 +178,13 @@ class Predictor:
         rows = {n: np.array([row[n] for _, row in self._recent]) for n in self._recent[0][1]}
         return self._free.along(times, rows, [time])[0]
 
-
-def _largest_px(camera: Camera, shift: Array) -> float:
-    """Return by how much a change of the interior orientation moves an image point at most."""
-    if not np.abs(shift).any():
-        return 0.0
-    moved = replace(camera, covariance=np.outer(shift, shift))
-    spread = moved.point_covariance(image_grid(camera.sensor))
-    return float(np.sqrt(np.trace(spread, axis1=1, axis2=2).max()))
+    def _largest_px(self, values: Array, shift: Array) -> float:
+        """Return by how much a change of the interior orientation moves an image point at most."""
+        if not shift.any():
+            return 0.0
+        if self._across is None:  # where corners and edges look, hardly changed by temperature
+            sensor = self.thermal.model.sensor
+            across = rays(sensor, values, image_grid(sensor))
+            self._across = across / -across[:, 2:]
+        J = partials(self.thermal.model.sensor, values, np.zeros(6), self._across)[1][..., IOP]
+        return float(np.linalg.norm(J @ shift, axis=1).max())

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _FEWEST = 4  # control points: three have up to four poses
+_THIN = 0.005  # of points in one line: their extent across it over that along it
 _BESIDE_PX = 5.0  # an image point may lie so far beyond a profile's end
 _GRAZING = np.sin(np.radians(1.0))  # between a ray and a plane: beyond it a pixel is metres
 
@@ -71,17 +72,25 @@ def resect(
         return failed(
             "too_few_targets", f"{n} control points; a pose needs at least {fewest}", observations
         )
+    points = control.points[observations.targets]
+    extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if extent[1] <= _THIN * extent[0]:
+        why = "the control points lie in one line, about which the camera may turn: add one beside"
+        return failed("no_orientation", why, observations)
     suspects, pose = None, start
     if pose is None:
-        points = control.points[observations.targets]
         try:
             _, pose, fits = approximate_orientation(
                 sensor, points, observations.points, interior=interior
             )
-        except GeometryError as error:
-            return failed("no_orientation", str(error), observations)
+        except GeometryError:
+            why = f"no pose explains {n} control points; x, y (px) must be those of these X, Y, Z"
+            return failed("no_orientation", why, observations)
         suspects = ~fits
     result = adjust(sensor, control, observations, interior, pose, s, suspects, covariance)
+    if len(result.rejected) > s.max_rejected * n or result.status == "too_many_rejected":
+        why = "too many of them contradict the others; x, y (px) must be those of these X, Y, Z"
+        return failed("too_many_rejected", why, observations)
     if result.ok and start is None and is_ambiguous(sensor, control, observations, interior):
         why = (
             "the control points lie in one plane, and a second, mirrored pose fits nearly as "

@@ -83,6 +83,11 @@ class Templates:
         return made
 
     @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height px of the reference frame."""
+        return self._shape[1], self._shape[0]
+
+    @property
     def reference(self) -> Observations:
         """The points in the reference frame, as measured."""
         none = np.zeros(len(self._rows))
@@ -163,7 +168,7 @@ class Matching:
         self._weight = np.exp(-0.5 * (u**2 + v**2) / (_HALF / 1.8) ** 2)
         gy, gx = np.gradient(self.grey, axis=(1, 2)) if len(self.grey) else (self.grey, self.grey)
         flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, self.grey, np.ones_like(self.grey)]
-        J = np.stack(flat, axis=-1).reshape(len(self.grey), -1, 8)
+        J = np.stack(flat, axis=-1).reshape(len(self.grey), self._weight.size, 8)
         weighted = J * self._weight.reshape(-1, 1)
         N = np.linalg.pinv(weighted.mT @ J, rcond=1e-9, hermitian=True)
         self._step = N @ weighted.mT

@@ -218,13 +218,6 @@ def level_pulls(draws, epochs, noise=0.1, field=0.02):
     return np.array(pulls)
 
 
-@pytest.mark.slow
-def test_standard_deviations_of_the_level_are_true():
-    """200 draws, thermometer noise 0.1 K, field 0.02 mm: error over sd, 1 ± 2 / √400 per number."""
-    spread = np.sqrt(np.mean(level_pulls(200, 40) ** 2, axis=0))
-    assert np.all(np.abs(spread - 1.0) < 0.1), spread
-
-
 def test_the_level_is_not_as_uncertain_as_the_thermometer_is_noisy():
     """A few draws: ± 0.4 px is the field's share; 2.8 px was stated for 0.1 K of noise."""
     spread = np.sqrt(np.mean(level_pulls(4, 40)[:, :3] ** 2))

@@ -120,22 +120,6 @@ def test_base_model_of_a_driftless_effect(fitted):
     assert np.linalg.eigvalsh(np.array(model.covariance)).min() > -1e-18
 
 
-@pytest.mark.slow
-def test_standard_deviations_are_true():
-    """60 recordings: scatter of tau and the rates over their stated sd, 1 ± 3/√120."""
-    pulls = []
-    for seed in range(60):
-        s = simulated(seed, epochs=60)
-        f = fit_thermal_model([reduced(s)], [LAG], T0=30.0, search=False)
-        (lag,) = f.model.effects
-        pull = [(lag.values["tau"] - 70.0) / lag.sds["tau"]]
-        for n in ("c", "x0", "y0"):
-            pull.append((f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}"))
-        pulls.append(pull)
-    spread = np.sqrt(np.mean(np.square(pulls), axis=0))
-    assert np.all(np.abs(spread - 1.0) < 3 / np.sqrt(120)), spread
-
-
 def test_a_lens_mean_offset_of_targets_is_no_drift():
     """Coordinates wrong by 0.05 mm: rates stay right, the level alone suffers."""
     s = simulated(3)

@@ -7,7 +7,6 @@ the chip gives without having measured. Few examples here, thousands in the slow
 from __future__ import annotations
 
 import math
-import threading
 import time
 
 import pytest
@@ -320,7 +319,3 @@ def test_any_option_is_taken_or_refused_in_one_line(kind, name, amount):
         assert "Traceback" not in message
 
     check()
-
-
-def test_threads_are_not_left_behind():
-    assert not [t for t in threading.enumerate() if t.name == "instrument"]

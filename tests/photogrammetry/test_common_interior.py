@@ -36,20 +36,13 @@ def photographs(rng, sigma_mm: float, gross: int = 0):
     return known, measured
 
 
-@pytest.mark.parametrize(
-    ("sigma_mm", "count"),
-    [
-        (0.0, 40),
-        (0.05, 40),
-        pytest.param(0.02, 600, marks=pytest.mark.slow),
-        pytest.param(0.1, 600, marks=pytest.mark.slow),
-    ],
-)
-def test_the_camera_is_as_sure_as_stated(sigma_mm, count):
+@pytest.mark.parametrize("sigma_mm", [0.0, 0.05])
+def test_the_camera_is_as_sure_as_stated(sigma_mm):
     """Draws of field and image noise: error over sd of c, x0, y0, and no draw without end.
 
-    600 draws know each ratio to 3 %: it is between 0.9 and 1.1.
+    More of them: the section `calibrate` of benchmarks.audit.
     """
+    count = 40
     z, sigma0 = [], []
     for k in range(count):
         known, measured = photographs(np.random.default_rng([7, k]), sigma_mm)
@@ -60,7 +53,7 @@ def test_the_camera_is_as_sure_as_stated(sigma_mm, count):
         z.append((r.interior.as_array() - scene.INTERIOR.as_array())[PRINCIPAL] / sd)
         sigma0.append(r.sigma0)
     rms = np.sqrt(np.mean(np.square(z), axis=0))
-    assert rms == pytest.approx(np.ones(3), abs=max(3 / np.sqrt(2 * count), 0.1))
+    assert rms == pytest.approx(np.ones(3), abs=3 / np.sqrt(2 * count))
     assert np.mean(sigma0) == pytest.approx(1.0, abs=0.03)
 
 

@@ -21,26 +21,19 @@ def rms(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("memory", [0.0, 0.5, 0.8])
-@pytest.mark.parametrize("px", [0.02, 0.1])
-def test_errors_are_as_large_as_stated_whatever_the_mount_does(px, memory):
-    """200 series of 100 epochs; their errors about the series' mean, c, x0 and y0."""
-    z, _ = standardised(40, 200, 100, Tremble(px, memory))
-    assert rms(z) == pytest.approx(np.ones(3), abs=0.1)
-
-
-@pytest.mark.slow
 def test_a_mount_that_stands_still_costs_nothing():
-    """200 series without a tremble: the sds of `series`, within 5 %."""
-    z, sd = standardised(41, 200, 100, STILL)
-    _, still = standardised(41, 200, 100, STILL, "series")
+    """60 series without a tremble: the sds of `series`, within 5 %."""
+    z, sd = standardised(41, 60, 100, STILL)
+    _, still = standardised(41, 60, 100, STILL, "series")
     assert rms(z) == pytest.approx(np.ones(3), abs=0.1)
     assert rms(sd) == pytest.approx(rms(still), rel=0.05)
 
 
 @pytest.mark.parametrize("tremble", [STILL, TREMBLES, SWAYS])
 def test_errors_are_as_large_as_stated(tremble):
-    """The same with six series: they know the ratio to some 8 %, with memory to 20 %."""
+    """Of six series, which know the ratio to some 8 %, with memory to 20 %; hundreds, with further
+    trembles, are the section `mount` of benchmarks.audit.
+    """
     z, sd = standardised(42, 6, 100, tremble)
     assert rms(z) == pytest.approx(np.ones(3), abs=0.4 if tremble.memory else 0.2)
     if tremble is STILL:

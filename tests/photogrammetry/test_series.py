@@ -68,24 +68,6 @@ def test_differences_within_the_series_have_their_stated_sd(exterior):
     assert ratio.max() < 1.055
 
 
-@pytest.mark.slow
-def test_the_level_has_its_stated_sd():
-    """The common part: over 60 series, each with another error of the coordinates."""
-    rng = np.random.default_rng(31)
-    z = []
-    for _ in range(60):
-        field, truth, observations = series(rng, epochs=12)
-        r = adjust_series(
-            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior="series", target_noise=False, snooping_alpha=0.0),
-        )  # fmt: skip
-        shared = [0, 1, 2, 10, 11, 12, 13, 14, 15]
-        z.append((r.values - truth).mean(axis=0)[shared] / r.level_sd[shared])
-    rms = np.sqrt(np.mean(np.square(z), axis=0))
-    assert rms.min() > 0.72  # 60 draws: a standard error of 9 %
-    assert rms.max() < 1.28
-
-
 def test_a_static_set_up_is_worth_fifty_times():
     """DESIGN idea 3: 0.3 px with a free orientation per epoch, 0.005 px with one for the series."""
     field, _, observations = series(np.random.default_rng(32), coordinate_error=0.0, hidden=0.0)

@@ -347,13 +347,13 @@ def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
 def test_a_series_is_read_page_by_page(client_of, monkeypatch):
     """One page in memory, whatever the length; and no transaction is open between them."""
     from thermocald.output.dashboard import view
-    from thermocald.store.database import store
+    from thermocald.store.database import columns
 
     asked = []
-    page = store.read_page
+    page = columns.read_page
     monkeypatch.setattr(view, "_ROWS_AT_ONCE", 100)
-    monkeypatch.setattr(store, "read_columns", None)
-    monkeypatch.setattr(store, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1])
+    monkeypatch.setattr(columns, "read_columns", None)
+    monkeypatch.setattr(columns, "read_page", lambda *a: (asked.append(a[-2:]), page(*a))[1])
     answer = client_of().get("/api/series.csv", params={"camera": "rpi", "series": "M1"})
     assert len(answer.text.splitlines()) == 1201
     assert asked == [(-1, 100), *((after, 100) for after in range(100, 1201, 100))]

@@ -148,6 +148,22 @@ def test_three_points_are_too_few(tmp_path):
         renew_configuration(path, tc.load_camera(tmp_path / "model.yaml").at(20.0))
 
 
+@pytest.mark.parametrize(
+    ("gcps", "words"),
+    [({"src": [[1, 2]] * 5}, "gcps.src has 5 points and gcps.dst 8"),
+     ({"dst": [[5.9 + 1e-4 * k, 50.8, 138] for k in range(8)]}, "do X and Y hold degrees"),
+     (None, "'dst' is missing")],
+)  # fmt: skip
+def test_control_points_that_pyorc_would_not_take_are_said(tmp_path, gcps, words):
+    path, _ = configuration(tmp_path / "site.json")
+    document = json.loads(path.read_text())
+    document["gcps"] = {} if gcps is None else document["gcps"] | gcps
+    path.write_text(json.dumps(document))
+    with pytest.raises(DataError, match=words) as refused:
+        ControlPoints.read(path, "m")
+    assert str(refused.value).count(str(path)) == 1
+
+
 def river_camera() -> Camera:
     """The Geul's camera as pyorc solved it, known to a hundredth of its focal length."""
     document = json.loads((RIVER / "geul-pyorc.json").read_text())

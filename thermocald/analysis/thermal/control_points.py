@@ -189,7 +189,13 @@ def _from_json(path: Path) -> ControlPoints:
             return _from_pyorc(document, str(path))
         if isinstance(document, dict) and document.get("type") == "FeatureCollection":
             return _from_features(document, str(path))
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except DataError:
+        raise
+    except KeyError as error:
+        raise DataError(
+            f"{path}: is no sound JSON of control points: {error} is missing"
+        ) from error
+    except (TypeError, ValueError, IndexError) as error:
         raise DataError(f"{path}: is no sound JSON of control points: {error}") from error
     raise DataError(f"{path}: is neither pyorc's camera configuration (gcps) nor GeoJSON")
 
@@ -200,6 +206,10 @@ def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:
     image = np.array(gcps["src"], dtype=float)
     if points.ndim != 2 or points.shape[1] == 2:  # on the water
         points = np.column_stack([points, np.full(len(points), float(gcps["z_0"]))])
+    if len(image) != len(points):
+        raise DataError(
+            f"{where}: gcps.src has {len(image)} points and gcps.dst {len(points)}: each needs both"
+        )
     names = [f"gcp{i}" for i in range(len(points))]
     assumed = (
         f"{where} has no standard deviations: {_SURVEYED_MM:g} mm for coordinates and "

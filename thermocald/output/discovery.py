@@ -378,7 +378,7 @@ def _effect(effect: EffectFound) -> Section:
     ]  # fmt: skip
     if alike := dict.fromkeys(a["effect"] for a in effect.alternatives if a.get("resembles")):
         text.append(
-            f"Effects that merely resemble it: {', '.join(alike)}. None passes the absolute "
+            f"Effects that merely resemble it: {', '.join(alike)}. They do not pass the absolute "
             "test."
             + ("" if effect.term else " The smooth bridge in M1 does not transfer to another "
                "series.")

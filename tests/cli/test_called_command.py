@@ -9,8 +9,7 @@ import sys
 import pytest
 
 from tests.commands import call
-from thermocald.cli import _called
-from thermocald.cli.commands import COMMANDS, PANELS, command, group
+from thermocald.cli.commands import COMMANDS, PANELS
 
 _SAY = """
 import sys
@@ -26,8 +25,8 @@ except SystemExit:
 _MODULES = {f"thermocald.cli.{entry.module}" for entry in COMMANDS.values()}
 
 
-@pytest.mark.parametrize("words", [["run", "--help"], ["-v", "run", "--help"]])
-def test_the_others_are_not_imported(words):
+def test_the_others_are_not_imported():
+    words = ["-v", "run", "--help"]
     done = subprocess.run(
         [sys.executable, "-c", _SAY, *words], capture_output=True, text=True, check=True
     )
@@ -74,26 +73,3 @@ def test_options_for_experts_stand_apart():
     assert "--report" in usual
     assert "--window" in advanced
     assert "--window" not in usual
-
-
-@pytest.mark.parametrize(
-    ("words", "called"),
-    [
-        (["study", "x.db"], "study"),
-        (["--verbose", "testfield", "print"], "testfield"),
-        (["--help", "study"], ""),
-        (["--version"], ""),
-        (["stduy"], ""),
-        ([], ""),
-    ],
-)
-def test_the_called_one(words, called):
-    assert _called(words) == called
-
-
-def test_every_word_has_its_function():
-    for name, entry in COMMANDS.items():
-        if entry.group:
-            assert group(name).registered_commands, name
-        else:
-            assert (command(name).__doc__ or "").strip(), name

@@ -60,7 +60,7 @@ _HEADER = re.compile(
 )
 _HOOK = re.compile(  # whoever knows the address may send
     r"(?i)((?:hooks\.slack\.com/services|api\.telegram\.org/bot|discord(?:app)?\.com/api/webhooks"
-    r"|[\w.]*webhook\.office\.com/\w+|maker\.ifttt\.com/\S+/key)/?)[^\s'\"<>?]+"
+    r"|webhook\.office\.com/\w+|maker\.ifttt\.com/\S+/key)/?)[^\s'\"<>?]+"
 )
 _PEM = re.compile(r"(?s)(-----BEGIN [\w ]*PRIVATE KEY-----).*?(?=-----END|\Z)")
 _SHORTEST = 4  # a shorter one is part of too many words

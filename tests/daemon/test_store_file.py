@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.series import EpochResult
+from thermocald.store.series import EpochResult, Event
 
 
 @pytest.fixture
@@ -368,6 +369,37 @@ def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemo
     numbers, _ = daemon.stored()
     assert numbers == [r["epoch"] for r in daemon.results()] == list(range(1, len(numbers) + 1))
     assert "Traceback" not in daemon.log()
+
+
+@pytest.mark.parametrize(
+    "what",
+    [{"number": 2**64}, {"frame": Path("a\udcff.png")}, {"frame_time": float("nan")},
+     {"number": -5}],
+    ids=str,
+)  # fmt: skip
+def test_a_row_that_no_store_takes_is_lost_and_holds_up_none(guard, path, what):
+    epoch = replace(Epoch(4, 1e9 + 4, 1e9 + 4, {"t": 20.0}), **what)
+    assert not guard.append(Row(guard.all_series()[0], epoch, None, {}, True))
+    assert (guard.waiting, guard.lost) == (0, 1)
+    guard.keep(5)
+    assert guard.told[5]
+    assert numbers(path) == [1, 2, 3, 5]
+
+
+def test_an_event_that_quotes_the_name_of_a_file_holds_up_no_epoch(guard, path):
+    guard.event(Event(1.0, "x", "cannot write a\udcff.png"))
+    guard.keep(4)
+    assert numbers(path) == [1, 2, 3, 4]
+    assert [event.text for event in guard.stored_events()] == ["cannot write a\\udcff.png"]
+
+
+@pytest.mark.parametrize("name", ["x" * 249 + ".db", "x" * 300, "loop.db"])
+def test_a_name_that_is_none_is_refused_in_one_line(tmp_path, name):
+    if name == "loop.db":
+        (tmp_path / name).symlink_to(tmp_path / name)
+    with pytest.raises(StoreError) as told:
+        StoreGuard(tmp_path / name)
+    assert len(str(told.value).splitlines()) == 1
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ import numpy as np
 
 from thermocald.addresses import without_secrets
 from thermocald.errors import OutputError, StoreError, StoreFullError
-from thermocald.files import is_unmounted, make_folder, mount_point
+from thermocald.files import cannot_write, is_unmounted, make_folder, mount_point
 from thermocald.store.database.file import HELPERS, StoreFile, helper, read_wal_tail
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event
@@ -52,7 +52,12 @@ class FollowedStore:
         self._events = events
         self._durable = durable
         self._mount = mount_point(path)
-        self._open()
+        try:
+            self._open()
+        except OSError as error:  # a name that is too long for its helper files
+            if isinstance(error, StoreError):
+                raise
+            raise StoreError(str(cannot_write(path, error))) from error
 
     def _open(self) -> None:
         self._require_mount()
@@ -202,7 +207,8 @@ class FollowedStore:
 
 
 def _aside(path: Path) -> Path:
-    return helper(path, "wal-aside")
+    wal = helper(path, "wal")
+    return wal.with_name(f".{wal.name[:60]}.aside")
 
 
 def _device(path: Path) -> int:
@@ -447,7 +453,7 @@ class StoreGuard:
         if self.away or isinstance(error, StoreFullError) or not self._flush_events():
             return False
         try:
-            self.store.add_event(Event(self._waiting[0].epoch.frame_time, "row_refused", "probe"))
+            self.store.add_event(Event(time.time(), "row_refused", "probe"))
         except StoreError:
             return False
         return True
@@ -475,7 +481,8 @@ class StoreGuard:
         while self._events:
             try:
                 event = self._events[0]
-                self.store.add_event(replace(event, text=without_secrets(event.text)))
+                text = event.text.encode(errors="backslashreplace").decode()  # of a file's name
+                self.store.add_event(replace(event, text=without_secrets(text)))
             except StoreError as error:
                 log.debug("an event waits: %s", error)
                 return False

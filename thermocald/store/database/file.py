@@ -127,7 +127,7 @@ HELPERS = ("wal", "shm")
 
 def helper(path: Path, kind: str) -> Path:
     """Return the path of a store's -wal or -shm file: next to what a link leads to."""
-    return Path(f"{path.resolve()}-{kind}")
+    return Path(f"{os.path.realpath(path)}-{kind}")  # `resolve` raises RuntimeError for a loop
 
 
 def written_elsewhere(path: Path) -> bool:
@@ -191,7 +191,11 @@ def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]
         full = _name(cause).startswith(_NO_ROOM)
         kind = StoreFullError if full else StoreError
         raise kind(f"{path}: {doing}: {_advice(cause)}") from cause
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as cause:
+    except (
+        ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError,
+    ) as cause:  # fmt: skip
+        if not reading and isinstance(cause, UnicodeEncodeError | OverflowError):
+            raise StoreError(f"{path}: {doing}: {cause}") from cause
         if not reading:
             raise
         raise StoreError(f"{path}: {doing}: the store is damaged ({cause})") from cause

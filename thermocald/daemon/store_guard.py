@@ -55,8 +55,6 @@ class FollowedStore:
         try:
             self._open()
         except OSError as error:  # a name that is too long for its helper files
-            if isinstance(error, StoreError):
-                raise
             raise StoreError(str(cannot_write(path, error))) from error
 
     def _open(self) -> None:

@@ -38,6 +38,7 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
     "mount": audit_camera.mount,
     "calibrate": audit_camera.calibrate,
     "noise": audit_camera.noise,
+    "cameras": audit_camera.cameras,
     "survey": audit_field.survey,
     "online": audit_camera.online,
     "significance": audit_study.significance,

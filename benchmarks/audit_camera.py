@@ -15,7 +15,9 @@ from thermocald.photogrammetry.camera.camera_model import (
     CameraSpec,
     ExteriorOrientation,
     InteriorOrientation,
+    Sensor,
     project,
+    rotation,
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -34,14 +36,21 @@ NOISE_PX = 0.04
 class Scene:
     """A camera before a corner of 48 targets whose coordinates err as stated."""
 
-    def __init__(self, rng: np.random.Generator, sigma_mm: float, noise_px: float = NOISE_PX):
+    def __init__(
+        self, rng: np.random.Generator, sigma_mm: float, noise_px: float = NOISE_PX,
+        camera: str = "", depth: str = "corner",
+    ):  # fmt: skip
         self.rng, self.noise = rng, noise_px
         plain = corner_field("plain", per_side=4, pitch_mm=150.0)
         model = demonstration_model(plain)
         self.sensor = model.sensor
         self.iop, self.eop = model.interior.as_array(), model.exterior.as_array()
-        self.field = TestField.build(plain.names, plain.points, sigma_mm)
-        self.points = plain.points + sigma_mm * rng.standard_normal(plain.points.shape)
+        points = plain.points
+        if camera:
+            self.sensor, self.iop = _camera(*CAMERAS[camera])
+            points = _filled(self.sensor, self.iop, self.eop, depth, rng)
+        self.field = TestField.build(plain.names, points, sigma_mm)
+        self.points = points + sigma_mm * rng.standard_normal(points.shape)
 
     def observe(self, iop: Array, eop: Array, gross: float = 0.0) -> Observations:
         seen = project(self.sensor, iop, eop, self.points)
@@ -55,6 +64,83 @@ class Scene:
             self.sensor, self.field, observations, InteriorOrientation.from_array(self.iop),
             ExteriorOrientation.from_array(self.eop),
         )  # fmt: skip
+
+
+CAMERAS = {
+    '1/4", 62°': (3280, 2464, 0.00112, 62.0, -0.04),
+    "phone, 69°, fx/fy 1.003": (4000, 3000, 0.0014, 69.0, 0.03, 3e-3, 1e-3),
+    '1", 79°': (5472, 3648, 0.0024, 79.0, -0.03),
+    '1/4", 100°': (2592, 1944, 0.0014, 100.0, -0.03),
+    '1/2.3", 120°': (4000, 3000, 0.00155, 120.0, -0.02),
+}
+"""Width, height, pixel in mm, horizontal angle of view, k1 of OpenCV; C1, C2."""
+
+DEPTHS = ("corner", "sheet", "wall", "room")
+
+
+def _camera(
+    width: int, height: int, pitch: float, angle: float, k1: float, C1: float = 0.0, C2: float = 0.0
+) -> tuple[Sensor, Array]:
+    """A camera by its angle of view, its principal point a little beside the middle."""
+    sensor = Sensor(width, height, pitch)
+    c = 0.5 * width * pitch / np.tan(np.radians(0.5 * angle))
+    return sensor, InteriorOrientation(
+        c=c, x0=0.003 * width * pitch, y0=-0.004 * width * pitch, A1=k1 / c**2,
+        A2=0.1 * abs(k1) / c**4, B1=1e-4 / c, B2=-2e-4 / c, C1=C1, C2=C2,
+    ).as_array()  # fmt: skip
+
+
+def _filled(sensor: Sensor, iop: Array, eop: Array, depth: str, rng: np.random.Generator) -> Array:
+    """48 targets (48, 3) mm that fill the image, 1 m away and more: three walls that meet, a bent
+    sheet, one oblique wall, or anywhere in a room.
+    """
+    u, v = (
+        a.ravel() for a in np.meshgrid(np.linspace(-0.88, 0.88, 8), np.linspace(-0.85, 0.85, 6))
+    )
+    x, y = 0.5 * sensor.pixel_pitch * np.stack([u * sensor.width, v * sensor.height]) / iop[0]
+    third = np.cos((np.arctan2(y, x) - 0.5 * np.pi) % (2 * np.pi / 3) - np.pi / 3)
+    away = (
+        1000.0
+        * {
+            "corner": 1.0 / (1.0 + 1.4 * np.hypot(x, y) * third),
+            "sheet": (1.0 - 0.25 * u**2) / (1.0 + 0.3 * x),
+            "wall": 1.0 / (1.0 + 0.7 * x / np.abs(x).max()),
+            "room": rng.uniform(1.0, 2.5, len(x)),
+        }[depth]
+    )
+    rays = np.stack([x, y, -np.ones(len(x))], axis=1) * away[:, None]
+    return eop[3:] + rays @ rotation(eop[:3]).T
+
+
+def cameras(draws: int, rng: np.random.Generator) -> list[Row]:
+    """Cameras from 62° to 120° before four fields each, in series of 3 to 100 epochs."""
+    rows = []
+    for camera in CAMERAS:
+        off, change, level, refused = [], [], [], []
+        for depth in DEPTHS:
+            for k in range(max(draws // 8, 1)):
+                scene = Scene(rng, 0.01, camera=camera, depth=depth)
+                alone = scene.adjust(scene.observe(scene.iop, scene.eop))
+                if alone.ok:
+                    error = alone.values - np.concatenate([scene.iop, scene.eop])
+                    off.append((error / alone.sd)[[0, 1, 2, 13, 14, 15]])
+                else:
+                    refused.append(depth)
+                found, truth = _series(scene, (3, 10, 30, 100)[k % 4], 0.0, "series")
+                error = (found.values - truth)[:, :3]
+                sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
+                change.append((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
+                level.append(error.mean(axis=0) / np.sqrt(np.diag(found.level_covariance)[:3]))
+        print(f"({camera}: {len(refused)} epochs refused before {set(refused)})", file=sys.stderr)
+        rows += [
+            ratio("`replay`, daemon: an epoch", f"sd of c, x0, y0, X0, Y0, Z0; {camera}",
+                  "noise, the field's coordinates", np.array(off)),
+            ratio("`replay`, `study`: a series", f"sd of last − first; {camera}",
+                  "noise of both epochs", np.array(change)),
+            ratio("`replay`, `study`: a series", f"sd of the level; {camera}",
+                  "EOP and field, common to all epochs", np.array(level)),
+        ]  # fmt: skip
+    return rows
 
 
 def epoch(draws: int, rng: np.random.Generator) -> list[Row]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -38,11 +37,11 @@ NEAR = 35.0  # °C at which `predict` is asked
 
 def simulated(
     seed: int, effects: tuple[ModelEffect, ...] = (LAG,), epochs: int = 120, power: float = 9.0,
-    until: float = 500.0, series: str = "M1",
+    until: float = 500.0, series: str = "M1", begin: float = 80.0,
 ) -> Any:  # fmt: skip
-    """The camera of the preset, heated until some second, with effects of our choice."""
+    """The camera of the preset, heated between two seconds, with effects of our choice."""
     s = preset_simulation("rpi-v2.1-heating", seed=seed, series=series)
-    lamp = Course.steps([0, 80.0, until, 1e5], [0.0, power, 0.0])
+    lamp = Course.steps([0, begin, until, 1e5], [0.0, power, 0.0])
     programme = replace(s.programme, epochs=epochs, sources={"housing": lamp})
     return replace(s, model=replace(s.model, effects=effects), programme=programme)
 
@@ -119,25 +118,32 @@ def read_apart(s: Any, late: float, interval: float = 15.0, noise_k: float = 0.0
     )  # fmt: skip
 
 
+def switched(seed: int) -> Any:
+    """The camera without effects, its lamp switched at instants that no frame knows."""
+    begin, until = np.random.default_rng([seed, 9]).uniform(0.0, 10.0, 2)
+    return simulated(seed, (), begin=80.0 + begin, until=500.0 + until)
+
+
 def delay(draws: int, rng: np.random.Generator) -> list[Row]:
-    """A logger whose clock is wrong by up to 90 s, read every 15 s between the frames."""
-    shifts, rates, noise = [], [], []
-    for seed in _seeds(rng, draws):
-        s = simulated(seed, ())
-        late = float(rng.uniform(-90.0, 90.0))
-        f = fitted(read_apart(s, late), ModelEffect("time_offset", {"d": 0.0}))
-        shifts.append((f.model.effects[0].values["d"] + late) / f.model.sd("time_offset.d"))
-        rates.append(
-            [(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
-        )
-        noise.append(f.fitted["series"][0].thermometer_sd / 0.05)
-    print(f"(thermometer: {np.mean(noise):.2f} of its noise)", file=sys.stderr)
-    return [
-        ratio("`fit`", "sd of a clock's shift, ± 90 s; readings of 15 s, ± 0.05 K",
-              "noise of image and thermometer", np.array(shifts)),
-        ratio("`fit`", "sd of the rates of c, x0, y0 beside it",
-              "noise of image and thermometer", np.array(rates)),
-    ]  # fmt: skip
+    """A logger whose clock is wrong by up to 90 s, read between the frames, every 10 to 60 s."""
+    shifts, rates = [], []
+    for interval in (10.0, 15.0, 30.0, 60.0):
+        shift, rate = [], []
+        for seed in _seeds(rng, draws):
+            s = switched(seed)
+            late = float(rng.uniform(-90.0, 90.0))
+            source = read_apart(s, late, interval)
+            f = fitted(source, ModelEffect("time_offset", {"d": 0.0}))
+            shift.append((f.model.effects[0].values["d"] + late) / f.model.sd("time_offset.d"))
+            rate.append(
+                [(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
+            )
+        what = f"readings of {interval:g} s, ± 0.05 K"
+        shifts.append(ratio("`fit`", f"sd of a clock's shift, ± 90 s; {what}",
+                            "noise of image and thermometer", np.array(shift)))  # fmt: skip
+        rates.append(ratio("`fit`", f"sd of the rates of c, x0, y0 beside it; {what}",
+                           "noise of image and thermometer", np.array(rate)))  # fmt: skip
+    return shifts + rates
 
 
 def _seeds(rng: np.random.Generator, draws: int) -> list[int]:

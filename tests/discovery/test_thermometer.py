@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.thermal.thermometer import estimate_reading_noise, find_latent_times, smooth_channel
+from thermocald.thermal.thermometer import (
+    estimate_reading_noise,
+    find_curved_times,
+    find_latent_times,
+    smooth_channel,
+    thermometers,
+)
 
 
 def trajectory(t):
@@ -49,7 +55,8 @@ def test_kinks_get_a_latent_instant(readings):
 
 def test_course_is_closer_than_readings(readings):
     t, y = readings
-    c = smooth_channel(t, y, np.ones(len(t), bool), np.zeros(len(t), bool), 0.0625)
+    none = np.zeros(len(t), bool)
+    c = smooth_channel(t, y, np.ones(len(t), bool), none, none, 0.0625)
     assert np.std(c.trajectory - trajectory(t)) < 0.7 * np.std(y - trajectory(t))
     assert c.trajectory + c.deviation == pytest.approx(y)
 
@@ -58,7 +65,8 @@ def test_a_missing_reading_is_uncertain(readings):
     t, y = readings
     y = y.copy()
     y[50] = np.nan
-    c = smooth_channel(t, y, np.ones(len(t), bool), np.zeros(len(t), bool), 0.0625)
+    none = np.zeros(len(t), bool)
+    c = smooth_channel(t, y, np.ones(len(t), bool), none, none, 0.0625)
     assert c.deviation[50] == 0.0
     assert c.sd[50] > 2 * c.sd[100]
 
@@ -96,3 +104,45 @@ def test_kinks_between_sparse_readings_are_found():
     assert np.min(np.abs(latent - 200)) < 20
     assert np.min(np.abs(latent - 805)) < 20
     assert len(latent) < 8
+
+
+def test_the_noise_of_twenty_readings_with_two_kinks():
+    """Up to eight in seventeen third differences hold a kink: as a rule they are no noise."""
+    found = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        t = rng.uniform(0, 60) + 60.0 * np.arange(20)
+        kinked = 20 + 0.05 * np.clip(t - 200, 0, 600)
+        found.append(estimate_reading_noise(t, kinked + rng.normal(0, 0.05, 20), None))
+    assert 0.04 < np.median(found) < 0.09
+    assert np.mean(np.array(found) > 0.2) < 0.1
+
+
+def test_between_sparse_readings_the_temperature_follows_its_curve():
+    """Of a warm-up straight lines between readings of 30 s are too low by h²/12 T'' everywhere."""
+    # the sharpest intervals, at the begin, have unknown values of their own
+    t, fine = 30.0 * np.arange(15), np.arange(120.0, 420.0, 2.0)
+    y = trajectory(t + 300.0) + np.random.default_rng(5).normal(0, 0.001, 15)
+    c = thermometers(t, {"T": y}, {"T": None})[1]["T"]
+    straight = np.interp(fine, t, y) - trajectory(fine + 300.0)
+    curved = np.interp(fine, c.times, c.trajectory) - trajectory(fine + 300.0)
+    assert np.mean(straight) < -0.005
+    assert abs(np.mean(curved)) < 0.001
+
+
+def test_on_a_curve_nothing_is_unknown_but_the_readings():
+    t = 30.0 * np.arange(15)
+    y = trajectory(t + 300.0) + np.random.default_rng(5).normal(0, 0.02, 15)
+    c = thermometers(t, {"T": y}, {"T": None})[1]["T"]
+    on_curve = c.mixing.diagonal() == 0
+    weights = c.mixing.toarray()[on_curve]
+    assert on_curve.sum() >= 3 * 9  # the sharpest intervals have values of their own
+    assert weights[:, c.real].sum(axis=1) == pytest.approx(1.0)
+    assert not weights[:, ~c.real].any()
+    # as sharp as a reading, but for the ends, where there are two neighbours on one side
+    assert np.linalg.norm(weights, axis=1).max() < 1.1
+
+
+def test_frequent_readings_need_no_curve(readings):
+    t, y = readings
+    assert not len(find_curved_times(t, y, 0.0625))

@@ -288,7 +288,8 @@ def reduce_series(
     if source.noises is not None:
         noises = {name: source.noises[name][usable] for name in present}
     knots, instruments = thermometers(reading_times, present, source.resolutions, noises)
-    trajectory = instruments[reference].trajectory
+    # on a curve between two readings nothing was read
+    trajectory = instruments[reference].trajectory[instruments[reference].mixing.diagonal() > 0]
     trajectory = trajectory[np.isfinite(trajectory)]
     history = History(
         times,

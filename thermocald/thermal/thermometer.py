@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.normals import spread_windows
 
 if TYPE_CHECKING:
@@ -23,12 +24,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index
 
 _SMOOTHING = np.logspace(-1, 5, 19)
 _MOST_FOR_NOISE = 200_000  # readings, in a dozen runs
 _OFTEN_SHARP = 0.2  # share of the intervals above which bends are no kinks by themselves
 _KINK = 1.5  # times the usual bend that a kink then has
+_ALIKE = 0.75  # of the sharpest bend around: it may be this one's kink
+_STRAIGHT = 0.25  # of a reading's noise: what straight lines may miss in a series, root of the sum
+_PARTS = 4  # of an interval between two readings that a straight line does not carry
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +111,9 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
     if len(values) < 8:
         return max(float(floor), 1e-6)
     d = _third_differences(t, values)
-    kept = np.ones(len(d), dtype=bool)
+    # of few readings two kinks spoil four in ten, and a mean square would never be rid of them
+    spread = mad_sd(d)
+    kept = np.abs(d) <= 4.0 * spread if spread > 0.0 else np.ones(len(d), dtype=bool)
     scale = 0.0
     for _ in range(20):
         scale = float(np.sqrt(np.mean(d[kept] ** 2)))
@@ -151,9 +157,32 @@ def find_latent_times(times: Array, readings: Array, resolution: float | None) -
         return np.zeros(0)
     if sharp.mean() > _OFTEN_SHARP:  # it bends everywhere: a kink is where it bends most
         padded = np.pad(size, 2)
-        sharp &= size >= np.max([padded[k : k + len(size)] for k in range(5)], axis=0)
+        # at a reading it bends in both intervals alike, and noise says in which more
+        sharp &= size >= _ALIKE * np.max([padded[k : k + len(size)] for k in range(5)], axis=0)
         sharp &= size > _KINK * np.median(size[size > limit])
     return 0.5 * (t[:-1] + t[1:])[sharp]
+
+
+def find_curved_times(times: Array, readings: Array, resolution: float | None) -> Array:
+    """Find instants between two readings where the temperature follows its neighbours' curve.
+
+    A straight line lies below a warming that slows down, by a twelfth of h² T'' in the mean: little
+    in one interval, but it has one sign, and is a delay of h²/12τ in all. None where all lines
+    together miss less than a quarter of the noise of one reading; none beside a kink
+    (`find_latent_times`).
+    """
+    valid = np.isfinite(readings)
+    t, y = times[valid], readings[valid]
+    noise = estimate_reading_noise(t, y, resolution)
+    bend, limit = _measure_bends(t, y, noise)
+    smooth = np.ones(len(bend), dtype=bool)
+    smooth[np.searchsorted(t, find_latent_times(times, readings, resolution)) - 1] = False
+    missed = max(float(np.sum(bend[smooth] ** 2 - (limit / 3.0) ** 2)), 0.0) if len(t) > 3 else 0.0
+    if np.sqrt(missed) / 24.0 < _STRAIGHT * noise:
+        return np.zeros(0)
+    share = np.arange(1, _PARTS) / _PARTS
+    inside: Array = (t[:-1, None] + share * np.diff(t)[:, None])[smooth].ravel()
+    return inside
 
 
 def _measure_bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
@@ -175,15 +204,16 @@ def smooth_channel(
     readings: Array,
     own: NDArray[np.bool_],
     latent: NDArray[np.bool_],
+    curved: NDArray[np.bool_],
     resolution: float | None,
     noises: Array | None = None,
 ) -> Thermometer:
     """Smooth one column on knots: its times, its latent ones, and those of other columns (NaN),
     which carry nothing.
 
-    times (K,) s ascending, readings (K,) °C with NaN where missing; own, latent (K,): True where a
-    knot is a time at which this column was read, or a latent one of it; noises (K,) K: where
-    readings are means of many.
+    times (K,) s ascending, readings (K,) °C with NaN where missing; own, latent, curved (K,): True
+    where a knot is a time at which this column was read, a latent one of it, or one on the curve
+    through its neighbours; noises (K,) K: where readings are means of many.
     """
     from scipy.sparse import csr_array, lil_array
 
@@ -206,12 +236,16 @@ def smooth_channel(
         sd[missing] = (2.0 * noise + np.abs(np.gradient(smooth)))[~there]
     mixing = lil_array((len(times), len(times)))
     mixing.setdiag(np.ones(len(times)))
-    rows = np.flatnonzero(latent)
+    knot, rows = np.flatnonzero(own), np.flatnonzero(latent)
+    index = np.clip(np.searchsorted(t, times[rows]) - 1, 0, max(len(t) - 2, 0))
+    if curved.any():
+        sharp = np.isin(np.arange(len(t) - 1), index)
+        for row in np.flatnonzero(curved):
+            points, weights = _weigh_neighbours(t, times[row], sharp)
+            mixing[row, row], mixing[row, knot[points]] = 0.0, weights
+            trajectory[row] = weights @ smooth[points]
     if len(rows):
         bend, limit = _measure_bends(t, filled, noise)
-        index = np.searchsorted(t, times[rows]) - 1
-        index = np.clip(index, 0, len(t) - 2)
-        knot = np.flatnonzero(own)
         for row, i in zip(rows, index, strict=True):
             share = (times[row] - t[i]) / (t[i + 1] - t[i])
             mixing[row, knot[i]], mixing[row, knot[i + 1]] = 1 - share, share
@@ -226,6 +260,22 @@ def smooth_channel(
     return Thermometer(times, trajectory, deviation, sd, csr_array(mixing), own, noise)
 
 
+def _weigh_neighbours(t: Array, at: float, sharp: NDArray[np.bool_]) -> tuple[Index, Array]:
+    """Return the readings, two on either side, and their weights in the curve through them.
+
+    sharp (K - 1,): intervals across which no curve goes.
+    """
+    i = int(np.searchsorted(t, at)) - 1
+    first = i - 1 if i > 0 and not sharp[i - 1] else i
+    last = i + 2 if i + 2 < len(t) and not sharp[i + 1] else i + 1
+    points = np.arange(first, last + 1)
+    apart = t[points, None] - t[None, points]
+    np.fill_diagonal(apart, 1.0)
+    ratio = (at - t[None, points]) / apart
+    np.fill_diagonal(ratio, 1.0)
+    return points, np.prod(ratio, axis=1)
+
+
 def extend(channel: Thermometer) -> Thermometer:
     """Add knots before its begin and after its end, as uncertain as they are.
 
@@ -235,7 +285,7 @@ def extend(channel: Thermometer) -> Thermometer:
     """
     t = channel.times
     k = np.flatnonzero(np.isfinite(channel.trajectory))
-    step = float(np.median(np.diff(t[k])))
+    step = float(np.median(np.diff(t[channel.real])))
     before = -step * np.array([12.0, 6.0, 3.0, 0.5]) + t[0]
     after = step * np.array([0.5, 1.5, 3.0, 6.0, 12.0]) + t[-1]
     first = np.polyfit(t[k[:4]], channel.trajectory[k[:4]], 1)[0]
@@ -309,18 +359,24 @@ def thermometers(
         name: find_latent_times(times, r, resolutions.get(name)) if noises is None else np.zeros(0)
         for name, r in readings.items()
     }
-    knots, first = np.unique(np.concatenate([times, *latent.values()]), return_index=True)
+    curved = {
+        name: find_curved_times(times, r, resolutions.get(name)) if noises is None else np.zeros(0)
+        for name, r in readings.items()
+    }
+    between = [*latent.values(), *curved.values()]
+    knots, first = np.unique(np.concatenate([times, *between]), return_index=True)
     from_reading = first < len(times)
     channels = {}
     for name, r in readings.items():
         on_knots = np.full(len(knots), np.nan)
         on_knots[from_reading] = r[first[from_reading]]
-        own_latent = np.isin(knots, latent[name])
+        own_latent, own_curved = np.isin(knots, latent[name]), np.isin(knots, curved[name])
         known = None
         if noises is not None:
             known = np.full(len(knots), np.nan)
             known[from_reading] = noises[name][first[from_reading]]
-        own = from_reading & ~own_latent
-        channel = smooth_channel(knots, on_knots, own, own_latent, resolutions.get(name), known)
+        own = from_reading & ~own_latent & ~own_curved
+        resolution = resolutions.get(name)
+        channel = smooth_channel(knots, on_knots, own, own_latent, own_curved, resolution, known)
         channels[name] = extend(channel)
     return next(iter(channels.values())).times, channels

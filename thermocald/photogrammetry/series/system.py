@@ -276,7 +276,7 @@ class SeriesSystem:
     def _bounded(self, d_own: Array) -> Array:
         """The steps (E, p), shortened where they would move the image out of all proportion."""
         A = self.design.at.A[..., self.design.own]
-        reach = np.abs(d_own) @ np.abs(A).max(axis=(0, 1))
+        reach = np.abs(d_own) @ np.abs(A).max(axis=(0, 1), initial=0.0)
         far = np.flatnonzero(reach > _FARTHEST_PX)
         if len(far):
             px = np.abs(np.einsum("tkp,ep->etk", A, d_own[far]))

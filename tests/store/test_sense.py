@@ -351,7 +351,10 @@ def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_pat
     results[0].report(tmp_path / "study.html")
     results[2].report(tmp_path / "discovery.html")
     (tmp_path / "fit.html").write_text(render_certificate(results[1]))
-    pages = [(tmp_path / f"{kind}.html").read_text() for kind in ("study", "fit", "discovery")]
+    pages = [
+        (tmp_path / f"{kind}.html").read_text().replace("\xa0", " ")
+        for kind in ("study", "fit", "discovery")
+    ]
     for message in messages:
         for k, (result, page) in enumerate(zip(results, pages, strict=True)):
             (told,) = (text for text in result.as_dict()["doubts"] if message in text)

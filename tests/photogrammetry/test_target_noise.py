@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from thermocald.photogrammetry.epoch.snooping import limit_2d
-from thermocald.photogrammetry.series.target_noise import correlated_pairs, noise_ratios
+from thermocald.photogrammetry.series.target_noise import noise_ratios
 
 TARGETS = 150
 
@@ -59,47 +59,3 @@ def test_a_few_jumps_do_not_raise_a_targets_noise():
     residuals[3, :, 0] += 50.0
     after, _ = noise_ratios(residuals, weights, used, 1.0)
     assert np.median(np.abs(after / before - 1.0)) < 0.2
-
-
-def corners(rng, epochs, markers, correlation, unknowns):
-    """Residuals of markers' corners, and of coordinates that err together how much they do.
-
-    Two corners correlate along the edge that they share; unknowns: of each epoch, adjusted before.
-    """
-    T = 4 * markers
-    error = rng.standard_normal((epochs, T, 2))
-    for axis, first, second in ((0, 0, 1), (0, 2, 3), (1, 1, 2), (1, 3, 0)):
-        error[:, second::4, axis] *= np.sqrt(1.0 - correlation**2)
-        error[:, second::4, axis] += correlation * error[:, first::4, axis]
-    flat = error.reshape(epochs, -1)
-    base, _ = np.linalg.qr(rng.standard_normal((2 * T, unknowns)))
-    left = flat - flat @ base @ base.T
-    share = 1.0 - unknowns / (2 * T)
-    used = np.ones((epochs, T), dtype=bool)
-    return left.reshape(error.shape), used, np.arange(T) // 4, share
-
-
-@pytest.mark.parametrize("epochs", [10, 20, 39])
-@pytest.mark.parametrize("markers", [3, 8, 35])
-def test_corners_that_err_by_themselves_are_not_said_to_err_together(epochs, markers):
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        assert len(correlated_pairs(*corners(rng, epochs, markers, 0.0, 14))) == 0
-
-
-@pytest.mark.parametrize("epochs", [10, 20, 60])
-def test_few_epochs_show_that_corners_err_together(epochs):
-    """A marker's shift then varies by 0.3 of what independent corners leave.
-
-    Less is taken off than could be: n - 1 of n for the mean, and what few epochs leave unsure.
-    """
-    found = []
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        residuals, used, group, share = corners(rng, epochs, 35, -0.7, 14)
-        pairs = correlated_pairs(residuals, used, group, share)
-        mean = np.zeros((len(group), 2, 1))
-        mean[:, 0] = 1.0  # a shift in x, of every corner
-        weights = np.ones((1, len(group), 3))
-        found.append(1.0 + pairs.normal_matrices(weights, mean).item() / len(group))
-    np.testing.assert_allclose(np.mean(found), 1.0 - 0.7 * (1.0 - 1.0 / epochs), atol=0.06)

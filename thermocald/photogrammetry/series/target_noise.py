@@ -32,7 +32,6 @@ _ALIKE = 1e4  # degrees of freedom of targets that are all measured alike
 _MEDIAN_CHI2_1 = 0.4549
 _SIGNIFICANT = 4.0  # correlations of n pairs below 4/√n are noise: 6e-5 two-sided
 _FEWEST_PAIRS = 40
-_FEWEST_TOGETHER = 8  # epochs that show both of a pair, to count among all
 _LEAST_CORRELATION = 0.3
 _SMOOTH = 15  # epochs
 _FEWEST_RADII = 8  # targets
@@ -118,15 +117,14 @@ def correlated_pairs(
 
     residuals (E, T, 2) px; used (E, T); group (T,): what each target belongs to. In a group with a
     significant correlation every covariance counts, the small ones too: leaving them out would
-    understate the group's common error. Few epochs show no single correlation, but that there are
-    some: then all groups count. Without such groups the result is empty.
+    understate the group's common error. Without such groups the result is empty.
     """
     E = len(residuals)
     seen = np.repeat(used, 2, axis=1)
     v = np.where(seen, residuals.reshape(E, -1), 0.0)
     mean = v.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     v = np.where(seen, v - mean, 0.0)
-    found, shown, beyond, count = [], [], 0.0, 0
+    left, right, covariances = [], [], []
     for label in np.flatnonzero(np.bincount(group) > 1):
         targets = np.flatnonzero(group == label)
         columns = np.stack([2 * targets, 2 * targets + 1], axis=1).ravel()
@@ -138,21 +136,18 @@ def correlated_pairs(
         r = np.divide(covariance, scale, out=np.zeros_like(covariance), where=scale > 0)
         limit = np.maximum(_SIGNIFICANT / np.sqrt(np.maximum(n, 1.0)), _LEAST_CORRELATION)
         i, j = np.nonzero(np.triu(n > 0, 1))
-        shown.append(bool(((np.abs(r) > limit) & (n >= _FEWEST_PAIRS))[i, j].any()))
-        found.append((columns[i], columns[j], covariance[i, j]))
-        many = n[i, j] >= _FEWEST_TOGETHER
-        beyond += float(((n - 1.0) * r * r - 1.0)[i, j] @ many)
-        count += int(many.sum())
-    if E < _FEWEST_PAIRS:
-        # what the parameters take from the residuals makes them correlate too, by this at most
-        own = 0.5 * seen.sum() * (1.0 - redundancy_share) / redundancy_share
-        shown = [beyond - own > _SIGNIFICANT * np.sqrt(2.0 * count)] * len(found)
-    some = [pairs for pairs, here in zip(found, shown, strict=True) if here]
-    if not some:
+        if ((np.abs(r) > limit) & (n >= _FEWEST_PAIRS))[i, j].any():
+            left.append(columns[i])
+            right.append(columns[j])
+            covariances.append(covariance[i, j])
+    if not left:
         none = np.empty(0, dtype=np.int64)
         return CorrelatedPairs(none, none, np.empty(0))
-    left, right, covariances = (np.concatenate(each) for each in zip(*some, strict=True))
-    return CorrelatedPairs(left, right, covariances / redundancy_share)
+    return CorrelatedPairs(
+        np.concatenate(left),
+        np.concatenate(right),
+        np.concatenate(covariances) / redundancy_share,
+    )
 
 
 def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, float]:

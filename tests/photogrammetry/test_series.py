@@ -282,3 +282,23 @@ def test_what_the_perspective_knows_is_what_an_epoch_knows_by_itself():
     own = np.median(apart.sd[:, :3], axis=0)
     assert alike.perspective_sd[:3] == pytest.approx(own, rel=0.15)
     assert (alike.perspective_sd[:3] > 5 * np.median(alike.sd[:, :3], axis=0)).any()
+
+
+@pytest.mark.parametrize(("held", "moved"), [("C1", 2), ("C2", 1)])
+def test_what_a_held_affinity_does_to_the_level_is_said(held, moved):
+    """A camera with an affinity of 1e-4 that is not estimated; nothing else is wrong."""
+    field, truth = scene.corner_field(0.02), scene.INTERIOR.as_array()
+    values = replace(scene.INTERIOR, **{held: 1e-4}).as_array()
+    seen = project(scene.SENSOR, values, scene.EXTERIOR.as_array(), field.points)
+    observations = [
+        Observations(np.arange(len(seen)), seen, np.full(seen.shape, scene.SIGMA_PX))
+        for _ in range(12)
+    ]
+    r = adjust_series(scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR)
+    off = np.abs(r.values.mean(axis=0)[:3] - truth[:3])
+    assert off[moved] == pytest.approx(r.affinity_bias[moved], rel=0.1)
+    assert (off < r.affinity_bias[:3] + 0.1 * r.level_sd[:3]).all()
+    free = SeriesSettings(free=(*SeriesSettings().free, "C1", "C2"))
+    r = adjust_series(scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, free)
+    assert not r.affinity_bias.any()
+    assert abs(r.values.mean(axis=0)[moved] - truth[moved]) < 0.1 * off[moved]

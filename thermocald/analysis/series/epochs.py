@@ -24,6 +24,7 @@ from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.numbers import parameter_label, signed
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.series.covariances import AFFINITY
 from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
 from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.result import Result, document_of, jsonable, new_figure
@@ -258,6 +259,7 @@ class Epochs(Result):
             "noise_ratio": None if self.adjustment is None else self.adjustment.noise_ratio,
             "field_ratio": None if self.adjustment is None else self.adjustment.field_ratio,
             "outer_noise": _outer_noise(self.adjustment),
+            "held_affinity": _held_affinity(self.adjustment),
             "rejected": int(self.n_rejected.sum()),
             "left_out": list(self.left_out),
             "field_movements": [
@@ -310,6 +312,13 @@ class Epochs(Result):
             out.append(
                 "the outermost targets are as noisy as those in the image's middle times "
                 f"{outer['value']:.1f} ± {outer['sd']:.1f}; the weights follow that"
+            )
+        if held := document["held_affinity"]:
+            label, micrometres = parameter_label(held["parameter"]), 1e3 * held["level_mm"]
+            out.append(
+                f"C1 and C2 are held: an affinity of {AFFINITY:g} would move the level of {label} "
+                f"by {micrometres:.2f} µm, {held['sds']:.1f} of its standard deviations; "
+                "differences between epochs are not concerned"
             )
         if document["exterior_choice"]:
             out.append(f"--exterior {self.exterior}: {document['exterior_choice']}")
@@ -473,6 +482,19 @@ def _outer_noise(adjustment: SeriesAdjustment | None) -> dict[str, float] | None
     if not abs(value - 1.0) > max(3.0 * sd, _UNEVEN - 1.0):
         return None
     return {"value": value, "sd": sd}
+
+
+def _held_affinity(adjustment: SeriesAdjustment | None) -> dict[str, Any] | None:
+    """Return the parameter whose level a held affinity moves by most sds; None below one."""
+    if adjustment is None:
+        return None
+    sd = np.where(adjustment.level_sd > 0, adjustment.level_sd, np.inf)[: len(_DRAWN)]
+    sds = adjustment.affinity_bias[: len(_DRAWN)] / sd
+    worst = int(np.argmax(sds))
+    if not sds[worst] > 1.0:
+        return None
+    mm = float(adjustment.affinity_bias[worst])
+    return {"parameter": PARAMETER_NAMES[worst], "level_mm": mm, "sds": float(sds[worst])}
 
 
 def _imported(module: str) -> Any:

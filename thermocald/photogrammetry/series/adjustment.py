@@ -35,6 +35,7 @@ from thermocald.photogrammetry.series.covariances import (
     line_weights,
     of_common,
     of_correlated,
+    of_held_affinity,
     of_priors,
     of_slow_targets,
     stillness,
@@ -284,7 +285,7 @@ def result(found: Adjusted) -> SeriesAdjustment:
         np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
         _sds(by_perspective(system) * pooled), float(np.sqrt(series.field_variance)),
         _outer_noise(series, estimate),
-        _noise_ratio(sigma0, sound), movement, found.choice, slow, pairs,
+        _noise_ratio(sigma0, sound), of_held_affinity(system), movement, found.choice, slow, pairs,
     )  # fmt: skip
 
 

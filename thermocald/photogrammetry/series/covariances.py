@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS
+from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
 from thermocald.photogrammetry.series.normals import among_all, cofactors
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.system import SeriesSystem
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
+AFFINITY = 1e-4  # of a good lens: fx and fy of phones differ by 1e-4 to 3e-3
+C1, C2 = PARAMETER_NAMES.index("C1"), PARAMETER_NAMES.index("C2")
 _MOST_TAKEN_OFF = 0.6  # of the variance of a combination of parameters
 
 
@@ -137,6 +139,32 @@ def by_perspective(system: SeriesSystem) -> Array:
         N = system.N[system.good].mean(axis=0)[free[:, None], free]
         out[free] = np.diag(inverse_of_determined(N))
     return out
+
+
+def of_held_affinity(system: SeriesSystem) -> Array:
+    """How far the level (16,) lies off, at most, where an affinity or shear of `AFFINITY` is held.
+
+    The mean image of all epochs is adjusted with and without it; the targets' offsets take part.
+    """
+    design, A = system.design, system.design.at.A
+    out = np.zeros(16)
+    free = np.union1d(design.own, design.common)
+    weights = system.used(system.good).sum(axis=0)
+    seen = (weights[:, :2] > 0).all(axis=1)
+    V = np.linalg.inv(_full(weights[seen]))
+    if design.offset_prior is not None:
+        V += np.linalg.inv(_full(design.offset_prior[seen]))
+    W = np.linalg.inv(V)
+    N = np.einsum("tki,tkl,tlj->ij", A[seen], W, A[seen], optimize=True)
+    Q = inverse_of_determined(N[free[:, None], free])
+    for held in np.setdiff1d([C1, C2], free):
+        out[free] = np.maximum(out[free], np.abs(Q @ N[free, held]) * AFFINITY)
+    return out
+
+
+def _full(weights: Array) -> Array:
+    """Weights (T, 3) xx, yy, xy as matrices (T, 2, 2)."""
+    return np.stack([weights[:, [0, 2]], weights[:, [2, 1]]], axis=1)
 
 
 def of_common(system: SeriesSystem, covariance: Array) -> Array:

@@ -147,7 +147,8 @@ class SeriesAdjustment:
     has its own exterior orientation anyway; field_ratio: the standard deviations of the field's
     coordinates over those stated, 1 where no more are shown; outer_noise: noise of the outermost
     target over that in the image's middle, and its standard deviation; noise_ratio: the noise found
-    over the one stated; movement: of the mount; choice: how the exterior orientation was estimated
+    over the one stated; affinity_bias (16,): of the level, by an affinity of 1e-4 that is held
+    (`of_held_affinity`); movement: of the mount; choice: how the exterior orientation was estimated
     and why; slow (16, 16): covariance of a straight line from slow errors of targets; pairs: of
     coordinates that err together.
     """
@@ -171,6 +172,7 @@ class SeriesAdjustment:
     field_ratio: float = 1.0
     outer_noise: tuple[float, float] = (float("nan"), float("nan"))
     noise_ratio: float = 1.0
+    affinity_bias: Array = field(default_factory=lambda: np.zeros(16))
     movement: Movement = STILL
     choice: str = ""
     slow: Array = field(default_factory=lambda: np.zeros((16, 16)))

@@ -276,18 +276,15 @@ def ring_misfit(
     across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ u, axis=1)
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
     across, side = across.astype(np.float32), (angle * along).astype(np.float32)
-    radii = np.array(RADII)[:, None]
-    rho, outside, inside = (
-        each.astype(np.float32) for each in (radii, radii - RING_INNER, RING_OUTER - radii)
-    )
+    rho = np.array(RADII, dtype=np.float32)[:, None]
     misfit = np.full(len(level), np.inf)
     for blur in _BLURS_PX:
         left = np.nonzero(misfit > allowed_misfit(maps))[0]
         if len(left) == 0:
             break
         scale = (across[left] / np.float32(blur))[:, None]
-        drawn = normal_cdf(outside * scale)
-        drawn += normal_cdf(inside * scale)
+        drawn = normal_cdf((rho - np.float32(RING_INNER)) * scale)
+        drawn += normal_cdf((np.float32(RING_OUTER) - rho) * scale)
         drawn -= np.float32(1)
         drawn *= normal_cdf(rho * (side[left] / np.float32(blur))[:, None])
         misfit[left] = np.minimum(misfit[left], _rms_after_shift(level[left], drawn))

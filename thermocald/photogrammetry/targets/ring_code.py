@@ -273,9 +273,9 @@ def ring_misfit(
     angle = np.where(mine, angle, -angle) * (2 * np.pi / bits)
     u = _circle(ANGLES)
     # How many px a radius is: across the circles, and across a radial edge at that radius.
-    across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ u, axis=1)
+    px = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ u, axis=1)
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
-    across, side = across.astype(np.float32), (angle * along).astype(np.float32)
+    across, side = px.astype(np.float32), (angle * along).astype(np.float32)
     rho = np.array(RADII, dtype=np.float32)[:, None]
     misfit = np.full(len(level), np.inf)
     for blur in _BLURS_PX:

@@ -343,7 +343,7 @@ def _partials(
 
 
 def _normal_matrix(A: Array, covariance: Array) -> Array:
-    N: Array = np.sum(A.mT @ np.linalg.inv(covariance) @ A, axis=0)
+    N: Array = np.sum(np.swapaxes(A, -1, -2) @ np.linalg.inv(covariance) @ A, axis=0)
     return N
 
 

@@ -170,9 +170,9 @@ class Matching:
         flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, self.grey, np.ones_like(self.grey)]
         J = np.stack(flat, axis=-1).reshape(len(self.grey), self._weight.size, 8)
         weighted = J * self._weight.reshape(-1, 1)
-        N = np.linalg.pinv(weighted.mT @ J, rcond=1e-9, hermitian=True)
-        self._step = N @ weighted.mT
-        self._sandwich = (self._step @ self._step.mT)[:, :2, :2]
+        N = np.linalg.pinv(np.swapaxes(weighted, -1, -2) @ J, rcond=1e-9, hermitian=True)
+        self._step = N @ np.swapaxes(weighted, -1, -2)
+        self._sandwich = (self._step @ np.swapaxes(self._step, -1, -2))[:, :2, :2]
 
     def search(
         self, image: NDArray[Any], start: Array, reach: int, rows: NDArray[np.int64] | None = None
@@ -242,7 +242,7 @@ class Matching:
         scale = (r**2 @ weight) * (1 + 8 / max(freedom, 1.0))
         scale *= _correlated(r.reshape(n, *own.shape))
         A = p[:, 2:].reshape(-1, 2, 2)
-        covariance = A @ self._sandwich[rows] @ A.mT * scale[:, None, None]
+        covariance = A @ self._sandwich[rows] @ np.swapaxes(A, -1, -2) * scale[:, None, None]
         return Matched(p[:, :2].copy(), covariance + _INTERPOLATED_PX**2 * np.eye(2), reasons)
 
 

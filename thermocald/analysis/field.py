@@ -23,6 +23,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     partials,
 )
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.geometry import (
     GeometryBounds,
     image_coverage,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
-FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
+FREE = DEFAULT_FREE
 """The interior parameters whose standard deviations are predicted."""
 _USED = [PARAMETER_NAMES.index(name) for name in (*FREE, *EOP_NAMES)]
 CELLS = (4, 3)

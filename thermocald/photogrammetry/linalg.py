@@ -118,6 +118,14 @@ def inverse_of_determined(N: Array) -> Array:
     return inverse
 
 
+def inverse_2x2(M: Array) -> Array:
+    """Inverses of matrices (n, 2, 2): numpy's decompositions take ten times as long."""
+    a, b, c, d = (M[:, i, k] for i in (0, 1) for k in (0, 1))
+    adjugate = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
+    inverse: Array = adjugate / (a * d - b * c)[:, None, None]
+    return inverse
+
+
 def stacked_inverses(N: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Inverse of each symmetric matrix (E, p, p), and which could be inverted (E,).
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PARAMETER_NAMES
-from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
+from thermocald.photogrammetry.linalg import inverse_2x2, inverse_of_determined, root_of
 from thermocald.photogrammetry.series.normals import among_all, cofactors
 
 if TYPE_CHECKING:
@@ -151,10 +151,10 @@ def of_held_affinity(system: SeriesSystem) -> Array:
     free = np.union1d(design.own, design.common)
     weights = system.used(system.good).sum(axis=0)
     seen = (weights[:, :2] > 0).all(axis=1)
-    V = np.linalg.inv(_full(weights[seen]))
+    V = inverse_2x2(_full(weights[seen]))
     if design.offset_prior is not None:
-        V += np.linalg.inv(_full(design.offset_prior[seen]))
-    W = np.linalg.inv(V)
+        V += inverse_2x2(_full(design.offset_prior[seen]))
+    W = inverse_2x2(V)
     N = np.einsum("tki,tkl,tlj->ij", A[seen], W, A[seen], optimize=True)
     Q = inverse_of_determined(N[free[:, None], free])
     for held in np.setdiff1d([C1, C2], free):

@@ -34,9 +34,9 @@ import numpy as np
 
 from thermocald.arrays import Array, Image, Single, scratch
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.photogrammetry.linalg import scaled_solve
+from thermocald.photogrammetry.linalg import inverse_2x2, scaled_solve
 from thermocald.photogrammetry.targets.frame_status import NoiseModel, estimate_noise
-from thermocald.photogrammetry.targets.outline import LocalMap, Windows, inverse_2x2, windows
+from thermocald.photogrammetry.targets.outline import LocalMap, Windows, windows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

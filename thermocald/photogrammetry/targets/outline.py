@@ -26,6 +26,7 @@ import numpy as np
 
 from thermocald.arrays import Array, Image, Single, scratch
 from thermocald.photogrammetry.camera.camera_model import Sensor, project
+from thermocald.photogrammetry.linalg import inverse_2x2
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -83,14 +84,6 @@ class LocalMap:
         """Half width and height (n, 2) px of the ellipses' bounding boxes."""
         extent: Array = np.linalg.norm(self.linear, axis=2)
         return extent
-
-
-def inverse_2x2(M: Array) -> Array:
-    """Inverses of matrices (n, 2, 2): numpy's decompositions take ten times as long."""
-    a, b, c, d = (M[:, i, k] for i in (0, 1) for k in (0, 1))
-    adjugate = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
-    inverse: Array = adjugate / (a * d - b * c)[:, None, None]
-    return inverse
 
 
 def facing(centre: Array, points: Array, normals: Array) -> tuple[Array, Array]:

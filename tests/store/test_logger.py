@@ -329,7 +329,8 @@ def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_
     [
         *((head, "degF") for head in (
             "(F)", "T °F", "degF", "TempF", "[F]", "tempf", "temp_f", "Temperature, F", "Temp. (F)",
-            "deg. F", "Degrees F", "T ℉", "TºF", "Fahrenheit", "housing_f", "T_degF")),
+            "deg. F", "Degrees F", "T ℉", "TºF", "Fahrenheit", "housing_f", "T_degF", "T1 F°",
+            "Temp (Fahr.)", "Temp Farenheit", "degrees-f", "T (F, mean)", "温度(华氏)")),
         *((head, "degC") for head in (
             "Celsius(°C)", "Temperatur[°C]", "TempC", "温度(℃)", "T_degC")),
         *((head, "K") for head in ("T [K]", "kelvin", "degK", "(K)", "housing_k")),
@@ -385,6 +386,8 @@ def test_a_name_that_cannot_be_given_is_refused(tmp_path, name, words):
         "Date Time,Temperature, F",
         "Date Time,Temperature,°F",
         "Station,Turm\nDate Time,Temperature, F",
+        "Unit: °F\nDate Time,Temp",
+        "F°,06/14/2026 12:00,70.2,75.2\nDate Time,Temp (F°)",
     ],
 )
 def test_the_unit_is_found_in_any_head(tmp_path, head):
@@ -396,3 +399,12 @@ def test_the_unit_is_found_in_any_head(tmp_path, head):
         path, LogOptions(clock=DeviceClock(zone=time_zone("UTC")))
     ).channels.values()
     assert values == pytest.approx((np.arange(70.25, 76) - 32) / 1.8)
+
+
+def test_a_column_of_units_and_numbers_that_commas_cut(tmp_path):
+    """°F without its column's name is read as °C, and 21,5 cut at its comma as 21."""
+    data = "Time,Temp,Temp Unit\n2026-06-14 12:00,34.7,F°\n2026-06-14 12:01,35.15,F°\n"
+    (values,) = logged(tmp_path, data).channels.values()
+    assert values == pytest.approx([1.5, 1.75])
+    with pytest.raises(DataError, match="line 2: the rows hold more fields than the head"):
+        logged(tmp_path, PLAIN.replace("21.", "21,"))

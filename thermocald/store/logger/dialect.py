@@ -31,11 +31,12 @@ UNITS = ("degC", "K", "degF")
 
 _LETTERS = {"c": "degC", "k": "K", "f": "degF"}
 _STATED = re.compile(
-    r"(?:°|º|˚|(?<![^\W\d_])deg(?:rees?|\.)?|(?<![^\W\d_])grad)[\s_]*(?P<degree>[CFK])(?![^\W\d_])"
-    r"|[(\[{]\s*(?P<bracket>[CFK])\s*[)\]}]"
-    r"|(?P<word>celsius|fahrenheit|kelvin)"
-    r"|(?P<sign>[℃℉])"
-    r"|temp(?:eratur[ae]?)?[\s_./-]*(?P<temp>[CFK])(?![^\W\d_])"
+    r"(?:°|º|˚|(?<![^\W\d_])deg(?:rees?|\.)?|(?<![^\W\d_])grad)[\s_-]*(?P<degree>[CFK])(?![^\W\d_])"
+    r"|(?<![^\W\d_])(?P<before>[CFK])\s?[°º˚]"
+    r"|[(\[{<]\s*[o*]?(?P<bracket>[CFK])\.?\s*[)\]}>,]"
+    r"|(?P<word>celsius|f\w?[ah]r?h?r?[ae]n?h?ei[td]|fahr(?![^\W\d_])|kelvin)"
+    r"|(?P<sign>[℃℉])|(?P<chinese>[华華]氏)"
+    r"|temp(?:eratur[ae]?)?[\s_./:-]*(?P<temp>[CFK])(?![^\W\d_])"
     r"|[_,/]\s*(?P<tail>[CFK])$",
     re.IGNORECASE,
 )
@@ -53,6 +54,8 @@ def stated_unit(text: str) -> str | None:
     kind, value = next((k, v.lower()) for k, v in found.groupdict().items() if v)
     if kind == "sign":
         return "degC" if value == "℃" else "degF"
+    if kind == "chinese":
+        return "degF"
     return _LETTERS[value[0]]
 
 
@@ -86,6 +89,7 @@ _CONSISTENT = 0.8
 _PREAMBLE = 12
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+\s*[^\d\s.,:]{0,4}")
 _POINT_NUMBER = re.compile(r"[+-]?\d+\.\d+\s*[^\d\s.,:]{0,4}")
+_CUT = re.compile(r"[+-]?\d+;\d+")  # one number, cut at its decimal comma
 _BARE_UNIT = re.compile(r"[°º]?\s*[CFK]|℃|℉|deg\s?[CFK]|%", re.IGNORECASE)
 _READING = re.compile(
     r"(?:[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?\s*(?:[°º]?\s*[CFK]|℃|℉|deg\s?[CF]|%)?)?"
@@ -98,7 +102,8 @@ _READING = re.compile(
 class LoggerFile:
     """A table in a file: the names of its columns, and what was found out about it.
 
-    first_line: that of the first row; sample: some rows, from its beginning and its end.
+    first_line: that of the first row; sample: some rows, from its beginning and its end; above: the
+    lines above the head.
     """
 
     path: Path
@@ -108,6 +113,7 @@ class LoggerFile:
     separator: str
     decimal: str
     sample: tuple[tuple[str, ...], ...]
+    above: tuple[str, ...] = ()
 
     @property
     def description(self) -> str:
@@ -160,10 +166,26 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             f"{path}: no row holds a time and a number; is it a log of temperatures? Separator and "
             "decimal mark can be given (--separator ';' --decimal ',')"
         )
-    names = _names([row for _, row in start[:first]], width)
+    head = [row for _, row in start[:first]]
+    above = tuple(" ".join(row) for row in head)
+    # what stood there were statistics, where another head follows
+    for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
+        if start[i][1] not in head and _is_head(start[i][1]) and _is_data(start[i + 1][1]):
+            head, first = [start[i][1]], i + 1
+    names = _names(head, width)
     rows = tuple(tuple(_fitted(row, len(names))) for _, row in start[first:] + last)
     found = decimal or _decimal(rows, mark)
-    return LoggerFile(path, names, start[first][0], encoding, mark, found, rows)
+    ends = [";".join(row[-2:]) for row in rows if row[-1]]
+    if mark == "," and head and len(head[-1]) < width and ends and all(map(_CUT.fullmatch, ends)):
+        raise DataError(
+            f"{path}, line {start[first][0]}: the rows hold more fields than the head: do commas "
+            "stand in the numbers and between the columns? Write either another way"
+        )
+    return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above)
+
+
+def _is_head(row: list[str]) -> bool:
+    return not _is_data(row) and any(map(TIME_NAME.search, row))
 
 
 def _parsed(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
@@ -244,7 +266,8 @@ def _separator(path: Path, lines: list[str]) -> str:
             return mark
     raise DataError(
         f"{path}: no separator ({', '.join(SEPARATORS.values())}) cuts it into rows with a time "
-        "and a number each; say --separator"
+        f"and a number each, as in {sample[-1].strip()[:60]!r}; say --separator, or write times "
+        "and numbers another way"
     )
 
 

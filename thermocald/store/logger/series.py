@@ -142,7 +142,8 @@ def _overlap(frames: Array, log: Array) -> None:
     raise DataError(
         f"photographs ({iso(frames[0])} to {iso(frames[-1])}) and log ({iso(log[0])} to "
         f"{iso(log[-1])}) lie {gap / 3600:.1f} h apart: is a time zone wrong (--camera-timezone, "
-        "--log-timezone), or a clock (--camera-clock, --log-clock)?"
+        "--log-timezone), or a clock (--camera-clock, --log-clock)"
+        + (", or are years written with two figures?" if gap > 3e7 else "?")
     )
 
 

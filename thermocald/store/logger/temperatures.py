@@ -53,7 +53,7 @@ _TEMPERATURE_NAME = re.compile(
 )
 _OTHER_NAME = re.compile(
     r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|\bnr\b|index|count|record|lux|light|dew|taupunkt"
-    r"|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
+    r"|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
     # what a thermometer is to show, not what it shows
     r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
     r"|temp\w*[ _]?set|soll|consigne|desired|target|wanted|nominal|reference value|forecast"
@@ -65,6 +65,9 @@ _MEAN = re.compile(r"(?<![^\W_])(?:avg|mean)(?![^\W_])", re.IGNORECASE)
 _HEADER_ZONE = re.compile(r"(?:GMT|UTC)\s*[+-]\s*\d{1,2}(?::?\d{2})?", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
+_UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
+_ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
+"""Lines above a table that speak of its unit."""
 _LABEL = "entity_id"
 """Home Assistant writes all sensors below one another, each row with its name."""
 _NO_READING = {-127.0, -999.0, -9999.0, -99.0, 9999.0}
@@ -584,10 +587,12 @@ def _unit(table: _Table, name: str) -> tuple[str | None, str]:
         if unit:
             found.setdefault(unit, "each reading")
     for column in file.names:
-        if column.lower() in ("unit", "units", "einheit", "unit_of_measurement"):
+        if _UNIT_NAME.search(column):
             for text in set(file.column(column)):
                 if unit := stated_unit(f"({text})") or stated_unit(text):
                     found.setdefault(unit, f"the column {column!r}")
+    if not found and any(map(_ABOVE.search, file.above)):
+        return "degF", "a line above the table"
     if len(found) > 1:
         raise DataError(
             f"{file.path}, column {name!r}: is {' and '.join(found)} at once; say which with --unit"

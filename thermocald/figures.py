@@ -408,7 +408,7 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
     with drawing_style():
         n = len(names)
         short = [shortened(name, 18) for name in names]
-        size = 1.4 + 0.42 * n
+        size = 1.3 + 0.31 * n
         drawing = new_drawing(size, size)
         axis = drawing.subplots()
         axis.set_facecolor("#dddddd")

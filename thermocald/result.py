@@ -72,7 +72,7 @@ class Result(ABC):
 
 
 def new_figure(
-    rows: int, columns: int = 1, panel: tuple[float, float] = (7.0, 2.2)
+    rows: int, columns: int = 1, panel: tuple[float, float] = (5.0, 2.0)
 ) -> tuple[Figure, Any]:
     """Make a figure of matplotlib and its axes (rows, columns), which no window and no state knows.
 

@@ -94,6 +94,16 @@ _CUT = """() => [...document.querySelectorAll('svg text')].filter(t => {
 # Tables that go on beyond the page.
 _SCROLLED = """() => [...document.querySelectorAll('.scroll')]
   .filter(e => e.scrollWidth > e.clientWidth + 1).map(e => e.getAttribute('aria-label'))"""
+# Drawings that must be dragged sideways, and letters too small to read on a phone.
+_DRAGGED = """() => [...document.querySelectorAll('.panel')].filter(p =>
+  p.scrollWidth > p.clientWidth + 1
+  || p.querySelector('svg')?.getBoundingClientRect().right > innerWidth)
+  .map(p => p.closest('figure').id)"""
+_SMALL = """() => [...document.querySelectorAll('.panel svg')].filter(svg => {
+  const scale = svg.getBoundingClientRect().width / svg.viewBox.baseVal.width;
+  return [...svg.querySelectorAll('text')]
+    .some(t => scale * parseFloat(getComputedStyle(t).fontSize) < 6.5); })
+  .map(svg => svg.getAttribute('aria-label'))"""
 _WIDER = """width => [...document.querySelectorAll('body *')]
   .filter(e => !e.closest('.scroll, svg, .panel'))
   .filter(e => e.getBoundingClientRect().right > width + 1)
@@ -303,6 +313,8 @@ def test_a_report_as_a_page(name, page_text, open_page):
         page = open_page(html, width)
         assert _faults(page, width) == NONE
         keep(page, f"{name}-{width}")
+        if width == 390:
+            assert (page.evaluate(_DRAGGED), page.evaluate(_SMALL)) == ([], [])
         if width == 1280 and name != "study-names":
             assert page.evaluate(_SCROLLED) == []
     page = open_page(html, 794)  # A4 at 96 px per inch

@@ -222,7 +222,7 @@ def _drawing(
     mean, spread = 1e3 * of_type["value"], 1e3 * BAND * of_type["sd_between"]
     labelled = len(found) <= _MOST_LABELLED
     with drawing_style():
-        drawing = new_drawing(7.0, 0.9 + (0.2 if labelled else 0.05) * len(found))
+        drawing = new_drawing(5.0, 0.9 + (0.2 if labelled else 0.05) * len(found))
         axis = drawing.subplots()
         axis.axvspan(mean - spread, mean + spread, color=PALETTE[0], alpha=0.12, lw=0)
         axis.axvline(mean, color=PALETTE[0], lw=1)
@@ -231,7 +231,7 @@ def _drawing(
                           color=PALETTE[1] if odd else "#333333")  # fmt: skip
         axis.set_yticks(
             range(len(found)) if labelled else [],
-            [shortened(specimen, 26) for *_, specimen, _ in found] if labelled else [],
+            [shortened(specimen, 22) for *_, specimen, _ in found] if labelled else [],
         )
         axis.grid(visible=False, axis="y")
         label_axes(axis, f"{parameter_label(rate)} in µm/K")

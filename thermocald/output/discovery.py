@@ -277,21 +277,22 @@ def _bars(groups: list[tuple[float, list[tuple[str, float, str]]]], label: str) 
     """Draw bars (name, px, colour) in groups, each against its noise, px."""
     bars = [bar for _, group in groups for bar in group]
     with drawing_style():
-        drawing = new_drawing(9.0, 0.9 + 0.3 * len(bars) + 0.1 * len(groups))
+        drawing = new_drawing(5.0, 0.9 + 0.4 * len(bars) + 0.1 * len(groups))
         axis = drawing.subplots()
-        ticks, place = [], 0.0
+        place = 0.0
         for k, (noise, group) in enumerate(groups):
-            first = place
-            for _, length, colour in group:
-                axis.barh(place, length, 0.7, color=colour)
-                axis.annotate(f"{length:.3f}", (length, place), (4, 0), fontsize=8,
+            for j, (name, length, colour) in enumerate(group):
+                axis.annotate(shortened(name, 60), (0.0, place), (2, 3), fontsize=8,
+                              textcoords="offset points")  # fmt: skip
+                axis.barh(place - 0.2, length, 0.4, color=colour)
+                axis.annotate(f"{length:.3f}", (length, place - 0.2), (4, 0), fontsize=8,
                               textcoords="offset points", va="center")  # fmt: skip
-                ticks.append(place)
+                axis.plot([noise, noise], [place - 0.45, place + 0.05], ":", color="black", lw=1.5,
+                          label="" if j or k else "noise")  # fmt: skip
                 place -= 1.0
-            axis.plot([noise, noise], [first + 0.5, place + 0.5], "--", color=GREY, lw=1.2,
-                      label="" if k else "noise")  # fmt: skip
-            place -= 0.4
-        axis.set_yticks(ticks, [shortened(name, 40) for name, *_ in bars])
+            place -= 0.2
+        axis.set_ylim(place + 0.5, 0.6)
+        axis.set_yticks([])
         axis.set_xlim(0.0, 1.12 * max(length for _, length, _ in bars))
         axis.grid(visible=False, axis="y")
         label_axes(axis, label)
@@ -319,7 +320,7 @@ def gap_figure(d: Discovery) -> Figure:
         "gaps",
         "The gap",
         "Measured minus simulated image points, with and without what was found, against the noise "
-        "of an image coordinate (dashed). The constants are those of M1 throughout.",
+        "of an image coordinate (dotted). The constants are those of M1 throughout.",
         drawing=_bars(groups, "gap between model and measurement in px RMS"),
     )
 
@@ -412,7 +413,7 @@ def _noise_test(d: Discovery) -> Section:
     names = x.best.names[len(x.base.terms) :]
     tests = list(zip(names, x.surrogates, strict=False))
     with drawing_style():
-        drawing = new_drawing(9.0, 0.4 + 1.7 * len(tests))
+        drawing = new_drawing(5.0, 0.4 + 1.7 * len(tests))
         axes = np.atleast_1d(drawing.subplots(len(tests), 1))
         for axis, (name, test) in zip(axes, tests, strict=True):
             _draw_surrogates(axis, name, test)
@@ -468,7 +469,7 @@ def _candidates(d: Discovery) -> Section:
         "candidates",
         "The candidates, each alone",
         f"What the base model with one effect more leaves of M1. {'Blue: named. ' if best else ''}"
-        "The dashed line is the noise, below which nothing can be explained.",
+        "The dotted line is the noise, below which nothing can be explained.",
         drawing=_bars([(noise, bars)], "left on M1 in px RMS"),
     )
     items = tuple((name, _why(d, name, s, left, noise)) for name, s, left in rows)
@@ -532,7 +533,7 @@ def _misfit_matrix(d: Discovery) -> Figure:
     a = d.examination.base_adequacy[0]
     scores = np.maximum(np.abs(a.scores[:, ::-1]), 1e-3)
     with drawing_style():
-        drawing = new_drawing(9.0, 3.0)
+        drawing = new_drawing(5.0, 3.0)
         axis = drawing.subplots()
         image = axis.pcolormesh(scores, cmap="magma_r", norm="log")
         axis.grid(visible=False)

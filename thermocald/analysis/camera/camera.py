@@ -228,7 +228,7 @@ class Camera(Result):
 
     def plot(self) -> Figure:
         """Draw what the distortion does to a grid of image points, px."""
-        figure, axes = new_figure(1, panel=(6.0, 4.5))
+        figure, axes = new_figure(1, panel=(5.0, 3.75))
         axis = axes[0, 0]
         width, height = self.sensor.width, self.sensor.height
         u, v = np.meshgrid(np.linspace(0, width - 1, 25), np.linspace(0, height - 1, 19))

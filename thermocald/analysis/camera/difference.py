@@ -142,7 +142,7 @@ class CameraDifference(Result):
     def plot(self) -> Figure:
         """Draw by how much each direction is seen elsewhere, enlarged, over the image."""
         sensor = self.first.sensor
-        figure, axes = new_figure(1, 1, (7.0, 7.0 * sensor.height / sensor.width))
+        figure, axes = new_figure(1, 1, (5.0, 5.0 * sensor.height / sensor.width))
         axis = axes[0, 0]
         every = np.arange(_GRID**2).reshape(_GRID, _GRID)[::2, ::2].ravel()
         arrows = axis.quiver(*self._grid[every].T, *self.shifts[every].T, angles="xy", width=0.002)

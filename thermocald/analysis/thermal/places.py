@@ -231,7 +231,7 @@ class Places(Result):
         return lines
 
     def plot(self) -> Figure:
-        figure, axes = new_figure(1, panel=(6.0, 4.0))
+        figure, axes = new_figure(1, panel=(5.0, 3.4))
         ax = axes[0, 0]
         x, y = self.points.T[:2]
         ax.errorbar(x, y, BAND * self.sd[:, 1], BAND * self.sd[:, 0], "o")

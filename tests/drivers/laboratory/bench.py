@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from tests.drivers.fakes.sysfs import Sysfs
 from thermocald.hal import Clock, VirtualClock
 
 if TYPE_CHECKING:
@@ -28,6 +30,43 @@ class Bench:
     unplug: Callable[[], None]
     plug: Callable[[], None]
     clock: Clock = field(default_factory=VirtualClock)
+
+
+def on_loopback(server, options: dict[str, Any], clock: type[Clock] = VirtualClock):
+    """The laboratory of an output to a server on loopback; unplugging stops it."""
+
+    @contextmanager
+    def output(tmp_path, monkeypatch):
+        running = [server()]
+        port = running[0].port
+        yield Bench(
+            {"port": port, **options},
+            unplug=running[0].close,
+            plug=lambda: running.append(server(port)),
+            clock=clock(),
+        )
+        running[-1].close()
+
+    return output
+
+
+def on_sysfs(attach, options: dict[str, Any]):
+    """The laboratory of a sensor in a sysfs tree; unplugging makes its folder vanish.
+
+    attach: (tree, 0 or 1 the second time) → the folder.
+    """
+
+    @contextmanager
+    def thermometer(tmp_path, monkeypatch):
+        tree = Sysfs(tmp_path)
+        folder = attach(tree, 0)
+        yield Bench(
+            {"sysfs": str(tmp_path), **options},
+            unplug=lambda: shutil.rmtree(folder),
+            plug=lambda: attach(tree, 1),
+        )
+
+    return thermometer
 
 
 def on_i2c(chip_name: str):

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from tests.drivers.laboratory.bench import Bench
+from tests.drivers.small_camera import write_small_camera
 from thermocald.hal import VirtualClock
 
 
@@ -21,4 +22,11 @@ def _mock(tmp_path, monkeypatch):
     )
 
 
-camera = thermometer = output = _mock
+@contextmanager
+def camera(tmp_path, monkeypatch):
+    with _mock(tmp_path, monkeypatch) as bench:
+        bench.options["model"] = str(write_small_camera(tmp_path / "small.thermal.yaml"))
+        yield bench
+
+
+thermometer = output = _mock

@@ -21,6 +21,7 @@ __all__ = [
     "address",
     "cluster",
     "count",
+    "execute",
     "field",
     "filled",
     "head",
@@ -38,12 +39,18 @@ def address(server: Server, query: str = "", **given: str) -> ServerAddress:
     return ServerAddress.parse(server.address(query, name="thermocald", **given))
 
 
-def count(server: Server, table: str) -> int:
-    """The rows of a table of the database `thermocald`."""
+def execute(server: Server, statement: str, *values: object) -> list[tuple]:
+    """What a statement gives in the database `thermocald`."""
     import psycopg
 
     with psycopg.connect(server.address(name="thermocald")) as connection:
-        return connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
+        cursor = connection.execute(statement, values or None)
+        return cursor.fetchall() if cursor.description else []
+
+
+def count(server: Server, table: str) -> int:
+    """The rows of a table of the database `thermocald`."""
+    return execute(server, f"SELECT count(*) FROM {table}")[0][0]
 
 
 def _programs() -> Path | None:
@@ -141,7 +148,21 @@ def server(cluster, template):
     return cluster
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
+def role(server):
+    """The name of a role that may log in, with the password `berry`, and nothing else."""
+    import psycopg
+
+    with psycopg.connect(server.address(), autocommit=True) as connection:
+        connection.execute("DROP ROLE IF EXISTS pi")
+        connection.execute("CREATE ROLE pi LOGIN PASSWORD 'berry'")
+    yield "pi"
+    with psycopg.connect(server.address(name="thermocald"), autocommit=True) as connection:
+        connection.execute("DROP OWNED BY pi")
+        connection.execute("DROP ROLE pi")
+
+
+@pytest.fixture(scope="session")
 def archive(tmp_path_factory):
     """Two recordings of one camera, 80 epochs each."""
     folder = tmp_path_factory.mktemp("archive")

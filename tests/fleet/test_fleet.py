@@ -94,8 +94,7 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
     (kind,) = document["types"]
     assert kind["type"] == "imx219 3280×2464"
 
-
-def test_the_table_fits_a_terminal_and_an_address_narrows_it(fleet):
+    # the table fits a terminal, and an address narrows it
     lines = run("fleet", fleet).splitlines()
     assert max(map(len, lines)) <= 80
     assert lines[0].startswith("17 cameras at 17 stations: 9 sound, 1 late")

@@ -9,7 +9,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from tests.fleet.conftest import address, count
+from tests.fleet.conftest import address, count, execute
 from thermocald.fleet.forward import Cursor, Forwarder
 from thermocald.fleet.overview import add_findings, read_overview
 from thermocald.store.database.store import Store
@@ -23,6 +23,13 @@ def filled_store(path, head, field, make_epoch, make_result, epochs=5) -> Path:
         for i in range(1, epochs + 1):
             store.append(series, make_epoch(i), make_result(i))
     return path
+
+
+def findings(place) -> set[str]:
+    """The kinds of what an overview finds."""
+    now, cameras = read_overview(place, Path("x"))
+    add_findings(cameras, [], now)
+    return {finding.kind for camera in cameras for finding in camera.findings}
 
 
 @pytest.fixture
@@ -40,9 +47,7 @@ def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):
     assert count(server, "station") == 2
     with FleetReader(place) as fleet:
         assert fleet.stations()["gauge-7"].stores == 2
-    now, cameras = read_overview(place, Path("x"))
-    add_findings(cameras, [], now)
-    assert "twins" in {finding.kind for camera in cameras for finding in camera.findings}
+    assert "twins" in findings(place)
 
 
 @pytest.mark.parametrize("names", [("gauge-7", "gauge-7"), ("gauge-7", "gauge-8")])
@@ -64,18 +69,13 @@ def test_a_copied_store_that_runs_at_two_stations_is_reported(
                 store.append(series, epoch, make_result(i))
     cursors = [path.with_name(f"{path.stem}.cursor") for path in (two[0], clone)]
 
-    def kinds() -> set[str]:
-        now, cameras = read_overview(place, Path("x"))
-        add_findings(cameras, [], now)
-        return {finding.kind for camera in cameras for finding in camera.findings}
-
     Forwarder(two[0], place, names[0], cursors[0]).send_waiting()
-    assert "twins" not in kinds()
+    assert "twins" not in findings(place)
     Forwarder(clone, place, names[1], cursors[1]).send_waiting()
     one_name = names[0] == names[1]
     assert count(server, "series") == (1 if one_name else 2)
     assert count(server, "epoch") == (11 + behind if one_name else 16 + behind)  # each is there
-    assert ("twins" in kinds()) == one_name
+    assert ("twins" in findings(place)) == one_name
 
 
 def test_epochs_calibrated_again_are_no_twins(server, two, make_result):
@@ -92,34 +92,13 @@ def test_epochs_calibrated_again_are_no_twins(server, two, make_result):
 def test_one_station_that_got_a_new_store_is_no_twin(server, two):
     place = address(server)
     Forwarder(two[0], place, "gauge-7").send_waiting()
-    with psycopg.connect(server.address(name="thermocald")) as connection:
-        connection.execute("UPDATE station SET contact = contact - 7200")
+    execute(server, "UPDATE station SET contact = contact - 7200")
     Forwarder(two[1], place, "gauge-7").send_waiting()
     with FleetReader(place) as fleet:
         assert fleet.stations()["gauge-7"].stores == 1
 
 
-@pytest.mark.parametrize("part", ["database", "user", "host", "option", "port in another form"])
-def test_another_server_gets_every_row(server, two, part):
-    """As the cursor sees it; for another database, as the rows arrive."""
-    one = "postgresql://owner@127.0.0.1:5432/thermocald?host=/run/a"
-    other = {
-        "database": one.replace("/thermocald", "/elsewhere"),
-        "user": one.replace("owner@", "other@"),
-        "host": one.replace("/run/a", "/run/b"),
-        "option": one + "&options=-csearch_path%3Dx",
-        "port in another form": one.replace(":5432", "") + "&port=5433",
-    }[part]
-    places = [ServerAddress.parse(text).place for text in (one, other)]
-    with Store.open(two[0]) as store:
-        path = two[0].with_name("cursor")
-        cursor = Cursor.read(path, store, places[0], "a")
-        cursor.sent["epoch"] = 5
-        cursor.write(path)
-        assert Cursor.read(path, store, places[0], "a").sent["epoch"] == 5
-        assert Cursor.read(path, store, places[1], "a").sent["epoch"] == 0
-    if part != "database":
-        return
+def test_another_database_gets_every_row(server, two):
     with psycopg.connect(server.address(), autocommit=True) as connection:
         connection.execute("DROP DATABASE IF EXISTS elsewhere WITH (FORCE)")
         connection.execute("CREATE DATABASE elsewhere")
@@ -158,6 +137,7 @@ OTHERS = {
     "database as an option": ONE + "&dbname=other",
     "user as an option": ONE + "&user=other",
     "port as an option": ONE + "&port=5433",
+    "port in another form": ONE.replace(":5432", "") + "&port=5433",
     "a schema": ONE + "&options=-csearch_path%3Dother",
     "an address beside the name": ONE + "&hostaddr=10.0.0.9",
 }
@@ -255,6 +235,4 @@ def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, ma
     for path in (*order, *order):
         Forwarder(path, place, "gauge-7", cursors[path]).send_waiting()
     assert count(server, "epoch") == 11
-    now, cameras = read_overview(place, Path("x"))
-    add_findings(cameras, [], now)
-    assert "twins" in {finding.kind for camera in cameras for finding in camera.findings}
+    assert "twins" in findings(place)

@@ -13,7 +13,7 @@ pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
 from benchmarks.generated_fleet import GeneratedCamera, add_camera
-from tests.fleet.conftest import address
+from tests.fleet.conftest import address, execute
 from thermocald.store.server.fleet_reader import SPREAD, FleetReader
 from thermocald.store.server.writer import ServerWriter
 
@@ -22,17 +22,15 @@ VALUES = ("c", "sd_c", "x0", "sd_x0", "y0", "sd_y0")
 
 
 def summary(server):
-    with psycopg.connect(server.address(name="thermocald")) as connection:
-        return {row[:2]: row[2:] for row in connection.execute("SELECT * FROM summary")}
+    return {row[:2]: row[2:] for row in execute(server, "SELECT * FROM summary")}
 
 
 def scanned(server):
     """The same from every row of the table of epochs."""
-    with psycopg.connect(server.address(name="thermocald")) as connection:
-        rows = connection.execute(
-            "SELECT series, number, revision, frame_time, status, temperatures, "
-            "c, sd_c, x0, sd_x0, y0, sd_y0 FROM epoch"
-        ).fetchall()
+    rows = execute(
+        server, "SELECT series, number, revision, frame_time, status, temperatures, "
+        "c, sd_c, x0, sd_x0, y0, sd_y0 FROM epoch"
+    )  # fmt: skip
     latest = {}
     for series, number, revision, *_ in rows:
         latest[series, number] = max(revision, latest.get((series, number), 0))
@@ -104,9 +102,8 @@ def test_late_repeated_and_revised_rows_count_exactly_once(server, filled):
     assert len(expected) >= 6
     assert summary(server) == expected
     again = "SELECT thermocald_summarise(series, array_agg(DISTINCT thermocald_slot(frame_time))) "
-    with psycopg.connect(server.address(name="thermocald")) as connection:
-        connection.execute("DELETE FROM summary")
-        connection.execute(f"{again} FROM epoch GROUP BY series")
+    execute(server, "DELETE FROM summary")
+    execute(server, f"{again} FROM epoch GROUP BY series")
     assert summary(server) == expected
 
 

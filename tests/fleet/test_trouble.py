@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 import psycopg
 
-from tests.fleet.conftest import address, count, new_cluster
+from tests.fleet.conftest import address, count, execute, new_cluster
 from thermocald.cli.server import find_series_tasks
 from thermocald.errors import ServerError, ServerGone, StoreError, StoreVersionError
 from thermocald.fleet.forward import Forwarder
@@ -59,15 +59,16 @@ def test_names_are_values_and_never_statements(server, tmp_path, head, field, ma
 
 def test_a_newer_server_is_told_from_an_older_one(filled, server):
     store, _ = filled
-    with psycopg.connect(server.address(name="thermocald")) as connection:
-        connection.execute("UPDATE thermocald_version SET version = 9999")
+    execute(server, "UPDATE thermocald_version SET version = 9999")
     there = address(server)
     forwarder = Forwarder(store.path, there, "b")
     for use in (forwarder.send_waiting, lambda: ServerStore(there), lambda: FleetReader(there)):
         with pytest.raises(StoreVersionError, match="update thermocald here"):
             use()
-    with psycopg.connect(server.address(name="thermocald")) as connection:
-        connection.execute("UPDATE thermocald_version SET version = 1")
+    execute(server, "UPDATE thermocald_version SET version = 0")
+    with pytest.raises(StoreVersionError, match="server init"):
+        Forwarder(store.path, there, "b").send_waiting()
+    execute(server, "UPDATE thermocald_version SET version = 1")
     assert Forwarder(store.path, address(server), "b").send_waiting().rows == 20
 
 

@@ -21,8 +21,8 @@ LONGEST = (
     "cli/test_first_hour", "photogrammetry/test_mount", "daemon/test_rhythm",
     "real_corners/test_real_corners", "test_properties", "store/test_kills", "analysis/test_scene",
     # of the quick one
-    "output/test_pages", "daemon/test_faults", "daemon/test_page_attacks", "daemon/test_sessions",
-    "cli/test_commands",
+    "output/test_pages", "photogrammetry/test_templates", "daemon/test_faults",
+    "daemon/test_page_attacks", "daemon/test_sessions", "cli/test_commands",
     "discovery/test_examination", "daemon/test_clock", "photogrammetry/test_boards",
     "daemon/test_changes", "output/test_testfield_print", "fleet/test_reprocess",
     "cli/test_testfield", "cli/test_discover", "cli/test_encodings", "cli/test_real_data",

@@ -4,42 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import (
-    ExteriorOrientation,
-    InteriorOrientation,
-    Sensor,
-    project,
-)
+from tests.photogrammetry.exact_rendering import look_at
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, project
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.series.adjustment import adjust_series
+from thermocald.photogrammetry.series.result import SeriesSettings
 
 SENSOR = Sensor(3280, 2464, 0.00112)
 INTERIOR = InteriorOrientation(3.04, 0.02, -0.03, -5e-3, 4e-4, -1e-5, 3e-4, -2e-4)
 SIGMA_PX = 0.04
 
 
-def corner_field(sigma_mm: float = 0.0) -> TestField:
-    """147 targets on three mutually perpendicular planes."""
-    a, b = (g.ravel() for g in np.meshgrid(np.linspace(60, 600, 7), np.linspace(60, 600, 7)))
+def corner_field(sigma_mm: float = 0.0, per_side: int = 7) -> TestField:
+    """147 targets, or so many on a side, on three mutually perpendicular planes."""
+    at = np.linspace(60, 600, per_side)
+    a, b = (g.ravel() for g in np.meshgrid(at, at))
     z = np.zeros_like(a)
     points = np.vstack([np.c_[a, b, z], np.c_[a, z, b], np.c_[z, a, b]])
     return TestField.build([str(i) for i in range(len(points))], points, sigma_mm)
 
 
-def looking_at(centre, target, roll=0.0):
-    """A camera at one place that looks at another."""
-    backward = np.array(centre, dtype=float) - np.array(target, dtype=float)
-    backward /= np.linalg.norm(backward)
-    up = [0, 0, 1] if abs(backward[2]) < 0.95 else [0, 1, 0]
-    right = np.cross(up, backward)
-    right /= np.linalg.norm(right)
-    R = np.column_stack([right, np.cross(backward, right), backward])
-    c, s = np.cos(roll), np.sin(roll)
-    return ExteriorOrientation.from_rotation(
-        R @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), centre
-    )
-
-
-EXTERIOR = looking_at([950, 900, 800], [150, 180, 160])
+EXTERIOR = look_at([950, 900, 800], [150, 180, 160])
 
 
 def true_points(field: TestField, interior=INTERIOR, exterior=EXTERIOR):
@@ -54,3 +40,15 @@ def observe(field: TestField, rng, interior=INTERIOR, exterior=EXTERIOR, sigma_p
     seen = seen[SENSOR.contains(points[seen])]
     noisy = points[seen] + rng.normal(0, sigma_px, (len(seen), 2))
     return Observations(seen, noisy, np.full((len(seen), 2), sigma_px))
+
+
+def adjusted(field: TestField, observations: Observations, **settings):
+    """An epoch's adjustment that begins at the truth."""
+    return adjust(SENSOR, field, observations, INTERIOR, EXTERIOR, AdjustmentSettings(**settings))
+
+
+def adjusted_series(field: TestField, observations, **settings):
+    """A series' adjustment that begins at the truth."""
+    return adjust_series(
+        SENSOR, field, observations, INTERIOR, EXTERIOR, SeriesSettings(**settings)
+    )

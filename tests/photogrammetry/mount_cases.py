@@ -9,9 +9,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, PRINCIPAL, project
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
-from thermocald.photogrammetry.series.result import SeriesSettings
 
 
 @dataclass(frozen=True)
@@ -20,17 +18,6 @@ class Tremble:
 
     px: float
     memory: float = 0.0
-
-
-def small_field(per_side: int = 4) -> TestField:
-    """Targets on three mutually perpendicular planes."""
-    a, b = (
-        g.ravel()
-        for g in np.meshgrid(np.linspace(60, 600, per_side), np.linspace(60, 600, per_side))
-    )
-    z = np.zeros_like(a)
-    points = np.vstack([np.c_[a, b, z], np.c_[a, z, b], np.c_[z, a, b]])
-    return TestField.build([str(i) for i in range(len(points))], points)
 
 
 def simulate(rng, field: TestField, epochs: int, tremble: Tremble):
@@ -58,15 +45,12 @@ def simulate(rng, field: TestField, epochs: int, tremble: Tremble):
 
 def standardised(seed: int, count: int, epochs: int, tremble: Tremble, exterior: str = "auto"):
     """Errors of c, x0, y0 about the series' mean over their sds (count·E, 3), and the sds in px."""
-    field = small_field()
+    field = scene.corner_field(per_side=4)
     z, sds = [], []
     for k in range(count):
         rng = np.random.default_rng([seed, k])
         grid, truth = simulate(rng, field, epochs, tremble)
-        r = adjust_series(
-            scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior=exterior),
-        )  # fmt: skip
+        r = scene.adjusted_series(field, grid, exterior=exterior)
         error = (r.values - truth)[r.ok, PRINCIPAL]
         z.append((error - error.mean(axis=0)) / r.sd[r.ok, PRINCIPAL])
         sds.append(r.sd[r.ok, PRINCIPAL])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 from tests.photogrammetry.exact_rendering import Scene, noisy
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR
 from tests.photogrammetry.single_targets import AT_ORIGIN, SIZE, SingleTargets, single_targets
+from thermocald.photogrammetry.frame.tracking import GradientWeights
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.frame_status import NoiseModel
 from thermocald.photogrammetry.targets.outline import local_maps
@@ -139,67 +139,30 @@ def test_noise_that_grows_with_the_light_is_weighed(targets):
     rng = np.random.default_rng(15)
     over = []
     for _ in range(30):
-        image = targets.frame(None, 0).astype(float)
+        image = targets.frame(None, 0)
         for x, y, patch in targets.patches:
-            image[y : y + SIZE, x : x + SIZE] = rng.normal(patch, np.sqrt(1 + 0.06 * patch))
-        fit = fit_circles(np.clip(np.rint(image), 0, 255).astype(np.uint8), targets.maps)
+            grey = rng.normal(patch, np.sqrt(1 + 0.06 * patch))
+            image[y : y + SIZE, x : x + SIZE] = np.clip(np.rint(grey), 0, 255)
+        fit = fit_circles(image, targets.maps)
         over.append((fit.points - targets.true) / np.sqrt(np.einsum("nii->ni", fit.covariances)))
     assert fit.noise.gain == pytest.approx(0.06, abs=0.015)
     assert 0.9 <= _rms(np.array(over)) <= 1.1
 
 
-@pytest.mark.slow
-def test_operators_of_opencv_are_far_from_the_bound(targets, capsys):
-    """SimpleBlobDetector, thresholded centroid, and fitEllipse on the same frames."""
-    rng = np.random.default_rng(16)
-    errors: dict[str, list[np.ndarray]] = {}
-    for _ in range(25):
-        frame = targets.frame(rng, NOISE)
-        fit = fit_circles(frame, targets.maps)
-        errors.setdefault("blurred disc", []).append(fit.points - targets.true)
-        for name, operator in PEERS.items():
-            found = [
-                operator(frame[y : y + SIZE, x : x + SIZE]) + np.array([x, y])
-                for x, y, _ in targets.patches
-            ]
-            errors.setdefault(name, []).append(np.array(found) - targets.true)
-    bound = targets.bound(NOISE)
-    # What an operator on ellipses is after is the ellipse's centre: eccentricity is no fault of its
-    # own, though the user has to pay for it.
-    ellipse = fit_circles(_sixteen_bit(targets), _of_ellipses(targets.maps)).points
-    eccentricity = ellipse - targets.true
-    ratio = {name: _rms(np.array(e) / bound) for name, e in errors.items()}
-    own = {name: _rms((np.array(e) - eccentricity) / bound) for name, e in errors.items()}
-    with capsys.disabled():
-        print(f"\n{'RMS error over the Cramér-Rao bound':40s}{'target':>8s}{'ellipse':>9s}")
-        for name, value in ratio.items():
-            print(f"  {name:38s}{value:8.2f}{own[name]:9.2f}")
-    assert ratio.pop("blurred disc") <= 1.25
-    assert min(ratio.values()) > 2.5
-    assert min(own[name] for name in ratio) > 1.5
-
-
-def _centroid(patch: np.ndarray) -> np.ndarray:
-    m = cv2.moments((patch < 115).astype(np.uint8), binaryImage=True)
-    return np.array([m["m10"], m["m01"]]) / m["m00"]
-
-
-def _ellipse(patch: np.ndarray) -> np.ndarray:
-    contours, _ = cv2.findContours(
-        (patch < 115).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-    )
-    return np.array(cv2.fitEllipse(max(contours, key=len))[0])
-
-
-def _blob(patch: np.ndarray) -> np.ndarray:
-    parameters = cv2.SimpleBlobDetector_Params()
-    parameters.minArea, parameters.maxArea = 30, 3000
-    parameters.filterByCircularity = parameters.filterByInertia = False
-    keypoints = cv2.SimpleBlobDetector_create(parameters).detect(patch)
-    return np.array(max(keypoints, key=lambda k: k.size).pt)
-
-
-PEERS = {"SimpleBlobDetector": _blob, "threshold, centroid": _centroid, "fitEllipse": _ellipse}
+def test_a_step_with_fixed_weights_is_at_the_bound_and_its_sigmas_are_true(targets):
+    frame = targets.frame(None, 0)
+    plain = np.zeros(len(targets.true), dtype=bool)
+    fit = fit_circles(frame, targets.maps, noise=KNOWN_NOISE)
+    weights = GradientWeights.build(frame, targets.maps, plain, fit.parameters, KNOWN_NOISE)
+    rng = np.random.default_rng(31)
+    over_bound, over_stated = [], []
+    for _ in range(60):
+        step = weights.apply(targets.frame(rng, NOISE))
+        error = step.parameters[:, :2] - targets.true
+        over_bound.append(error / targets.bound(NOISE))
+        over_stated.append(error / np.sqrt(np.einsum("nii->ni", step.covariances)))
+    assert _rms(np.array(over_bound)) <= 1.25
+    assert 0.95 <= _rms(np.array(over_stated)) <= 1.05
 
 
 def _one(diameter_px: float, at: tuple[float, float], spoil=None, **render):

@@ -48,16 +48,12 @@ def test_figures_of_a_frame():
     assert found["blur_curvature"] == pytest.approx(0.2)
     assert (found["contrast"], found["grey"], found["saturation"]) == (-120, 180, 0)
 
-
-def test_few_targets_tell_the_middle_only():
+    # few targets tell the middle only
     points = np.array([[10.0, 10.0], [20.0, 400.0]])
     quality = {"blur": np.array([0.8, 1.0])}
     found = frame_figures(
         Observations(np.arange(2), points, np.full((2, 2), 0.01), None, quality), SMALL_SENSOR
     )
     assert found == {"blur_px": pytest.approx(0.9)}
-
-
-def test_nothing_gives_nothing():
     none = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
     assert frame_figures(none, SMALL_SENSOR) == {}

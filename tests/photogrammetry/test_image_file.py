@@ -46,7 +46,7 @@ def test_grey_values_are_opencv_s(subsampling):
     assert np.array_equal(decode_grey(data), _opencv(data))
 
 
-def test_what_simplejpeg_refuses_is_read_by_opencv(monkeypatch):
+def test_what_simplejpeg_refuses_is_read_by_opencv():
     damaged = bytearray(_cv2_jpeg(_colours()))
     damaged[len(damaged) // 2 : len(damaged) // 2 + 2] = b"\xff\xc0"
     with pytest.raises(ValueError):
@@ -113,7 +113,7 @@ def frames() -> list[np.ndarray]:
     return [noisy(clean, rng) for _ in range(3)]
 
 
-@pytest.mark.parametrize("restart", [0, 41, 410])
+@pytest.mark.parametrize("restart", [0, 41])
 def test_tracked_centres_are_the_same_to_the_last_bit(frames, restart, monkeypatch):
     """Of a frame decoded in parts and as a whole; only the first is decoded whole."""
     options = [cv2.IMWRITE_JPEG_RST_INTERVAL, restart] if restart else []
@@ -139,15 +139,3 @@ def _forbidden(restart: int):
         return original(data, **options)
 
     return decode
-
-
-def test_luminance_is_the_grey_of_the_colours():
-    """Colours converted to grey give JPEG's luminance again where no channel is clipped: the
-    rounding of three channels, with their weights, stays below half a grey value.
-    """
-    data = simplejpeg.encode_jpeg(_colours() // 2 + 64, 95, "BGR", "420")
-    colours = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    converted = cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)
-    assert np.ptp(colours.astype(int), axis=2).mean() > 20, "there is no colour in it"
-    assert 0 < colours.min() <= colours.max() < 255
-    assert np.array_equal(converted, decode_grey(data))

@@ -9,7 +9,6 @@ import pytest
 from tests.blocks import InBlocks
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.long_series import adjust_long_series
 from thermocald.photogrammetry.series.normals import ObservationGrid, spread_windows
 from thermocald.photogrammetry.series.result import SeriesSettings
@@ -71,10 +70,7 @@ def test_the_blocks_do_not_matter(case, exterior):
 def test_it_is_the_adjustment_of_all_at_once(case):
     """But for what a sample of 120 epochs knows less of the noise than all 480."""
     field, truth, grid = case
-    whole = adjust_series(
-        scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR,
-        SeriesSettings(exterior="series", target_noise=False),
-    )  # fmt: skip
+    whole = scene.adjusted_series(field, grid, exterior="series", target_noise=False)
     parts = blocked(case, 50, target_noise=False)
     apart = (parts.rows.values - whole.values)[:, OWN]
     level = apart.mean(axis=0)
@@ -106,24 +102,13 @@ def test_what_the_sample_never_saw_is_still_adjusted(case):
     assert np.sqrt(np.mean(z[seen] ** 2)) < 1.15
 
 
-def test_an_epoch_without_targets_has_a_reason(case):
-    field, truth, grid = case
-    gone = np.zeros(grid.observed.shape, dtype=bool)
-    gone[77] = True
-    r = blocked((field, truth, grid.reject(gone)), 60)
-    assert r.rows.status[77] == "no_observations"
-    assert r.rows.reasons[77] == "no target was measured"
-    assert np.isnan(r.rows.values[77]).all()
-
-
-@pytest.mark.parametrize("exterior", ["series", "mount"])
-def test_processes_do_not_matter(case, exterior):
+def test_processes_do_not_matter(case):
     """Blocks on two processes give the bits of one."""
     field, _, grid = case
     one, two = (
         adjust_long_series(
             scene.SENSOR, field, InBlocks(grid, 60), scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior=exterior), together=120, jobs=jobs,
+            SeriesSettings(exterior="mount"), together=120, jobs=jobs,
         )
         for jobs in (1, 2)
     )  # fmt: skip

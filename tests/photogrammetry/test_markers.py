@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.exact_rendering import Scene, look_at, noisy
-from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw_marker
+from tests.photogrammetry.fields import SMALL_CAMERA, draw_marker
 from thermocald.errors import TestFieldError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets.corner import measure_corners
@@ -165,26 +165,3 @@ def test_photographs_of_apriltags(shared):
         assert {int(field.names[t].split(".")[0]) for t in observed.targets} == numbers
         assert len(observed) == 4 * len(numbers)
         assert observed.sigmas.max() < 0.2
-
-
-def test_a_board_of_aruco_on_film(shared):
-    """ChArUco's own markers: 48 of them, at sub-pixel the same from frame to frame as the hand."""
-    film = cv2.VideoCapture(str(shared / "data" / "charuco" / "testcalibration.mp4"))
-    ok, picture = film.read()
-    film.release()
-    assert ok
-    field = TestField.build(
-        [f"{n}.{k}" for n in range(48) for k in range(4)],
-        np.zeros((192, 3)),
-        kinds="marker_corner",
-        codes=[f"DICT_5X5_1000:{n}:{k}" for n in range(48) for k in range(4)],
-    )
-    observed = measure_markers(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), field)
-    assert len(observed) >= 0.9 * 192
-
-
-def test_image_size_is_that_of_the_camera():
-    assert SCENE.render(SMALL_CAMERA, VIEWS["frontal"]).shape == (
-        SMALL_SENSOR.height,
-        SMALL_SENSOR.width,
-    )

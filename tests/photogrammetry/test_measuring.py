@@ -55,11 +55,10 @@ def drawn(rng: np.random.Generator, points: np.ndarray, Q: np.ndarray, sigma_mm:
     return (c, x0, y0), field, seen
 
 
-@pytest.mark.parametrize("n", [6, 12])
-def test_errors_are_what_the_covariance_says(n):
+def test_errors_are_what_the_covariance_says():
     """Pose, camera and a place on the water over 300 draws: chi-square and error/sd near 1."""
-    rng = np.random.default_rng(n)
-    points, Q = control_points(n, rng), camera_covariance()
+    rng = np.random.default_rng(6)
+    points, Q = control_points(6, rng), camera_covariance()
     places = np.array([[300.0, 9_000.0, 0.0], [-2_000.0, 25_000.0, 0.0]])
     square, errors = [], []
     for _ in range(300):
@@ -80,14 +79,14 @@ def test_errors_are_what_the_covariance_says(n):
 
 
 def test_places_on_a_plane_against_a_monte_carlo():
-    """Sd within 3 %, covariance within 6 %: 40,000 draws of an intersection of its own."""
+    """Sd within 3 %, covariance within 6 %: 10,000 draws of an intersection of its own."""
     rng = np.random.default_rng(2)
     points, Q = control_points(10, rng), camera_covariance()
     _, field, seen = drawn(rng, points, Q, 10.0)
     r = resect(SENSOR, INTERIOR, Q, field, seen, snooping_alpha=0.0)
     uv = np.array([[1700.0, 1500.0], [900.0, 1900.0]])
     X, C = place_on(SENSOR, r.values, r.covariance, uv, SIGMA, WATER)
-    N = 40_000
+    N = 10_000
     draws = rng.multivariate_normal(r.values, r.covariance, N)
     found = np.empty((N, 2, 3))
     level, tilt = rng.normal(0, WATER.sd_mm, N), rng.normal(0, WATER.sd_tilt, (N, 2))

@@ -5,13 +5,11 @@ from __future__ import annotations
 import corner_camera as scene
 import numpy as np
 import pytest
-from mount_cases import Tremble, simulate, small_field, standardised
+from mount_cases import Tremble, simulate, standardised
 
 from thermocald.photogrammetry.camera.camera_model import PRINCIPAL, PRINCIPAL_POINT, project
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.mount import Movement, components, drift_period
-from thermocald.photogrammetry.series.result import SeriesSettings
 
 STILL, TREMBLES, SWAYS = Tremble(0.0), Tremble(0.1), Tremble(0.1, 0.8)
 
@@ -50,12 +48,9 @@ def test_series_states_what_the_movement_does_too():
 
 
 def adjusted(seed: int, epochs: int, tremble: Tremble, **settings):
-    field = small_field()
+    field = scene.corner_field(per_side=4)
     grid, truth = simulate(np.random.default_rng(seed), field, epochs, tremble)
-    r = adjust_series(
-        scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR,
-        SeriesSettings(exterior="auto", **settings),
-    )  # fmt: skip
+    r = scene.adjusted_series(field, grid, exterior="auto", **settings)
     return r, truth
 
 
@@ -75,7 +70,7 @@ def test_auto_says_what_it_chose_and_why():
 
 def test_a_knock_makes_the_mount_loose_not_the_camera_wrong():
     """The tripod is moved by 2 px in mid-series: sds as of orientations per epoch, and true."""
-    field = small_field()
+    field = scene.corner_field(per_side=4)
     rng = np.random.default_rng(45)
     grid, truth = simulate(rng, field, 80, STILL)
     moved = truth.copy()
@@ -86,9 +81,7 @@ def test_a_knock_makes_the_mount_loose_not_the_camera_wrong():
         for m, t in zip(moved, truth, strict=True)
     ]
     grid.points[...] += np.array(shift)
-    r = adjust_series(
-        scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR, SeriesSettings(exterior="auto")
-    )
+    r = scene.adjusted_series(field, grid, exterior="auto")
     assert r.exterior == "mount"
     assert r.movement.jumps == (40,)
     error = (r.values - truth)[:, PRINCIPAL]
@@ -130,12 +123,10 @@ def test_a_strong_warm_up_is_no_movement_of_the_mount():
 def test_gross_errors_in_most_epochs_do_not_take_the_epochs_out():
     """Three targets of 48 are 20 px off in two of three epochs, before a field with sigmas."""
     rng = np.random.default_rng(3)
-    plain = small_field()
+    plain = scene.corner_field(per_side=4)
     field = TestField.build(plain.names, plain.points, 0.03)
     grid, _ = simulate(rng, field, 24, Tremble(0.0))
     for e in range(24):
         grid.points[e, rng.permutation(len(field))[: 3 if e % 3 else 0]] += 20.0
-    r = adjust_series(
-        scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR, SeriesSettings(exterior="mount")
-    )
+    r = scene.adjusted_series(field, grid, exterior="mount")
     assert r.ok.sum() >= 22

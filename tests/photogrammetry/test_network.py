@@ -49,16 +49,19 @@ def test_bent_sheet_from_twelve_rolled_stations(with_nominal):
 
 
 @pytest.mark.slow
-def test_standard_deviations_are_true():
-    """Scatter over stated sd of targets and interior orientation, 100 seeded repetitions.
+def test_standard_deviations_and_correlations_are_true():
+    """Scatter over stated sd of targets, interior orientation, distances: 100 repetitions.
 
-    The mean over 90 coordinates is known to 1 % from 100 repetitions (neighbouring coordinates
+    Distances of targets that neighbour each other are far better than the sigmas alone say. The
+    mean over 90 coordinates is known to 1 % from 100 repetitions (neighbouring coordinates
     correlate, so somewhat less), that of one interior parameter to 7 %: three of those are allowed.
     The observations are normal; what the model does not have is not tested.
     """
     field = cases.bent_sheet(6, 5)
     stations = cases.convergent_stations(field, 8)
-    errors, variances, interiors, interior_variances, sigma0 = [], [], [], [], []
+    rng = np.random.default_rng(7)
+    pairs = [tuple(rng.choice(30, 2, replace=False)) for _ in range(25)]
+    errors, variances, interiors, interior_variances, sigma0, squares = [], [], [], [], [], []
     for seed in range(100):
         network, truth, _ = _survey(
             field, stations, 0.05, seed, loss=0.0, nominal=field, interior=cases.INTERIOR
@@ -68,6 +71,13 @@ def test_standard_deviations_are_true():
         interiors.append(network.camera.interior.as_array() - cases.INTERIOR.as_array())
         interior_variances.append(np.diag(network.interior_covariance))
         sigma0.append(network.sigma0)
+        for a, b in pairs:
+            e = (truth[b] - truth[a]) / np.linalg.norm(truth[b] - truth[a])
+            h = np.zeros(90)
+            h[3 * b : 3 * b + 3], h[3 * a : 3 * a + 3] = e, -e
+            difference = np.linalg.norm(network.points[b] - network.points[a])
+            error = difference - np.linalg.norm(truth[b] - truth[a])
+            squares.append(error**2 / (h @ network.covariance @ h))
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(variances))
     assert 0.9 < ratio < 1.1
     per_axis = np.sqrt(np.mean(np.square(errors), axis=(0, 1)) / np.mean(variances, axis=(0, 1)))
@@ -77,6 +87,7 @@ def test_standard_deviations_are_true():
     )
     assert np.all((per_parameter > 0.79) & (per_parameter < 1.21))
     assert abs(np.mean(sigma0) - 1) < 0.01
+    assert 0.8 < np.sqrt(np.mean(squares)) < 1.2
 
 
 @pytest.mark.slow
@@ -200,7 +211,7 @@ def test_a_missing_scale_is_refused(distances, reason):
 
 
 def test_wrong_sigmas_show_in_sigma0_and_twenty_fold_ones_are_refused():
-    stations = cases.convergent_stations(_BENT)
+    stations = cases.convergent_stations(_BENT, 8)
     photos, _ = cases.photographs(_BENT, stations, 0.05, np.random.default_rng(0))
     names = [f"t{i}" for i in range(len(_BENT))]
     scale = [Distance("t0", "t47", float(np.linalg.norm(_BENT[47] - _BENT[0])), 0.01)]
@@ -214,10 +225,10 @@ def test_wrong_sigmas_show_in_sigma0_and_twenty_fold_ones_are_refused():
 
 
 def test_advice_names_the_missing_roll():
-    flat = cases.convergent_stations(_BENT, rolled=False)
+    flat = cases.convergent_stations(_BENT, 8, rolled=False)
     network, _, _ = _survey(_BENT, flat, 0.05, 0)
     assert any("turned about its axis" in note for note in advice(network))
-    rolled, _, _ = _survey(_BENT, cases.convergent_stations(_BENT), 0.05, 0)
+    rolled, _, _ = _survey(_BENT, cases.convergent_stations(_BENT, 8), 0.05, 0)
     assert not any("turned about its axis" in note for note in advice(rolled))
     sd = [float(np.sqrt(n.interior_covariance[1, 1])) for n in (network, rolled)]
     assert sd[0] > 3 * sd[1]
@@ -226,7 +237,7 @@ def test_advice_names_the_missing_roll():
 def test_a_foreign_photograph_is_left_out_and_named():
     field = _BENT
     rng = np.random.default_rng(5)
-    photos, _ = cases.photographs(field, cases.convergent_stations(field), 0.05, rng)
+    photos, _ = cases.photographs(field, cases.convergent_stations(field, 8), 0.05, rng)
     photos["photo4"].points[:] = rng.uniform(0, 2400, photos["photo4"].points.shape)
     length = float(np.linalg.norm(field[47] - field[0]))
     network = adjust_network(
@@ -241,7 +252,7 @@ def test_a_photograph_of_another_focus_is_left_out_and_named():
     """The principal distance of one is 3 % longer: it can be oriented, but not with the others."""
     field = _BENT
     rng = np.random.default_rng(6)
-    stations = cases.convergent_stations(field)
+    stations = cases.convergent_stations(field, 8)
     photos, _ = cases.photographs(field, stations, 0.05, rng)
     zoomed = CameraModel(cases.SENSOR, cases.INTERIOR.with_values(c=cases.INTERIOR.c * 1.03))
     other, _ = cases.photographs(field, stations[7:8], 0.05, rng, camera=zoomed)

@@ -72,17 +72,3 @@ def test_a_saturated_sheet_says_so(sheet, aslant):
     assert status.word == "nothing_found"
     assert "saturated" in status.reason
     assert "expose" in status.reason
-
-
-@pytest.mark.slow
-def test_the_photographs_of_the_sheet_are_true(sheet):
-    """The targets are where the camera model has them: what stands above can be relied upon."""
-    field, sheets = sheet
-    middle = field.points.mean(axis=0)
-    station = looking_at(middle + np.array(STANDS["straight"]), middle, 0.4)
-    found = measure(photograph(sheets, CAMERA, station, noise=1.0, finer=2), field).observations
-    truth = CAMERA.project(station, field.points[found.targets])
-    off = found.points - truth
-    # the page's raster is not the printer's: up to half a pixel of 150 dpi at its edges
-    assert np.abs(off).max() < 1.0
-    assert np.abs(off - off.mean(axis=0)).max() < 0.35

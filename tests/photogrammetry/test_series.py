@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from thermocald.photogrammetry.camera.camera_model import project
-from thermocald.photogrammetry.epoch.adjustment import adjust
+from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.normals import ObservationGrid
-from thermocald.photogrammetry.series.result import SeriesSettings
 
 OWN = np.arange(8)
 
 
-def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None):
+def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None, per_side=7):
     """A drifting camera; the true field differs from the known one by its sigma."""
-    known = scene.corner_field(coordinate_error)
+    known = scene.corner_field(coordinate_error, per_side)
     true = TestField.build(
         known.names, known.points + rng.normal(0, coordinate_error, known.points.shape)
     )
@@ -47,36 +45,12 @@ def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None):
     return known, truth, observations
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("exterior", ["series", "per_epoch"])
-def test_differences_within_the_series_have_their_stated_sd(exterior):
-    """Over 25 series of 60 epochs, in spite of wrong coordinates switched on and off."""
-    rng = np.random.default_rng(30)
-    squares = []
-    for _ in range(25):
-        field, truth, observations = series(rng)
-        r = adjust_series(
-            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior=exterior, target_noise=False, snooping_alpha=0.0),
-        )  # fmt: skip
-        assert set(r.status) == {"ok"}
-        error = (r.values - truth)[:, OWN]
-        squares.append(((error - error.mean(axis=0)) / r.sd[:, OWN]) ** 2 * 60 / 59)
-    ratio = np.sqrt(np.mean(squares, axis=(0, 1)))
-    # 1,500 epochs know a standard deviation to 1.8 %; three of those, for eight parameters
-    assert ratio.min() > 0.945
-    assert ratio.max() < 1.055
-
-
 def test_a_static_set_up_is_worth_fifty_times():
     """DESIGN idea 3: 0.3 px with a free orientation per epoch, 0.005 px with one for the series."""
     field, _, observations = series(np.random.default_rng(32), coordinate_error=0.0, hidden=0.0)
     px = {}
     for exterior in ("series", "per_epoch"):
-        r = adjust_series(
-            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior=exterior),
-        )  # fmt: skip
+        r = scene.adjusted_series(field, observations, exterior=exterior)
         px[exterior] = np.median(r.sd[:, 1]) / scene.SENSOR.pixel_pitch
     assert px["per_epoch"] == pytest.approx(0.3, abs=0.1)
     assert px["series"] == pytest.approx(0.005, abs=0.002)
@@ -87,10 +61,9 @@ def test_ignoring_the_targets_errors_understates():
     field, truth, observations = series(np.random.default_rng(33), coordinate_error=0.1, epochs=100)
     ratio = {}
     for offsets in (True, False):
-        r = adjust_series(
-            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior="series", target_offsets=offsets, target_noise=False),
-        )  # fmt: skip
+        r = scene.adjusted_series(
+            field, observations, exterior="series", target_offsets=offsets, target_noise=False
+        )
         error = (r.values - truth)[:, 1]
         ratio[offsets] = error.std()
     assert ratio[True] < 0.5 * ratio[False]
@@ -99,17 +72,15 @@ def test_ignoring_the_targets_errors_understates():
 def test_whether_it_stood_still_is_tested():
     rng = np.random.default_rng(34)
     field, _, observations = series(rng, epochs=40, moved=17)
-    r = adjust_series(
-        scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, SeriesSettings()
-    )
+    r = scene.adjusted_series(field, observations)
     assert int(np.nanargmax(r.stillness)) == 17
     assert r.stillness[17] > 40
     others = np.delete(r.stillness, 17)
     assert np.median(others) == pytest.approx(5.35, abs=1.5)  # chi-square with 6 degrees
 
 
-@pytest.mark.parametrize("hidden", [0.0, 0.02])  # the same matrices for all, and each its own
-@pytest.mark.parametrize("correlation", [0.0, 0.4])
+# the same matrices for all, and each its own
+@pytest.mark.parametrize(("hidden", "correlation"), [(0.0, 0.0), (0.02, 0.4)])
 def test_epochs_by_themselves_are_those_of_the_epoch_adjustment(hidden, correlation):
     """Without anything in common the batch is the single adjustment, epoch by epoch."""
     rng = np.random.default_rng(35)
@@ -118,15 +89,16 @@ def test_epochs_by_themselves_are_those_of_the_epoch_adjustment(hidden, correlat
         obs.points[rng.choice(len(obs), 2, replace=False)] += rng.uniform(0.3, 20.0, (2, 2))
     covariance = correlation * scene.SIGMA_PX**2
     observations = [replace(obs, covariances=np.full(len(obs), covariance)) for obs in observations]
-    settings = SeriesSettings(exterior="per_epoch", target_offsets=False, target_noise=False,
-                              snooping_alpha=0.0005)  # fmt: skip
     grid = ObservationGrid.from_observations(field, observations)
     before = grid.weights.copy()
-    r = adjust_series(scene.SENSOR, field, grid, scene.INTERIOR, scene.EXTERIOR, settings)
+    r = scene.adjusted_series(
+        field, grid, exterior="per_epoch", target_offsets=False, target_noise=False,
+        snooping_alpha=0.0005,
+    )  # fmt: skip
     np.testing.assert_array_equal(grid.weights, before)  # the caller's
     assert r.rejected.sum() >= 40
     for e, obs in enumerate(observations):
-        one = adjust(scene.SENSOR, field, obs, scene.INTERIOR, scene.EXTERIOR)
+        one = scene.adjusted(field, obs)
         assert set(one.rejected) == set(np.flatnonzero(r.rejected[e]).tolist())
         assert np.all(np.abs(r.values[e] - one.values)[OWN] < 0.03 * one.sd[OWN])
         np.testing.assert_allclose(r.sd[e, OWN], one.sd[OWN], rtol=0.01)
@@ -139,9 +111,7 @@ def test_gross_errors_are_found():
     for obs in observations:
         bad = rng.choice(len(obs), 2, replace=False)
         obs.points[bad] += rng.uniform(1.0, 50.0, (2, 2))
-    r = adjust_series(
-        scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, SeriesSettings()
-    )
+    r = scene.adjusted_series(field, observations)
     assert r.rejected.sum() >= 60
     assert r.rejected.sum() < 60 + 0.01 * r.observed.sum()
 
@@ -150,9 +120,7 @@ def test_epochs_without_a_result_have_a_reason():
     field, _, observations = series(np.random.default_rng(37), epochs=12)
     observations[3] = None
     observations[5] = observations[5].select(np.arange(len(observations[5])) < 5)
-    r = adjust_series(
-        scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, SeriesSettings()
-    )
+    r = scene.adjusted_series(field, observations)
     assert r.status[3] == "no_observations"
     assert r.status[5] == "too_few_targets"
     assert all(r.reasons[e] for e in (3, 5))
@@ -165,32 +133,13 @@ def test_sigma0_is_against_the_stated_sigmas(exterior):
     """With noise of twice the stated sigmas it is 2, and the standard deviations follow."""
     field, _, observations = series(np.random.default_rng(38), epochs=60, coordinate_error=0.0)
     halved = [replace(o, sigmas=o.sigmas / 2) for o in observations]
-    settings = SeriesSettings(exterior=exterior)
     stated, wrong = (
-        adjust_series(scene.SENSOR, field, o, scene.INTERIOR, scene.EXTERIOR, settings)
-        for o in (observations, halved)
+        scene.adjusted_series(field, o, exterior=exterior) for o in (observations, halved)
     )
     assert np.median(stated.sigma0) == pytest.approx(1.0, abs=0.05)
     assert np.median(wrong.sigma0) == pytest.approx(2.0, abs=0.1)
     assert wrong.noise_ratio == pytest.approx(2.0, abs=0.1)
     np.testing.assert_allclose(wrong.sd[:, OWN], stated.sd[:, OWN], rtol=0.05)
-
-
-def test_a_gross_error_among_twelve_targets_of_a_series():
-    """It is rejected, or the epoch has no result; `ok` never hides residuals of 20 sigma."""
-    field, truth, observations = series(np.random.default_rng(39), coordinate_error=0.0, epochs=40)
-    few = [o.select(np.isin(o.targets, np.arange(3, 147, 12))) for o in observations]
-    rng = np.random.default_rng(40)
-    for o in few[::3]:
-        o.points[rng.integers(len(o))] += rng.uniform(2, 20, 2)
-    r = adjust_series(
-        scene.SENSOR, field, few, scene.INTERIOR, scene.EXTERIOR,
-        SeriesSettings(exterior="per_epoch"),
-    )  # fmt: skip
-    assert r.ok.sum() >= 24
-    assert r.sigma0[r.ok].max() < 3
-    z = ((r.values - truth) / r.sd)[r.ok][:, :3]
-    assert np.sqrt(np.mean(z**2)) < 1.4
 
 
 @pytest.mark.parametrize(
@@ -208,9 +157,7 @@ def test_gross_errors_among_twelve_targets_end_in_a_status(seed, gross_px, exter
     for o in few:
         wrong = rng.random(len(o)) < 0.08
         o.points[wrong] += rng.uniform(-gross_px, gross_px, (int(wrong.sum()), 2))
-    r = adjust_series(
-        scene.SENSOR, field, few, scene.INTERIOR, scene.EXTERIOR, SeriesSettings(exterior=exterior)
-    )
+    r = scene.adjusted_series(field, few, exterior=exterior)
     assert all(bool(why) != (word == "ok") for word, why in zip(r.status, r.reasons, strict=True))
     assert np.isfinite(r.values[r.ok]).all()
     assert (r.sd[r.ok][:, :3] > 0).all()
@@ -227,12 +174,9 @@ def test_a_field_worse_than_stated_is_said_and_scales_the_level(factor):
     rng = np.random.default_rng(32)
     z, ratios = [], []
     for _ in range(20):
-        field, truth, observations = series(rng, epochs=25, coordinate_error=0.02 * factor)
+        field, truth, observations = series(rng, 25, 0.02 * factor, per_side=4)
         stated = TestField.build(field.names, field.points, 0.02)
-        r = adjust_series(
-            scene.SENSOR, stated, observations, scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior="series"),
-        )  # fmt: skip
+        r = scene.adjusted_series(stated, observations, exterior="series")
         ratios.append(r.field_ratio)
         error = (r.values - truth)[r.ok][:, :3].mean(axis=0)
         z.append(error / r.level_sd[:3])
@@ -261,7 +205,7 @@ def test_noise_that_grows_towards_the_edge_is_seen_with_its_sd(factor):
     off = []
     for seed in range(12):
         field, observations = noisy_outside(np.random.default_rng(seed), factor)
-        r = adjust_series(scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR)
+        r = scene.adjusted_series(field, observations)
         value, sd = r.outer_noise
         off.append((value - factor) / sd)
     assert np.sqrt(np.mean(np.square(off))) < 1.6  # 99.9 % point of twelve
@@ -272,10 +216,7 @@ def test_noise_that_grows_towards_the_edge_is_seen_with_its_sd(factor):
 def test_what_the_perspective_knows_is_what_an_epoch_knows_by_itself():
     field, observations = noisy_outside(np.random.default_rng(1), 1.0)
     alike, apart = (
-        adjust_series(
-            scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior=exterior),
-        )
+        scene.adjusted_series(field, observations, exterior=exterior)
         for exterior in ("series", "per_epoch")
     )  # fmt: skip
     assert np.isnan(apart.perspective_sd).all()
@@ -294,12 +235,11 @@ def test_what_a_held_affinity_does_to_the_level_is_said(held, moved):
         Observations(np.arange(len(seen)), seen, np.full(seen.shape, scene.SIGMA_PX))
         for _ in range(12)
     ]
-    plain = SeriesSettings(target_noise=False, snooping_alpha=0.0)
-    r = adjust_series(scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, plain)
+    plain = {"target_noise": False, "snooping_alpha": 0.0}
+    r = scene.adjusted_series(field, observations, **plain)
     off = np.abs(r.values.mean(axis=0)[:3] - truth[:3])
     assert off[moved] == pytest.approx(r.affinity_bias[moved], rel=0.02)
     assert (off < 1.02 * r.affinity_bias[:3]).all()
-    free = replace(plain, free=(*plain.free, "C1", "C2"))
-    r = adjust_series(scene.SENSOR, field, observations, scene.INTERIOR, scene.EXTERIOR, free)
+    r = scene.adjusted_series(field, observations, free=(*DEFAULT_FREE, "C1", "C2"), **plain)
     assert not r.affinity_bias.any()
     assert abs(r.values.mean(axis=0)[moved] - truth[moved]) < 0.1 * off[moved]

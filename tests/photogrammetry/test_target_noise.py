@@ -18,11 +18,11 @@ def drawn(rng, epochs, spread):
     return noise, weights, np.ones((epochs, TARGETS), dtype=bool), true
 
 
-@pytest.mark.parametrize("freedom", [5.0, 30.0, 1000.0])
 @pytest.mark.parametrize("alpha", [0.01, 0.0005])
-def test_the_limit_is_the_quantile_of_f(freedom, alpha):
+def test_the_limit_is_the_quantile_of_f(alpha):
+    freedom = np.array([5.0, 30.0, 1000.0])
     expected = 2.0 * stats.f.isf(alpha, 2, freedom)
-    np.testing.assert_allclose(limit_2d(alpha, np.array([1.0 / freedom])), expected, rtol=1e-9)
+    np.testing.assert_allclose(limit_2d(alpha, 1.0 / freedom), expected, rtol=1e-9)
 
 
 def test_targets_measured_alike_are_not_told_apart_by_chance():
@@ -32,8 +32,7 @@ def test_targets_measured_alike_are_not_told_apart_by_chance():
     assert freedom.min() > 100
 
 
-@pytest.mark.parametrize("epochs", [10, 20, 100])
-@pytest.mark.parametrize("spread", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize(("epochs", "spread"), [(10, 0.8), (20, 0.0), (100, 0.3)])
 def test_as_many_good_points_fail_as_stated(epochs, spread):
     """Points of further epochs, tested with what the first ones showed of each target.
 

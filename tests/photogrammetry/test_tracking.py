@@ -79,10 +79,7 @@ def test_windows_are_enough_and_sigmas_stay_true(tracker, clean, rng, no_search)
     assert _rms(np.mean(z, axis=0)) < 1.35 / np.sqrt(15)
 
 
-@pytest.mark.parametrize(
-    "px",
-    [0.12, 1.2, *(pytest.param(px, marks=pytest.mark.slow) for px in (0.05, 0.3))],
-)
+@pytest.mark.parametrize("px", [0.12, 1.2])
 def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
     camera = _shifted(px)
     image = _render(camera)
@@ -99,26 +96,22 @@ def test_weights_are_renewed_when_targets_have_moved(tracker, rng, no_search):
     assert tracker.measure(noisy(image, rng)).renewed == 0
 
 
-def test_light_may_change(tracker, clean, rng, no_search):
+def test_light_and_noise_may_change(tracker, clean, rng, no_search):
     for factor in (0.9, 0.5, 1.1):
         measured = tracker.measure(noisy(clean * factor, rng))
         assert len(measured.observations) >= 100
         assert 0.88 <= _rms(_z(measured)) <= 1.12
         contrast = np.median(measured.observations.quality["contrast"])
         assert contrast == pytest.approx(-150 * factor, rel=0.02)
-
-
-def test_noise_may_change(tracker, clean, rng, no_search):
     measured = tracker.measure(noisy(clean, rng, 4.0))
     assert 0.88 <= _rms(_z(measured)) <= 1.12
     assert np.median(measured.observations.quality["noise"]) == pytest.approx(4.0, rel=0.1)
 
 
 def test_defocus_is_seen_in_the_blur(tracker, rng, no_search):
-    for blur in (0.83, 1.2):
-        image = draw(FIELD, NORMALS).render(SMALL_CAMERA, STATION, blur=blur)
-        measured = tracker.measure(noisy(image, rng))
-        assert np.median(measured.observations.quality["blur"]) == pytest.approx(blur, abs=0.02)
+    image = draw(FIELD, NORMALS).render(SMALL_CAMERA, STATION, blur=1.2)
+    measured = tracker.measure(noisy(image, rng))
+    assert np.median(measured.observations.quality["blur"]) == pytest.approx(1.2, abs=0.02)
 
 
 def test_a_target_may_be_hidden_and_come_back(tracker, clean, rng, no_search):
@@ -164,8 +157,5 @@ def test_frames_of_another_kind(tracker, clean, rng):
     sixteen = tracker.measure(frame.astype(np.uint16) * 256)
     assert "uint16" in sixteen.searched
     assert sixteen.status.ok
-
-
-def test_reset_begins_anew(tracker, clean, rng):
     tracker.reset()
-    assert "nothing is tracked" in tracker.measure(noisy(clean, rng)).searched
+    assert "nothing is tracked" in tracker.measure(frame).searched

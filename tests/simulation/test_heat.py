@@ -12,12 +12,6 @@ AIR = {"ambient": Course.constant(22.0)}
 TIMES = np.arange(0.0, 1500.0, 7.3)
 
 
-def test_one_body_step_of_power():
-    network = HeatNetwork({"a": 150.0}, (Link("a", "ambient", 0.5),))
-    T = network.solve(TIMES, 22.0, {"a": Course.constant(5.0)}, AIR)["a"]
-    np.testing.assert_allclose(T, 22 + 10 * (1 - np.exp(-TIMES / 300)), rtol=0, atol=1e-9)
-
-
 def test_one_body_pulse_of_power():
     """A jump in the middle, not at any instant that is asked for."""
     network = HeatNetwork({"a": 150.0}, (Link("a", "ambient", 0.5),))
@@ -30,14 +24,6 @@ def test_one_body_pulse_of_power():
         peak * np.exp(-(TIMES - 511.11) / 300),
     )
     np.testing.assert_allclose(T, 22 + expected, rtol=0, atol=1e-9)
-
-
-def test_one_body_ramp_of_the_air():
-    network = HeatNetwork({"a": 150.0}, (Link("a", "ambient", 0.5),))
-    air = {"ambient": Course.polygon([0.0, 1500.0], [22.0, 52.0])}
-    T = network.solve(TIMES, 22.0, {}, air)["a"]
-    expected = 22 + 0.02 * (TIMES - 300 * (1 - np.exp(-TIMES / 300)))
-    np.testing.assert_allclose(T, expected, rtol=0, atol=1e-9)
 
 
 def two_bodies():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,8 +17,6 @@ from thermocald.physics.testfields import demonstration_field, demonstration_mod
 
 
 def full_model():
-    from dataclasses import replace
-
     model = demonstration_model(demonstration_field("circles"))
     model = model.with_effect(ModelEffect("thermal_lag", {"tau": 84.0}, {"tau": 1.9}))
     model = model.with_effect(
@@ -145,8 +146,6 @@ def test_camera_file(tmp_path):
     ],
 )
 def test_bad_cameras(tmp_path, path, value, says):
-    import copy
-
     document = copy.deepcopy(CAMERA)
     change(document, path, value)
     with pytest.raises(ConfigurationError, match=says):
@@ -193,8 +192,6 @@ def test_programme_file(tmp_path):
     ],
 )
 def test_bad_programmes(tmp_path, path, value, says):
-    import copy
-
     document = copy.deepcopy(PROGRAMME)
     change(document, path, value)
     with pytest.raises(ConfigurationError, match=says):

@@ -111,32 +111,6 @@ def test_written_and_read_again(tmp_path):
     np.testing.assert_allclose(recording.testfield.points, s.field.points, rtol=0, atol=1e-9)
 
 
-def test_seed_decides_everything(tmp_path):
-    for name, seed in (("a", 4), ("b", 4), ("c", 5)):
-        simulation(epochs=5, seed=seed).write(tmp_path / name)
-    text = {n: (tmp_path / n / "observations.csv").read_bytes() for n in "abc"}
-    assert text["a"] == text["b"]
-    assert text["a"] != text["c"]
-
-
-def test_frames_can_be_measured(tmp_path):
-    from thermocald.photogrammetry.targets.corner import measure_corners
-    from thermocald.photogrammetry.targets.markers import locate_markers
-
-    field = demonstration_field("markers")
-    s = simulation(epochs=2, field=field)
-    s.write(tmp_path / "r", with_frames=True)
-    recording = read_recording(tmp_path / "r")
-    assert not recording.has_observations
-    import cv2
-
-    image = cv2.imread(str(recording.epochs[1].frame), cv2.IMREAD_GRAYSCALE)
-    seen = measure_corners(image, locate_markers(image, field))
-    error = seen.points - s.image_points(slice(1, 2))[0, seen.targets]
-    assert len(seen) > 150
-    assert np.sqrt(np.mean(error**2)) < 0.05
-
-
 def test_another_camera_is_refused():
     s = simulation()
     with pytest.raises(ConfigurationError, match="a model belongs to one camera"):
@@ -148,32 +122,3 @@ def test_nothing_in_sight_is_said():
     away = s.model.exterior.with_values(kappa=0.0, phi=3.0)
     with pytest.raises(GeometryError, match="the camera sees 0 of 147 targets"):
         next(replace(s, model=replace(s.model, exterior=away)).observations())
-
-
-@pytest.mark.slow
-def test_a_day(tmp_path):
-    """8,640 epochs of 147 targets in 10 s with their CSV; memory hardly grows with the length."""
-    import subprocess
-    import sys
-
-    code = (
-        "import resource, sys, time; from pathlib import Path; sys.path.insert(0, sys.argv[1]);"
-        "import numpy as np;"
-        "from thermocald.physics.presets import preset_simulation;"
-        "from dataclasses import replace; from thermocald.physics.heat import Course;"
-        "s = preset_simulation('rpi-v2.1-heating');"
-        "p = replace(s.programme, epochs=int(sys.argv[2]));"
-        "p = replace(p, sources={'housing': Course.constant(4.)});"
-        "s = replace(s, programme=p); t = time.perf_counter(); s.write(Path(sys.argv[3]));"
-        "print(time.perf_counter() - t, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
-    )
-    found = {}
-    for epochs in (1080, 8640):
-        run = subprocess.run(
-            [sys.executable, "-c", code, ".", str(epochs), str(tmp_path / str(epochs))],
-            check=True, capture_output=True, text=True,
-        )  # fmt: skip
-        found[epochs] = [float(v) for v in run.stdout.split()]
-    assert found[8640][0] < 10.0
-    # the temperatures of a day are 12 MB; the observations, 160 MB of text, are nowhere
-    assert found[8640][1] - found[1080][1] < 40.0

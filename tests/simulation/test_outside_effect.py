@@ -64,6 +64,13 @@ assert abs(found.values["x0"] - 2e-3) < 4 * found.sds["x0"], found
 s.write(Path := __import__("pathlib").Path("M1"))
 d = discover_series(reduce_together([series_input(read_recording(Path))]))
 print("discovered", *(e.effect for e in d.effects))
+
+import sys
+from tests.commands import call
+print(call("simulate", "--list").stdout)
+sys.path.insert(0, "DOCS")
+import reference
+print(reference._effect_page())
 """
 
 
@@ -90,17 +97,14 @@ def python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_an_effect_from_outside(tmp_path):
     outside(tmp_path)
 
-    ran = python(tmp_path, "-c", PROGRAM)
-    listed = python(tmp_path, "-m", "thermocald", "simulate", "--list")
-    page = python(
-        tmp_path, "-c",
-        "import sys; sys.path.insert(0, 'ROOT'); import reference; print(reference._effect_page())"
-        .replace("ROOT", str(Path(__file__).parents[2] / "docs/_site")),
-    )  # fmt: skip
+    site = Path(__file__).parents[2] / "docs/_site"
+    ran = python(tmp_path, "-c", PROGRAM.replace("DOCS", str(site)))
 
-    assert ran.stdout.split() == ["discovered", "saturation"], ran.stderr
-    assert "saturation" in listed.stdout, listed.stderr
-    assert "Adds a tanh" in page.stdout, page.stderr
+    assert ran.returncode == 0, ran.stderr
+    found, listed = ran.stdout.split("\n", 1)
+    assert found.split() == ["discovered", "saturation"]
+    assert listed.count("saturation") > 1
+    assert "Adds a tanh" in listed
 
 
 def test_a_class_that_is_no_effect_is_refused(tmp_path):

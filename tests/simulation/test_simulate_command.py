@@ -9,32 +9,12 @@ import pytest
 
 from tests.commands import answer
 from thermocald.errors import ThermocaldError
-from thermocald.files import dump_yaml
-from thermocald.physics.presets import PRESETS, preset_simulation
+from thermocald.physics.presets import preset_simulation
 from thermocald.store.recording.reader import read_recording
-
-PROGRAMME = {
-    "format": "thermocald-programme/1",
-    "name": "short",
-    "series": "M7",
-    "epochs": 4,
-    "interval": 10.0,
-    "ambient": 21.0,
-    "sources": {"board": 3.0},
-}
 
 
 def run(*arguments):
     return answer("simulate", *arguments)
-
-
-def test_list():
-    result = run("--list")
-    assert result.exit_code == 0
-    for name in (*PRESETS, "thermal_lag", "target_displacement"):
-        assert name in result.output
-    listed = json.loads(run("--list", "--json", "-").stdout)
-    assert len(listed["effects"]) == 20
 
 
 def test_preset_to_recording_and_json(tmp_path):
@@ -53,19 +33,6 @@ def test_preset_to_recording_and_json(tmp_path):
     assert again.exit_code == 0
     files = [(tmp_path / n / "observations.csv").read_bytes() for n in "rs"]
     assert files[0] == files[1]
-
-
-def test_model_and_programme(tmp_path):
-    run("--preset", "rpi-v2.1-heating", "--out", tmp_path / "r", "--model-out", tmp_path / "m.yaml")
-    (tmp_path / "p.yaml").write_text(dump_yaml(PROGRAMME))
-    result = run(
-        "--model", tmp_path / "m.yaml", "--programme", tmp_path / "p.yaml",
-        "--testfield", tmp_path / "r" / "testfield.csv", "--out", tmp_path / "s",
-    )  # fmt: skip
-    assert result.exit_code == 0, result.exception
-    recording = read_recording(tmp_path / "s")
-    assert recording.series == "M7"
-    assert len(recording.epochs) == 4
 
 
 @pytest.mark.parametrize(

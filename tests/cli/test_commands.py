@@ -200,6 +200,15 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
                "--free", "none", "--json", "-")  # fmt: skip
     assert json.loads(done.stdout)["interior"]["c"] == c
 
+    # what a copy has measured was measured before
+    copy = tmp_path / "copy.png"
+    copy.write_bytes(images[0].read_bytes())
+    done = run("calibrate", *images, copy, "--testfield", tmp_path / "field.csv", "--camera",
+               tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
+    again = json.loads(done.stdout)
+    assert again["interior"] == document["interior"]
+    assert again["photographs"][3]["reason"] == f"is a copy of {images[0].name}"
+
 
 def test_the_demo_finds_what_was_put_in(tmp_path):
     """Twelve epochs: drift found within 4 sd of the drift put in, and files that can be read."""

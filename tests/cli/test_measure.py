@@ -195,6 +195,8 @@ def test_what_is_printed(tmp_path):
      ("water.yaml", "line: {point: [1, 2], direction: [0, 0, 1]}\n", "must be three numbers"),
      ("gcp.csv", "target,X,Y,Z\na,1,2,3\n", "column sX is missing"),
      ("points.csv", "time,name,x,y,sx,sy\n1700021600,sky,1640,-900,0.2,0.2\n", "above the horizon"),
+     ("points.csv", "time,name,x,y,sx,sy\n1700021600,a,5000,1700,0.2,0.2\n", "px lies outside"),
+     ("points.csv", "time,name,x,y,sx,sy\n1700021600,a,1640,1700,0,0.2\n", "must be above 0"),
      ("points.csv", "time,name,x,y,sx,sy\n1600000000,old,1640,1700,0.2,0.2\n", "outside the temp")],
 )  # fmt: skip
 def test_what_cannot_be_measured_is_one_line(tmp_path, file, content, words):
@@ -235,6 +237,7 @@ def beyond_the_camera(_, row):
     ("change", "words"),
     [(degrees, "do X and Y hold degrees?"),
      (lambda _, r: {"X": float(r["X"]) / 1000, "Y": float(r["Y"]) / 1000}, "are they in m?"),
+     (lambda _, r: {n: 1000 * float(r[n]) for n in "XYZ"}, "are they in mm?"),
      (lambda _, r: {"x": 4 * float(r["x"])}, "px, outside the camera's 3280 × 2464 px"),
      (lambda _, r: {"x": r["y"], "y": r["x"]}, "X and Y, or x and y, are exchanged"),
      (beyond_the_camera, "or a sign is wrong"),

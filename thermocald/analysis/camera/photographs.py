@@ -30,7 +30,7 @@ from thermocald.photogrammetry.network.common_interior import CommonInterior, ad
 from thermocald.photogrammetry.orientation import approximate_orientation
 from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.result import with_sds
-from thermocald.store.logger.photographs import moment_taken
+from thermocald.store.logger.photographs import find_copies, moment_taken
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -158,8 +158,13 @@ def calibrate_photographs(
     measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
     prior = Prior(camera.sensor, camera.interior, principal_distance=camera.principal_distance)
+    copies: dict[int, int] = {}
+    with suppress(OSError):  # said below, of the photograph
+        copies = find_copies(paths)
     for k, path in enumerate(paths):
         try:
+            if k in copies:
+                raise ImageError(f"is a copy of {paths[copies[k]].name}")
             found = measure(decode_grey(path), testfield, prior)
         except (ImageError, GeometryError) as error:
             word = "bad_image" if isinstance(error, ImageError) else "no_orientation"

@@ -30,6 +30,8 @@ UNITS = {"mm": 1.0, "m": 1000.0}
 """Lengths that control points and planes may be given in, in mm."""
 
 _LEAST_EXTENT_MM = 50.0  # of a gauge's points: metres read as mm, or degrees, lie nearer together
+_LEAST_OF_A_GRID_MM = 1000.0  # of points that a hundred times as much lies between and the origin
+_LARGEST_EXTENT_MM = 2e6  # beyond it mm were read as metres
 _FITS = 3.0  # sigma0 of points that were mirrored back
 _ROUND_MM = 1e6  # coordinates count from a round number near the points
 _SURVEYED_MM = 20.0  # a GNSS receiver with corrections, where nothing is said
@@ -88,13 +90,19 @@ class ControlPoints:
             row = int(np.argmin(np.isfinite(points).all(axis=1)))
             raise DataError(f"{where}, {names[row]}: a control point needs X, Y and Z")
         extent = scale * float(np.ptp(points[:, :2], axis=0).max())
-        if 0 < extent < _LEAST_EXTENT_MM:
+        grid = np.abs(scale * points.mean(axis=0)[:2]).max() > 100.0 * extent
+        if 0 < extent < (_LEAST_OF_A_GRID_MM if unit == "mm" and grid else _LEAST_EXTENT_MM):
             degrees = (np.abs(points[:, :2]) <= (180, 90)).all()
             raise DataError(
-                f"{where}: in {unit}, all control points lie within {extent:.2g} mm: "
+                f"{where}: in {unit}, all control points lie within {extent:.3g} mm: "
                 + ("do X and Y hold degrees? " if degrees else "are they in m? ")
                 + "Metres of UTM or a national grid are needed"
                 + ("" if degrees else ", and the unit m")
+            )
+        if extent > _LARGEST_EXTENT_MM:
+            raise DataError(
+                f"{where}: in {unit}, control points extend over {extent / 1000:.0f} m: "
+                + ("are they in mm?" if unit == "m" else "which of them is wrong?")
             )
         origin = np.round(scale * points.mean(axis=0) / _ROUND_MM) * _ROUND_MM
         try:

@@ -56,7 +56,7 @@ def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     middle, extent = points.mean(axis=0), np.linalg.norm(np.ptp(points, axis=0))
     places = surface.points if isinstance(surface, Profile) else surface.point
     away = float(np.linalg.norm(places - middle, axis=-1).min())
-    if away > _FARTHEST * extent:
+    if away > _FARTHEST * extent > 0:
         unit = UNITS[control.unit]
         raise ConfigurationError(
             f"{path}: lies {away / unit:.0f} {control.unit} from control points that extend over "
@@ -277,6 +277,12 @@ def measure_places(
     points, covariance = place_on(
         sensor, states[member], pose.covariance, image, sigmas, surface, now.covariance, member
     )
+    if not (inside := sensor.contains(image, -1.0)).all():
+        row = int(np.argmin(inside))
+        raise DataError(
+            f"image point {names[row]} at {image[row, 0]:.0f}, {image[row, 1]:.0f} px lies outside "
+            f"the camera's {sensor.width} × {sensor.height} px"
+        )
     scale = UNITS[control.unit]
     points, covariance = (points + control.origin) / scale, covariance / scale**2
     levels = () if isinstance(surface, Plane) else _levels(points, covariance, moments, member)

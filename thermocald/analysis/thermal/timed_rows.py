@@ -179,4 +179,6 @@ def _number(column: str, text: str) -> float:
         value = np.nan
     if not np.isfinite(value):
         raise ValueError(f"column {column}: {text!r} is not a number")
+    if column in ("sx", "sy") and value <= 0:
+        raise ValueError(f"column {column}: a standard deviation must be above 0")
     return value

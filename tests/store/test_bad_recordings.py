@@ -88,6 +88,13 @@ def test_a_column_missing_is_named(recording_path):
         path.write_text(text)
 
 
+def test_a_column_in_kelvin_is_explained(recording_path):
+    for line in range(2, 7):
+        set_field(recording_path / "epochs.csv", line, "temperature", "294.5")
+    with pytest.raises(RecordingError, match=r"kelvin: subtract 273\.15"):
+        read_recording(recording_path)
+
+
 def test_semicolons_are_explained(recording_path):
     path = recording_path / "epochs.csv"
     path.write_text(path.read_text().replace(",", ";"))

@@ -9,7 +9,6 @@ from thermocald.errors import StoreError
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.store.database.epochs import (
     POINT_QUANTUM_PX,
-    pack_covariance,
     pack_observations,
     unpack_covariance,
     unpack_observations,
@@ -40,18 +39,6 @@ def test_points_of_five_decimals_are_exact():
         seen.targets, np.array([[float(f"{v:.5f}") for v in p] for p in seen.points]), seen.sigmas
     )
     assert np.array_equal(unpack_observations(pack_observations(rounded)).points, rounded.points)
-
-
-@pytest.mark.parametrize("n", [0, 1, 150])
-def test_size_is_as_stated(n):
-    assert len(pack_observations(observations(n))) == 8 + 18 * n
-    assert len(pack_covariance(np.eye(16))) == 1088
-
-
-def test_covariance_is_exact():
-    a = np.random.default_rng(2).normal(size=(30, 16))
-    covariance = a.T @ a
-    assert np.array_equal(unpack_covariance(pack_covariance(covariance)), covariance)
 
 
 def test_what_does_not_fit_is_kept_otherwise():

@@ -92,8 +92,8 @@ def test_many_columns_are_refused_quickly(tmp_path):
         Table(tmp_path / "t.csv", ["c1"])
 
 
-def test_a_field_of_two_hundred_thousand_targets_is_refused(tmp_path):
-    lines = (f"{i},{i % 500},{i // 500},0,1,0.1,0.1,0.1\n" for i in range(200_000))
+def test_a_field_of_twenty_thousand_targets_is_refused(tmp_path):
+    lines = (f"{i},{i % 500},{i // 500},0,1,0.1,0.1,0.1\n" for i in range(20_000))
     (tmp_path / "testfield.csv").write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(lines))
     with pytest.raises(TestFieldError, match="more than 4000 targets"):
         read_testfield(tmp_path / "testfield.csv")
@@ -128,20 +128,6 @@ def test_a_width_of_ten_to_the_400_is_refused(recording, tmp_path):
         read_camera(tmp_path / "camera.yaml")
 
 
-@pytest.mark.parametrize(
-    ("values", "reason"),
-    [
-        (("1e300", "21.5"), "above 1000 °C"),
-        (("21.5", "2_5.0"), r"line 3, column housing: '2_5\.0' is not a number"),
-        (("294.5", "294.6"), r"kelvin: subtract 273\.15"),
-    ],
-)
-def test_impossible_temperatures_are_refused(recording, values, reason):
-    (recording / "epochs.csv").write_text(EPOCHS.format(*values))
-    with pytest.raises(RecordingError, match=reason):
-        read_recording(recording)
-
-
 def test_names_that_a_terminal_would_obey_are_refused_or_shown_as_codes(recording):
     (recording / "recording.yaml").write_text(HEAD.replace("name: x", 'name: "x\\e[2J"'))
     with pytest.raises(RecordingError, match="printable") as refused:
@@ -153,13 +139,6 @@ def test_names_that_a_terminal_would_obey_are_refused_or_shown_as_codes(recordin
         read_recording(recording)
     assert "\x1b" not in str(refused.value)
     assert printable("a\x1b[31mb\x9b°\nc") == "a\\x1b[31mb\\x9b°\nc"
-
-
-def test_a_coordinate_of_ten_to_the_308_is_refused(tmp_path):
-    path = tmp_path / "testfield.csv"
-    path.write_text("target,X,Y,Z,diameter,sX,sY,sZ\na,0,0,0,,0,0,0\nb,1e308,0,0,,0,0,0\n")
-    with pytest.raises(TestFieldError, match="line 3, column X: must be within 1e"):
-        read_testfield(path)
 
 
 def test_a_cameras_number_of_ten_to_the_400_is_refused():

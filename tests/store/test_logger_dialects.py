@@ -25,23 +25,12 @@ def read(path, head, row, unit=""):
     return read_log(path, options, NEAR)
 
 
-TOA5 = [
-    '"TOA5","CR1000","CR1000","1234","CR1000.Std.32","CPU:prog.CR1","1","Table1"',
-    '"TIMESTAMP","RECORD","AirTC_Avg","BattV_Min"',
-    '"TS","RN","Deg C","Volts"',
-    '"","","Avg","Min"',
-]
 DIALECTS = {
-    "Campbell TOA5": (TOA5, lambda m, t, i: f'"{m:%Y-%m-%d %H:%M:%S}",{i},{t:.2f},12.9'),
     "Onset, twelve hours": (
         ["#,Date-Time (UTC),Ch: 1 - Temperature   (°C )"],
         lambda m, t, i: f"{i + 1},{m:%m/%d/%Y %I:%M:%S %p},{t:.2f}"),
-    "Elitech": (["No.,Time,Temperature°C"],
-                lambda m, t, i: f"{i + 1},{m:%Y-%m-%d %H:%M:%S},{t:.1f}"),
     "Ruuvi": (["Date,Temperature (°C),Humidity (%),RSSI (dBm)"],
               lambda m, t, i: f"{m:%Y-%m-%dT%H:%M:%S.000Z},{t:.2f},50.1,-60"),
-    "Govee in °F": (["Timestamp for sample frequency every 1 min,Temperature_Fahrenheit"],
-                    lambda m, t, i: f"{m:%Y-%m-%d %H:%M:%S},{1.8 * t + 32:.2f}"),
     "Tinytag": (["Record,Date,Time,Temperature"],
                 lambda m, t, i: f"{i + 1},{m:%d %b %Y},{m:%H:%M:%S},{t:.2f} °C"),
     "InfluxDB in ns": (["name,time,value"],

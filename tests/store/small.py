@@ -1,0 +1,27 @@
+"""The least that a store can hold: a series of one target, epochs as functions of a number."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thermocald.epoch import Epoch
+from thermocald.photogrammetry.camera.camera_model import Sensor
+from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.series import EpochResult
+
+
+def create_small_series(store, name: str = "M1", start: str = ""):
+    """The series `name` of a camera `rpi` with a thermometer `t`."""
+    camera = CameraSpec("rpi", Sensor(640, 480, 0.001))
+    head = Head("a", name, 10.0, camera, {"t": Channel()})
+    return store.create_series(head, TestField.build(["a"], np.zeros((1, 3))), start=start)
+
+
+def small_epoch(number: int, begin_s: float = 1e9, interval_s: float = 1.0) -> Epoch:
+    time_s = begin_s + interval_s * number
+    return Epoch(number, time_s, time_s, {"t": 20.0})
+
+
+def small_result(number: int) -> EpochResult:
+    return EpochResult("ok", "", np.full(16, float(number)), np.eye(16), 1.0, 5, 9)

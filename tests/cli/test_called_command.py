@@ -57,13 +57,12 @@ def test_the_list_imports_none_and_cuts_no_line_off():
         ("thermocald testfield su", ["survey"]),
     ],
 )
-def test_a_shell_completes_commands_and_options(typed, expected):
-    words = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
-    done = subprocess.run(
-        [sys.executable, "-m", "thermocald"], capture_output=True, text=True, check=True,
-        env={**os.environ, "_THERMOCALD_COMPLETE": "complete_bash", **words},
-    )  # fmt: skip
-    assert done.stdout.split() == expected
+def test_a_shell_completes_commands_and_options(monkeypatch, typed, expected):
+    monkeypatch.setenv("COMP_WORDS", typed)
+    monkeypatch.setenv("COMP_CWORD", str(typed.count(" ")))
+    monkeypatch.setenv("_THERMOCALD_COMPLETE", "complete_bash")
+    done = call()
+    assert (done.returncode, done.stdout.split()) == (0, expected)
 
 
 def test_options_for_experts_stand_apart():

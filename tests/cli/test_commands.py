@@ -127,7 +127,6 @@ def test_export_of_several_series_names_the_option(recording, tmp_path):
     ("arguments", "status", "words"),
     [
         (("replay", "no-such-folder"), 1, "does not exist"),
-        (("replay",), 2, "missing argument"),
         (("export", "{recording}", "--format", "xlsx"), 2, "csv, json and parquet"),
         (("replay", "{recording}", "--free", "c,zoom"), 2, "'zoom' is no IOP"),
         (("replay", "{recording}", "--exterior", "both"), 2, "per_epoch, series, mount, auto"),

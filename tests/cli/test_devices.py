@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 
 import pytest
-import typer
 import yaml
-from typer.testing import CliRunner
 
+from tests.commands import answer
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
-from thermocald.cli.check import devices as command
 from thermocald.config import parse_config
 from thermocald.daemon import soundness as devices
 from thermocald.errors import ConfigurationError, DeviceError
@@ -68,11 +66,8 @@ def test_what_is_attached_can_be_written_as_it_is_shown(sysfs):
 
 
 def test_the_command(sysfs, tmp_path):
-    app = typer.Typer()
-    app.command("devices")(command)
-    app.callback()(lambda: None)
     out = tmp_path / "devices.json"
-    result = CliRunner().invoke(app, ["devices", "--json", str(out)])
+    result = answer("devices", "--json", out)
     assert result.exit_code == 0, result.output
     document = json.loads(out.read_text())
     assert document["format"] == "thermocald-devices/1"
@@ -101,17 +96,12 @@ def test_a_probe_takes_one_of_each_and_names_what_fails(sysfs, tmp_path):
 @pytest.fixture
 def check(tmp_path):
     """Runs `thermocald check config.yaml --probe`: (its error, its lines, its JSON)."""
-    from thermocald.cli.check import check
-
-    app = typer.Typer()
-    app.command("check")(check)
-    app.callback()(lambda: None)
 
     def run(document, *more):
         path = tmp_path / "config.yaml"
         path.write_text(yaml.safe_dump(document))
         out = tmp_path / "check.json"
-        result = CliRunner().invoke(app, ["check", str(path), "--json", str(out), *more])
+        result = answer("check", path, "--json", out, *more)
         said = json.loads(out.read_text()) if out.exists() else None
         return result.exception, result.stdout.splitlines(), said
 

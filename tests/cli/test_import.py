@@ -197,14 +197,6 @@ def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path,
     assert block.values.tolist() == [[5, 6]]
 
 
-def test_kelvin_in_a_log_is_refused_with_the_remedy(tmp_path):
-    from thermocald.store.logger.temperatures import read_log
-
-    (tmp_path / "log.csv").write_text("time,housing\n1,294.5\n2,294.6\n")
-    with pytest.raises(ThermocaldError, match=r"294\.5 looks like kelvin: say --unit K"):
-        read_log(tmp_path / "log.csv")
-
-
 def test_the_readme_leads_to_a_plot_in_ten_commands():
     """As many as it lists, with options that exist; test_first_hour walks them."""
     from pathlib import Path

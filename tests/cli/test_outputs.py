@@ -25,8 +25,9 @@ import pytest
 import typer
 
 from tests.cli.test_import import photograph
+from tests.commands import call
 from tests.photogrammetry.network_cases import convergent_stations
-from thermocald.cli import application, main
+from thermocald.cli import application
 from thermocald.errors import OutputError
 from thermocald.files import new_file, write_text
 from thermocald.photogrammetry import camera_files
@@ -224,13 +225,6 @@ def refusing(tmp_path):
         yield make
 
 
-def run(monkeypatch, capsys, *arguments: str) -> tuple[int, str]:
-    monkeypatch.setattr(sys, "argv", ["thermocald", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code, capsys.readouterr().err
-
-
 def test_every_command_that_writes_is_tried():
     found = dict(leaves(typer.main.get_command(application())))
     outputs = {"--out", "--output", "--figures"}
@@ -248,17 +242,14 @@ SLOW = [name for name in COMMANDS if name not in QUICK]
         *(pytest.param(n, k, marks=pytest.mark.slow) for n in SLOW for k in ("full", "denied")),
     ],
 )
-def test_a_place_that_cannot_be_written_is_one_sentence(
-    world, refusing, monkeypatch, capsys, tmp_path, name, kind
-):
+def test_a_place_that_cannot_be_written_is_one_sentence(world, refusing, tmp_path, name, kind):
     fields = {field for part in COMMANDS[name] for _, field, _, _ in Formatter().parse(part)}
     values = {field: str(world[field]) for field in fields - {None, "to"}}
-    capsys.readouterr()
     folder = refusing(kind)
-    monkeypatch.chdir(tmp_path)
     before = world.files()
     arguments = [part.format(**values, to=folder) for part in COMMANDS[name]]
-    code, said = run(monkeypatch, capsys, *name.split(), *arguments)
+    done = call(*name.split(), *arguments, folder=tmp_path)
+    code, said = done.returncode, done.stderr
     assert code == (3 if kind == "full" else 2), said
     errors = [line for line in said.splitlines() if line.startswith("error:")]
     assert len(errors) == 1
@@ -309,21 +300,12 @@ FILES: dict[str, list[str]] = {
 QUICK_FILES = ["camera convert", "check", "server dashboard", "testfield import", "devices"]
 
 
-def written_to(world, monkeypatch, capsys, name: str, out: Path) -> tuple[int, str]:
+def written_to(world, name: str, out: Path) -> tuple[int, str]:
     fields = {field for part in FILES[name] for _, field, _, _ in Formatter().parse(part)}
     values = {field: str(world[field]) for field in fields - {None, "out"}}
-    capsys.readouterr()
     arguments = [part.format(**values, out=out) for part in FILES[name]]
-    return call_main(monkeypatch, capsys, *name.split(" as ")[0].split(), *arguments)
-
-
-def call_main(monkeypatch, capsys, *arguments: str) -> tuple[int, str]:
-    monkeypatch.setattr(sys, "argv", ["thermocald", *arguments])
-    try:
-        main()
-    except SystemExit as ended:
-        return int(ended.code or 0), capsys.readouterr().err
-    return 0, capsys.readouterr().err
+    done = call(*name.split(" as ")[0].split(), *arguments)
+    return done.returncode, done.stderr
 
 
 def read_pipe(path: Path) -> tuple[Thread, list[bytes]]:
@@ -338,7 +320,7 @@ def read_pipe(path: Path) -> tuple[Thread, list[bytes]]:
     "name",
     [pytest.param(name, marks=() if name in QUICK_FILES else pytest.mark.slow) for name in FILES],
 )
-def test_what_is_not_a_file_is_never_replaced(world, monkeypatch, capsys, tmp_path, name, kind):
+def test_what_is_not_a_file_is_never_replaced(world, tmp_path, name, kind):
     out, target = tmp_path / "out", tmp_path / "folder/target.yaml"
     target.parent.mkdir()
     reader, found = None, [b""]
@@ -358,7 +340,7 @@ def test_what_is_not_a_file_is_never_replaced(world, monkeypatch, capsys, tmp_pa
             target.write_text("before")
         out.symlink_to(target)
     before = out.lstat().st_ino, stat.S_IFMT(out.lstat().st_mode)
-    code, said = written_to(world, monkeypatch, capsys, name, out)
+    code, said = written_to(world, name, out)
     assert "Traceback" not in said
     assert (out.lstat().st_ino, stat.S_IFMT(out.lstat().st_mode)) == before
     if kind == "folder":
@@ -449,7 +431,7 @@ MEASURED = {
 }
 
 
-def test_what_was_measured_is_never_written_over(world, monkeypatch, capsys, tmp_path):
+def test_what_was_measured_is_never_written_over(world, tmp_path):
     """`-o thermocald.db` in place of `--store`: a month of epochs for a table.
 
     By every name of the file; that every command looks is in test_wrong_usage.
@@ -466,7 +448,7 @@ def test_what_was_measured_is_never_written_over(world, monkeypatch, capsys, tmp
     (tmp_path / "epochs-link").symlink_to("M/epochs.csv")
     for what, place in MEASURED.items():
         before = (tmp_path / place).read_bytes()
-        code, said = written_to(world, monkeypatch, capsys, "check", tmp_path / place)
+        code, said = written_to(world, "check", tmp_path / place)
         assert code == 2, what
         assert "cannot be written: it is" in said
         assert "choose another name" in said

@@ -77,18 +77,8 @@ def test_print_that_cannot_be_is_refused(tmp_path):
 def photographs(tmp_path_factory):
     """A printed A3 sheet, a little bent, as JPEG photographs in a folder."""
     folder = tmp_path_factory.mktemp("survey")
-    run(
-        "testfield",
-        "print",
-        "--paper",
-        "A3",
-        "--flat",
-        "--landscape",
-        "--diameter",
-        12,
-        "--out",
-        folder,
-    )
+    sheet = ("--paper", "A3", "--flat", "--landscape", "--diameter", 12)
+    run("testfield", "print", *sheet, "--out", folder)
     nominal = read_testfield(folder / "testfield.csv")
     points = nominal.points.copy()
     points[:, 2] = 3e-5 * (points[:, 0] - 200) ** 2

@@ -47,6 +47,7 @@ BAD = [
     ("- 1\n", "must hold `key: value` lines"),
     ("a: 1\na: 2\n", r"line 2, column 1: key 'a' is duplicated"),
     ("a: {b: 1, b: 2}\n", "key 'b' is duplicated"),
+    ("a: 010\n", "line 1, column 4: 010 is octal in YAML"),
     ("a: [1\n", "line 2"),
     ("1: x\n", "key 1 must be text"),
     ("a: !!python/object:os.system x\n", "could not determine a constructor"),

@@ -12,7 +12,7 @@ import difflib
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 from urllib.parse import urlsplit
 
 from pydantic import (
@@ -43,6 +43,12 @@ def relative_to_file(value: Path | None, info: ValidationInfo) -> Path | None:
     return folder / value.expanduser()
 
 
+def _is_number(annotation: Any) -> bool:
+    """Return whether a field holds a number, which may have limits or be missing."""
+    parts = (annotation, *get_args(annotation))
+    return any(part in (int, float) or get_args(part)[:1] in ((int,), (float,)) for part in parts)
+
+
 class Section(BaseModel):
     """A part of the file: immutable, finite numbers, no unknown keys."""
 
@@ -55,6 +61,13 @@ class Section(BaseModel):
             for key in data:
                 if key not in cls.model_fields:
                     raise _unknown(str(key), list(cls.model_fields))
+        for key, value in data.items() if isinstance(data, dict) else ():
+            known = cls.model_fields.get(key)
+            if isinstance(value, bool) and known and _is_number(known.annotation):
+                message = f"is {value}, as YAML reads yes, no, on, off; a number is needed"
+                raise PydanticCustomError(
+                    "unknown_key", "{message}", {"message": message, "key": key}
+                )
         return data
 
 
@@ -123,7 +136,7 @@ class SensorConfig(Section):
     """Width of the image."""
     height_px: Annotated[int, Field(ge=16, le=100_000)]
     """Height of the image."""
-    pixel_pitch_mm: Annotated[float, Field(gt=0.0, le=0.1)]
+    pixel_pitch_mm: Annotated[float, Field(ge=1e-4, le=0.1)]
     """Size of a pixel."""
 
 
@@ -230,7 +243,7 @@ class CameraConfig(DeviceConfig):
     """Name of the measurement series."""
     sensor: SensorConfig | None = None
     """Size of the image and of a pixel."""
-    principal_distance_mm: Annotated[float, Field(gt=0.0, le=10_000.0)] | None = None
+    principal_distance_mm: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = None
     """Nominal; helps to find a first orientation."""
     testfield: Path | None = None
     """A testfield.csv; without it frames are only taken."""

@@ -15,6 +15,7 @@ import errno
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import time
@@ -271,7 +272,17 @@ _CONSTRUCTION = (ValueError, KeyError, IndexError, AttributeError, TypeError, Ov
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """The safe loader, which also refuses a key that is duplicated."""
+    """The safe loader, which also refuses a key that is duplicated, and numbers that begin with 0,
+    which YAML 1.1 takes as octal: `010` is 8.
+    """
+
+    def construct_whole(self, node: yaml.ScalarNode) -> int:
+        if re.fullmatch(r"[+-]?0[0-9_]+", node.value):
+            raise yaml.constructor.ConstructorError(
+                None, None, f"{node.value} is octal in YAML: write no 0 before it, or quote a text",
+                node.start_mark,
+            )  # fmt: skip
+        return int(self.construct_yaml_int(node))
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[str] = set()
@@ -284,6 +295,9 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
                 seen.add(key.value)
         mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)
         return mapping
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_whole)
 
 
 def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> dict[str, Any]:

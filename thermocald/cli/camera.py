@@ -45,7 +45,10 @@ def calibrate(
         "of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON, as initial values.",
     ),
     pixel_pitch: float | None = typer.Option(
-        None, min=1e-6, help="Size of a pixel in mm, without --camera or where that lacks it."
+        None,
+        min=1e-5,
+        max=1.0,
+        help="Size of a pixel in mm, without --camera or where that lacks it.",
     ),
     camera_out: Path | None = typer.Option(
         None, help="Write the camera: .json with covariance (what every --camera takes), or .yaml."

@@ -151,31 +151,6 @@ def test_a_device_may_be_called_like_another_kind():
     assert parse(doc).outputs[0].name == "river"
 
 
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.dictionaries(
-            st.sampled_from(["name", "driver", "period_s", "x", "path"]), inner, max_size=3
-        )
-    ),
-    max_leaves=8,
-)
-KEYS = st.sampled_from([*Config.model_fields, "camera", "x"])
-
-
-@settings(max_examples=300, deadline=None, derandomize=True)
-@given(changes=st.dictionaries(KEYS, VALUES, max_size=3))
-def test_any_values(changes):
-    try:
-        parse(document(**changes))
-    except ConfigurationError as error:
-        message = str(error)
-    else:
-        return
-    assert message.startswith("/etc/thermocald/config.yaml: ")
-
-
 @settings(
     max_examples=200,
     deadline=None,

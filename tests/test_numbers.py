@@ -16,7 +16,4 @@ from thermocald.numbers import typeset_powers, with_sd
 )  # fmt: skip
 def test_powers_are_raised_and_names_are_left(text, set_):
     assert typeset_powers(text) == set_
-
-
-def test_a_unit_has_raised_powers_too():
     assert with_sd(-7.49e-7, 0.47e-7, "mm-1/K") == "(−7.49 ± 0.47)·10⁻⁷ mm⁻¹/K"

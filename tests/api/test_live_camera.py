@@ -70,7 +70,7 @@ def test_every_effect_follows_as_along_says(name):
         assert_same([found[k]], along)
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_lag_delay_and_play_together(order):
     camera = tc.ThermalCamera(thermal_model(*(CHAIN[i] for i in order)))
     times, T = course(200, 5.0)

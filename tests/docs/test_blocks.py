@@ -124,8 +124,3 @@ def test_csv_is_rectangular(block):
     text = block.text.split("\n", 1)[1] if block.text.startswith("#") else block.text
     rows = list(csv.reader(StringIO(text)))
     assert len({len(row) for row in rows}) == 1
-
-
-def test_the_shipped_configuration_is_valid():
-    path = ROOT / "config.yaml"
-    parse_config(yaml.safe_load(path.read_text()), path, option_names)

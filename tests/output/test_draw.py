@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from thermocald.figures import Curve, Panel, draw_panel
 
 
-@pytest.mark.parametrize("lowest", [-11.8, -1234.0, -0.0123, -3.0, 5e-5, -9.9e-5, 3.0405])
+@pytest.mark.parametrize("lowest", [-1234.0, -0.0123, -9.9e-5, 3.0405])
 def test_the_y_label_is_inside_the_drawing_and_clear_of_the_numbers(lowest):
     """Of `Δx₀ in µm` a half was cut off where ticks had more digits than was reckoned with."""
     x = np.linspace(0, 25, 150)

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -78,8 +79,6 @@ def test_the_camera_is_the_warm_one_and_all_else_stays(tmp_path):
     assert K[0, 0] == pytest.approx((CAMERA["c"] + 0.4e-3 * 16) / PITCH)
     true = POSE[3:] / 1000 + ORIGIN_M
     assert document["lens_position"] == pytest.approx(true.tolist(), abs=2e-3)
-    import cv2
-
     at = points / 1000 + ORIGIN_M
     seen, _ = cv2.projectPoints(
         at, np.array(document["rvec"]), np.array(document["tvec"]), K,
@@ -115,8 +114,6 @@ def test_the_real_pyorc_projects_as_we_do(tmp_path, pyorc):
 def test_opencv_pose_is_the_same_camera():
     pose = ExteriorOrientation.from_array(POSE)
     rvec, tvec = opencv_pose(pose, np.zeros(3))
-    import cv2
-
     R, _ = cv2.Rodrigues(rvec)
     assert -R.T @ tvec * 1000 == pytest.approx(POSE[3:])
     assert R[2] == pytest.approx(-pose.rotation[:, 2])
@@ -176,15 +173,22 @@ def river_camera() -> Camera:
     return Camera(Sensor(1920, 1080, pitch), np.nan, interior.as_array(), Q)
 
 
-def pyorc_residuals() -> np.ndarray:
-    """Clicks minus projection of the pose that pyorc solves, (6, 2) px: OpenCV's solvePnP."""
-    import cv2
-
+def pyorc_points() -> tuple[np.ndarray, ...]:
+    """Places (6, 3) m about their mean, clicks (6, 2) px, OpenCV's matrix and distortion."""
     document = json.loads((RIVER / "geul-pyorc.json").read_text())
     dst, src = (np.array(document["gcps"][k], dtype=float) for k in ("dst", "src"))
-    K, k = (np.array(document[key]) for key in ("camera_matrix", "dist_coeffs"))
-    _, rvec, tvec = cv2.solvePnP(dst - dst.mean(axis=0), src, K, k)
-    seen, _ = cv2.projectPoints(dst - dst.mean(axis=0), rvec, tvec, K, k)
+    return (
+        dst - dst.mean(axis=0),
+        src,
+        *(np.array(document[key]) for key in ("camera_matrix", "dist_coeffs")),
+    )
+
+
+def pyorc_residuals() -> np.ndarray:
+    """Clicks minus projection of the pose that pyorc solves, (6, 2) px: OpenCV's solvePnP."""
+    dst, src, K, k = pyorc_points()
+    _, rvec, tvec = cv2.solvePnP(dst, src, K, k)
+    seen, _ = cv2.projectPoints(dst, rvec, tvec, K, k)
     return src - seen[:, 0]
 
 
@@ -221,12 +225,7 @@ def test_the_crosses_of_the_geul():
 
 def pyorc_heights() -> np.ndarray:
     """Error (6,) mm of each cross's height above its place, by OpenCV's pose of the other five."""
-    import cv2
-
-    document = json.loads((RIVER / "geul-pyorc.json").read_text())
-    dst, src = (np.array(document["gcps"][k], dtype=float) for k in ("dst", "src"))
-    K, k = (np.array(document[key]) for key in ("camera_matrix", "dist_coeffs"))
-    dst -= dst.mean(axis=0)
+    dst, src, K, k = pyorc_points()
     _, *whole = cv2.solvePnP(dst, src, K, k)
     errors = []
     for row in range(6):

@@ -7,8 +7,9 @@ operator that estimates more can reach it quite.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -28,7 +29,8 @@ QUANTISATION = 1 / 12
 @dataclass
 class SingleTargets:
     """n discs: diameters (n,) px and tilts (n,) deg as asked for, true projected centres (n, 2),
-    exact maps, patches [(x, y, image)], gradients per patch (2, h, w) DN/px.
+    exact maps, patches [(x, y, image)], and what makes the gradients per patch (2, h, w) DN/px,
+    which are drawn only where the bound is asked for.
     """
 
     diameters: np.ndarray
@@ -36,7 +38,11 @@ class SingleTargets:
     true: np.ndarray
     maps: LocalMap
     patches: list[tuple[int, int, np.ndarray]]
-    gradients: list[np.ndarray]
+    gradient_makers: list[Callable[[], np.ndarray]]
+
+    @cached_property
+    def gradients(self) -> list[np.ndarray]:
+        return [make() for make in self.gradient_makers]
 
     def bound(self, noise_sd: float) -> np.ndarray:
         """Cramér-Rao bounds (n, 2) px of x and y for white noise that is then rounded."""
@@ -101,14 +107,16 @@ def single_targets(
                 scene.disc(c, normal, size)
             return scene.render(PI_CAMERA, AT_ORIGIN, window, blur, finer=8)
 
-        # Moves in the image by ±0.05 px, made in object space parallel to the image plane.
-        step = 0.05 / scale * 1000
-        moves = []
-        for e in np.eye(3)[:2] * step:
-            a, b = (PI_CAMERA.project(AT_ORIGIN, (centre + s * e)[None])[0] for s in (1, -1))
-            moves.append(((draw(centre + e) - draw(centre - e)), a - b))
-        J = np.array([m[1] for m in moves])
-        gradients.append(np.tensordot(np.linalg.inv(J), np.array([m[0] for m in moves]), axes=1))
+        def gradient(centre=centre, draw=draw):
+            # Moves in the image by ±0.05 px, made in object space parallel to the image plane.
+            moves, by = [], []
+            for e in np.eye(3)[:2] * 0.05 / scale * 1000:
+                a, b = (PI_CAMERA.project(AT_ORIGIN, (centre + s * e)[None])[0] for s in (1, -1))
+                moves.append(draw(centre + e) - draw(centre - e))
+                by.append(a - b)
+            return np.tensordot(np.linalg.inv(by), moves, axes=1)
+
+        gradients.append(gradient)
         points.append(centre)
         normals.append(normal)
         radii.append(size / 2)

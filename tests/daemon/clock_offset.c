@@ -10,12 +10,10 @@
 #include <unistd.h>
 
 static long offset_s(void) {
-  static int file = -2;
+  static int file = -1;
+  const char *path = file < 0 ? getenv("CLOCK_OFFSET_FILE") : NULL;
   char text[32] = {0};
-  if (file == -2) {
-    const char *path = getenv("CLOCK_OFFSET_FILE");
-    file = path ? open(path, O_RDONLY | O_CLOEXEC) : -1;
-  }
+  if (path) file = open(path, O_RDONLY | O_CLOEXEC);
   if (file < 0 || pread(file, text, sizeof text - 1, 0) <= 0) return 0;
   return atol(text);
 }

@@ -8,9 +8,7 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +16,13 @@ import pytest
 import yaml
 
 from tests.daemon.forking import Forked, Forker
+from tests.drivers.small_camera import write_small_camera
 from thermocald.epoch import Epoch
-from thermocald.photogrammetry.camera.camera_model import Sensor, project
+from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.physics.model_file import write_model
-from thermocald.physics.testfields import corner_field, demonstration_field, demonstration_model
+from thermocald.physics.testfields import corner_field, demonstration_model
 from thermocald.store.database.store import Store
-from thermocald.store.recording.head import Head
+from thermocald.store.recording.head import Head, read_head
 from thermocald.store.recording.reader import CameraSpec, Channel, write_recording
 
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -45,7 +43,7 @@ class Daemon:
 
     def __init__(self, folder: Path, forker: Forker) -> None:
         self.folder = folder
-        self._forker = forker
+        self.forker = forker
         self.store = folder / "thermocald.db"
         self.config = folder / "config.yaml"
         self.process: subprocess.Popen[bytes] | Forked | None = None
@@ -56,18 +54,7 @@ class Daemon:
 
     def start(self, *options: str, config: bool = True, **environment: str) -> None:
         arguments = ["run", *(["--config", str(self.config)] if config else []), *options]
-        if "LD_PRELOAD" not in environment:  # which the loader reads
-            self.process = self._forker.start(self.folder, *arguments, **environment)
-            return
-        log = (self.folder / "log.txt").open("ab")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "thermocald", *arguments],
-            cwd=self.folder,
-            env={**ENVIRONMENT, **environment},
-            stdout=log,
-            stderr=log,
-        )
-        log.close()
+        self.process = self.forker.start(self.folder, *arguments, **environment)
 
     def signal(self, number: int) -> None:
         self.process.send_signal(number)
@@ -117,27 +104,18 @@ class Daemon:
 
 
 @pytest.fixture
-def spawn():
+def spawn(forker: Forker):
     """(folder, arguments) → a running `thermocald …`; what still runs after the test is killed."""
     started = []
 
-    def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "thermocald", *arguments],
-            cwd=folder,
-            env=ENVIRONMENT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        started.append(process)
-        return process
+    def start(folder: Path, *arguments: str) -> Forked:
+        started.append(forker.start(folder, *arguments, log=f"command-{len(started)}.txt"))
+        return started[-1]
 
     yield start
     for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture
@@ -149,11 +127,7 @@ def daemon(tmp_path: Path, forker: Forker):
 
 @pytest.fixture(scope="session")
 def small_camera(tmp_path_factory) -> Path:
-    """The demonstration's camera with a sixteenth of its pixels: quick to render and measure."""
-    model = demonstration_model(demonstration_field("markers"))
-    path = tmp_path_factory.mktemp("model") / "small.thermal.yaml"
-    write_model(path, replace(model, sensor=Sensor(820, 616, 0.00448)))
-    return path
+    return write_small_camera(tmp_path_factory.mktemp("model") / "small.thermal.yaml")
 
 
 @pytest.fixture
@@ -217,46 +191,55 @@ def recording(tmp_path_factory) -> Path:
     return make_recording(tmp_path_factory.mktemp("recording") / "small", 200)
 
 
+def replayed_camera(path: Path, **more: object) -> dict[str, object]:
+    """The entry of a camera that replays a recording."""
+    sensor = read_head(path).camera.sensor
+    return {
+        "driver": "replay", "recording": str(path), "testfield": str(path / "testfield.csv"),
+        "principal_distance_mm": 3.04,
+        "sensor": {"width_px": sensor.width, "height_px": sensor.height,
+                   "pixel_pitch_mm": sensor.pixel_pitch},
+        **more,
+    }  # fmt: skip
+
+
 @pytest.fixture
 def replayed():
     """A recording as devices of a configuration."""
 
     def make(path: Path, period_s: float = 0.05, loop: bool = True):
-        from thermocald.store.recording.head import read_head
-
-        sensor = read_head(path).camera.sensor
-        replay = {"driver": "replay", "recording": str(path), "loop": loop, "period_s": period_s}
+        rhythm = {"loop": loop, "period_s": period_s}
+        camera = replayed_camera(path, name="rpi", thermometers=["recorded"], **rhythm)
+        recorded = {"name": "recorded", "driver": "replay", "recording": str(path), **rhythm}
         return {
-            "cameras": [
-                {
-                    "name": "rpi", "thermometers": ["recorded"], "principal_distance_mm": 3.04,
-                    "testfield": str(path / "testfield.csv"), **replay,
-                    "sensor": {"width_px": sensor.width, "height_px": sensor.height,
-                               "pixel_pitch_mm": sensor.pixel_pitch},
-                }
-            ],
-            "thermometers": [{"name": "recorded", **replay}],
+            "cameras": [camera],
+            "thermometers": [recorded],
             "outputs": [{"name": "log", "driver": "jsonl", "path": "./results.jsonl"}],
-        }  # fmt: skip
+        }
 
     return make
 
 
+@pytest.fixture
+def measured(recording, replayed):
+    """Devices that give measurements five times a second: where no picture matters."""
+    return replayed(recording, 0.2)
+
+
 @pytest.fixture(scope="session")
-def shim(tmp_path_factory):
-    """name → the shared object of a C file beside this one, for LD_PRELOAD."""
+def preloaded(tmp_path_factory):
+    """What starts daemons above all C files beside this one; each asks for its own variables."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         pytest.skip("no C compiler: what the system tells a process cannot be changed")
-
-    def build(name: str) -> str:
-        path = tmp_path_factory.mktemp("shim") / f"{name}.so"
-        source = Path(__file__).with_name(f"{name}.c")
-        command = [compiler, "-shared", "-fPIC", "-O1", "-o", path, source, "-ldl"]
+    folder, built = tmp_path_factory.mktemp("preloaded"), []
+    for source in sorted(Path(__file__).parent.glob("*.c")):
+        built.append(str(folder / f"{source.stem}.so"))
+        command = [compiler, "-shared", "-fPIC", "-O1", "-o", built[-1], source, "-ldl"]
         subprocess.run(command, check=True)
-        return str(path)
-
-    return build
+    forker = Forker({**ENVIRONMENT, "LD_PRELOAD": ":".join(built)})
+    yield forker
+    forker.close()
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
 """Starts daemons by fork, after everything is imported: 200 starts in the time of ten.
 
-As a program it reads one JSON document per line: {"arguments", "folder", "environment"} forks and
-prints the child's process id, whose work is a command or, where it is given, a "script";
-{"ended": id} prints the exit status of a child that has ended.
+As a program it reads one JSON document per line: {"arguments", "folder", "environment", "script",
+"log"} forks and prints the child's process id, whose work is a command or, where it is given, the
+script; {"ended": id} prints the exit status of a child that has ended.
 """
 
 from __future__ import annotations
@@ -28,13 +28,15 @@ class Forker:
         )  # fmt: skip
         assert self._process.stdout.readline() == "ready\n"
 
-    def start(self, folder: Path, *arguments: str, script: str = "", **environment: str) -> Forked:
-        """`thermocald ARGUMENTS`, or a script, in a folder, whose log.txt gets what it prints."""
-        (folder / "log.txt").touch()  # whoever reads it need not wait for the child
-        return Forked(self, self.ask(
-            {"arguments": arguments, "folder": str(folder), "environment": environment,
-             "script": script}
-        ))  # fmt: skip
+    def start(
+        self, folder: Path, *arguments: str, script: str = "", log: str = "log.txt",
+        **environment: str,
+    ) -> Forked:  # fmt: skip
+        """`thermocald ARGUMENTS`, or a script, in a folder, whose log gets what it prints."""
+        (folder / log).touch()  # whoever reads it need not wait for the child
+        asked = {"arguments": arguments, "folder": str(folder), "environment": environment,
+                 "script": script, "log": log}  # fmt: skip
+        return Forked(self, self.ask(asked), folder / log)
 
     def ask(self, document: dict[str, object]) -> int:
         self._process.stdin.write(json.dumps(document) + "\n")
@@ -50,8 +52,8 @@ class Forker:
 class Forked:
     """A daemon started by fork; used as a `subprocess.Popen`."""
 
-    def __init__(self, forker: Forker, pid: int) -> None:
-        self.pid = pid
+    def __init__(self, forker: Forker, pid: int, log: Path) -> None:
+        self.pid, self._log = pid, log
         self.returncode: int | None = None
         self._forker = forker
         self._handle = os.pidfd_open(pid)
@@ -70,6 +72,11 @@ class Forked:
             os.close(self._handle)
             self.returncode = self._forker.ask({"ended": self.pid})
         return self.returncode
+
+    def said(self, timeout_s: float | None = 120.0) -> str:
+        """Wait for its end, and return what it has printed."""
+        self.wait(timeout_s)
+        return self._log.read_text()
 
     def send_signal(self, number: int) -> None:
         if self.poll() is None:
@@ -101,7 +108,7 @@ def main() -> None:
             os.environ.update(asked["environment"])
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
             sys.argv = ["thermocald", *asked["arguments"]]
-            log = os.open("log.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            log = os.open(asked["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
             os.dup2(log, 1)
             os.dup2(log, 2)
             faulthandler.enable()  # what ends a process without a word leaves its stack

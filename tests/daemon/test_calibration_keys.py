@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
+from tests.daemon.conftest import fast_run, make_recording, replayed_camera
 from thermocald.config import CalibrationConfig
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
@@ -33,7 +31,7 @@ KEYS = {
 
 
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory):
+def stored(tmp_path_factory, forker):
     """{key: columns of the series that was taken with it}; target 7 is 3 px off in all epochs."""
     folder = tmp_path_factory.mktemp("keys")
     taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4))
@@ -48,20 +46,13 @@ def stored(tmp_path_factory):
     path = folder / "spoilt"
     head = Head("spoilt", "M1", 10.0, taken.camera, taken.channels)
     write_recording(path, head, field, spoilt())
-    sensor = taken.camera.sensor
-    camera = {
-        "driver": "replay", "recording": str(path), "testfield": str(path / "testfield.csv"),
-        "principal_distance_mm": 3.04,
-        "sensor": {"width_px": sensor.width, "height_px": sensor.height,
-                   "pixel_pitch_mm": sensor.pixel_pitch},
-    }  # fmt: skip
     cameras = [
-        {**camera, "name": key, "calibration": {**PLAIN, **changed}}
+        replayed_camera(path, name=key, calibration={**PLAIN, **changed})
         for key, changed in KEYS.items()
     ]
     document = {"cameras": cameras, "frames": {"keep": "none"}, "store": {"durable": False}}
     run = fast_run(json.dumps(document), EPOCHS)
-    subprocess.run([sys.executable, "-c", run], cwd=folder, env=ENVIRONMENT, check=True)
+    assert forker.start(folder, script=run).wait(300.0) == 0
     names = ["status", "sigma0", "n_rejected", "c", "sd_c", "x0", "sd_x0", "A1", "sd_A1", "X0"]
     with Store.open(folder / "thermocald.db") as store:
         found = {s.camera: s for s in store.all_series()}

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
+from tests.daemon.conftest import fast_run, make_recording, replayed_camera
 from thermocald.analysis.series.recorded import table_of_stored
 from thermocald.names import channel_fault
 from thermocald.photogrammetry.camera.camera_model import project
@@ -26,7 +24,7 @@ HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory):
+def store(tmp_path_factory, forker):
     """One daemon, five cameras that see the same until epoch 27."""
     folder = tmp_path_factory.mktemp("changes")
     taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4, interval=10.0))
@@ -54,20 +52,16 @@ def store(tmp_path_factory):
         path = folder / f"{name}-recording"
         head = Head(name, "M1", 10.0, taken.camera, taken.channels)
         write_recording(path, head, field, changed(name))
-        cameras.append({
-            "name": name, "driver": "replay", "recording": str(path),
-            "testfield": str(path / "testfield.csv"), "principal_distance_mm": 3.04,
-            "thermometers": [f"t-{name}"], "calibration": {"exterior": "series"},
-            "sensor": {"width_px": sensor.width, "height_px": sensor.height,
-                       "pixel_pitch_mm": sensor.pixel_pitch},
-        })  # fmt: skip
+        cameras.append(replayed_camera(
+            path, name=name, thermometers=[f"t-{name}"], calibration={"exterior": "series"}
+        ))  # fmt: skip
     thermometers = [
         {"name": f"t-{c['name']}", "driver": "replay", "recording": c["recording"]} for c in cameras
     ]
     document = {"cameras": cameras, "thermometers": thermometers, "frames": {"keep": "none"},
                 "store": {"durable": False}}  # fmt: skip
     run = fast_run(json.dumps(document), EPOCHS)
-    subprocess.run([sys.executable, "-c", run], cwd=folder, env=ENVIRONMENT, check=True)
+    assert forker.start(folder, script=run).wait(300.0) == 0
     with Store.open(folder / "thermocald.db") as opened:
         yield opened
 

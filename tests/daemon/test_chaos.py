@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT
-from tests.daemon.forking import Forker
 from tests.daemon.test_page_attacks import Page
 from thermocald.errors import StoreError, ThermocaldError
 from thermocald.store.database.store import Store
@@ -30,7 +28,7 @@ SEED = int(os.environ.get("THERMOCALD_CHAOS_SEED", "1"))
 class Chaos:
     """The daemons of a folder, and what becomes of them."""
 
-    def __init__(self, daemon, offset: Path, preload: str) -> None:
+    def __init__(self, daemon, offset: Path) -> None:
         self.daemon = daemon
         self.folder = daemon.folder
         self.results = daemon.folder / "results.jsonl"
@@ -38,14 +36,9 @@ class Chaos:
         self.offset = offset
         self.count: dict[str, int] = {}
         self.page: Page | None = None
-        self._forker = Forker(
-            {**ENVIRONMENT, "LD_PRELOAD": preload, "CLOCK_OFFSET_FILE": str(offset)}
-        )
 
     def start(self) -> None:
-        self.daemon.process = self._forker.start(
-            self.folder, "run", "--config", str(self.daemon.config)
-        )
+        self.daemon.start(CLOCK_OFFSET_FILE=str(self.offset))
 
     def progress(self) -> None:
         """Wait for a result that comes from now on."""
@@ -59,7 +52,6 @@ class Chaos:
         if self.page is not None:
             self.page.close()
         self.daemon.close()
-        self._forker.close()
 
     def told(self) -> dict[int, tuple[float, float]]:
         """What was reported as stored: {epoch: (c, frame_time)}."""
@@ -132,11 +124,12 @@ class Chaos:
 
 
 @pytest.fixture
-def chaos(daemon, recording, replayed, shim, tmp_path):
+def chaos(daemon, recording, replayed, preloaded, tmp_path):
     offset = tmp_path / "offset"
     offset.write_text("0".ljust(12))
+    daemon.forker = preloaded
     daemon.configure(**replayed(recording))
-    made = Chaos(daemon, offset, shim("clock_offset"))
+    made = Chaos(daemon, offset)
     yield made
     made.close()
 

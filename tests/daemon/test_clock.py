@@ -28,14 +28,15 @@ def content(daemon, folder):
     return columns, steps, read_recording(folder / "archive").columns.frame_time
 
 
-def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, devices, shim, tmp_path):
+def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, devices, preloaded, tmp_path):
     """120 days ahead for 3 s, an hour back: found to delete all frames and to leave times wrong."""
     offset = tmp_path / "offset"
     offset.write_text("0")
     frames = {"keep": "all", "folder": str(tmp_path / "frames"), "max_age_days": 90,
               "min_free_gb": 0.0}  # fmt: skip
     daemon.configure(**devices(period_s=0.3), frames=frames)
-    daemon.start(LD_PRELOAD=shim("clock_offset"), CLOCK_OFFSET_FILE=str(offset))
+    daemon.forker = preloaded
+    daemon.start(CLOCK_OFFSET_FILE=str(offset))
     daemon.until(lambda: len(daemon.results()) > 4)
     for seconds, steps in ((120 * DAY, 1), (0, 2), (-HOUR, 3), (0, 4)):
         # written over, since the process holds the file open
@@ -59,7 +60,7 @@ def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, devices, shim, tmp_
 
 
 def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(
-    daemon, devices, shim, tmp_path
+    daemon, devices, preloaded, tmp_path
 ):
     import time
 
@@ -68,7 +69,8 @@ def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(
     frames = {"keep": "all", "folder": str(tmp_path / "frames"), "max_age_days": 90,
               "min_free_gb": 0.0}  # fmt: skip
     daemon.configure(**devices(period_s=0.3), frames=frames)
-    daemon.start(LD_PRELOAD=shim("clock_offset"), CLOCK_OFFSET_FILE=str(offset))
+    daemon.forker = preloaded
+    daemon.start(CLOCK_OFFSET_FILE=str(offset))
     daemon.until(lambda: len(daemon.results()) > 4)
     offset.write_text("0".ljust(12))
     daemon.until(lambda: "time stamps follow" in daemon.log())

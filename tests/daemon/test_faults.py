@@ -77,9 +77,9 @@ def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, dev
     assert "hung" in daemon.events()
 
 
-def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
+def test_a_store_that_cannot_be_written_waits_in_memory(daemon, measured):
     """What a card that fails does to a running daemon: no write beyond a file size gets through."""
-    daemon.configure(**devices())
+    daemon.configure(**measured)
     daemon.start()
     daemon.until(lambda: len(daemon.results()) > 3)
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
@@ -103,14 +103,13 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
 
 @pytest.mark.parametrize("failing", ["write", "sync"])
 def test_a_disk_that_fails_beneath_the_store_loses_nothing(
-    daemon, devices, shim, tmp_path, failing
+    daemon, measured, preloaded, tmp_path, failing
 ):
     """Input/output errors: of writes, and of the flush that a commit is worth nothing without."""
     asked = tmp_path / "asked"
-    daemon.configure(**devices())
-    daemon.start(
-        LD_PRELOAD=shim("disk_error"), DISK_ERROR_OF=str(daemon.store), DISK_ERROR_FILE=str(asked)
-    )
+    daemon.forker = preloaded
+    daemon.configure(**measured)
+    daemon.start(DISK_ERROR_OF=str(daemon.store), DISK_ERROR_FILE=str(asked))
     daemon.until(lambda: len(daemon.results()) > 3)
     asked.write_text(failing)
     daemon.until(lambda: "results wait in memory" in daemon.log())
@@ -129,12 +128,12 @@ def test_a_disk_that_fails_beneath_the_store_loses_nothing(
 
 
 def test_on_a_read_only_file_system_it_says_so_and_leaves_the_rest_to_the_restart(
-    daemon, devices, small_disk
+    daemon, measured, small_disk
 ):
     disk = small_disk(8)
     subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
     daemon.store = disk / "thermocald.db"
-    daemon.configure(**devices())
+    daemon.configure(**measured)
     daemon.start()
     assert daemon.wait() == 1
     assert "error:" in daemon.log()

@@ -5,27 +5,20 @@ from __future__ import annotations
 import csv
 import os
 import shlex
-import subprocess
-import sys
 import time
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT
+from tests.commands import call
 from thermocald.errors import StoreError
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 
 UNITS = Path(__file__).resolve().parents[2] / "systemd"
-
-
-def thermocald(*options: str, cwd: Path, **more: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "thermocald", *options],
-        cwd=cwd, env={**ENVIRONMENT, **more}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+# a machine whose clock is synchronised: without that nothing is deleted for its age
+SYNCHRONISED = {"CLOCK_SYNCHRONISED": "1"}
 
 
 def readings_of(daemon, name=None) -> list:
@@ -47,7 +40,7 @@ def test_a_thermometer_alone_is_stored_and_archived(daemon, devices):
     assert all(20 < r.values["temperature"] < 30 for r in kept)
     gaps = [b.utc - a.utc for a, b in pairwise(kept)]
     assert min(gaps) > 0.1
-    done = thermocald("archive", "--config", "config.yaml", "--to", "out", cwd=daemon.folder)
+    done = call("archive", "--config", "config.yaml", "--to", "out", folder=daemon.folder)
     assert done.returncode == 0, done.stderr
     with (daemon.folder / "out/thermometer-air.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -98,13 +91,7 @@ def test_readings_wait_for_a_store_that_cannot_be_written(daemon, devices):
 
 
 @pytest.fixture
-def synchronised(shim) -> dict[str, str]:
-    """A machine whose clock is synchronised: without that nothing is deleted for its age."""
-    return {"LD_PRELOAD": shim("clock_offset"), "CLOCK_SYNCHRONISED": "1"}
-
-
-@pytest.fixture
-def timer_command(tmp_path, synchronised):
+def timer_command(daemon, preloaded):
     """The command line of the timer's unit, its paths moved below a folder of the test."""
     lines = (UNITS / "thermocald-archive.service").read_text().splitlines()
     (line,) = [one for one in lines if one.startswith("ExecStart=")]
@@ -114,25 +101,30 @@ def timer_command(tmp_path, synchronised):
     for old, new in moved.items():
         words = [word.replace(old, new) for word in words]
 
-    def run() -> subprocess.CompletedProcess[str]:
-        return thermocald(*words[1:], cwd=tmp_path, **synchronised)
+    daemon.forker = preloaded
+
+    def run() -> tuple[int, str]:
+        done = preloaded.start(daemon.folder, *words[1:], log="timer.txt", **SYNCHRONISED)
+        said = done.said()
+        (daemon.folder / "timer.txt").unlink()
+        return done.returncode, said
 
     return run
 
 
 @pytest.mark.slow
 def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
-    daemon, devices, timer_command, synchronised
+    daemon, devices, timer_command
 ):
-    assert timer_command().returncode == 2  # no configuration: one line, no traceback
+    assert timer_command()[0] == 2  # no configuration: one line, no traceback
     limits = {"keep": "all", "folder": str(daemon.folder / "frames"), "max_age_days": 1,
               "min_free_gb": 0.01}  # fmt: skip
     daemon.configure(**devices(), frames=limits)
-    assert "nothing was stored yet" in timer_command().stderr
+    assert "nothing was stored yet" in timer_command()[1]
     for series in ("M1", "M2"):
         sections = devices(series=series)
         daemon.configure(**sections, frames=limits)
-        daemon.start(**synchronised)
+        daemon.start(**SYNCHRONISED)
         count = len(daemon.results())
         daemon.until(lambda n=count: len(daemon.results()) > n + 3)
         if series == "M1":
@@ -141,9 +133,9 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
     old = sorted((daemon.folder / "frames").rglob("*.png"))[0]
     yesterday = time.time() - 2 * 86400
     os.utime(old, (yesterday, yesterday))
-    done = timer_command()
-    assert done.returncode == 0, done.stderr
-    assert "1 frames" in done.stderr
+    status, said = timer_command()
+    assert status == 0, said
+    assert "1 frames" in said
     assert not old.exists()
     assert (daemon.folder / "recordings/one-M1").is_dir()
     assert not (daemon.folder / "recordings/one-M2").exists()
@@ -152,9 +144,9 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
     # and where no daemon runs, the command itself does and logs it; a second run archives nothing
     old = sorted((daemon.folder / "frames").rglob("*.png"))[0]
     os.utime(old, (yesterday, yesterday))
-    done = timer_command()
-    assert done.returncode == 0, done.stderr
-    assert "one-M1" not in done.stderr
+    status, said = timer_command()
+    assert status == 0, said
+    assert "one-M1" not in said
     assert not old.exists()
     assert daemon.events().count("frames_deleted") == 2
 

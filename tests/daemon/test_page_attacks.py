@@ -7,19 +7,16 @@ import subprocess
 import sys
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
-from thermocald.epoch import Epoch
+from tests.store.small import create_small_series, small_epoch, small_result
 from thermocald.files import read_json
-from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
-from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.series import EpochResult
 
 
 def free_port() -> int:
@@ -34,13 +31,11 @@ def resident_mb(pid: int) -> float:
 
 
 def make_store(path: Path, epochs: int) -> None:
-    head = Head("a", "M1", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)), {"t": Channel()})
-    covariance = np.eye(16)
     with Store.open(path, "append", durable=False) as store:
-        series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+        series = create_small_series(store)
         for k in range(1, epochs + 1):
-            result = EpochResult("ok", "", np.full(16, k / 7), covariance, 1.0, 5, 9)
-            store.append(series, Epoch(k, 1e9 + 10 * k, 1e9 + 10 * k, {"t": k / 9}), result)
+            epoch = replace(small_epoch(k, interval_s=10.0), temperatures={"t": k / 9})
+            store.append(series, epoch, small_result(k / 7))
 
 
 def slow_reader(port: int, path: str) -> socket.socket:
@@ -132,12 +127,12 @@ def test_slow_and_silent_clients_take_no_memory_and_hold_nobody_up(tmp_path, pag
         channel.close()
 
 
-def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, devices):
+def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, measured):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        daemon.configure(**devices(), dashboard={"enabled": True, "port": port})
+        daemon.configure(**measured, dashboard={"enabled": True, "port": port})
         daemon.start(INVOCATION_ID="")
         daemon.until(lambda: "acquisition goes on without it" in daemon.log(), 90.0)
         count = len(daemon.results())
@@ -149,8 +144,8 @@ def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, devices):
         assert daemon.stop() == 0
 
 
-def test_under_systemd_the_page_is_not_the_daemons_child(daemon, devices):
-    daemon.configure(**devices(), dashboard={"enabled": True, "port": free_port()})
+def test_under_systemd_the_page_is_not_the_daemons_child(daemon, measured):
+    daemon.configure(**measured, dashboard={"enabled": True, "port": free_port()})
     daemon.start(INVOCATION_ID="0" * 32)
     daemon.until(lambda: len(daemon.results()) > 3)
     children = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children")

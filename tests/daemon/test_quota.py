@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -84,29 +83,22 @@ def filled_and_emptied(daemon, disk: Path, fill=fill, empty=empty, **environment
     assert "store_out" in daemon.events()
 
 
-def test_a_full_disk_is_said_and_waited_for(daemon, devices, small_disk, tmp_path):
-    disk = small_disk(40)
+@pytest.mark.parametrize("kind", ["small_disk", "small_card"])
+def test_a_full_disk_is_said_and_waited_for(daemon, measured, kind, request):
+    made = request.getfixturevalue(kind)
+    disk = made(40) if kind == "small_disk" else made
     daemon.store = disk / "thermocald.db"
-    daemon.configure(**devices(period_s=0.5))
+    daemon.configure(**measured)
     filled_and_emptied(daemon, disk)
-    assert "observations_paused" in daemon.events()
-
-
-def test_a_full_card_is_said_and_waited_for(daemon, devices, small_card):
-    daemon.store = small_card / "thermocald.db"
-    daemon.configure(**devices(period_s=0.5))
-    filled_and_emptied(daemon, small_card)
     assert "observations_paused" in daemon.events()
 
 
 class Quota:
     """A quota of the daemon's files in a folder, which the kernel here may not know."""
 
-    def __init__(self, folder: Path, library: str) -> None:
+    def __init__(self, folder: Path) -> None:
         self._file = folder.with_name("quota")
-        self.environment = {
-            "LD_PRELOAD": library, "QUOTA_OF": str(folder), "QUOTA_FILE": str(self._file)
-        }  # fmt: skip
+        self.environment = {"QUOTA_OF": str(folder), "QUOTA_FILE": str(self._file)}
 
     def reach(self, folder: Path, room: int = 0) -> None:
         used = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
@@ -118,26 +110,26 @@ class Quota:
 
 
 @pytest.fixture
-def quota(daemon, tmp_path, shim):
+def quota(daemon, tmp_path, preloaded):
     folder = tmp_path / "home"
     folder.mkdir()
-    daemon.store = folder / "thermocald.db"
-    return Quota(folder, shim("quota"))
+    daemon.forker, daemon.store = preloaded, folder / "thermocald.db"
+    return Quota(folder)
 
 
 @pytest.mark.parametrize("late", [{}, {"QUOTA_LATE": "1"}])
-def test_a_quota_is_said_and_waited_for(daemon, devices, quota, late):
+def test_a_quota_is_said_and_waited_for(daemon, measured, quota, late):
     """QUOTA_LATE: the flush fails too, as where blocks are allocated late."""
-    daemon.configure(**devices(period_s=0.5))
+    daemon.configure(**measured)
     home = daemon.store.parent
     filled_and_emptied(daemon, home, quota.reach, quota.lift, **quota.environment, **late)
     assert "Traceback" not in daemon.log()
 
 
-def test_an_output_under_a_quota_goes_on_with_whole_lines_and_what_waited(daemon, devices, quota):
-    home, given = daemon.store.parent, devices()
-    given["outputs"].append({"name": "two", "driver": "jsonl", "path": str(home / "two.jsonl")})
-    daemon.configure(**given)
+def test_an_output_under_a_quota_goes_on_with_whole_lines_and_what_waited(daemon, measured, quota):
+    home = daemon.store.parent
+    measured["outputs"].append({"name": "two", "driver": "jsonl", "path": str(home / "two.jsonl")})
+    daemon.configure(**measured)
     daemon.start(**quota.environment)
     daemon.until(lambda: len(daemon.results("home/two.jsonl")) > 3)
     quota.reach(home, 100)  # less than a line
@@ -161,24 +153,26 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("case", COMMANDS)
-def test_a_command_under_a_quota_says_so_and_leaves_nothing_half(case, quota, recording, tmp_path):
+def test_a_command_under_a_quota_says_so_and_leaves_nothing_half(
+    case, quota, recording, tmp_path, preloaded
+):
     quota.reach(tmp_path / "home", 200)
     out = tmp_path / "home/out"
     command = [part.format(recording=recording, out=out) for part in COMMANDS[case]]
-    done = subprocess.run(
-        [sys.executable, "-m", "thermocald", *command], capture_output=True, check=False, text=True,
-        env={**os.environ, **quota.environment},
-    )  # fmt: skip
+    done = preloaded.start(tmp_path, *command, **quota.environment)
+    said = done.said()
     assert done.returncode == 3
-    assert "error: " in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "error: " in said
+    assert "Traceback" not in said
     assert not [path for path in out.parent.rglob("*") if path.is_file()]
 
 
-@pytest.mark.parametrize("room", [1, 511, 4095, 8193, 30_000])
-def test_what_was_reported_kept_is_kept_where_a_quota_leaves_a_little(daemon, devices, quota, room):
+@pytest.mark.parametrize("room", [1, 4095, 8193, 30_000])
+def test_what_was_reported_kept_is_kept_where_a_quota_leaves_a_little(
+    daemon, measured, quota, room
+):
     """A write that fits in part; then it is killed, and lifted, and goes on."""
-    daemon.configure(**devices(period_s=0.2))
+    daemon.configure(**measured)
     daemon.start(**quota.environment)
     daemon.until(lambda: len(daemon.results()) > 3)
     quota.reach(daemon.store.parent, room)
@@ -194,9 +188,9 @@ def test_what_was_reported_kept_is_kept_where_a_quota_leaves_a_little(daemon, de
     assert kept <= set(daemon.stored()[0])
 
 
-def test_where_a_quota_is_reached_before_it_begins_it_says_so(daemon, devices, quota):
+def test_where_a_quota_is_reached_before_it_begins_it_says_so(daemon, measured, quota):
     quota.reach(daemon.store.parent)
-    daemon.configure(**devices())
+    daemon.configure(**measured)
     daemon.start(**quota.environment)
     assert daemon.wait() in (1, 3)
     assert "error: " in daemon.log()
@@ -207,19 +201,19 @@ def test_where_a_quota_is_reached_before_it_begins_it_says_so(daemon, devices, q
     assert daemon.stop() == 0
 
 
-def test_what_waits_when_it_is_ended_on_a_full_disk_is_counted(daemon, devices, small_disk):
+def test_what_waits_when_it_is_ended_on_a_full_disk_is_counted(daemon, measured, small_disk):
     disk = small_disk(40)
     daemon.store = disk / "thermocald.db"
-    ended_when_full(daemon, devices, disk)
+    ended_when_full(daemon, measured, disk)
 
 
-def test_what_waits_when_it_is_ended_under_a_quota_is_counted(daemon, devices, quota):
+def test_what_waits_when_it_is_ended_under_a_quota_is_counted(daemon, measured, quota):
     home = daemon.store.parent
-    ended_when_full(daemon, devices, home, quota.reach, quota.lift, **quota.environment)
+    ended_when_full(daemon, measured, home, quota.reach, quota.lift, **quota.environment)
 
 
-def ended_when_full(daemon, devices, disk, fill=fill, empty=empty, **environment) -> None:
-    daemon.configure(**devices(period_s=0.5))
+def ended_when_full(daemon, measured, disk, fill=fill, empty=empty, **environment) -> None:
+    daemon.configure(**measured)
     daemon.start(**environment)
     daemon.until(lambda: len(daemon.results()) > 3)
     fill(disk)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 
 import pytest
@@ -33,13 +32,13 @@ def test_it_is_checked_taken_interrupted_resumed_and_archived(session, tmp_path)
     path = tmp_path / "t.db"
     while _epochs(path) < 4:
         assert time.monotonic() < deadline
-        assert first.poll() is None, first.stderr.read()
+        assert first.poll() is None, first.said()
         time.sleep(0.1)
-    first.send_signal(signal.SIGKILL)
+    first.kill()
     first.wait()
     had = _epochs(path)
     second = session(*command)
-    _, told = second.communicate(timeout=120)
+    told = second.said()
     assert second.returncode == 0, told
     assert f"has {had} epochs; {14 - had} are still to be taken" in told
     assert "192 targets" in told
@@ -64,14 +63,14 @@ def _epochs(path) -> int:
 @pytest.mark.slow
 def test_it_ends_with_the_report(session, tmp_path):
     process = session("--epochs", "30", "--series", "M1")
-    _, told = process.communicate(timeout=200)
+    told = process.said(200)
     assert process.returncode == 0, told
     assert "<svg" in (tmp_path / "phone-1-M1.html").read_text()
 
 
 def test_a_camera_that_sees_nothing_is_told_before_it_begins(session, tmp_path):
     process = session("--epochs", "5", exposure_s=0.01, camera=[{"kind": "timeout", "at": 1}])
-    _, told = process.communicate(timeout=120)
+    told = process.said()
     assert process.returncode == 3
     assert "no answer" in told
     assert not (tmp_path / "t.db").exists()
@@ -79,7 +78,7 @@ def test_a_camera_that_sees_nothing_is_told_before_it_begins(session, tmp_path):
 
 def test_wrong_usage_is_one_line(session):
     process = session("--camera", "nobody")
-    _, told = process.communicate(timeout=60)
+    told = process.said()
     assert process.returncode == 2
     assert "there are: phone-1" in told
     assert "Traceback" not in told

@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 import yaml
 
+from tests.commands import call
 from thermocald.daemon.control import ask
 from thermocald.daemon.session import Session
 from thermocald.errors import DataError, UsageError
@@ -60,7 +61,7 @@ def test_the_command_has_the_daemon_take_a_session_and_ends_with_its_recording(l
     daemon.until(lambda: "watch" in series_of(daemon.store))
     process = command("start", "--camera", "phone-1", "--series", "M7", "--start", "cold",
                       "--epochs", "6", "--no-report")  # fmt: skip
-    _, told = process.communicate(timeout=120)
+    told = process.said()
     assert process.returncode == 0, told
     assert "taken by the daemon" in told
     assert "192 targets" in told
@@ -106,7 +107,7 @@ def test_it_pauses_while_the_phone_is_away_and_the_command_survives_a_restart(li
     daemon.kill()
     time.sleep(1.5)  # the command asks twice a second
     daemon.start()
-    _, told = process.communicate(timeout=120)
+    told = process.said()
     assert process.returncode == 0, told
     assert "paused: " in told
     assert "the camera is back" in told
@@ -136,14 +137,13 @@ def status_of(daemon) -> dict:
 def test_status_and_stop(live, command, daemon):
     live()
     process = command("start", "--series", "M7", "--start", "warm", "--epochs", "1000", "--no-wait")
-    _, told = process.communicate(timeout=60)
+    told = process.said()
     assert process.returncode == 0, told
     daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
-    out, told = command("status", "--json", "-").communicate(timeout=60)
+    out = call("session", "status", "--json", "-", folder=daemon.folder).stdout
     one = json.loads(out)["sessions"]["phone-1"]
     assert (one["series"], one["start"], one["state"]) == ("M7", "warm", "running")
-    _, told = command("stop").communicate(timeout=60)
-    assert "of 1000 epochs, stopped" in told
+    assert "of 1000 epochs, stopped" in command("stop").said()
     taken = daemon.session()["taken"]
     assert daemon.session()["state"] == "stopped"
     # it may be taken up again, but not as something else

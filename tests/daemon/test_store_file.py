@@ -11,20 +11,16 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
+from tests.store.small import create_small_series, small_epoch, small_result
 from thermocald.daemon.store_guard import FollowedStore, Row, StoreGuard
-from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
 from thermocald.files import read_json
 from thermocald.output.dashboard.view import View
-from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
-from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.series import EpochResult, Event
+from thermocald.store.series import Event
 
 
 @pytest.fixture
@@ -44,15 +40,12 @@ def guard(path):
 def keeping(path, durable=False) -> StoreGuard:
     """A guard with epochs 1, 2, 3, and a `keep` that notes what it told of each."""
     guard = StoreGuard(path, durable=durable)
-    head = Head("a", "M1", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)), {"t": Channel()})
-    field = TestField.build(["a"], np.zeros((1, 3)))
-    series = guard.store.create_series(head, field, start="cold")
+    series = create_small_series(guard.store, start="cold")
     guard.told = {}
 
     def keep(number: int, time_s: float = 1e9) -> None:
-        values = EpochResult("ok", "", np.full(16, float(number)), np.eye(16), 1.0, 5, 9)
-        epoch = Epoch(number, time_s + number, time_s + number, {"t": 20.0})
-        guard.told[number] = guard.append(Row(series, epoch, values, {}, True))
+        row = Row(series, small_epoch(number, time_s), small_result(number), {}, True)
+        guard.told[number] = guard.append(row)
 
     guard.keep = keep
     for number in (1, 2, 3):
@@ -184,11 +177,10 @@ def test_a_deleted_store_behind_a_link_is_written_again_behind_it(tmp_path):
     link = tmp_path / "t.db"
     link.symlink_to(tmp_path / "disk/real.db")
     guard = StoreGuard(link, durable=False)
-    head = Head("a", "M1", 10.0, CameraSpec("rpi", Sensor(640, 480, 0.001)))
-    series = guard.store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+    series = create_small_series(guard.store)
     for name in (tmp_path / "disk").iterdir():
         name.unlink()
-    guard.append(Row(series, Epoch(1, 1e9, 1e9), None, {}, True))
+    guard.append(Row(series, small_epoch(1), None, {}, True))
     guard.close()
     assert link.is_symlink()
     assert numbers(tmp_path / "disk/real.db") == [1]
@@ -235,35 +227,6 @@ def test_a_refused_row_is_not_called_stored(guard):
     assert (guard.told[2], guard.told[4], guard.lost) == (False, True, 1)
 
 
-@pytest.mark.parametrize("kind", ["same", "link", "hard link", "relative", "replaced name"])
-@pytest.mark.parametrize("process", ["this", "another"])
-def test_the_file_is_locked_whatever_it_is_called(guard, path, tmp_path, kind, process):
-    other = tmp_path / "other.db"
-    if kind == "link":
-        other.symlink_to(path)
-    elif kind == "hard link":
-        os.link(path, other)
-    elif kind == "relative":
-        other = tmp_path / "kept/../kept/t.db"
-    else:
-        other = path
-    if process == "this":
-        with pytest.raises(StoreError, match="another thermocald writes it"):
-            StoreGuard(other)
-    else:
-        script = (
-            "import sys; from pathlib import Path; "
-            "from thermocald.daemon.store_guard import StoreGuard; StoreGuard(Path(sys.argv[1]))"
-        )
-        done = subprocess.run(
-            [sys.executable, "-c", script, str(other)],
-            env=ENVIRONMENT, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert "another thermocald writes it" in done.stderr
-    guard.keep(4)
-    assert numbers(path) == [1, 2, 3, 4]
-
-
 def test_a_store_that_cannot_be_made_leaves_nothing_behind(tmp_path):
     database = sqlite3.connect(tmp_path / "foreign.db")
     database.execute("CREATE TABLE x (y)")
@@ -275,8 +238,8 @@ def test_a_store_that_cannot_be_made_leaves_nothing_behind(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["foreign.db"]
 
 
-def test_the_running_daemon_says_so_and_loses_nothing(daemon, devices):
-    daemon.configure(**devices())
+def test_the_running_daemon_says_so_and_loses_nothing(daemon, measured):
+    daemon.configure(**measured)
     daemon.start()
     daemon.until(lambda: len(daemon.results()) > 3)
     for name in daemon.folder.glob("thermocald.db*"):
@@ -352,10 +315,10 @@ def test_a_disk_that_becomes_read_only_while_the_daemon_writes(ext4):
     assert numbers(path) == [1, 2, 3, 4, 5, 6, 7]
 
 
-def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemon, devices):
+def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemon, measured):
     folder, broken, mended = ext4
     daemon.store = folder / "thermocald.db"
-    daemon.configure(**devices())
+    daemon.configure(**measured)
     daemon.start()
     daemon.until(lambda: len(daemon.results()) > 3)
     broken()
@@ -378,7 +341,7 @@ def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemo
     ids=str,
 )  # fmt: skip
 def test_a_row_that_no_store_takes_is_lost_and_holds_up_none(guard, path, what):
-    epoch = replace(Epoch(4, 1e9 + 4, 1e9 + 4, {"t": 20.0}), **what)
+    epoch = replace(small_epoch(4), **what)
     assert not guard.append(Row(guard.all_series()[0], epoch, None, {}, True))
     assert (guard.waiting, guard.lost) == (0, 1)
     guard.keep(5)

@@ -13,9 +13,11 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 
 import pytest
 
+from tests.commands import call
 from tests.daemon.conftest import ENVIRONMENT
 from thermocald.daemon.systemd import JournalHandler
 
@@ -111,10 +113,7 @@ def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeyp
         f"sys.argv = ['thermocald', 'run', '--config', {str(daemon.config)!r}]; "
         "from thermocald.cli import main; main()"
     )
-    daemon.process = subprocess.Popen(
-        [sys.executable, "-c", script], cwd=daemon.folder,
-        env={**ENVIRONMENT, "JOURNAL_STREAM": "8:1"}, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    daemon.process = daemon.forker.start(daemon.folder, script=script, JOURNAL_STREAM="8:1")
     found: dict[str, dict[str, str]] = {}
     deadline = time.monotonic() + 60
     while "device_back" not in found:
@@ -125,7 +124,6 @@ def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeyp
             continue
         found[entry.get("THERMOCALD_EVENT", "")] = entry
     daemon.stop()
-    daemon.process.stderr.close()
     journal.close()
     assert found["started"]["PRIORITY"] == "6"
     assert found["device_out"]["THERMOCALD_DEVICE"] == "one"
@@ -184,22 +182,18 @@ def test_top_is_always_up_to_date(daemon, devices, key):
     assert "Traceback" not in plain
 
 
-def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, devices):
-    def status(*options: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "thermocald", "status", "--store", str(daemon.store)]
-        return subprocess.run([*command, *options], cwd=daemon.folder, env=ENVIRONMENT,
-                              capture_output=True, text=True, check=False)  # fmt: skip
-
+def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, measured):
+    status = partial(call, "status", "--store", daemon.store)
     gone = status()
     assert (gone.returncode, gone.stderr.count("\n")) == (1, 1)
-    daemon.configure(**devices())
+    daemon.configure(**measured)
     daemon.start()
     daemon.until(lambda: len(daemon.results()) > 2)
     told = status("--json", "-")
     document = json.loads(told.stdout)
     assert document["pid"] == daemon.process.pid
-    assert document["cameras"]["one"]["device"] == "open"
-    assert document["thermometers"]["housing"]["last"]["temperature"] == pytest.approx(25, abs=3)
+    assert document["cameras"]["rpi"]["device"] == "open"
+    assert document["thermometers"]["recorded"]["last"]["temperature"] == pytest.approx(25, abs=3)
     daemon.kill()
     killed = status()
     assert killed.returncode == 1

@@ -19,19 +19,15 @@ Mask = NDArray[np.bool_]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
-class _Kept(threading.local):
-    def __init__(self) -> None:
-        self.buffers: dict[str, NDArray[np.uint8]] = {}
-
-
-_KEPT = _Kept()
+_KEPT = threading.local()  # by name
 
 
 def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """Return an array with undefined contents; the thread's next call with this name reuses it."""
     kind = np.dtype(dtype)
     size = int(np.prod(shape)) * kind.itemsize
-    buffer = _KEPT.buffers.get(name)
+    buffer: NDArray[np.uint8] | None = getattr(_KEPT, name, None)
     if buffer is None or buffer.size < size:
-        buffer = _KEPT.buffers[name] = np.empty(size, dtype=np.uint8)
+        buffer = np.empty(size, dtype=np.uint8)
+        setattr(_KEPT, name, buffer)
     return buffer[:size].view(kind).reshape(shape)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 from urllib.parse import urlsplit
@@ -454,8 +454,9 @@ def parse_config(
         config = Config.model_validate(document, context={"folder": path.absolute().parent})
     except ValidationError as cause:
         raise ConfigurationError(in_words(path, cause)) from cause
-    for where, kind, device in _devices(config):
-        _check_options(f"{path}: {where}", kind, device, option_names)
+    for kind in ("camera", "thermometer", "output"):
+        for i, device in enumerate(getattr(config, f"{kind}s")):
+            _check_options(f"{path}: {kind}s[{i}]", kind, device, option_names)
     for i, camera in enumerate(config.cameras):
         for key in ("testfield", "thermal_model", "control_points", "control_reference"):
             file = getattr(camera, key)
@@ -497,12 +498,6 @@ def _same_file(one: Path, other: Path) -> bool:
         return one.samefile(other)
     except OSError:
         return one.resolve() == other.resolve()
-
-
-def _devices(config: Config) -> Iterator[tuple[str, str, DeviceConfig]]:
-    for kind in ("camera", "thermometer", "output"):
-        for i, device in enumerate(getattr(config, f"{kind}s")):
-            yield f"{kind}s[{i}]", kind, device
 
 
 def _check_options(

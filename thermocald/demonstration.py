@@ -97,19 +97,15 @@ def _compare(table: tc.Epochs, truth: Array, pitch: float) -> list[dict[str, Any
         found, sd, true = table.values[ok, k], table.sd[ok, k], truth[ok, k]
         error = (found - found.mean()) - (true - true.mean())
         drifts = {
-            "in": float(true[hottest] - true[0]),
-            "found": float(found[hottest] - found[0]),
-            "sd": float(np.hypot(sd[hottest], sd[0])),
+            "drift_in": float(true[hottest] - true[0]),
+            "drift_found": float(found[hottest] - found[0]),
+            "sd_drift_found": float(np.hypot(sd[hottest], sd[0])),
         }
         rows.append(
             {
                 "name": name,
-                "drift_in_mm": drifts["in"],
-                "drift_found_mm": drifts["found"],
-                "sd_drift_found_mm": drifts["sd"],
-                "drift_in_px": drifts["in"] / pitch,
-                "drift_found_px": drifts["found"] / pitch,
-                "sd_drift_found_px": drifts["sd"] / pitch,
+                **{f"{key}_mm": drift for key, drift in drifts.items()},
+                **{f"{key}_px": drift / pitch for key, drift in drifts.items()},
                 "rate_in_mm_per_k": float(true @ t / (t @ t)),
                 "rate_found_mm_per_k": float(found @ t / (t @ t)),
                 "scatter_over_sd": float(np.sqrt(np.mean(error**2) / np.mean(sd**2))),

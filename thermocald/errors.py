@@ -31,34 +31,6 @@ Leaves also are the built-in exception that they mean.
 
 from __future__ import annotations
 
-__all__ = [
-    "BadReading",
-    "ConfigurationError",
-    "DataError",
-    "DeviceDenied",
-    "DeviceError",
-    "DeviceFinished",
-    "DeviceGone",
-    "DeviceNotFound",
-    "DeviceTimeout",
-    "DriverMissing",
-    "GeometryError",
-    "ImageError",
-    "OutputError",
-    "PermanentDeviceError",
-    "RecordingError",
-    "ServerError",
-    "ServerGone",
-    "StoreError",
-    "StoreFullError",
-    "StoreVersionError",
-    "TestFieldError",
-    "ThermocaldError",
-    "TransientDeviceError",
-    "UsageError",
-    "WrongDevice",
-]
-
 
 class ThermocaldError(Exception):
     """Base of everything that thermocald raises on purpose; `exit_status` is CONVENTIONS §4's."""

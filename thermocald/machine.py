@@ -23,13 +23,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
 NOT_BEFORE = 1_700_000_000.0  # no machine has taken frames with this program before then
 _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 _STA_UNSYNC = 0x40
 
 State = Literal["ok", "missing", "warning", "not needed"]
+_Said = tuple[State, str, str]  # state, text and remedy of a finding
 
 # bits of get_throttled: now, and since the start
 _THROTTLED = {
@@ -44,6 +45,7 @@ _THROTTLED = {
 }
 _SUPPLY_BITS = (0, 16)
 _HOT_C = 80.0  # the firmware throttles from 80 °C on
+_COOLER = "give the board a heat sink, or a cooler place"
 _FREE_BYTES = 1_000_000_000
 # device nodes → the group that may open them, and what they are for
 _GROUPS = {
@@ -97,12 +99,15 @@ class Machine:
 
     def findings(self) -> list[Finding]:
         """Look at everything, in the order in which it is best mended."""
-        checks = (
-            self._board, self._camera_stack, self._camera_enabled, self._groups, self._i2c,
-            self._one_wire, self._phones, self._clock, self._power, self._heat, self._disk,
-            self._service,
-        )  # fmt: skip
-        return [finding for check in checks for finding in check()]
+        checks = {
+            "machine": self._board, "camera stack": self._camera_stack,
+            "camera connector": self._camera_enabled, "groups": self._groups, "I2C": self._i2c,
+            "1-wire": self._one_wire, "phones": self._phones, "clock": self._clock,
+            "power": self._power, "board temperature": self._heat, "disk": self._disk,
+            "service": self._service,
+        }  # fmt: skip
+        said = {name: check() for name, check in checks.items()}
+        return [Finding(name, *found) for name, found in said.items() if found is not None]
 
     def _read(self, path: str) -> str | None:
         """A file's text without NULs and white space at its ends; None where it cannot be read."""
@@ -130,108 +135,82 @@ class Machine:
         text = self._read("boot/firmware/config.txt") or self._read("boot/config.txt") or ""
         return [line.split("#")[0].strip() for line in text.splitlines()]
 
-    def _board(self) -> Iterator[Finding]:
+    def _board(self) -> _Said:
         system = self._read("etc/os-release") or ""
         names = dict(line.split("=", 1) for line in system.splitlines() if "=" in line)
         name = names.get("PRETTY_NAME", "an unknown system").strip('"')
-        yield Finding("machine", "ok", f"{self.board or 'not a Raspberry Pi'}, {name}")
+        return "ok", f"{self.board or 'not a Raspberry Pi'}, {name}", ""
 
-    def _camera_stack(self) -> Iterator[Finding]:
+    def _camera_stack(self) -> _Said:
         absent = [name for name in ("libcamera", "picamera2") if not self.has_module(name)]
         if not absent:
-            yield Finding("camera stack", "ok", "picamera2 and libcamera are found")
-        elif not self._is_pi:
-            yield Finding(
-                "camera stack", "not needed", "picamera2 is for the camera of a Raspberry Pi"
-            )
-        elif self._found("usr/lib/python3/dist-packages/picamera2"):
-            yield Finding(
-                "camera stack", "missing",
-                "picamera2 is installed, but this Python environment does not see the system's "
-                "modules",
-                "python3 -m venv --system-site-packages --upgrade .venv",
-            )  # fmt: skip
-        else:
-            yield Finding(
-                "camera stack", "missing", f"{' and '.join(absent)} not installed",
-                "sudo apt-get install python3-picamera2",
-            )  # fmt: skip
+            return "ok", "picamera2 and libcamera are found", ""
+        if not self._is_pi:
+            return "not needed", "picamera2 is for the camera of a Raspberry Pi", ""
+        if self._found("usr/lib/python3/dist-packages/picamera2"):
+            why = "picamera2 is installed, but this Python environment does not see the system's"
+            remedy = "python3 -m venv --system-site-packages --upgrade .venv"
+            return "missing", f"{why} modules", remedy
+        why = f"{' and '.join(absent)} not installed"
+        return "missing", why, "sudo apt-get install python3-picamera2"
 
-    def _camera_enabled(self) -> Iterator[Finding]:
+    def _camera_enabled(self) -> _Said | None:
         if not self._is_pi or not self._settings:
-            return
+            return None
         wanted = ("camera_auto_detect=1", "dtoverlay=imx", "dtoverlay=ov", "dtoverlay=arducam")
         if any(line.startswith(wanted) for line in self._settings):
-            yield Finding("camera connector", "ok", "config.txt enables it")
-        else:
-            yield Finding(
-                "camera connector", "missing", "config.txt does not enable it",
-                "echo camera_auto_detect=1 | sudo tee -a /boot/firmware/config.txt && sudo reboot",
-            )  # fmt: skip
+            return "ok", "config.txt enables it", ""
+        remedy = "echo camera_auto_detect=1 | sudo tee -a /boot/firmware/config.txt && sudo reboot"
+        return "missing", "config.txt does not enable it", remedy
 
-    def _groups(self) -> Iterator[Finding]:
+    def _groups(self) -> _Said:
         if self.uid == 0:
-            yield Finding("groups", "ok", "root may open every device")
-            return
+            return "ok", "root may open every device", ""
         needed = [
             group
             for group, nodes in _GROUPS.items()
             if self._found(*(f"dev/{node}" for node in nodes))
         ]
         lacking = [group for group in needed if group not in self.groups]
-        if lacking:
-            yield Finding(
-                "groups", "missing", f"{self.user} is not in {', '.join(lacking)}",
-                f"sudo usermod -aG {','.join(lacking)} {self.user}    # then log in again",
-            )  # fmt: skip
-        else:
-            yield Finding("groups", "ok", "no group is missing")
+        if not lacking:
+            return "ok", "no group is missing", ""
+        remedy = f"sudo usermod -aG {','.join(lacking)} {self.user}    # then log in again"
+        return "missing", f"{self.user} is not in {', '.join(lacking)}", remedy
 
-    def _i2c(self) -> Iterator[Finding]:
-        buses = self._found("dev/i2c-*")
+    def _i2c(self) -> _Said:
+        buses = [bus.name for bus in self._found("dev/i2c-*")]
         # the connectors of monitors have a bus too, 20 and 21 on a Pi
-        if any(bus.name == "i2c-1" for bus in buses) or (buses and not self._is_pi):
-            yield Finding("I2C", "ok", f"{', '.join(bus.name for bus in buses)}")
-        elif self._is_pi:
-            yield Finding(
-                "I2C", "missing", "off: thermometers on the pins are not seen",
-                "sudo raspi-config nonint do_i2c 0",
-            )  # fmt: skip
-        else:
-            yield Finding("I2C", "not needed", "no bus")
+        if "i2c-1" in buses or (buses and not self._is_pi):
+            return "ok", ", ".join(buses), ""
+        if not self._is_pi:
+            return "not needed", "no bus", ""
+        remedy = "sudo raspi-config nonint do_i2c 0"
+        return "missing", "off: thermometers on the pins are not seen", remedy
 
-    def _one_wire(self) -> Iterator[Finding]:
-        probes = self._found("sys/bus/w1/devices/*-*")
+    def _one_wire(self) -> _Said | None:
         if self._found("sys/bus/w1/devices"):
-            yield Finding("1-wire", "ok", f"{len(probes)} found")
-        elif self._is_pi:
-            yield Finding(
-                "1-wire", "not needed", "off; only a DS18B20 needs it",
-                "echo dtoverlay=w1-gpio | sudo tee -a /boot/firmware/config.txt && sudo reboot",
-            )  # fmt: skip
+            return "ok", f"{len(self._found('sys/bus/w1/devices/*-*'))} found", ""
+        if not self._is_pi:
+            return None
+        remedy = "echo dtoverlay=w1-gpio | sudo tee -a /boot/firmware/config.txt && sudo reboot"
+        return "not needed", "off; only a DS18B20 needs it", remedy
 
-    def _phones(self) -> Iterator[Finding]:
+    def _phones(self) -> _Said:
         path = os.pathsep.join(str(self.root / folder) for folder in ("usr/bin", "usr/local/bin"))
         if shutil.which("adb", path=path):
-            yield Finding("phones", "ok", "adb is installed")
-        else:
-            yield Finding(
-                "phones", "not needed", "adb is not installed; only phones need it",
-                "sudo apt-get install adb",
-            )  # fmt: skip
+            return "ok", "adb is installed", ""
+        why = "adb is not installed; only phones need it"
+        return "not needed", why, "sudo apt-get install adb"
 
-    def _clock(self) -> Iterator[Finding]:
+    def _clock(self) -> _Said:
         if self.synchronised is None:
-            yield Finding("clock", "warning", "it is not known whether it is synchronised")
-        elif self.synchronised:
-            yield Finding("clock", "ok", "synchronised")
-        else:
-            yield Finding(
-                "clock", "missing", "not synchronised: times of epochs may be wrong",
-                "sudo timedatectl set-ntp true",
-            )  # fmt: skip
+            return "warning", "it is not known whether it is synchronised", ""
+        if self.synchronised:
+            return "ok", "synchronised", ""
+        why = "not synchronised: times of epochs may be wrong"
+        return "missing", why, "sudo timedatectl set-ntp true"
 
-    def _power(self) -> Iterator[Finding]:
+    def _power(self) -> _Said | None:
         text = self._read("sys/devices/platform/soc/soc:firmware/get_throttled")
         try:
             bits = int(text, 16) if text else None
@@ -245,69 +224,51 @@ class Machine:
             ]
             bits = None if not alarms else int("1" in alarms)
         if bits is None:
-            if self._is_pi:
-                yield Finding("power", "warning", "the firmware does not report under-voltage")
-            return
+            why = "the firmware does not report under-voltage"
+            return ("warning", why, "") if self._is_pi else None
         seen = [text for bit, text in _THROTTLED.items() if bits >> bit & 1]
         if not seen:
-            yield Finding("power", "ok", "no under-voltage, no throttling")
-            return
+            return "ok", "no under-voltage, no throttling", ""
         supply = any(bits >> bit & 1 for bit in _SUPPLY_BITS)
-        yield Finding(
-            "power", "missing" if bits & 0xF else "warning", "; ".join(seen),
-            "use the board's own power supply and a short cable" if supply
-            else "give the board a heat sink, or a cooler place",
-        )  # fmt: skip
+        remedy = "use the board's own power supply and a short cable" if supply else _COOLER
+        return "missing" if bits & 0xF else "warning", "; ".join(seen), remedy
 
-    def _heat(self) -> Iterator[Finding]:
+    def _heat(self) -> _Said | None:
         text = self._read("sys/class/thermal/thermal_zone0/temp")
         if not self._is_pi or text is None or not text.lstrip("-").isdigit():
-            return
+            return None
         degrees = int(text) / 1000.0
-        if degrees >= _HOT_C:
-            yield Finding(
-                "board temperature", "warning", f"{degrees:.0f} °C: it throttles",
-                "give the board a heat sink, or a cooler place",
-            )  # fmt: skip
-        else:
-            yield Finding("board temperature", "ok", f"{degrees:.0f} °C")
+        if degrees < _HOT_C:
+            return "ok", f"{degrees:.0f} °C", ""
+        return "warning", f"{degrees:.0f} °C: it throttles", _COOLER
 
-    def _disk(self) -> Iterator[Finding]:
+    def _disk(self) -> _Said | None:
         folder = self.root / "var/lib/thermocald"
         while not folder.exists() and folder != self.root:
             folder = folder.parent
         try:
             about = os.statvfs(folder)
         except OSError:
-            return
+            return None
         free = about.f_bavail * about.f_frsize
         where = "/" + str(folder.relative_to(self.root)).removeprefix(".")
         if about.f_flag & os.ST_RDONLY:
-            yield Finding(
-                "disk", "missing", f"{where} is read-only: nothing can be stored",
-                "sudo mount -o remount,rw /    # after a look at the log: dmesg | tail",
-            )  # fmt: skip
-        elif free < _FREE_BYTES:
-            yield Finding(
-                "disk", "warning", f"{where} has {free / 1e6:.0f} MB free",
-                "sudo apt-get clean; thermocald archive --config /etc/thermocald/config.yaml "
-                "--retention",
-            )  # fmt: skip
-        else:
-            yield Finding("disk", "ok", f"{where} has {free / 1e9:.1f} GB free")
+            remedy = "sudo mount -o remount,rw /    # after a look at the log: dmesg | tail"
+            return "missing", f"{where} is read-only: nothing can be stored", remedy
+        if free < _FREE_BYTES:
+            archive = "thermocald archive --config /etc/thermocald/config.yaml --retention"
+            remedy = f"sudo apt-get clean; {archive}"
+            return "warning", f"{where} has {free / 1e6:.0f} MB free", remedy
+        return "ok", f"{where} has {free / 1e9:.1f} GB free", ""
 
-    def _service(self) -> Iterator[Finding]:
-        units = self._found("usr/lib/systemd/system/thermocald.service",
-                            "etc/systemd/system/thermocald.service")  # fmt: skip
-        if not units:
-            yield Finding("service", "not needed", "not installed; `thermocald run` works without")
-        elif self._found("etc/systemd/system/multi-user.target.wants/thermocald*.service"):
-            yield Finding("service", "ok", "starts with the machine")
-        else:
-            yield Finding(
-                "service", "warning", "installed, but it does not start with the machine",
-                "sudo systemctl enable --now thermocald",
-            )  # fmt: skip
+    def _service(self) -> _Said:
+        if not self._found("usr/lib/systemd/system/thermocald.service",
+                           "etc/systemd/system/thermocald.service"):  # fmt: skip
+            return "not needed", "not installed; `thermocald run` works without", ""
+        if self._found("etc/systemd/system/multi-user.target.wants/thermocald*.service"):
+            return "ok", "starts with the machine", ""
+        why = "installed, but it does not start with the machine"
+        return "warning", why, "sudo systemctl enable --now thermocald"
 
 
 def finding_lines(findings: Sequence[Finding]) -> list[str]:

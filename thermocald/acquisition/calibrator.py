@@ -34,7 +34,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+    from thermocald.photogrammetry.camera.camera_model import (
+        CameraSpec,
+        InteriorOrientation,
+        Sensor,
+    )
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _WRONG_START = 5.0  # times the usual sigma0: the camera has been knocked
@@ -68,24 +72,6 @@ class EpochCalibrator(Protocol):
         """Forget where the camera was."""
 
 
-class _Camera(Protocol):
-    @property
-    def sensor(self) -> Sensor: ...
-    @property
-    def principal_distance(self) -> float | None: ...
-    @property
-    def interior(self) -> InteriorOrientation | None: ...
-
-
-class _Recorded(Protocol):
-    """What is read here of a store.recording.reader.Recording."""
-
-    @property
-    def camera(self) -> _Camera: ...
-    @property
-    def testfield(self) -> TestField: ...
-
-
 class Calibrator:
     """Measures and adjusts the epochs of one camera, one after the other.
 
@@ -116,9 +102,9 @@ class Calibrator:
         self._usual = float("nan")
 
     @classmethod
-    def of_recording(cls, recording: _Recorded, settings: AdjustmentSettings | None = None) -> Self:
-        """The calibrator of a recording's camera before its test field."""
-        camera = recording.camera
+    def of_recording(cls, recording: Any, settings: AdjustmentSettings | None = None) -> Self:
+        """The calibrator of a recording's (store.recording.reader) camera before its test field."""
+        camera: CameraSpec = recording.camera
         return cls(
             camera.sensor,
             recording.testfield,

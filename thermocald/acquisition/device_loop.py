@@ -182,14 +182,6 @@ class Link:
             log.exception("%s %s: does not say what it is", self.kind, self.name)
             return {}
 
-    def warnings(self) -> list[str]:
-        """Settings of the device that harm the results, in one sentence each."""
-        try:
-            return list(self.device.warnings())
-        except Exception:
-            log.exception("%s %s: its warnings cannot be read", self.kind, self.name)
-            return []
-
     def _back(self) -> None:
         if self.state == "out":
             away_s = self._clock.monotonic() - self.out_since
@@ -236,11 +228,16 @@ class Link:
 
     def status(self, busy_s: float, hang_after_s: float) -> dict[str, Any]:
         """Return the device's part of the daemon's status."""
+        try:
+            warnings = list(self.device.warnings())
+        except Exception:
+            log.exception("%s %s: its warnings cannot be read", self.kind, self.name)
+            warnings = []
         return {
             "device": "hung" if busy_s > hang_after_s else self.state,
             "why": self.why,
             "since": self.since,
-            "warnings": self.warnings(),
+            "warnings": warnings,
             "faults": self.faults,
         }
 

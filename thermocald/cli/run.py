@@ -216,14 +216,9 @@ def keys() -> Iterator[Callable[[float], str]]:
 
 
 def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
+    from thermocald.config import load_config
     from thermocald.daemon.live_state import running_status
 
-    return running_status(_store(config, store))
-
-
-def _store(config: Path | None, store: Path | None) -> Path:
-    if store is not None:
-        return store
-    from thermocald.config import load_config
-
-    return load_config(require_config(config, "--config FILE or --store FILE")).store.path
+    if store is None:
+        store = load_config(require_config(config, "--config FILE or --store FILE")).store.path
+    return running_status(store)

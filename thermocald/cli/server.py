@@ -27,13 +27,12 @@ from thermocald.cli.common import (
     write_json,
     write_text,
 )
-from thermocald.config import Config, load_config
+from thermocald.config import load_config
 from thermocald.errors import DataError, OutputError, UsageError
 from thermocald.store.server.connection import ServerAddress, is_server
 from thermocald.store.sources import source_name
 
 if TYPE_CHECKING:
-    from thermocald.fleet.forward import FrameRule
     from thermocald.fleet.reprocess import Outcome
 
 
@@ -114,14 +113,17 @@ def forward(
     import socket
     import threading
 
-    from thermocald.fleet.forward import Forwarder, forward_forever
+    from thermocald.fleet.forward import Forwarder, FrameRule, forward_forever
 
-    rule: FrameRule | None = None
+    rule = None
     if config is not None:
         read = load_config(config)
         store, to = store or read.store.path, to or read.forward.to
         station = station or read.forward.station
-        rule = _configured(read)
+        section = read.forward
+        if section.frames != "none":
+            most = int(section.frames_mb_per_day * 1e6)
+            rule = FrameRule(read.frames.folder, section.frames, section.every_n, most)
         if to is None:
             say(f"{config}: forward.to is null: nothing is sent")
             return
@@ -141,16 +143,6 @@ def forward(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     forward_forever(forwarder, ended.wait)
-
-
-def _configured(config: Config) -> FrameRule | None:
-    from thermocald.fleet.forward import FrameRule
-
-    section = config.forward
-    if section.frames == "none":
-        return None
-    most = int(section.frames_mb_per_day * 1e6)
-    return FrameRule(config.frames.folder, section.frames, section.every_n, most)
 
 
 def fleet(

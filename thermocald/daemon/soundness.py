@@ -20,22 +20,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.config import Config, DeviceConfig
-    from thermocald.hal import Frame, Kind
+    from thermocald.hal import Kind
     from thermocald.store.recording.reader import Recording
 
 
 KINDS: tuple[Kind, ...] = ("camera", "thermometer", "output")
-
-
-@dataclass(frozen=True)
-class Attached:
-    """A device that a driver found; certain: whether it is known to be one for this driver."""
-
-    kind: Kind
-    driver: str
-    options: Mapping[str, Any]
-    about: str
-    certain: bool
 
 
 @dataclass(frozen=True)
@@ -57,15 +46,18 @@ class Probe:
         return f"{self.kind} {self.name} ({self.driver}), {self.took_s * 1e3:.0f} ms: {what}"
 
 
-def attached() -> tuple[list[Attached], list[str]]:
-    """Return the devices that are found, and notes on drivers that could not look."""
-    found: list[Attached] = []
+def attached() -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the devices that are found, and notes on drivers that could not look.
+
+    Each device has `kind`, `driver`, and what `hal.Found` holds.
+    """
+    found: list[dict[str, Any]] = []
     notes: list[str] = []
     for kind in KINDS:
         for name in driver_names(kind):
             try:
                 found += [
-                    Attached(kind, name, one.options, one.about, one.certain)
+                    {"kind": kind, "driver": name, **asdict(one)}
                     for one in load_driver(kind, name).attached()
                 ]
             except DeviceError as error:
@@ -95,42 +87,33 @@ def _probe(kind: Kind, device: DeviceConfig) -> Probe:
         why = str(error) if known else f"its driver failed: {type(error).__name__}: {error}"
         return Probe(kind, device.name, device.driver, took_s, {}, why)
     if kind == "camera":
-        values = _frame_values(result)
+        values = {"age_s": round(time.time() - result.utc, 3)}
+        if (image := result.image) is not None:
+            height, width = image.shape
+            mean, most = round(float(image.mean()), 1), int(image.max())
+            values |= {"width_px": width, "height_px": height, "grey_mean": mean, "grey_max": most}
+        values |= {"exposure_s": result.exposure, "sequence": result.sequence}
     else:
         values = {f"{channel}_c": round(celsius, 4) for channel, celsius in result.values.items()}
         values |= {f"{channel}_missing": why for channel, why in result.missing.items()}
     return Probe(kind, device.name, device.driver, took_s, values)
 
 
-def _frame_values(frame: Frame) -> dict[str, Any]:
-    values: dict[str, Any] = {"age_s": round(time.time() - frame.utc, 3)}
-    if frame.image is not None:
-        height, width = frame.image.shape
-        values |= {
-            "width_px": width,
-            "height_px": height,
-            "grey_mean": round(float(frame.image.mean()), 1),
-            "grey_max": int(frame.image.max()),
-        }
-    values |= {"exposure_s": frame.exposure, "sequence": frame.sequence}
-    return values
-
-
-def stanzas(found: Sequence[Attached]) -> Iterator[str]:
+def stanzas(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield lines of YAML; what is uncertain as comments."""
     import yaml
 
     if not found:
         yield "# nothing found"
     for kind in KINDS:
-        mine = [one for one in found if one.kind == kind]
-        certain = [one for one in mine if one.certain]
+        mine = [one for one in found if one["kind"] == kind]
+        certain = [one for one in mine if one["certain"]]
         if mine:
             yield f"{kind}s:" if certain else f"# {kind}s:"
-        for number, one in enumerate(sorted(mine, key=lambda one: not one.certain), 1):
-            mark = "" if one.certain else "# "
-            yield f"  # {one.about}"
-            stanza = {"name": f"{one.driver}-{number}", "driver": one.driver, **one.options}
+        for number, one in enumerate(sorted(mine, key=lambda one: not one["certain"]), 1):
+            mark, driver = "" if one["certain"] else "# ", one["driver"]
+            yield f"  # {one['about']}"
+            stanza = {"name": f"{driver}-{number}", "driver": driver, **one["options"]}
             text = yaml.safe_dump(stanza, default_flow_style=True, sort_keys=False, width=10_000)
             yield f"  {mark}- {text.strip()}"
 

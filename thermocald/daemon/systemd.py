@@ -42,7 +42,11 @@ class JournalHandler(logging.Handler):
         for attribute, name in _FIELDS.items():
             if (value := getattr(record, attribute, None)) is not None:
                 fields[name] = str(value)
-        message = b"".join(_encoded(name, value) for name, value in fields.items())
+        message = b""
+        for name, data in ((name, value.encode()) for name, value in fields.items()):
+            # a value of several lines has its length before it
+            size = b"\n" + struct.pack("<Q", len(data)) if b"\n" in data else b"="
+            message += name.encode() + size + data + b"\n"
         try:
             self._socket.sendto(message, self._path)
         except OSError:
@@ -52,13 +56,6 @@ class JournalHandler(logging.Handler):
     def close(self) -> None:
         self._socket.close()
         super().close()
-
-
-def _encoded(name: str, value: str) -> bytes:
-    data = value.encode()
-    if b"\n" not in data:
-        return name.encode() + b"=" + data + b"\n"
-    return name.encode() + b"\n" + struct.pack("<Q", len(data)) + data + b"\n"
 
 
 def set_up_logging(level: str) -> None:

@@ -270,10 +270,30 @@ def latest_epochs(
             covariance, seen = details(every[-1])
             if measured is not every[-1]:
                 _, seen = details(measured)
-        yield _stored_epoch(
-            every[-1],
-            unpack_covariance(covariance) if covariance else None,
-            unpack_observations(seen) if seen else None,
+        row = every[-1]
+        epoch = Epoch(
+            number=row["number"],
+            frame_time=row["frame_time"],
+            temperature_time=_nan(row["temperature_time"]),
+            temperatures=_mapping(row["temperatures"]),
+            frame=relative_path(row["frame"], f"epoch {row['number']}: frame", StoreError)
+            if row["frame"]
+            else None,
+            observations=unpack_observations(seen) if seen else None,
+            note=row["note"],
+        )
+        result = EpochResult(
+            status=row["status"],
+            reason=row["reason"],
+            values=np.array([row[name] for name in _VALUES], dtype=float),
+            covariance=unpack_covariance(covariance) if covariance else None,
+            sigma0=_nan(row["sigma0"]),
+            redundancy=row["redundancy"],
+            n_observations=row["n_observations"],
+            rejected=tuple(json.loads(row["rejected"])),
+        )
+        yield StoredEpoch(
+            epoch, result, _mapping(row["extra"]), bool(row["clock_trusted"]), row["revision"]
         )
 
 
@@ -322,36 +342,6 @@ def _joined(number: int, kept: int, parts: list[tuple[int, bytes]]) -> tuple[byt
     what = f"epoch {number}: its covariance or its observations"
     require_checksum(kept, what, (), data=covariance + seen)
     return covariance, seen
-
-
-def _stored_epoch(
-    row: Mapping[str, Any], covariance: Array | None, seen: Observations | None
-) -> StoredEpoch:
-    """An epoch from a row by column names."""
-    epoch = Epoch(
-        number=row["number"],
-        frame_time=row["frame_time"],
-        temperature_time=_nan(row["temperature_time"]),
-        temperatures=_mapping(row["temperatures"]),
-        frame=relative_path(row["frame"], f"epoch {row['number']}: frame", StoreError)
-        if row["frame"]
-        else None,
-        observations=seen,
-        note=row["note"],
-    )
-    result = EpochResult(
-        status=row["status"],
-        reason=row["reason"],
-        values=np.array([row[name] for name in _VALUES], dtype=float),
-        covariance=covariance,
-        sigma0=_nan(row["sigma0"]),
-        redundancy=row["redundancy"],
-        n_observations=row["n_observations"],
-        rejected=tuple(json.loads(row["rejected"])),
-    )
-    return StoredEpoch(
-        epoch, result, _mapping(row["extra"]), bool(row["clock_trusted"]), row["revision"]
-    )
 
 
 def _numbers_json(values: Mapping[str, float]) -> str:

@@ -51,6 +51,19 @@ _PAGE_SIZE = 8192
 _BUSY_S = 10.0
 # A quota or a limit on the size of files shows as an error of writing or growing a file.
 _NO_ROOM = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_TRUNCATE", "SQLITE_IOERR_SHMSIZE")
+_READ_ONLY = "the file or its folder is read-only; make it writable or choose another store"
+_NO_STORE = "it is not a store, or it is damaged ({})"
+_ADVICE = {
+    "SQLITE_FULL": "the disk is full; free some space, nothing that was stored before is lost",
+    "SQLITE_IOERR": "the disk failed or is full ({}); what was stored before is not touched",
+    "SQLITE_READONLY": _READ_ONLY,
+    "SQLITE_PERM": _READ_ONLY,
+    "SQLITE_CANTOPEN": "it cannot be opened; does its folder exist, and may this user write there?",
+    "SQLITE_BUSY": f"another process kept it locked for more than {_BUSY_S:g} s",
+    "SQLITE_NOTADB": _NO_STORE,
+    "SQLITE_CORRUPT": _NO_STORE,
+}
+"""By the beginning of SQLite's name of an error; {}: its own words."""
 # A small card must not be full of what waits to be moved; a replay need not sync so often.
 _WAL_LIMIT_BYTES = {True: 1_000_000, False: 4_000_000}  # durable or not
 _MMAP_BYTES = 2**31 - 1
@@ -69,7 +82,7 @@ class StoreFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._helpers: dict[str, tuple[int, int]] = {}
+        self._helpers: dict[str, tuple[int, ...]] = {}
         found = _identity(path)
         if found in _CLAIMED:
             raise _taken(path)
@@ -165,12 +178,14 @@ def _taken(path: Path) -> StoreError:
     )
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
+def _identity(path: Path, *, data: bool = False) -> tuple[int, ...] | None:
+    """Return what is the same for one file under all its names; data: and while it is as it is."""
     try:
         status = path.stat()
     except OSError:
         return None
-    return status.st_dev, status.st_ino
+    found = status.st_dev, status.st_ino
+    return (*found, status.st_size, status.st_mtime_ns) if data else found
 
 
 @contextmanager
@@ -188,9 +203,10 @@ def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]
     except ThermocaldError:
         raise
     except sqlite3.Error as cause:
-        full = _name(cause).startswith(_NO_ROOM)
-        kind = StoreFullError if full else StoreError
-        raise kind(f"{path}: {doing}: {_advice(cause)}") from cause
+        name = _name(cause)
+        kind = StoreFullError if name.startswith(_NO_ROOM) else StoreError
+        advice = next((text for start, text in _ADVICE.items() if name.startswith(start)), "{}")
+        raise kind(f"{path}: {doing}: {advice.format(cause)}") from cause
     except (
         ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError,
     ) as cause:  # fmt: skip
@@ -204,23 +220,6 @@ def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]
 def _name(cause: sqlite3.Error) -> str:
     """SQLite's name of the error, such as SQLITE_IOERR_WRITE; empty where Python raised it."""
     return getattr(cause, "sqlite_errorname", "") or ""
-
-
-def _advice(cause: sqlite3.Error) -> str:
-    name = _name(cause)
-    if name.startswith("SQLITE_FULL"):
-        return "the disk is full; free some space, nothing that was stored before is lost"
-    if name.startswith("SQLITE_IOERR"):
-        return f"the disk failed or is full ({cause}); what was stored before is not touched"
-    if name.startswith(("SQLITE_READONLY", "SQLITE_PERM")):
-        return "the file or its folder is read-only; make it writable or choose another store"
-    if name.startswith("SQLITE_CANTOPEN"):
-        return "it cannot be opened; does its folder exist, and may this user write there?"
-    if name.startswith("SQLITE_BUSY"):
-        return f"another process kept it locked for more than {_BUSY_S:g} s"
-    if name.startswith(("SQLITE_NOTADB", "SQLITE_CORRUPT")):
-        return f"it is not a store, or it is damaged ({cause})"
-    return str(cause)
 
 
 def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
@@ -424,24 +423,16 @@ def open_copy(
 def _copy_files(path: Path, wal: Path, copy: Path) -> None:
     """Copy file and -wal as they are at one time: a writer elsewhere may be at work."""
     for _ in range(_ATTEMPTS):
-        before = _state(path), _state(wal)
+        before = _identity(path, data=True), _identity(wal, data=True)
         shutil.copyfile(path, copy)
         if before[1] is not None:
             shutil.copyfile(wal, f"{copy}-wal")
-        if (_state(path), _state(wal)) == before:
+        if (_identity(path, data=True), _identity(wal, data=True)) == before:
             return
     raise StoreError(
         f"{path}: is being written by another process, and its -shm file may not be read by you; "
         "join that user's group, or use sudo"
     )
-
-
-def _state(path: Path) -> tuple[int, int, int] | None:
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 _HEADER = struct.Struct(">8I")  # magic, version, page size, sequence, two salts, two checksums

@@ -127,28 +127,14 @@ class Store(SeriesReader):
     def _epochs(
         self, series: StoredSeries, first: int, last: int | None, details: bool
     ) -> Iterator[StoredEpoch]:
-        """As they are read; what is missing of a whole series is logged at its end."""
-        missing, before = 0, first or 1
-        for stored in self._pages(series, first, last, details):
-            missing += max(0, stored.epoch.number - before)
-            before = stored.epoch.number + 1
-            yield stored
-        if not first and last is None:
-            missing += max(0, (self.last_epoch(series) or 0) + 1 - before)
-            if missing:
-                log.warning(
-                    "%s: %d epochs of series %s are missing; `thermocald check` says which",
-                    self.path, missing, series.name,
-                )  # fmt: skip
+        """As they are read; what is missing of a whole series is logged at its end.
 
-    def _pages(
-        self, series: StoredSeries, first: int, last: int | None, details: bool
-    ) -> Iterator[StoredEpoch]:
-        """The epochs page by page: no statement is open while another thread may close the file.
-
-        SQLite's library ends the process where a connection is closed under a statement.
+        Page by page: no statement is open while another thread may close the file. SQLite's library
+        ends the process where a connection is closed under a statement.
         """
-        while True:
+        whole = not first and last is None
+        missing, size, first = 0, _EPOCHS_AT_ONCE, first or 1
+        while size == _EPOCHS_AT_ONCE:
             page: list[StoredEpoch] = []
             failed: StoreError | None = None
             try:
@@ -160,12 +146,18 @@ class Store(SeriesReader):
                     del found
             except StoreError as error:
                 failed = error
-            yield from page
+            for stored in page:
+                missing += max(0, stored.epoch.number - first)
+                first = stored.epoch.number + 1
+                yield stored
             if failed is not None:
                 raise failed
-            if len(page) < _EPOCHS_AT_ONCE:
-                return
-            first = page[-1].epoch.number + 1
+            size = len(page)
+        if whole and (missing := missing + max(0, (self.last_epoch(series) or 0) + 1 - first)):
+            log.warning(
+                "%s: %d epochs of series %s are missing; `thermocald check` says which",
+                self.path, missing, series.name,
+            )  # fmt: skip
 
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
         """The observations of the epochs numbered `first` to `last`, without their quality."""

@@ -59,11 +59,9 @@ class ObservationRows:
             covariances = np.concatenate(
                 [np.zeros(len(p.epochs)) if p.covariances is None else p.covariances for p in parts]
             )
+        columns = ("epochs", "targets", "points", "sigmas")
         return cls(
-            np.concatenate([part.epochs for part in parts]),
-            np.concatenate([part.targets for part in parts]),
-            np.concatenate([part.points for part in parts]),
-            np.concatenate([part.sigmas for part in parts]),
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in columns),
             covariances,
             {n: np.concatenate([part.quality[n] for part in parts]) for n in parts[0].quality},
             parts[0].first,

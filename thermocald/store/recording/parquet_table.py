@@ -167,7 +167,10 @@ def parse_once(table: Table, required: Sequence[str]) -> Table:
         if copy.exists():
             os.utime(copy)
         else:
-            _forget_old(folder)
+            for old in folder.glob("*.parquet"):
+                with suppress(OSError):
+                    if old.stat().st_mtime < time.time() - 86_400 * _KEPT_DAYS:
+                        old.unlink()
             if shutil.disk_usage(folder).free < 2 * found.st_size:
                 return table
             partial = copy.with_name(f"{copy.stem}-{os.getpid()}.parquet")
@@ -198,13 +201,6 @@ def _cache() -> Path:
     if folder.is_symlink() or owner.st_uid != os.geteuid() or owner.st_mode & 0o077:
         raise OSError(f"{folder} is not this user's own")
     return folder
-
-
-def _forget_old(folder: Path) -> None:
-    for copy in folder.glob("*.parquet"):
-        with suppress(OSError):
-            if copy.stat().st_mtime < time.time() - 86_400 * _KEPT_DAYS:
-                copy.unlink()
 
 
 def _parse(table: Table, target: Path) -> None:

@@ -142,8 +142,12 @@ class ServerAddress:
 @contextmanager
 def in_words(address: ServerAddress | str, doing: str) -> Iterator[None]:
     """Turn psycopg's errors into ServerGone (may pass) or ServerError."""
-    import psycopg
-
+    try:
+        import psycopg
+    except ImportError as error:
+        raise DriverMissing(
+            f"a server's store needs psycopg: pip install 'thermocald[server]' ({error})"
+        ) from error
     try:
         yield
     except ThermocaldError:
@@ -229,7 +233,11 @@ class Connected:
             with self._pool:
                 connection = self._idle.pop() if self._idle else None
             if connection is None:
-                return _connect(self.address)
+                try:
+                    return psycopg.connect(self.address.url, **_SESSION)  # type: ignore[arg-type]
+                except psycopg.ProgrammingError as error:  # a parameter that libpq does not know
+                    said = without_secrets(str(error))
+                    raise StoreError(f"{self.address}: cannot be used: {said}") from error
             with suppress(psycopg.Error):
                 connection.execute("SELECT 1")
                 connection.rollback()
@@ -240,19 +248,6 @@ class Connected:
         """All rows of a statement with %s."""
         with self._transaction("it cannot be read") as connection:
             return connection.execute(statement, values).fetchall()
-
-
-def _connect(address: ServerAddress) -> Connection[Any]:
-    try:
-        import psycopg
-    except ImportError as error:
-        raise DriverMissing(
-            f"a server's store needs psycopg: pip install 'thermocald[server]' ({error})"
-        ) from error
-    try:
-        return psycopg.connect(address.url, **_SESSION)  # type: ignore[arg-type]
-    except psycopg.ProgrammingError as error:  # a parameter that libpq does not know
-        raise StoreError(f"{address}: cannot be used: {without_secrets(str(error))}") from error
 
 
 def create_tables(address: ServerAddress) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections import defaultdict
+from collections import defaultdict, namedtuple
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -153,25 +153,13 @@ class FleetCamera:
         return None if self.state is None else self.state.version
 
 
-class _Series(NamedTuple):
-    """A series, and what the summary says of it: first and last epoch (s UTC), how many epochs,
-    results, and slots with a sample.
-    """
-
-    key: Any
-    station: str
-    camera: str
-    name: str
-    head: str
-    identity: str
-    first: float
-    last: float
-    epochs: int
-    results: int
-    last_ok: float | None
-    low: float | None
-    high: float | None
-    sampled: int
+_Series = namedtuple(
+    "_Series", "key station camera name head identity first last epochs results last_ok low high "
+    "sampled",
+)  # fmt: skip
+"""A series, and what the summary says of it: first and last epoch (s UTC), how many epochs,
+results, and slots with a sample.
+"""
 
 
 class FleetReader(Connected):

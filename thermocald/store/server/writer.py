@@ -50,21 +50,17 @@ class ServerWriter(Connected):
         self.store = UUID(store)
         self._sent: set[UUID] = set()
         self._days: set[int] = set()
+        # {table: {column: type}} there: one query, as every round of a station needs it
+        self._tables: dict[str, dict[str, str]] = {}
         try:
-            self._tables = self._described()
+            for table, column, kind in self._query(
+                "SELECT table_name, column_name, udt_name FROM information_schema.columns "
+                "WHERE table_schema = 'public' ORDER BY ordinal_position"
+            ):
+                self._tables.setdefault(table, {})[column] = kind
         except BaseException:
             self.close()
             raise
-
-    def _described(self) -> dict[str, dict[str, str]]:
-        """{table: {column: type}} there: one query, as every round of a station needs it."""
-        found: dict[str, dict[str, str]] = {}
-        for table, column, kind in self._query(
-            "SELECT table_name, column_name, udt_name FROM information_schema.columns "
-            "WHERE table_schema = 'public' ORDER BY ordinal_position"
-        ):
-            found.setdefault(table, {})[column] = kind
-        return found
 
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]
@@ -86,7 +82,10 @@ class ServerWriter(Connected):
         with self._transaction(f"{len(rows)} {table}s were not sent") as connection:
             for id_ in sorted(needed):
                 if keys[id_] not in self._sent:
-                    self._insert_series(connection, keys[id_], series[id_])
+                    row, csv = series_row(series[id_])
+                    self._insert(connection, "testfield", [{"digest": row["digest"], "csv": csv}])
+                    whose = {"key": keys[id_], "station": self.station, "store": self.store}
+                    self._insert(connection, "series", [whose | row])
             for day in sorted(days):  # partitions for their months, of at most 31 days
                 connection.execute("SELECT thermocald_month(%s)", (day * _DAY_S,))
             self._insert(connection, table, ready)
@@ -133,12 +132,6 @@ class ServerWriter(Connected):
             # PostgreSQL's text knows no NUL; a note may hold what a broken device sent
             ready[name] = value.replace("\0", "\ufffd") if isinstance(value, str) else value
         return ready
-
-    def _insert_series(self, connection: Connection[Any], key: UUID, series: StoredSeries) -> None:
-        row, csv = series_row(series)
-        self._insert(connection, "testfield", [{"digest": row["digest"], "csv": csv}])
-        whose = {"key": key, "station": self.station, "store": self.store}
-        self._insert(connection, "series", [whose | row])
 
     def _insert(
         self, connection: Connection[Any], table: str, rows: Sequence[Mapping[str, Any]]

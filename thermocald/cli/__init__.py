@@ -47,17 +47,13 @@ def application(loaded: str | None = None) -> typer.Typer:
     return app
 
 
-def _words() -> list[str]:
-    """Return what is typed after `thermocald`, also where a shell asks how it goes on."""
-    if "_THERMOCALD_COMPLETE" in os.environ:
-        typed = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
-        return typed.split()[1:]
-    return sys.argv[1:]
-
-
-def _called(arguments: list[str]) -> str:
+def _called() -> str:
     """Return the command that is called, "" where it is none: a help, a wrong word."""
-    word = next((word for word in arguments if word not in _VERBOSE), "")
+    words = sys.argv
+    if "_THERMOCALD_COMPLETE" in os.environ:  # a shell asks how it goes on
+        typed = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
+        words = typed.split()
+    word = next((word for word in words[1:] if word not in _VERBOSE), "")
     return word if word in COMMANDS else ""
 
 
@@ -83,7 +79,7 @@ def main() -> None:
         signal.signal(signal.SIGTERM, _end)  # so that nothing half-written stays
     _settle_process()
     try:
-        status = application(_called(_words()))(prog_name="thermocald", standalone_mode=False)
+        status = application(_called())(prog_name="thermocald", standalone_mode=False)
         sys.stdout.flush()
         sys.exit(status or 0)
     except _USAGE_ERROR as error:

@@ -28,7 +28,6 @@ from thermocald.cli.common import (
 from thermocald.errors import UsageError
 from thermocald.files import write_text
 from thermocald.store.server.connection import is_server
-from thermocald.store.sources import require_source
 
 if TYPE_CHECKING:
     from thermocald.results import Study
@@ -101,24 +100,19 @@ def _study(inputs: list[str], settings: dict[str, Any], exterior: str, free: str
 
     labels: list[str | None] = []
     series: list[tc.Series] = []
-    for label, path in map(_labelled, inputs):
-        found = tc.open_all(path)
-        labels += [label] * len(found)
+    for text in inputs:
+        label, equals, rest = text.partition("=")
+        # A path may hold "="; what exists as it stands is a path.
+        if not equals or Path(text).exists() or is_server(text):
+            label, rest = "", text
+        found = tc.open_all(rest)
+        labels += [label or None] * len(found)
         series += found
     cameras = len({label or one.camera for label, one in zip(labels, series, strict=True)})
     with progress(settings["sets"] * cameras, "calibrating and simulating") as advance:
         return tc.study(
             *series, labels=labels, **settings, exterior=exterior, free=free, progress=advance
         )
-
-
-def _labelled(text: str) -> tuple[str | None, Path]:
-    """`LABEL=PATH` or `PATH`; DataError where there is nothing at the path."""
-    label, equals, rest = text.partition("=")
-    # A path may hold "="; what exists as it stands is a path.
-    if not equals or Path(text).exists() or is_server(text):
-        label, rest = "", text
-    return label or None, require_source(Path(rest))
 
 
 def discover(

@@ -131,7 +131,18 @@ class Sessions:
                 f"camera {session.camera!r} takes series {session.series!r} all the time, by its "
                 "configuration; give the session another --series"
             )
-        self._look_into_the_store(session)
+        for one in self._guard.all_series():
+            if (one.camera, one.name) != (session.camera, session.series):
+                continue
+            if session.start not in ("", one.start):
+                raise UsageError(
+                    f"series {one.name!r} was begun with --start {one.start!r}; choose another "
+                    "--series, or go on with that"
+                )
+            if (taken := self._guard.last_epoch(one)) >= session.epochs:
+                raise DataError(
+                    f"series {one.name!r} has {taken} epochs already; choose another --series"
+                )
         if session.programme:
             for other in self._active.values():
                 if other.session.programme:
@@ -246,21 +257,6 @@ class Sessions:
             "why": one.why,
         }  # fmt: skip
         self._guard.event(Event(self._clock.utc(), kind, about, data=data))
-
-    def _look_into_the_store(self, session: Session) -> None:
-        for one in self._guard.all_series():
-            if (one.camera, one.name) != (session.camera, session.series):
-                continue
-            if session.start not in ("", one.start):
-                raise UsageError(
-                    f"series {one.name!r} was begun with --start {one.start!r}; choose another "
-                    "--series, or go on with that"
-                )
-            taken = self._guard.last_epoch(one)
-            if taken >= session.epochs:
-                raise DataError(
-                    f"series {one.name!r} has {taken} epochs already; choose another --series"
-                )
 
 
 def _line(station: Station, camera: str) -> CameraLine:

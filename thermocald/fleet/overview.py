@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -27,7 +28,7 @@ from thermocald.analysis.statistics.random_effects import odd_specimens, populat
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import short_duration
 from thermocald.photogrammetry.linalg import mad_sd
-from thermocald.store.server.fleet_reader import Finding, FleetCamera, FleetReader, Rate
+from thermocald.store.server.fleet_reader import FleetCamera, FleetReader, Rate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from thermocald.store.server.connection import ServerAddress
     from thermocald.store.server.fleet_reader import StationState
 
+    Findings = Iterator[tuple[str, str]]
 
 RATED = ("c", "x0", "y0")
 ODD = 0.01
@@ -123,6 +125,8 @@ def _complete(camera: FleetCamera, state: StationState | None, now: float) -> No
     known = [t for e in recent if math.isfinite(t := e.temperatures.get(reference, math.nan))]
     on_the_way = [e.received - e.frame_time for e in recent if math.isfinite(e.received)]
     camera.state = state
+    if state is not None:
+        camera.waiting, camera.clock_s, camera.version = state.waiting, state.clock, state.version
     sensor = camera.head.camera.sensor
     # what the camera says that it is, else what its images are like
     model = str(camera.identity.get("model") or camera.identity.get("card") or "").strip()
@@ -201,60 +205,52 @@ def add_findings(cameras: Sequence[FleetCamera], types: Sequence[TypeOverview], 
     """Fill `findings` of all cameras; now: s UTC, by the server's clock."""
     of_name = {name: kind for kind in types for name in kind.cameras}
     for camera in cameras:
-        camera.findings = [
-            *_late(camera, now),
-            *_sensors(camera),
-            *_calibration(camera, now),
-            *_odd(camera, of_name.get(camera.name)),
-            *_clock(camera),
-        ]
+        found = chain(
+            _late(camera, now),
+            _sensors(camera),
+            _calibration(camera, now),
+            _odd(camera, of_name.get(camera.name)),
+            _clock(camera),
+        )
+        camera.findings = [{"kind": kind, "text": text} for kind, text in found]
 
 
-def _late(camera: FleetCamera, now: float) -> Iterator[Finding]:
+def _late(camera: FleetCamera, now: float) -> Findings:
     limit = max(_LATE_INTERVALS * camera.head.interval, _LATE_S)
     if camera.lag_s > limit:
         since = f"no epoch for {short_duration(camera.lag_s)}"
         state = camera.state
         if state is None:
-            yield Finding("late", f"{since}; its station has never reported")
+            why = "; its station has never reported"
         elif now - state.contact > _SILENT_S:
-            yield Finding(
-                "late",
-                f"{since}; its station was last heard {short_duration(now - state.contact)} ago: "
-                "power or network",
-            )
+            ago = short_duration(now - state.contact)
+            why = f"; its station was last heard {ago} ago: power or network"
         elif state.waiting:
-            yield Finding(
-                "late", f"{since}; {state.waiting} rows wait at its station and are coming"
-            )
+            why = f"; {state.waiting} rows wait at its station and are coming"
         else:
-            yield Finding(
-                "late", f"{since}, though its station reports: the camera or its daemon stands"
-            )
+            why = ", though its station reports: the camera or its daemon stands"
+        yield "late", since + why
     if camera.state is not None and camera.state.stores > 1:
-        yield Finding(
-            "twins",
+        text = (
             f"{camera.state.stores} stores report under its station's name: the card of one is a "
-            "copy; give each station its own name (forward.station)",
+            "copy; give each station its own name (forward.station)"
         )
+        yield "twins", text
     if camera.copied:
-        yield Finding(
-            "twins",
+        text = (
             "epochs of one number were taken at two times: its store runs at two stations, or a "
-            "backup was restored; move the store of a copied card away, and it makes its own",
+            "backup was restored; move the store of a copied card away, and it makes its own"
         )
-    if camera.state is not None and camera.state.refused:
-        yield Finding(
-            "refused",
-            f"the server refused {camera.state.refused} rows of its station; its log names them",
-        )
+        yield "twins", text
+    if camera.state is not None and (count := camera.state.refused):
+        yield "refused", f"the server refused {count} rows of its station; its log names them"
 
 
-def _sensors(camera: FleetCamera) -> Iterator[Finding]:
+def _sensors(camera: FleetCamera) -> Findings:
     for i, channel in enumerate(camera.head.channels):
         read = [e.temperatures.get(channel, math.nan) for e in camera.recent]
         if len(read) >= _FEWEST and (trouble := _trouble(camera, read, reference=i == 0)):
-            yield Finding("sensor", f"{channel}: {trouble}")
+            yield "sensor", f"{channel}: {trouble}"
 
 
 def _trouble(camera: FleetCamera, read: Sequence[float], *, reference: bool) -> str:
@@ -285,40 +281,37 @@ def _stuck_for(camera: FleetCamera, known: Sequence[float]) -> float:
     return camera.last_time - since
 
 
-def _calibration(camera: FleetCamera, now: float) -> Iterator[Finding]:
+def _calibration(camera: FleetCamera, now: float) -> Findings:
     recent = camera.recent
     if len(recent) >= _FEWEST and camera.ok < _LEAST_OK:
         failed = [e.status for e in recent if e.status not in WITH_VALUES]
         often = max(sorted({*failed}), key=failed.count)
-        yield Finding(
-            "calibrate", f"{len(failed)} of the last {len(recent)} epochs have no result: {often}"
-        )
+        lack = f"{len(failed)} of the last {len(recent)} epochs have no result: {often}"
+        yield "calibrate", lack
     if not math.isfinite(camera.last_ok):
-        yield Finding("calibrate", "was never calibrated")
+        yield "calibrate", "was never calibrated"
         return
     if now - camera.last_ok > _OLD_S and camera.lag_s < _OLD_S:
-        yield Finding("calibrate", f"the last result is {short_duration(now - camera.last_ok)} old")
+        yield "calibrate", f"the last result is {short_duration(now - camera.last_ok)} old"
     low, high = camera.range
     outside = max(low - camera.temperature, camera.temperature - high)
     if outside > _OUTSIDE_K:
-        yield Finding(
-            "calibrate",
+        text = (
             f"{camera.temperature:.1f} °C is {outside:.0f} K outside of {low:.0f} to {high:.0f} °C "
-            "that it was calibrated at",
+            "that it was calibrated at"
         )
+        yield "calibrate", text
     if not camera.rates and math.isfinite(low):
-        yield Finding(
-            "calibrate",
+        text = (
             f"calibrated from {low:.0f} to {high:.0f} °C only: how it moves with temperature is "
-            "not known; warm it up, or take its type's model (fit --type)",
+            "not known; warm it up, or take its type's model (fit --type)"
         )
+        yield "calibrate", text
     if camera.shift_px > _SHIFT_PX and camera.shift_sds > _SHIFT_SDS:
-        yield Finding(
-            "calibrate", f"has lately moved by {camera.shift_px:.1f} px from its own line"
-        )
+        yield "calibrate", f"has lately moved by {camera.shift_px:.1f} px from its own line"
 
 
-def _odd(camera: FleetCamera, kind: TypeOverview | None) -> Iterator[Finding]:
+def _odd(camera: FleetCamera, kind: TypeOverview | None) -> Findings:
     if kind is None or not camera.odd < ODD:
         return
 
@@ -329,21 +322,17 @@ def _odd(camera: FleetCamera, kind: TypeOverview | None) -> Iterator[Finding]:
 
     name = max(RATED, key=distance)
     usual = kind.rates[name]
-    yield Finding(
-        "odd",
+    text = (
         f"{name} moves by {camera.rates[name].value * 1e3:+.3f} µm/K, the others "
-        f"by {usual.value * 1e3:+.3f} ± {usual.sd_between * 1e3:.3f} (p = {camera.odd:.1g})",
+        f"by {usual.value * 1e3:+.3f} ± {usual.sd_between * 1e3:.3f} (p = {camera.odd:.1g})"
     )
+    yield "odd", text
 
 
-def _clock(camera: FleetCamera) -> Iterator[Finding]:
-    state = camera.state
-    if state is not None and abs(state.clock) > _CLOCK_S:
-        way = "ahead of" if state.clock > 0 else "behind"
-        yield Finding(
-            "clock",
-            f"its station's clock is {short_duration(abs(state.clock))} {way} the server's; "
-            "epochs keep the station's time",
-        )
+def _clock(camera: FleetCamera) -> Findings:
+    clock = camera.clock_s
+    if clock is not None and abs(clock) > _CLOCK_S:
+        far = f"{short_duration(abs(clock))} {'ahead of' if clock > 0 else 'behind'}"
+        yield "clock", f"its station's clock is {far} the server's; epochs keep the station's time"
     elif camera.lag_s < -_FUTURE_S:
-        yield Finding("clock", f"its last epoch is {short_duration(-camera.lag_s)} in the future")
+        yield "clock", f"its last epoch is {short_duration(-camera.lag_s)} in the future"

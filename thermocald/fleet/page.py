@@ -58,7 +58,7 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
         cameras += found
     types = camera_types(cameras)
     add_findings(cameras, types, now)
-    counts = Counter(kind for c in cameras for kind in {f.kind for f in c.findings})
+    counts = Counter(kind for c in cameras for kind in {f["kind"] for f in c.findings})
     return {
         "format": "thermocald-fleet/1",
         "servers": [str(address) for address in addresses],

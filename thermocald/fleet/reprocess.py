@@ -212,13 +212,6 @@ def find_blocks(
 
 def calibrate_block(block: Block) -> Outcome:
     """Calibrate one block and write its file, whole or not at all."""
-    columns, calibrated = _columns(block)
-    write_parquet(block.target, [columns], nan_is_null=True)
-    return Outcome(block, block.stop - block.first, calibrated)
-
-
-def _columns(block: Block) -> tuple[dict[str, Any], int]:
-    """The block's rows as columns, and how many epochs have a result."""
     recording = open_recording(block.recording)
     camera = recording.camera
     calibrator = Calibrator.of_recording(recording, AdjustmentSettings(free=block.free))
@@ -248,4 +241,6 @@ def _columns(block: Block) -> tuple[dict[str, Any], int]:
         "status": [r.status for r in results],
         "reason": [r.reason for r in results],
     }
-    return columns, sum(r.status == "ok" for r in results)
+    write_parquet(block.target, [columns], nan_is_null=True)
+    calibrated = sum(r.status == "ok" for r in results)
+    return Outcome(block, block.stop - block.first, calibrated)

@@ -76,6 +76,7 @@ _KELVIN = (220.0, 450.0)
 _GOOD_SHARE = 0.8
 _FAHRENHEIT = (45.0, 120.0)  # °F of rooms and cameras, which may be °C of a hot one
 _LATEST_S = 1e11
+_WORDS = {"dmy": "day/month", "mdy": "month/day"}
 _LONGER = 10.0  # times: a log in the wrong order of day and month runs over months
 
 
@@ -121,21 +122,19 @@ def log_options(
     ):
         if value is not None and value not in allowed:
             raise UsageError(f"{option} {value}: must be one of {', '.join(allowed)}")
-    names = dict(_renamed(text) for text in name or ())
+    names = {}
+    for text in name or ():
+        column, _, label = text.rpartition("=")
+        fault = channel_fault(label) if column and label else "must be COLUMN=LABEL"
+        if fault:
+            raise UsageError(f"--name {text}: {fault}")
+        names[column] = label
     mark = {"tab": "\t", "\\t": "\t"}.get(separator or "", separator)
     clock = device_clock(timezone, log_timezone, log_clock, ambiguous, "--log-timezone")
     return LogOptions(
         tuple(time_column or ()), tuple(temperature_column or ()), mark, decimal, date_order, unit,
         clock, names=names,
     )  # fmt: skip
-
-
-def _renamed(text: str) -> tuple[str, str]:
-    column, _, label = text.rpartition("=")
-    if not column or not label or (fault := channel_fault(label)):
-        why = fault if column and label else "must be COLUMN=LABEL"
-        raise UsageError(f"--name {text}: {why}")
-    return column, label
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -462,20 +461,16 @@ def _date_order(
             if abs(far["dmy"] - far["mdy"]) > 86400.0:
                 order = min(far, key=lambda o: far[o])
                 return order, [
-                    f"log: {first!r} is {_words(order)}: so it lies next to the photographs"
+                    f"log: {first!r} is {_WORDS[order]}: so it lies next to the photographs"
                 ]
         lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in spans.items()}
         order = min(lengths, key=lambda o: lengths[o])
         if max(lengths.values()) > _LONGER * lengths[order]:
-            return order, [f"log: {first!r} is {_words(order)}: so the rows follow one another"]
+            return order, [f"log: {first!r} is {_WORDS[order]}: so the rows follow one another"]
     raise DataError(
         f"{file.path}, column {names[0]!r}: {first!r} may be day/month or month/day: say "
         "--date-order dmy or mdy"
     )
-
-
-def _words(order: str) -> str:
-    return "day/month" if order == "dmy" else "month/day"
 
 
 def _temperature_columns(

@@ -71,14 +71,6 @@ class Rate:
     unit: str = "mm/K"
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Something that a person should look at: one word, see `fleet.overview`, and a sentence."""
-
-    kind: str
-    text: str
-
-
 @dataclass(slots=True, eq=False)
 class FleetCamera:
     """A camera at a station, as a server knows it, and from `state` on its overview.
@@ -93,14 +85,15 @@ class FleetCamera:
     epochs took to the server, NaN if not known; ok: fraction of its last epochs with a result;
     temperature: °C, the last of the reference, NaN without; shift_px: how far c, x0 or y0 has left
     its own line lately, and in standard deviations; odd: the probability that a camera of this type
-    is as unlike the others, NaN where that is not known.
+    is as unlike the others, NaN where that is not known; findings: what a person should look at: kind,
+    one word, see `fleet.overview`, and text, a sentence; waiting, clock_s, version: rows at its
+    station, its clock minus the server's, its program.
     """
 
     JSON: ClassVar = {
         "head": "", "identity": "", "last_time": "last_epoch", "last_ok": "", "range": "",
         "copied": "", "recent": "", "samples": "", "state": "", "calibrated_range":
-        "temperature_range", "shift_sds": "", "odd": "odd_p", "waiting": "waiting",
-        "clock_s": "clock_s", "version": "version",
+        "temperature_range", "shift_sds": "", "odd": "odd_p",
     }  # fmt: skip
 
     station: str
@@ -126,7 +119,10 @@ class FleetCamera:
     shift_px: float = math.nan
     shift_sds: float = math.nan
     odd: float = math.nan
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[dict[str, str]] = field(default_factory=list)
+    waiting: int | None = None
+    clock_s: float | None = None
+    version: str | None = None
 
     @property
     def name(self) -> str:
@@ -136,21 +132,6 @@ class FleetCamera:
     def calibrated_range(self) -> tuple[float, float] | None:
         """`range`, None without a result."""
         return self.range if math.isfinite(self.range[0]) else None
-
-    @property
-    def waiting(self) -> int | None:
-        """How many rows wait at its station."""
-        return None if self.state is None else self.state.waiting
-
-    @property
-    def clock_s(self) -> float | None:
-        """Its station's clock minus the server's."""
-        return None if self.state is None else self.state.clock
-
-    @property
-    def version(self) -> str | None:
-        """Its station's program."""
-        return None if self.state is None else self.state.version
 
 
 _Series = namedtuple(

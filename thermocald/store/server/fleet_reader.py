@@ -85,9 +85,9 @@ class FleetCamera:
     epochs took to the server, NaN if not known; ok: fraction of its last epochs with a result;
     temperature: °C, the last of the reference, NaN without; shift_px: how far c, x0 or y0 has left
     its own line lately, and in standard deviations; odd: the probability that a camera of this type
-    is as unlike the others, NaN where that is not known; findings: what a person should look at: kind,
-    one word, see `fleet.overview`, and text, a sentence; waiting, clock_s, version: rows at its
-    station, its clock minus the server's, its program.
+    is as unlike the others, NaN where that is not known; findings: what a person should look at:
+    kind, one word, see `fleet.overview`, and text, a sentence; waiting, clock_s, version: rows at
+    its station, its clock minus the server's, its program.
     """
 
     JSON: ClassVar = {

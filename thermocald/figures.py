@@ -379,7 +379,9 @@ def draw_arrows(axis: Any, arrows: Arrows) -> None:
         *arrows.points.T, *arrows.vectors.T, angles="xy", scale_units="xy", scale=scale,
         color=arrows.colour, width=0.006, headwidth=4, minlength=0,
     )  # fmt: skip
-    reference = _round_below(shown)
+    # the next lower 1, 2, 5 times a power of ten
+    power = 10.0 ** np.floor(np.log10(shown))
+    reference = float(max(m for m in (1.0, 2.0, 5.0) if m * power <= shown * 1.0000001) * power)
     axis.quiverkey(
         quiver, 0.9, 1.05, reference, f"{tick_text(reference)} px", labelpos="W",
         coordinates="axes", color="black", fontproperties={"size": 8},
@@ -395,12 +397,6 @@ def draw_arrows(axis: Any, arrows: Arrows) -> None:
     axis.set_aspect("equal")
     axis.locator_params(nbins=6)
     axis.grid(visible=False)
-
-
-def _round_below(value: float) -> float:
-    """The next lower 1, 2, 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(max(m for m in (1.0, 2.0, 5.0) if m * power <= value * 1.0000001) * power)
 
 
 def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:

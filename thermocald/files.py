@@ -20,7 +20,6 @@ import shutil
 import stat
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
@@ -388,14 +387,6 @@ def dump_yaml(document: dict[str, Any]) -> str:
     return text
 
 
-@dataclass(frozen=True, slots=True)
-class Quantity:
-    """A value and its standard deviation (None where none is known), in the unit asked for."""
-
-    value: float
-    sd: float | None = None
-
-
 def write_quantity(value: float, unit: str, sd: float | None = None) -> dict[str, Any]:
     """Return the mapping that a file holds for a number."""
     document: dict[str, Any] = {"value": float(value)}
@@ -450,7 +441,7 @@ class QuantityReader:
         low: float = -math.inf, above: float = -math.inf, high: float = math.inf,
     ) -> float:  # fmt: skip
         """Read the value of a quantity: at least `low`, more than `above`, at most `high`."""
-        value = self.quantity(key, unit, default).value
+        value, _ = self.quantity(key, unit, default)
         if value <= above:
             raise self.fail(key, f"is {value:g} {unit}; it must be above {above:g}")
         if value < low:
@@ -466,8 +457,13 @@ class QuantityReader:
             raise self.fail(key, f"is {value:g}; it is a share below 1")
         return value
 
-    def quantity(self, key: str, unit: str, default: float | None = None) -> Quantity:
-        """Read a number in `unit`; an error if it is missing, no number, or of another unit."""
+    def quantity(
+        self, key: str, unit: str, default: float | None = None
+    ) -> tuple[float, float | None]:
+        """Read a number in `unit` and its standard deviation, None where none is known.
+
+        An error if it is missing, no number, or of another unit.
+        """
         raw = self.mapping.get(key, default)
         if raw is None:
             raise self.fail(key, f"is missing; it is a number in {unit}")
@@ -485,7 +481,7 @@ class QuantityReader:
                 if sd < 0:
                     raise inner.fail("sd", f"is {sd:g}; a standard deviation is not negative")
             raw = raw["value"]
-        return Quantity(self.finite(key, raw), sd)
+        return self.finite(key, raw), sd
 
     def finite(self, key: str, raw: Any) -> float:
         """Return a value at a key as a finite number."""

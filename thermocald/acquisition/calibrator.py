@@ -161,32 +161,15 @@ class Calibrator:
         observations = self.weighed(observations)
         last = self._last
         if last is not None and last.interior is not None and last.exterior is not None:
-            result = adjust(
-                self.sensor,
-                self.testfield,
-                observations,
-                last.interior,
-                last.exterior,
-                self.settings,
-            )
+            start = last.interior, last.exterior
+            result = adjust(self.sensor, self.testfield, observations, *start, self.settings)
             lost = {"no_convergence", "too_many_rejected"}
             if result.status not in lost and not result.sigma0 > _WRONG_START * self._usual:
                 return self._keep(result)
-        return self._keep(self._cold(observations))
-
-    def _cold(self, observations: Observations) -> Adjustment:
+        seen = self.sensor, self.testfield, observations
         if not self.settings.free and self._interior is not None:
-            return pose_only(
-                self.sensor, self.testfield, observations, self._interior, self.settings
-            )
-        return cold_start(
-            self.sensor,
-            self.testfield,
-            observations,
-            self.settings,
-            self._nominal_c,
-            self._interior,
-        )
+            return self._keep(pose_only(*seen, self._interior, self.settings))
+        return self._keep(cold_start(*seen, self.settings, self._nominal_c, self._interior))
 
     def _keep(self, result: Adjustment) -> Adjustment:
         if result.ok:
@@ -212,14 +195,10 @@ def calibrated_epochs(
                 calibrator.reset()
             yield calibrator.calibrate(epoch)
         return
-    for block in in_order(_calibrated, calibrator, _blocks(epochs), jobs):
-        yield from block
-
-
-def _blocks(epochs: Iterable[Epoch]) -> Iterator[list[Epoch]]:
     source = iter(epochs)
-    while block := list(islice(source, EPOCHS_OF_A_BLOCK)):
-        yield block
+    blocks = iter(lambda: list(islice(source, EPOCHS_OF_A_BLOCK)), [])
+    for block in in_order(_calibrated, calibrator, blocks, jobs):
+        yield from block
 
 
 def _calibrated(calibrator: Calibrator, epochs: list[Epoch]) -> list[CalibratedEpoch]:

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from thermocald.acquisition.device_loop import Link
 from thermocald.errors import ConfigurationError, WrongDevice
@@ -30,8 +29,7 @@ _REMEMBERED = 16
 _OLDEST_IN_PERIODS = 1.5
 
 
-@dataclass(frozen=True, slots=True)
-class PairedReadings:
+class PairedReadings(NamedTuple):
     """What the thermometers said around a frame.
 
     utc: s, of the reference thermometer, NaN if there is none; temperatures: {channel: °C};
@@ -173,7 +171,7 @@ class Thermometers:
         paired = pair_readings({name: self.nearest(name, monotonic) for name in names}, monotonic)
         # a reference that was not read leaves its place empty: no other takes it
         columns = dict.fromkeys(self.columns(names), math.nan)
-        return PairedReadings(paired.utc, {**columns, **paired.temperatures}, paired.skew_s)
+        return paired._replace(temperatures={**columns, **paired.temperatures})
 
     def _answered(self, name: str, monotonic: float) -> bool:
         kept = self._kept[name]

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
-    from thermocald.hal import Frame
     from thermocald.photogrammetry.field.testfield import Observations
 
 START_EPOCHS = 10
@@ -343,7 +342,10 @@ class CameraLine:
         if ground.fast:
             self.thermometers.read_now(self.plan.config.thermometers)
         if self._checking:
-            self._look_at(frame)
+            assert self.plan.calibrator is not None
+            found = check_frame(self.plan.name, self.plan.calibrator, frame)
+            if self._checking:
+                self._checking, self.checked = False, found
             return
         with self._swap:
             run = self.run
@@ -352,12 +354,6 @@ class CameraLine:
             run.pipeline.submit(frame)
         if ground.epochs and run.taken - run.first + 1 >= ground.epochs:
             self.loop.stop()
-
-    def _look_at(self, frame: Frame) -> None:
-        assert self.plan.calibrator is not None
-        found = check_frame(self.plan.name, self.plan.calibrator, frame)
-        if self._checking:
-            self._checking, self.checked = False, found
 
     def waiting(self) -> int:
         """Return how many epochs are on their way."""

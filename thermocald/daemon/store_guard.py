@@ -136,7 +136,13 @@ class FollowedStore:
         # else what is in a -wal file that has no name any more would be lost with the connection;
         # what is below another disk now is not found by its name; what was on another disk stays
         # there, and cannot be read where that was pulled out
-        if not swapped and (file.deleted or covered or not self._emptied_wal()):
+        emptied = False
+        if not (swapped or file.deleted or covered):
+            try:
+                emptied = self.store.checkpoint()
+            except StoreError as error:
+                log.debug("%s", error)
+        if not swapped and not emptied:
             copy = self._rescued()
         there, other = file.there, self.path.exists()
         if there:
@@ -158,14 +164,6 @@ class FollowedStore:
         self._open()
         self._note("store_followed", text)
         return carried
-
-    def _emptied_wal(self) -> bool:
-        """Return whether all of the -wal file could be moved into the file."""
-        try:
-            return self.store.checkpoint()
-        except StoreError as error:
-            log.debug("%s", error)
-            return False
 
     def _rescued(self) -> Path:
         """Copy all that the open store holds beside where it was; return where."""

@@ -100,10 +100,9 @@ def effect_of(reader: QuantityReader) -> ModelEffect:
             plain = raw.get("value") if isinstance(raw, dict) else raw
             values[key] = tuple(plain) if isinstance(plain, list) else str(plain)
             continue
-        quantity = parameters.quantity(key, units[key])
-        values[key] = quantity.value
-        if quantity.sd is not None:
-            own[key] = quantity.sd
+        values[key], sd = parameters.quantity(key, units[key])
+        if sd is not None:
+            own[key] = sd
     try:
         effect.check(values)
     except ConfigurationError as error:
@@ -154,12 +153,11 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
             return {}
         reader = top.inner(key)
         reader.only(names)
-        values = {}
+        values: dict[str, float] = {}
         for name in reader.mapping:
-            quantity = reader.quantity(name, PARAMETER_UNITS[name] + per)
-            values[name] = quantity.value
-            if quantity.sd is not None:
-                sds[f"{key}.{name}"] = quantity.sd
+            values[name], sd = reader.quantity(name, PARAMETER_UNITS[name] + per)
+            if sd is not None:
+                sds[f"{key}.{name}"] = sd
         return values
 
     interior = group("interior", IOP_NAMES)

@@ -266,7 +266,14 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
         "is duplicated or after a later one; numbers must increase",
     )
     for name in ("frame_time", *timed):
-        _check_times(table, name, found[name])
+        times = found[name]
+        behind = times - np.fmax.accumulate(np.concatenate([[-np.inf], times]))[:-1]
+        if (back := np.flatnonzero(behind < 0)).size:
+            row = int(back[0])
+            said = f"{times[row]:.3f} s after {times[row] - behind[row]:.3f} s"
+            table.fail(row, name, f"time runs backwards: {said}")
+        if fault := time_fault(times):
+            table.fail(fault[0], name, fault[1])
     temperature_time = found.get("temperature_time", np.full(len(numbers), np.nan))
     for name in channels:
         values = found[name]
@@ -299,15 +306,3 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
         {name: found[name] for name in extra},
         read_readings(log, channels) if channels and (log := folder / READINGS).exists() else None,
     )
-
-
-def _check_times(table: Table, name: str, times: Array) -> None:
-    """Refuse times (E,) s, NaN for none, that run backwards or are no seconds since 1970."""
-    latest = np.fmax.accumulate(np.concatenate([[-np.inf], times]))
-    table.check(
-        name,
-        times < latest[:-1],
-        lambda row: f"time runs backwards: {times[row]:.3f} s after {latest[row]:.3f} s",
-    )
-    if fault := time_fault(times):
-        table.fail(fault[0], name, fault[1])

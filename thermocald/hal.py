@@ -297,21 +297,14 @@ class VirtualClock:
         return True
 
 
-_GROUPS: Mapping[Kind, str] = {
-    "camera": "thermocald.cameras",
-    "thermometer": "thermocald.thermometers",
-    "output": "thermocald.outputs",
-}
-
-
 def driver_names(kind: Kind) -> list[str]:
     """Return the registered drivers of one kind, sorted."""
-    return sorted({point.name for point in entry_points(group=_GROUPS[kind])})
+    return sorted({point.name for point in entry_points(group=f"thermocald.{kind}s")})
 
 
 def load_driver(kind: Kind, name: str) -> type[Any]:
     """Return the class behind one entry point; ConfigurationError names those that exist."""
-    points = {point.name: point for point in entry_points(group=_GROUPS[kind])}
+    points = {point.name: point for point in entry_points(group=f"thermocald.{kind}s")}
     if name not in points:
         raise ConfigurationError(
             f"there is no {kind} driver {name!r}; installed are: "

@@ -215,7 +215,51 @@ class Calibration(Result):
 
     def lines(self) -> list[str]:
         """Return what `thermocald calibrate` prints."""
-        return calibration_lines(self.as_dict())
+        document = self.as_dict()
+        lines: list[str] = []
+        interior = document["interior"]
+        if document["status"] == "ok":
+            used = sum(p["exterior"] is not None for p in document["photographs"])
+            lines.append(
+                f"calibrated from {used} of {document['n_photographs']} photographs: sigma0 "
+                f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
+                + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
+            )
+            rows = [("", "value ± sd", "in px")]
+            pitch = document["camera"]["pixel_pitch"]
+            for name in IOP_NAMES:
+                sd = interior.get(f"sd_{name}")
+                if sd is None:
+                    rows.append((name, f"{plain(interior[name], UNITS[name], 6)} (held)", ""))
+                    continue
+                px = (
+                    with_sd(interior[name] / pitch, sd / pitch) if name in ("c", "x0", "y0") else ""
+                )
+                rows.append((name, with_sd(interior[name], sd, UNITS[name]), px))
+            width = [max(len(row[k]) for row in rows) for k in range(3)]
+            lines += [
+                "  ".join(f"{t:<{w}}" for t, w in zip(row, width, strict=True)) for row in rows
+            ]
+            lines += doubt_lines(document["doubts"])
+            if document["camera"]["pixel_pitch_assumed"]:
+                lines.append(
+                    "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are "
+                    "thousandths of px; give --pixel-pitch or --camera"
+                )
+        else:
+            lines.append(f"not calibrated: {document['status']}: {document['reason']}")
+        for p in document["photographs"]:
+            line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
+            if p["exterior"] is not None:
+                e = p["exterior"]
+                line += f", {p['rms_px']:.2f} px, at " + ", ".join(
+                    with_sd(e[n], e["sd_" + n]) for n in ("X0", "Y0", "Z0")
+                )
+                line += " mm"
+            if p["reason"]:
+                line += f": {p['reason']}"
+            lines.append(line)
+        return lines
 
     def page(self, title: str = "") -> str:
         """Return residuals and coverage as HTML text; title: by default the camera's name."""
@@ -290,47 +334,3 @@ def discovery_lines(found: Discovery) -> list[str]:
             f"{before.object_mm_at_10m:.2f} → {after.object_mm_at_10m:.2f} mm at 10 m"
         )
     return [*lines, *doubt_lines(found.doubts)]
-
-
-def calibration_lines(document: dict[str, Any]) -> list[str]:
-    """Return what `thermocald calibrate` prints of its document."""
-    lines: list[str] = []
-    interior = document["interior"]
-    if document["status"] == "ok":
-        used = sum(p["exterior"] is not None for p in document["photographs"])
-        lines.append(
-            f"calibrated from {used} of {document['n_photographs']} photographs: sigma0 "
-            f"{document['sigma0']:.2f}, redundancy {document['redundancy']}"
-            + (f"; {CAUSES_OF_SIGMA0}" if document["sigma0"] > 1.0 + MATERIAL else "")
-        )
-        rows = [("", "value ± sd", "in px")]
-        pitch = document["camera"]["pixel_pitch"]
-        for name in IOP_NAMES:
-            sd = interior.get(f"sd_{name}")
-            if sd is None:
-                rows.append((name, f"{plain(interior[name], UNITS[name], 6)} (held)", ""))
-                continue
-            px = with_sd(interior[name] / pitch, sd / pitch) if name in ("c", "x0", "y0") else ""
-            rows.append((name, with_sd(interior[name], sd, UNITS[name]), px))
-        width = [max(len(row[k]) for row in rows) for k in range(3)]
-        lines += ["  ".join(f"{t:<{w}}" for t, w in zip(row, width, strict=True)) for row in rows]
-        lines += doubt_lines(document["doubts"])
-        if document["camera"]["pixel_pitch_assumed"]:
-            lines.append(
-                "the pixel pitch is not known and taken as 1 µm: c, x0, y0 in mm are thousandths "
-                "of px; give --pixel-pitch or --camera"
-            )
-    else:
-        lines.append(f"not calibrated: {document['status']}: {document['reason']}")
-    for p in document["photographs"]:
-        line = f"{p['image']}: {p['status']}, {p['n_targets']} targets"
-        if p["exterior"] is not None:
-            e = p["exterior"]
-            line += f", {p['rms_px']:.2f} px, at " + ", ".join(
-                with_sd(e[n], e["sd_" + n]) for n in ("X0", "Y0", "Z0")
-            )
-            line += " mm"
-        if p["reason"]:
-            line += f": {p['reason']}"
-        lines.append(line)
-    return lines

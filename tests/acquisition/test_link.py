@@ -35,7 +35,7 @@ def link_of(clock):
 def poll(clock, link, device, times: int, period_s: float) -> list[bool]:
     answers = []
     for _ in range(times):
-        answers.append(link.call(device.read) is not None)
+        answers.append(link.do(device.read))
         clock.advance(period_s - 0.1)
     return answers
 
@@ -55,7 +55,7 @@ def test_fast_ticks_back_off(clock, link_of):
     attempts = []
     device.open = lambda: attempts.append(clock.monotonic()) or _gone()
     for _ in range(600):
-        link.call(device.read)
+        link.do(device.read)
         clock.advance(0.05)
     assert 10 < len(attempts) < 40  # not 600: the pauses grow to 2 s
     assert max(b - a for a, b in pairwise(attempts)) <= 2.1
@@ -71,10 +71,10 @@ def test_what_no_retry_mends_is_given_up_and_told(clock, link_of):
     def denied():
         raise DeviceDenied("group video")
 
-    assert link.call(denied) is None
+    assert not link.do(denied)
     assert link.ended
     assert events == ["device_failed"]
-    assert link.call(device.read) is None
+    assert not link.do(device.read)
 
 
 def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of):
@@ -96,7 +96,7 @@ def test_a_device_that_is_not_there_at_boot_is_looked_for(clock, link_of):
 
 def test_a_bug_in_a_driver_is_a_fault_not_the_end(clock, link_of):
     device, link, _ = link_of()
-    assert link.call(lambda: 1 / 0) is None
+    assert not link.do(lambda: 1 / 0)
     assert link.state == "out"
     clock.advance(10.0)
-    assert link.call(device.read) is not None
+    assert link.do(device.read)

@@ -17,7 +17,7 @@ import math
 import threading
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 from thermocald.addresses import without_secrets
 from thermocald.errors import (
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from thermocald.hal import Clock, Device, Kind, Output
 
-    T = TypeVar("T")
     OnEvent = Callable[[float, str, str], None]
 
 _QUEUE = 200  # results that wait for an output
@@ -132,14 +131,14 @@ class Link:
         """Whether nothing more will come of this device."""
         return self.state in ("failed", "finished")
 
-    def call(self, action: Callable[[], T]) -> T | None:
-        """Do something with the open device; None if it is away."""
+    def do(self, action: Callable[[], object]) -> bool:
+        """Do something with the open device; whether it was there."""
         if self.ended or (self.state == "out" and self._clock.monotonic() < self._retry_at):
-            return None
+            return False
         try:
             if self.state != "open":
                 self.device.open()
-            result = action()
+            action()
         except TransientDeviceError as error:
             self._out(str(error), max(self._period_s, _LONGEST_PAUSE_S))
         except PermanentDeviceError as error:
@@ -151,28 +150,14 @@ class Link:
             self._out(f"{type(error).__name__}: {error}", max(self._period_s, _LONGEST_PAUSE_S))
         else:
             self._back()
-            return result
-        return None
-
-    def do(self, action: Callable[[], object]) -> bool:
-        """Do something with the open device; whether it was there."""
-
-        def done() -> bool:
-            action()
             return True
-
-        return bool(self.call(done))
+        return False
 
     def close(self) -> None:
         """Release the device."""
         self.device.close()
         if not self.ended:
             self.state = "closed"
-
-    def rest(self) -> None:
-        """Release a device that is not needed for now; one that is away stays so."""
-        if self.state == "open":
-            self.close()
 
     def identity(self) -> dict[str, Any]:
         """Return what the device says it is; empty if it cannot say."""
@@ -306,7 +291,8 @@ class DeviceLoop:
                     break
                 self._busy_since = self._clock.monotonic()
                 if self._idle():
-                    self.link.rest()
+                    if self.link.state == "open":  # one that is away stays so
+                        self.link.close()
                 elif self.link.do(self._action):
                     self.done += 1
                 else:

@@ -132,7 +132,7 @@ class Thermometers:
     def read_now(self, names: Sequence[str]) -> None:
         """Read some in the caller's thread: a recording's come with its frames."""
         for name in names:
-            self.links[name].call(partial(self.read, name))
+            self.links[name].do(partial(self.read, name))
 
     def add(self, name: str, reading: Reading) -> None:
         """Keep a reading; WrongDevice where one of its channels cannot be a column."""

@@ -59,26 +59,20 @@ class ObservationRows:
             covariances = np.concatenate(
                 [np.zeros(len(p.epochs)) if p.covariances is None else p.covariances for p in parts]
             )
-        columns = ("epochs", "targets", "points", "sigmas")
-        return cls(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in columns),
-            covariances,
-            {n: np.concatenate([part.quality[n] for part in parts]) for n in parts[0].quality},
-            parts[0].first,
+        epochs, targets, points, sigmas = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("epochs", "targets", "points", "sigmas")
         )
+        quality = {n: np.concatenate([part.quality[n] for part in parts]) for n in parts[0].quality}
+        return cls(epochs, targets, points, sigmas, covariances, quality, parts[0].first)
 
     def rows(self, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Self:
         """Some of them; `first` is that of a slice."""
-        start = rows.start or 0 if isinstance(rows, slice) else 0
-        return type(self)(
-            self.epochs[rows],
-            self.targets[rows],
-            self.points[rows],
-            self.sigmas[rows],
-            None if self.covariances is None else self.covariances[rows],
-            {name: values[rows] for name, values in self.quality.items()},
-            self.first + start,
-        )
+        first = self.first + (rows.start or 0 if isinstance(rows, slice) else 0)
+        covariances = None if self.covariances is None else self.covariances[rows]
+        quality = {name: values[rows] for name, values in self.quality.items()}
+        kept = self.epochs[rows], self.targets[rows], self.points[rows], self.sigmas[rows]
+        return type(self)(*kept, covariances, quality, first)
 
     def between(self, begin: int, end: int) -> Self:
         """The rows of the epochs `begin` to before `end`, of rows in their order; no copies."""

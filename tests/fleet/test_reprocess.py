@@ -85,9 +85,9 @@ def test_an_unknown_analysis_and_a_server_to_calibrate_are_said(archive, tmp_pat
     from thermocald.cli.server import find_series_tasks
 
     with pytest.raises(UsageError, match="there are calibrate, discover, study"):
-        find_series_tasks([archive], tmp_path, "dream", 100)
+        find_series_tasks([archive], tmp_path, "dream")
     with pytest.raises(DataError, match="no recording or series is there"):
-        find_series_tasks([tmp_path], tmp_path, "study", 100)
+        find_series_tasks([tmp_path], tmp_path, "study")
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ def findings(place) -> set[str]:
     """The kinds of what an overview finds."""
     now, cameras = read_overview(place, Path("x"))
     add_findings(cameras, [], now)
-    return {finding.kind for camera in cameras for finding in camera.findings}
+    return {finding["kind"] for camera in cameras for finding in camera.findings}
 
 
 @pytest.fixture

@@ -53,8 +53,8 @@ def test_names_are_values_and_never_statements(server, tmp_path, head, field, ma
         grant(address(server), evil, writes=True)
     assert count(server, "epoch") == 1
     if "/" not in evil:
-        (task,) = find_series_tasks([base], tmp_path / "out", "discover", 100)
-        assert task.target.parent == tmp_path / "out"
+        (task,) = find_series_tasks([base], tmp_path / "out", "discover")
+        assert task[1].parent == tmp_path / "out"
 
 
 def test_a_newer_server_is_told_from_an_older_one(filled, server):

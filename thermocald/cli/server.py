@@ -6,7 +6,7 @@ analysed on its own, wherever that is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -167,43 +167,31 @@ def fleet(
 ANALYSES = ("discover", "study")
 
 
-@dataclass(frozen=True, slots=True)
-class SeriesTask:
-    """An analysis of one series: a recording's folder or an address that selects it.
+def find_series_tasks(sources: list[Path], out: Path, analysis: str) -> list[tuple[Path, Path]]:
+    """Every series that is not analysed yet: a recording's folder or an address, and its JSON file.
 
-    target: the JSON file it writes; sets: of the study's Monte-Carlo simulation.
-    """
-
-    analysis: str
-    source: Path
-    target: Path
-    sets: int = 100_000
-
-
-def find_series_tasks(sources: list[Path], out: Path, analysis: str, sets: int) -> list[SeriesTask]:
-    """A task for every series below some folders, or at some addresses, that is not done yet.
-
-    Raises DataError where there is none, UsageError for an unknown analysis.
+    sources: folders and addresses. Raises DataError where there is no series, UsageError for an
+    unknown analysis.
     """
     from thermocald.fleet.reprocess import find_series
 
     if analysis not in ANALYSES:
         raise UsageError(f"--do {analysis}: there are calibrate, {', '.join(ANALYSES)}")
-    tasks = [SeriesTask(analysis, place, out / f"{name}.json", sets)
-             for name, place in sorted(find_series(sources).items())]  # fmt: skip
-    return [task for task in tasks if not task.target.exists()]
+    tasks = [(place, out / f"{name}.json") for name, place in sorted(find_series(sources).items())]
+    return [task for task in tasks if not task[1].exists()]
 
 
-def analyse(task: SeriesTask) -> Outcome:
-    """Do one task and write its file, whole or not at all."""
+def analyse(analysis: str, sets: int, task: tuple[Path, Path]) -> Outcome:
+    """Analyse one series and write its file, whole or not at all; sets: of a study."""
     import thermocald as tc
     from thermocald.fleet.reprocess import Outcome
 
-    if task.analysis == "discover":
-        document = tc.discover(tc.open(task.source)).as_dict()
+    source, target = task
+    if analysis == "discover":
+        document = tc.discover(tc.open(source)).as_dict()
     else:
-        document = tc.study(*tc.open_all(task.source), sets=task.sets).as_dict()
-    write_json(document, str(task.target))
+        document = tc.study(*tc.open_all(source), sets=sets).as_dict()
+    write_json(document, str(target))
     return Outcome(task)
 
 
@@ -244,9 +232,10 @@ def reprocess(
         with progress(len(blocks), "blocks") as advance:
             outcomes = run_tasks(calibrate_block, blocks, engine, jobs, lambda _: advance(1))
     else:
-        tasks = find_series_tasks(sources, out, do, sets)
+        tasks = find_series_tasks(sources, out, do)
+        work = partial(analyse, do, sets)
         with progress(len(tasks), "series") as advance:
-            outcomes = run_tasks(analyse, tasks, engine, jobs, lambda _: advance(1))
+            outcomes = run_tasks(work, tasks, engine, jobs, lambda _: advance(1))
     count, failed = len(outcomes), [o for o in outcomes if o.error]
     document: dict[str, Any]
     if do == "calibrate":
@@ -257,7 +246,7 @@ def reprocess(
         said = f"{calibrated} of {epochs} epochs calibrated in {count - len(failed)} blocks"
     else:
         document = {"series": count}
-        places = [{"source": source_name(o.task.source)} for o in failed]
+        places = [{"source": source_name(o.task[0])} for o in failed]
         said = f"{count - len(failed)} of {count} series done"
     errors = [{**place, "error": o.error} for place, o in zip(places, failed, strict=True)]
     write_json({**document, "failed": errors}, json)

@@ -293,7 +293,7 @@ def test_what_a_library_says_is_clean_in_status_event_and_log(caplog, kind):
         "output", "hook", Quoting(clock=SystemClock()), SystemClock(),
         on_event=lambda utc, kind, text: events.append(text),
     )  # fmt: skip
-    link.call(lambda: True)
+    link.do(lambda: True)
     told = [link.why, *events]
     assert told
     assert not [text for text in told if f"user:{SECRET}" in text]

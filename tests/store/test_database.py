@@ -138,7 +138,8 @@ def test_several_cameras_and_series(filled, head, field, make_epoch, make_result
 def test_events_stand_with_their_epoch(filled, make_epoch):
     store, series = filled
     knock = Event(1.6e9 + 211, "knock", "the camera moved", series.id, 21, {"chi2": 91.5})
-    store.append(series, make_epoch(21), events=[knock])
+    store.append(series, make_epoch(21))
+    store.add_event(knock)
     gone = Event(1.6e9 + 300, "device_gone", "lens thermometer unplugged")
     store.add_event(gone)
     assert store.events() == [knock, gone]
@@ -179,7 +180,7 @@ def test_a_failed_epoch_leaves_nothing(filled, make_epoch, make_result):
     before = list(store._db.iterdump())
     wrong = replace(make_epoch(21), frame_time=np.nan)  # a column that must not be empty
     with pytest.raises(StoreError, match="epoch 21 of series 'M1' was not kept"):
-        store.append(series, wrong, make_result(21), events=[Event(0.0, "note", "x")])
+        store.append(series, wrong, make_result(21))
     assert list(store._db.iterdump()) == before
     store.append(series, make_epoch(21), make_result(21))
 

@@ -246,11 +246,11 @@ def demo_config(folder: Path, seed: int) -> Config:
     return parse_config(config, Path("config.yaml"))
 
 
-def recording_config(path: Path, *, loop: bool = False) -> Config:
+def recording_config(path: Path) -> Config:
     """Return a recording as camera and thermometer."""
     head = read_head(path)
     sensor = head.camera.sensor
-    replay = {"driver": "replay", "recording": str(path.absolute()), "loop": loop}
+    replay = {"driver": "replay", "recording": str(path.absolute())}
     period = max(0.05, head.interval)
     return parse_config(
         {

@@ -202,9 +202,7 @@ class Store(SeriesReader):
             after = int(found["number"][-1])
             yield {name: found[source[name]] for name in names}
 
-    def readings(
-        self, thermometer: str | None = None, since_utc: float = 0.0
-    ) -> Iterator[LoggedReading]:
+    def readings(self, thermometer: str | None = None) -> Iterator[LoggedReading]:
         """Readings apart from epochs, in the order they were kept."""
         after = -1
         while True:
@@ -212,9 +210,8 @@ class Store(SeriesReader):
                 page = columns.select_rows(
                     connection,
                     "reading",
-                    "WHERE id > ? AND utc >= ? AND thermometer = ifnull(?, thermometer) "
-                    "ORDER BY id LIMIT ?",
-                    (after, since_utc, thermometer, _READINGS_AT_ONCE),
+                    "WHERE id > ? AND thermometer = ifnull(?, thermometer) ORDER BY id LIMIT ?",
+                    (after, thermometer, _READINGS_AT_ONCE),
                 ).fetchall()
                 for row in _sound_rows("reading", page):
                     name = file_name(row["thermometer"], "thermometer", StoreError)
@@ -344,9 +341,8 @@ class Store(SeriesReader):
         *,
         extra: Mapping[str, float] | None = None,
         clock_trusted: bool = True,
-        events: Iterable[Event] = (),
     ) -> None:
-        """Keep one epoch, its result and what happened meanwhile, in one transaction.
+        """Keep one epoch and its result, in one transaction.
 
         result: None if it is to be calibrated later, by `amend`. extra: further columns such as
         blur. Keeps nothing of the epoch and raises StoreError if its number does not come after the
@@ -357,15 +353,14 @@ class Store(SeriesReader):
         stored = StoredEpoch(
             epoch, result or EpochResult(NOT_CALIBRATED), extra or {}, clock_trusted, 0
         )
-        happened = list(events)
         try:
-            self._append(series, stored, happened)
+            self._append(series, stored)
         except StoreFullError:
             # what waits in the -wal file may be the room that is missing
             self.checkpoint()
-            self._append(series, stored, happened)
+            self._append(series, stored)
 
-    def _append(self, series: StoredSeries, stored: StoredEpoch, events: list[Event]) -> None:
+    def _append(self, series: StoredSeries, stored: StoredEpoch) -> None:
         epoch = stored.epoch
         with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not kept"):
             last, loose = self._ends.get(series.id) or (
@@ -377,8 +372,6 @@ class Store(SeriesReader):
                     f"epoch {last}; numbers must increase"
                 )
             epochs.insert_epoch(self._db, series.id, stored)
-            for event in events:
-                self._insert_event(event)
             full = loose + 1 >= columns.CHUNK
             if full and series.id not in self._unchunked:
                 self._build_chunks(series)
@@ -423,15 +416,12 @@ class Store(SeriesReader):
     def add_event(self, event: Event) -> None:
         """Log something that happened apart from an epoch."""
         with self._transaction("an event was not kept"):
-            self._insert_event(event)
-
-    def _insert_event(self, event: Event) -> None:
-        row = {
-            "id": columns.next_id(self._db, "event"), "utc": event.utc, "series_id": event.series,
-            "epoch": event.epoch, "kind": event.kind, "text": event.text,
-            "data": epochs.to_json(event.data),
-        }  # fmt: skip
-        columns.insert_row(self._db, "event", row)
+            row = {
+                "id": columns.next_id(self._db, "event"), "utc": event.utc,
+                "series_id": event.series, "epoch": event.epoch, "kind": event.kind,
+                "text": event.text, "data": epochs.to_json(event.data),
+            }  # fmt: skip
+            columns.insert_row(self._db, "event", row)
 
     def add_readings(self, readings: Sequence[LoggedReading]) -> None:
         """Keep what thermometers said apart from epochs, in one transaction."""

@@ -315,10 +315,10 @@ def test_a_disk_that_becomes_read_only_while_the_daemon_writes(ext4):
     assert numbers(path) == [1, 2, 3, 4, 5, 6, 7]
 
 
-def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemon, measured):
+def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemon, devices):
     folder, broken, mended = ext4
     daemon.store = folder / "thermocald.db"
-    daemon.configure(**measured)
+    daemon.configure(**devices())
     daemon.start()
     daemon.until(lambda: len(daemon.results()) > 3)
     broken()

@@ -204,7 +204,7 @@ def test_two_names_are_never_one():
         require_channels(["a", "b", "a"], "here", ConfigurationError)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(name=strategies.text(max_size=70))
 def test_any_text_as_a_channel_is_refused_or_right(tmp_path_factory, name):
     """Refused with one line, or read back as it was: from the store, the page and a recording."""

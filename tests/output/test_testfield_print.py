@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import xml.etree.ElementTree as ET
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -23,9 +27,19 @@ DPI = 200
 MM = DPI / 25.4  # px
 
 
-def rasterise(pdf, page=0, dpi=DPI):
-    """One page as a grey image (H, W)."""
-    return rasterised(pdf, page, dpi)
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory):
+    """design → the folder it is printed into and what was printed, once."""
+
+    @cache
+    def print_once(design):
+        folder = tmp_path_factory.mktemp("printed")
+        return folder, print_testfield(design, folder)
+
+    return print_once
+
+
+CORNER = Design(paper_size("A3"), 9.0, sheets=3)
 
 
 def page_px(field, rows, page, image):
@@ -61,12 +75,12 @@ def centroid(image, centre, radius_px, light=False):
     ],
     ids=["A4", "A3 14 bit", "odd size with markers", "light on dark"],
 )
-def test_rasterised_discs_are_where_the_csv_says(tmp_path, paper, options):
+def test_rasterised_discs_are_where_the_csv_says(printed, paper, options):
     page = paper_size(paper)
     design = Design(page, default_diameter(page), **options)
-    print_testfield(design, tmp_path)
-    field = read_testfield(tmp_path / "testfield.csv")
-    image = rasterise(tmp_path / "testfield.pdf")
+    folder, _ = printed(design)
+    field = read_testfield(folder / "testfield.csv")
+    image = rasterised(folder / "testfield.pdf", 0, DPI)
     assert image.shape == pytest.approx((page[1] * MM, page[0] * MM), abs=1.01)
     circles = [i for i, kind in enumerate(field.kinds) if kind == "circle"]
     assert len(circles) >= 30
@@ -79,12 +93,12 @@ def test_rasterised_discs_are_where_the_csv_says(tmp_path, paper, options):
 
 
 @pytest.mark.parametrize("bits", [12, 14])
-def test_rasterised_rings_carry_the_code_of_the_csv(tmp_path, bits):
+def test_rasterised_rings_carry_the_code_of_the_csv(printed, bits):
     """The ring is read off the raster pixel by pixel, clockwise, without the program's decoder."""
     page = paper_size("A4")
-    print_testfield(Design(page, 7.0, bits=bits), tmp_path)
-    field = read_testfield(tmp_path / "testfield.csv")
-    image = rasterise(tmp_path / "testfield.pdf", dpi=DPI)
+    folder, _ = printed(Design(page, 7.0, bits=bits))
+    field = read_testfield(folder / "testfield.csv")
+    image = rasterised(folder / "testfield.pdf", 0, DPI)
     coded = [i for i, code in enumerate(field.codes) if code]
     assert len({field.codes[i] for i in coded}) == len(coded) >= 20
     middle = 0.5 * (ring_code.RING_INNER + ring_code.RING_OUTER) * 3.5 * MM
@@ -98,11 +112,11 @@ def test_rasterised_rings_carry_the_code_of_the_csv(tmp_path, bits):
         assert f"RING{bits}:{smallest}" == field.codes[i]
 
 
-def test_markers_are_found_by_opencv_where_the_csv_says(tmp_path):
-    page = paper_size("A3", landscape=True)
-    print_testfield(Design(page, 9.0, dictionary="DICT_APRILTAG_36h11"), tmp_path)
-    field = read_testfield(tmp_path / "testfield.csv")
-    image = rasterise(tmp_path / "testfield.pdf")
+def test_markers_are_found_by_opencv_where_the_csv_says(printed):
+    page = paper_size("250x330")
+    folder, _ = printed(Design(page, default_diameter(page), dictionary="DICT_APRILTAG_36h11"))
+    field = read_testfield(folder / "testfield.csv")
+    image = rasterised(folder / "testfield.pdf", 0, DPI)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
     found = {
@@ -117,9 +131,9 @@ def test_markers_are_found_by_opencv_where_the_csv_says(tmp_path):
     assert np.abs(errors).max() / MM < 0.2  # OpenCV's corners without refinement: 1 to 2 px
 
 
-def test_rulers_are_as_long_as_they_say(tmp_path):
-    print_testfield(Design(paper_size("A4"), 7.0), tmp_path)
-    image = rasterise(tmp_path / "testfield.pdf", dpi=600)
+def test_rulers_are_as_long_as_they_say(printed):
+    folder, _ = printed(Design(paper_size("A4"), 7.0, bits=12))
+    image = rasterised(folder / "testfield.pdf", 0, 600)
     mm = 600 / 25.4
     dark = image < 128
     for lengthwise in (dark, np.rot90(dark, k=-1)):  # the second: the left edge becomes the top
@@ -133,14 +147,11 @@ def test_rulers_are_as_long_as_they_say(tmp_path):
         assert np.diff(ticks) / mm == pytest.approx(10.0, abs=0.06)
 
 
-def test_svg_draws_the_same_page(tmp_path):
+def test_svg_draws_the_same_page(printed):
     """Page size and the centres of all discs, read from the SVG's own path data."""
-    import re
-    import xml.etree.ElementTree as ET
-
     page = paper_size("A4")
-    printed = print_testfield(Design(page, 7.0), tmp_path)
-    root = ET.parse(tmp_path / "testfield.svg").getroot()
+    folder, done = printed(Design(page, 7.0, bits=12))
+    root = ET.parse(folder / "testfield.svg").getroot()
     size = [float(root.get(side).removesuffix("pt")) / 72 * 25.4 for side in ("width", "height")]
     assert size == pytest.approx(page, abs=0.01)
     boxes = []
@@ -155,27 +166,26 @@ def test_svg_draws_the_same_page(tmp_path):
     centres = (boxes[:, :2] + boxes[:, 2:]) / 2
     sides = boxes[:, 2:] - boxes[:, :2]
     discs = centres[np.all(np.abs(sides - 7.0) < 0.01, axis=1)]
-    expected = printed.field.points[:, :2] + TRIM
+    expected = done.field.points[:, :2] + TRIM
     expected[:, 1] = page[1] - expected[:, 1]
     distance = np.linalg.norm(expected[:, None] - discs[None], axis=2).min(axis=1)
     assert distance.max() < 0.005
 
 
-def test_corner_is_three_perpendicular_sheets_with_distinct_codes(tmp_path):
-    design = Design(paper_size("A3"), 9.0, sheets=3)
-    printed = print_testfield(design, tmp_path)
-    assert [f.name for f in printed.files] == [
+def test_corner_is_three_perpendicular_sheets_with_distinct_codes(printed):
+    _, done = printed(CORNER)
+    assert [f.name for f in done.files] == [
         "testfield.pdf", "testfield-1.svg", "testfield-2.svg", "testfield-3.svg", "testfield.csv",
     ]  # fmt: skip
-    field = printed.field
+    field = done.field
     planes = [np.flatnonzero(np.abs(field.points[:, axis]) < 1e-9) for axis in (2, 1, 0)]
-    assert [len(p) for p in planes] == [len(s.targets) for s in printed.sheets]
+    assert [len(p) for p in planes] == [len(s.targets) for s in done.sheets]
     assert field.points.min() >= 0
     codes = [c for c in field.codes if c]
     assert len(set(codes)) == len(codes)
     # seen from outside, on each sheet the order right, up, towards the viewer is right-handed:
     # otherwise the ring codes of that sheet would be mirrored
-    for rows, sheet, normal in zip(planes, printed.sheets, np.eye(3)[[2, 1, 0]], strict=True):
+    for rows, sheet, normal in zip(planes, done.sheets, np.eye(3)[[2, 1, 0]], strict=True):
         local = np.array([[t.x, t.y] for t in sheet.targets])
         axes = np.linalg.lstsq(
             np.column_stack([local, np.ones(len(local))]), field.points[rows], rcond=None
@@ -183,9 +193,9 @@ def test_corner_is_three_perpendicular_sheets_with_distinct_codes(tmp_path):
         assert np.cross(axes[0], axes[1]) == pytest.approx(normal, abs=1e-9)
 
 
-def test_the_plan_and_the_coordinates_agree_on_left_and_right(tmp_path):
+def test_the_plan_and_the_coordinates_agree_on_left_and_right(printed):
     """Who looks into the corner sees sheet 2 on the left; letters are on edges that coincide."""
-    sheets = print_testfield(Design(paper_size("A3"), 9.0, sheets=3), tmp_path).sheets
+    sheets = printed(CORNER)[1].sheets
     field = field_of(sheets)
     camera = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(3.04))
     image = camera.project(usual_station(camera, field), field.points)
@@ -209,10 +219,9 @@ def test_the_plan_and_the_coordinates_agree_on_left_and_right(tmp_path):
         assert len(first) == 2
 
 
-def test_a_corner_comes_with_the_plan_to_put_it_up(tmp_path):
+def test_a_corner_comes_with_the_plan_to_put_it_up(printed):
     pdfium = pytest.importorskip("pypdfium2")
-    print_testfield(Design(paper_size("A4"), 7.0, sheets=3), tmp_path)
-    document = pdfium.PdfDocument(tmp_path / "testfield.pdf")
+    document = pdfium.PdfDocument(printed(CORNER)[0] / "testfield.pdf")
     try:
         assert len(document) == 4
         words = " ".join(document[3].get_textpage().get_text_bounded().split())
@@ -225,7 +234,7 @@ def test_a_corner_comes_with_the_plan_to_put_it_up(tmp_path):
 def test_sigmas_are_those_of_an_unsurveyed_print():
     flat = field_of(lay_out(Design(paper_size("A3"), 9.0)))
     assert flat.sigmas[:, 2].min() > flat.sigmas[:, 0].max() > flat.sigmas[:, 0].min() > 0.09
-    corner = field_of(lay_out(Design(paper_size("A3"), 9.0, sheets=3)))
+    corner = field_of(lay_out(CORNER))
     assert corner.sigmas.min() > 2.9
 
 

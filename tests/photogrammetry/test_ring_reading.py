@@ -62,7 +62,8 @@ def _mirrored(number: int, bits: int = 14) -> int:
 
 
 def _in_clutter(seeds: range) -> list:
-    return [(s, ink, _codes(clutter(s), ink)) for s in seeds for ink in (-1, 1)]
+    frames = ((s, clutter(s)) for s in seeds)
+    return [(s, ink, _codes(frame, ink)) for s, frame in frames for ink in (-1, 1)]
 
 
 def test_no_code_in_clutter():

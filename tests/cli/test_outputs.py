@@ -455,3 +455,13 @@ def test_what_was_measured_is_never_written_over(world, tmp_path):
         assert (tmp_path / place).read_bytes() == before, what
     with Store.open(tmp_path / "t.db") as store:
         assert [event.text for event in store.events()] == ["kept"]
+
+
+@pytest.mark.parametrize(("closed", "status"), [(">&-", 2), ("2>&-", 0), ("<&- >&- 2>&-", 0)])
+def test_a_closed_output_is_no_traceback(tmp_path, closed, status):
+    done = subprocess.run(
+        ["sh", "-c", f'"$0" -m thermocald --version {closed}', sys.executable],
+        capture_output=True, text=True, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == status
+    assert done.stderr.count("\n") == (status > 0)

@@ -104,7 +104,8 @@ def main() -> None:
         # a folder that may not be written, a full disk: wherever it shows first
         if error.filename is None and error.errno is None:
             raise
-        failed = cannot_write(str(error.filename or "standard output"), error)
+        where = "its folder" if isinstance(error, FileNotFoundError) else "standard output"
+        failed = cannot_write(str(error.filename or where), error)
         what = error.strerror if isinstance(error.filename, str) and _is_read(error) else None
         say(f"error: {error.filename}: cannot be read: {what}" if what else f"error: {failed}")
         with contextlib.suppress(OSError):
@@ -130,6 +131,12 @@ def _settle_process() -> None:
     """Let no file be written by everybody, or read by nobody, and no output fail for its script."""
     given = os.umask(0o077)
     os.umask((given | 0o002) & ~0o700)
+    # what was closed (`>&-`): no store may take its number, and a result for it is an error
+    while (number := os.open(os.devnull, os.O_RDWR if sys.stderr is None else os.O_RDONLY)) < 3:
+        pass
+    os.close(number)
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
 

@@ -38,7 +38,8 @@ from thermocald.epoch import Epoch
 from thermocald.fleet.forward import Forwarder
 from thermocald.fleet.page import fleet_document
 from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import open_recording

@@ -15,8 +15,8 @@ from thermocald.config import Config, InteriorName, ParameterName, load_config, 
 from thermocald.errors import ConfigurationError
 from thermocald.files import dump_yaml
 from thermocald.hal import driver_names, option_names
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PARAMETER_NAMES
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE, IOP_NAMES, PARAMETER_NAMES
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 
 
 def document(**changes) -> dict:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.series import (
     Series,
     check_exterior,

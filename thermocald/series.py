@@ -18,8 +18,8 @@ from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.recorded import recorded_table, replay_into, table_of_stored
 from thermocald.analysis.study.measured import measured_series
 from thermocald.errors import DataError, UsageError
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE, AdjustmentSettings
+from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE, IOP_NAMES
+from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
 from thermocald.store.recording.reader import Recording, open_recording
 from thermocald.store.recording.sense import interior_doubts

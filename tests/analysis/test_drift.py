@@ -27,11 +27,13 @@ from thermocald.store.series import EpochResult
 SIGMA = 0.05
 
 
-def series(seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int = 60) -> Epochs:
-    """60 circles before a camera that warms up within 400 s; one of them may wander by some px."""
+def series(
+    seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int = 60, targets: int = 60
+) -> Epochs:
+    """Circles before a camera that warms up within 400 s; one of them may wander by some px."""
     plain = corner_field("plain", per_side=5, pitch_mm=124.0)
     rng = np.random.default_rng(seed)
-    rows = rng.permutation(len(plain))[:60]
+    rows = rng.permutation(len(plain))[:targets]
     field = TestField.build([plain.names[i] for i in rows], plain.points[rows], 0.02)
     true = field.points + rng.normal(0, 0.02, field.points.shape)
     model = demonstration_model(plain)
@@ -44,7 +46,7 @@ def series(seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int =
         points = project(model.sensor, now, eop, true)
         points[7, 0] += wanders * k / epochs
         points += rng.normal(0, SIGMA, points.shape)
-        observations.append(Observations(np.arange(60), points, np.full((60, 2), SIGMA)))
+        observations.append(Observations(np.arange(targets), points, np.full(points.shape, SIGMA)))
     start = np.tile(np.r_[iop, eop], (epochs, 1))
     zero = np.zeros(epochs, dtype=np.int64)
     apart = Epochs(
@@ -66,6 +68,16 @@ def test_no_target_is_accused_of_what_the_camera_did(seed):
     assert all(not c.rests_on for c in found)
     x0 = found[1]
     assert x0.last_minus_first == pytest.approx(-1.39e-3, abs=4 * x0.sd_last_minus_first)
+
+
+@pytest.mark.parametrize(("targets", "few"), [(12, 12), (60, None)])
+def test_a_level_that_few_targets_cannot_test_is_flagged(targets, few):
+    """12 targets before a field three times worse than stated put it at 1.6 sd."""
+    table = series(3, warms=False, epochs=12, targets=targets)
+
+    assert table.as_dict().get("level_tested_by_targets") == few
+    said = "12 targets are too few to test the test field's coordinates"
+    assert any(said in line for line in table.lines()) is bool(few)
 
 
 @pytest.mark.parametrize("epochs", [30, 80, 150])

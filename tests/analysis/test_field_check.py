@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.field import (
-    FREE,
     advise,
     check_field,
     precision,
@@ -16,6 +15,7 @@ from thermocald.analysis.field import (
 from thermocald.errors import GeometryError
 from thermocald.output.testfield.layout import Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import (
+    DEFAULT_FREE,
     IOP_NAMES,
     CameraModel,
     ExteriorOrientation,
@@ -29,7 +29,7 @@ from thermocald.physics.testfields import corner_field
 CAMERA = CameraModel(
     Sensor(3280, 2464, 0.00112), InteriorOrientation(c=3.04, x0=0.01, y0=-0.02, A1=-2e-3)
 )
-_COLUMNS = [IOP_NAMES.index(name) for name in FREE]
+_COLUMNS = [IOP_NAMES.index(name) for name in DEFAULT_FREE]
 
 
 def _printed(paper, sheets=1, diameter=12.0):
@@ -49,7 +49,7 @@ def test_predicted_are_the_standard_deviations_of_an_adjustment(exact):
     )
     result = adjust(
         CAMERA.sensor, field, seen, CAMERA.interior, station,
-        AdjustmentSettings(free=FREE, snooping_alpha=0.0),
+        AdjustmentSettings(free=DEFAULT_FREE, snooping_alpha=0.0),
     )  # fmt: skip
     assert result.status == "ok"
     stated = np.sqrt(np.diag(result.covariance))[_COLUMNS] / result.sigma0

@@ -239,3 +239,29 @@ def test_correct_images_command(folder, pair):
     difference = corrected[40:-40, 40:-40] - expected[40:-40, 40:-40]
     raw = cv2.imread(str(folder / "hot.png"), cv2.IMREAD_GRAYSCALE)[40:-40, 40:-40]
     assert difference.std() < 0.1 * (raw - expected[40:-40, 40:-40]).std()
+
+
+def test_constants_that_go_together_are_said_by_slope_and_curvature():
+    """Width and size of an exponential at room temperature correlate by 0.999."""
+    true = ModelEffect("exponential(temperature, w)", {"w": 15.0, "c": 3e-4, "x0": 9e-4})
+    s = simulated(1, listed=(true,))
+    start = replace(true, values={"w": 30.0, "c": 0.0, "x0": 0.0})
+
+    found = fit_thermal_model([reduced(s)], [start])
+
+    known = found.fitted["known_together"][0]
+    assert known["parameters"] == ["w"]
+    assert known["correlation"] > 0.99
+    low, high = found.model.validity["temperature"]
+    T = np.linspace(low, high, 41) - found.model.T0
+    _, slope, half = np.linalg.lstsq(
+        np.vander(T, 3, increasing=True), np.exp((T + found.model.T0) / 15.0), rcond=None
+    )[0]
+    for name in ("c", "x0"):
+        size = true.values[name]
+        for part, value in (("slope", s.model.rates[name] + size * slope),
+                            ("curvature", 2.0 * size * half)):  # fmt: skip
+            estimate = known[part][name]
+            assert estimate["value"] == pytest.approx(value, abs=4.0 * estimate["sd"])
+            assert estimate["sd"] < 0.02 * abs(value)
+    assert any("best known together, as they correlate by 0.99" in line for line in found.lines())

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from tests.discovery.test_tremble import trembling
-from thermocald.discovery.entries import find_ridge, find_trade_off
+from thermocald.discovery.entries import find_tied_constants, find_trade_off
 from thermocald.physics import catalogue
-from thermocald.physics.formula import Node
+from thermocald.physics.formula import Node, say_together
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Term
 
@@ -60,13 +60,31 @@ def saturating(fitter, middle, width):
 
 def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alone(lagging):
     """Its tail is an exponential: middle and size are one number."""
-    found = find_ridge(lagging, saturating(lagging, 3783.7, 288.2), 0)
+    found = find_tied_constants(lagging, saturating(lagging, 3783.7, 288.2), 0)
 
-    document, sentence = found
-    assert document == {"parameters": ["k"]}
-    assert "only their product" in sentence
+    assert found["parameters"] == ["k"]
+    assert found["exchanged"]
+    assert "known only together, as others explain the same: slope and " in say_together(found)
+
+
+@pytest.mark.parametrize(("middle", "width"), [(50.0, 20.0), (60.0, 30.0), (3783.7, 288.2)])
+def test_what_is_known_of_it_is_slope_and_curvature(lagging, middle, width):
+    """The curve is the same whichever of the formulas that explain the same is written."""
+    found = find_tied_constants(lagging, saturating(lagging, middle, width), 0)
+    history = lagging.series[0].history
+    T = Node("", name=history.reference)
+    square = Node("square", (Node("offset", (T,), (found["temperature"],)),))
+    parabola = lagging.refine(lagging.fit((Term(square.text(), BASE),)), max_iterations=0)
+
+    own = parabola.blocks[1]
+    scale = lagging.series[0].scale[:3]
+    for i, p in enumerate(BASE):
+        curvature, value = found["curvature"][p], 2 * parabola.coefficients[own.start + i]
+        assert curvature["value"] == pytest.approx(value / scale[i], abs=4 * curvature["sd"])
+        assert 0 < curvature["sd"] < 1e-4
+        assert found["slope"][p]["sd"] < 1e-5
 
 
 def test_a_saturation_within_the_recorded_range_is_known(lagging):
     T = lagging.series[0].history.temperature()
-    assert find_ridge(lagging, saturating(lagging, float(T.mean()), 8.0), 0) is None
+    assert find_tied_constants(lagging, saturating(lagging, float(T.mean()), 8.0), 0) is None

@@ -10,7 +10,7 @@ import pytest
 
 from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
 from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
+from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
 pytestmark = pytest.mark.slow
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 RUN_BLOCKS = (
     "import sys; from pathlib import Path;"
     "from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks;"
-    "from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE;"
+    "from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE;"
     "b = find_blocks([Path(sys.argv[1])], Path(sys.argv[2]), tuple(DEFAULT_FREE), 10);"
     "print([o.error for o in run_tasks(calibrate_block, b, sys.argv[3]) if o.error])"
 )

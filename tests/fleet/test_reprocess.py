@@ -12,7 +12,7 @@ import pytest
 from tests.fleet.deadly import die
 from thermocald.errors import DataError, UsageError
 from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
+from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
 

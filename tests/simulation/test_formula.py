@@ -10,7 +10,7 @@ import pytest
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.physics import catalogue
 from thermocald.physics.effect import Effect
-from thermocald.physics.formula import parse
+from thermocald.physics.formula import known_together, parse
 from thermocald.physics.history import History
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import read_effects, write_effects
@@ -171,15 +171,49 @@ def test_an_effect_file_is_read_as_it_was_written(tmp_path):
         read_effects(path)
 
 
-def test_a_constant_that_was_never_seen_is_not_stated_to_a_tenth_of_a_kelvin():
+def test_a_constant_that_is_not_known_is_not_stated_to_a_tenth_of_a_kelvin():
     """The tail of a tanh is an exponential: middle, width and size lie on a ridge."""
     effect = catalogue.get("saturation(temperature, k, w)")
     k, w = effect.nonlinear
-    width = {"value": 288.2, "sd": 1.7, "unit": "K"}
+    width = {"value": 288.2, "sd": None, "unit": "K"}
     near = {k: {"value": 38.0, "sd": 0.11, "unit": "degC"}, w: width}
-    far = {k: {"value": 3783.7, "sd": 0.11, "unit": "degC"}, w: width}
+    far = {k: {"value": 3783.7, "sd": None, "unit": "degC"}, w: width}
     assert "38.00 ± 0.11 °C" in effect.sentence({"a_c": {}, **near})
-    assert "combination" not in effect.sentence({"a_c": {}, **near})
-    said = effect.sentence({"a_c": {}, **far})
-    assert "± 0.11" not in said
-    assert "only a combination is known" in said
+    assert "tanh((T − about 3.8e+03 °C) / about 2.9e+02 K)" in effect.sentence({"a_c": {}, **far})
+
+
+def test_what_is_known_of_tied_constants_has_true_standard_deviations():
+    """y = r T + a exp(T / w), 300 times: slope and curvature err by what is stated."""
+    from scipy.optimize import curve_fit
+
+    rng, T, off = np.random.default_rng(5), np.linspace(20.0, 45.0, 60), []
+    nearest = np.linalg.pinv(np.vander(np.linspace(20.0, 45.0, 41) - 30.0, 3, increasing=True))
+
+    def course(T, w, a, r, level):
+        return level + r * T + a * np.exp(T / w)
+
+    for _ in range(300):
+        y = course(T, 30.0, 0.2, -0.02, 1.0) + rng.normal(0, 0.0005, len(T))
+        x, Q = curve_fit(course, T, y, [30.0, 0.2, -0.02, 1.0])
+        values = dict(zip(("w", "a", "rate"), x[:3].tolist(), strict=True))
+        known = known_together(
+            "exponential(temperature, w)", values, ("c",), Q[:3, :3], (20.0, 30.0, 45.0)
+        )
+        true = nearest @ course(np.linspace(20.0, 45.0, 41), 30.0, 0.2, -0.02, 1.0)
+        parts = {"slope": true[1], "curvature": 2.0 * true[2]}
+        found = {part: known[part]["c"] for part in parts}
+        off.append([(found[p]["value"] - value) / found[p]["sd"] for p, value in parts.items()])
+    # 300 draws know a ratio to 4 %
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(off), axis=0)), 1.0, atol=0.12)
+    assert known["parameters"] == ["w"]
+
+
+@pytest.mark.parametrize(
+    "text", ["rate(saturation(temperature, k, w))", "product(time, above(temperature, k))"]
+)
+def test_what_is_no_function_of_the_temperature_has_no_slope(text):
+    names = [name for name, _, _ in parse(text).free()]
+    values = {**dict.fromkeys(names, 30.0), "a": 1.0, "rate": 0.0}
+    known = known_together(text, values, ("c",), np.ones((len(values),) * 2), (20.0, 30.0, 45.0))
+    assert known["parameters"] == names
+    assert "slope" not in known

@@ -17,13 +17,13 @@ import numpy as np
 from thermocald.errors import GeometryError
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import (
+    DEFAULT_FREE,
     EOP_NAMES,
     PARAMETER_NAMES,
     CameraModel,
     ExteriorOrientation,
     partials,
 )
-from thermocald.photogrammetry.epoch.adjustment import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.geometry import (
     GeometryBounds,
     image_coverage,
@@ -39,9 +39,8 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
-FREE = DEFAULT_FREE
 """The interior parameters whose standard deviations are predicted."""
-_USED = [PARAMETER_NAMES.index(name) for name in (*FREE, *EOP_NAMES)]
+_USED = [PARAMETER_NAMES.index(name) for name in (*DEFAULT_FREE, *EOP_NAMES)]
 CELLS = (4, 3)
 """The image is divided into so many columns and rows to see whether it is filled."""
 MIN_SIZE_PX = 8.0
@@ -63,7 +62,7 @@ _ONE_PLANE = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Precision:
-    """Standard deviations that a station reaches, in the order of `FREE`; c, x0, y0 … in mm etc.
+    """Standard deviations that a station reaches, by `DEFAULT_FREE`; c, x0, y0 … in mm etc.
 
     epoch: one image, its orientation free, image noise alone; series: of one epoch relative to the
     others where the camera stands still, many epochs; level: one image, the test field's own
@@ -77,7 +76,7 @@ class Precision:
     def pixels(self, sensor_pitch: float) -> dict[str, tuple[float, float, float]]:
         """Sd of c, x0, y0 in px: (epoch, series, level) by name."""
         rows = np.stack([self.epoch, self.series, self.level], axis=1)[:3] / sensor_pitch
-        return {name: tuple(row) for name, row in zip(FREE, rows.tolist(), strict=False)}
+        return {name: tuple(row) for name, row in zip(DEFAULT_FREE, rows.tolist(), strict=False)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ class FieldCheck:
         sds = {}
         for kind in ("epoch", "series", "level"):
             values = getattr(self.precision, kind)
-            named = zip(FREE, values, strict=True)
+            named = zip(DEFAULT_FREE, values, strict=True)
             sds[kind] = {f"sd_{n}": float(v) if v < _NONE else None for n, v in named}
         sizes = sorted(self.sizes)
         return {
@@ -281,7 +280,9 @@ def _weak(
     # what nothing determines gets a variance that is large, and correlations that are 1
     covariance[np.ix_(_USED, _USED)] = scaled_inverse(N, 1e-13)
     values = np.concatenate([camera.interior.as_array(), station.as_array()])
-    return weaknesses(camera.sensor, points, image, values, covariance, FREE, GeometryBounds())
+    return weaknesses(
+        camera.sensor, points, image, values, covariance, DEFAULT_FREE, GeometryBounds()
+    )
 
 
 def _visible(
@@ -324,7 +325,7 @@ def precision(
 ) -> Precision:
     """The standard deviations that targets at points (n, 3) mm with sigmas (n, 3) mm give."""
     A, by_point = _partials(camera, station, points)
-    k, noise = len(FREE), np.eye(2) * sigma_px**2
+    k, noise = len(DEFAULT_FREE), np.eye(2) * sigma_px**2
     of_field = (by_point * sigmas[:, None, :] ** 2) @ np.swapaxes(by_point, 1, 2)
     N = _normal_matrix(A, noise)
     return Precision(
@@ -452,7 +453,7 @@ def _remarks(check: FieldCheck) -> list[str]:
 def _change(check: FieldCheck, which: int, now: Array, then: Array) -> str:
     pitch = check.camera.sensor.pixel_pitch
     before = f"{now[which] / pitch:.2g} px" if np.isfinite(now[which]) else "not determined"
-    name = parameter_label(FREE[which])
+    name = parameter_label(DEFAULT_FREE[which])
     return f"sd({name}) of one image {before} → {then[which] / pitch:.2g} px"
 
 

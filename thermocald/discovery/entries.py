@@ -26,11 +26,13 @@ from thermocald.discovery import criteria
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined, unit_diagonal
 from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
+from thermocald.physics.formula import known_together
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.thermal.scan import normals_of_term
 from thermocald.thermal.series import COLUMNS, FIELD_SCALES
 
 if TYPE_CHECKING:
+    from thermocald.arrays import Array
     from thermocald.discovery.examination import Examination
     from thermocald.discovery.gap import Gap
     from thermocald.thermal.fit import HypothesisFitter
@@ -275,38 +277,45 @@ def find_trade_off(
     return document, (f"; the time constants are not separable, their sum is {say_estimate(total)}")
 
 
-def find_ridge(
-    fitter: HypothesisFitter, fit: Fit, number: int
-) -> tuple[dict[str, Any], str] | None:
-    """Find the constants of a term that M1 exchanges for its size or each other; None without any.
+def find_tied_constants(fitter: HypothesisFitter, fit: Fit, number: int) -> dict[str, Any] | None:
+    """Find the constants of a formula that M1 exchanges for its size or each other; None without.
 
-    Of these M1 knows only what they make of its temperatures together. Returns the document, and
-    what is added to the statement. tanh far below its middle is an exponential: middle and size are
-    one number, and its slopes are nothing but rounding, which looks like knowledge. So a
-    temperature outside the recorded ones by more than their range counts, whatever the normal
-    equations say.
+    Of these M1 knows only what they make of its temperatures together (`known_together`). tanh far
+    below its middle is an exponential: middle and size are one number, and its slopes are nothing
+    but rounding, which looks like knowledge. So a temperature outside the recorded ones by more
+    than their range counts, whatever the normal equations say.
     """
-    history = fitter.series[0].history
-    recorded = np.concatenate([history.temperature(name) for name in history.readings])
+    e, term = fitter.series[0], fit.terms[number]
+    recorded = np.concatenate([e.history.temperature(name) for name in e.history.readings])
     low, high = float(np.nanmin(recorded)), float(np.nanmax(recorded))
-    term = fit.terms[number]
     A, _, searched = fitter.normal_equations(fit, only=[0])
     shares, axes = np.linalg.eigh(unit_diagonal(A)[0])
     loose = axes[:, shares < _EXCHANGED]
-    names = []
+    own, base = (next(b for b in fit.blocks if b.term == i) for i in (number, -1))
+    values: dict[str, float] = {}
+    rows: list[Array] = []  # of the values, in the unknowns
+    exchanged = []
     for place, (owner, name) in enumerate(searched, len(fit.coefficients)):
-        if owner != number:
-            continue
-        exchanged = float(np.abs(loose[place]).max(initial=0.0)) > _TAKES_PART
-        is_temperature = term.kind.nonlinear[name].unit == "degC"
-        value = float(dict(term.nonlinear)[name])
-        if exchanged or (is_temperature and not 2 * low - high <= value <= 2 * high - low):
-            names.append(name)
-    if not names:
-        return None
-    return {"parameters": names}, (
-        f"; of {', '.join(names)} and the size only their product over the recorded range "
-        "is known: others explain the same"
+        if owner == number:
+            value = float(dict(term.nonlinear)[name])
+            rows.append(np.eye(1, len(A), place)[0])
+            values[name] = value
+            is_temperature = term.kind.nonlinear[name].unit == "degC"
+            if float(np.abs(loose[place]).max(initial=0.0)) > _TAKES_PART or (
+                is_temperature and not 2 * low - high <= value <= 2 * high - low
+            ):
+                exchanged.append(name)
+    for block in (own, base):
+        for p in own.parameters:
+            row = np.zeros(len(A))
+            if p in block.parameters:
+                row[block.start + block.parameters.index(p)] = 1.0 / e.scale[COLUMNS.index(p)]
+            rows.append(row)
+            values[f"{p} {block.term}"] = float(row[: len(fit.coefficients)] @ fit.coefficients)
+    R, mean = np.array(rows), float(e.history.temperature().mean())
+    covariance = R @ inverse_of_determined(A) @ R.T
+    return known_together(
+        term.effect, values, own.parameters, covariance, (low, mean, high), exchanged
     )
 
 

@@ -8,10 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.discovery.entries import EffectFound, estimate_term, find_ridge, find_trade_off
+from thermocald.discovery.entries import (
+    EffectFound,
+    estimate_term,
+    find_tied_constants,
+    find_trade_off,
+)
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.linalg import explained, inverse_of_determined
 from thermocald.physics import catalogue
+from thermocald.physics.formula import say_together
 from thermocald.result import jsonable
 from thermocald.thermal.series import COLUMNS, unit_directions
 
@@ -155,15 +161,15 @@ def describe_proposal(
     number = len(found.best.terms) - 1
     term = found.best.terms[number]
     estimates = estimate_term(fit, number, found.fitter.series[0])
-    together = find_ridge(found.fitter, fit, number)
-    if together is not None:  # what the inverse says of them is of the others held
-        known_together = together[0]["parameters"]
+    trade_off = find_trade_off(found.fitter, fit, number)
+    tied = find_tied_constants(found.fitter, fit, number)
+    if tied and tied["exchanged"]:  # what the inverse says of them is of the others held
         estimates = {
-            k: {**v, "sd": None} if k in known_together or k.startswith("a_") else v
+            k: {**v, "sd": None} if k in tied["parameters"] or k.startswith("a_") else v
             for k, v in estimates.items()
         }
-    else:
-        together = find_trade_off(found.fitter, fit, number)
+    elif trade_off is not None:
+        tied = None
     sentence = catalogue.get(term.effect).sentence(estimates)
     evidence = {k: v for k, v in described.evidence.items() if k != "bridge"}
     by_m1, by_m2 = found.closed
@@ -182,8 +188,11 @@ def describe_proposal(
         },
         "absolute_test": jsonable(x.adequacy),
     }
-    if together is not None:
-        evidence["not_separable"], said = together
+    if tied:
+        evidence["not_separable"] = tied
+        sentence += f"; {say_together(tied)}"
+    elif trade_off is not None:
+        evidence["not_separable"], said = trade_off
         sentence += said
     return replace(
         described,

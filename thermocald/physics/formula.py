@@ -23,11 +23,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from thermocald.errors import ConfigurationError, DataError
-from thermocald.physics.effect import Effect, Parameter, coefficient_units, say_estimate
+from thermocald.numbers import with_sd
+from thermocald.physics.effect import (
+    PARAMETER_UNITS,
+    Effect,
+    Parameter,
+    coefficient_units,
+    say_estimate,
+)
 from thermocald.physics.operators import OPERATORS, Constant, Operator, interpolation_matrix
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from scipy.sparse import csr_array
 
@@ -39,11 +46,8 @@ _COLUMN = "column"
 _LONGEST = 300  # characters of a formula
 _DEEPEST = 8
 _OFFSET_C = "degC"
-_EVER_MEASURED_C = (-90.0, 180.0)  # what thermometers of cameras may read
-_RIDGE = (
-    "; about that temperature nothing was measured: of its constants and the size only a "
-    "combination is known, none by itself"
-)
+_TOGETHER = 0.99
+_ON_THE_CURVE = 41  # temperatures
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +153,19 @@ class Node:
         parts = [n.text() for n in self.inputs]
         parts += [c if isinstance(c, str) else repr(float(c)) for c in self.constants]
         return f"{self.operator}({', '.join(parts)})"
+
+    def steady(self, temperatures: Array) -> Array | None:
+        """Return the values (n,) of a bound formula where the camera has long been at one of some
+        temperatures (n,) °C; None where it is no function of a temperature.
+        """
+        if self.is_leaf:
+            return None if self.operator else temperatures
+        inner = [v for n in self.inputs if (v := n.steady(temperatures)) is not None]
+        if len(inner) < len(self.inputs) or len(self.channels()) > 1:
+            return None
+        if self.kind.value is not None:
+            return self.kind.value(*inner, *self.constants)
+        return inner[0] if self.kind.keeps else None
 
     # -- units ---------------------------------------------------------------------------------
 
@@ -404,23 +421,13 @@ class _OfFormula(Effect):
         }
         moved = [n[2:] for n in estimates if n.startswith("a_")]
         verb = "follow" if len(moved) > 1 else "follows"
-        text = f"{', '.join(moved) or 'the camera'} {verb} {self.node.words(said)}"
-        unseen = [n for n, e in estimates.items() if n in said and _never_seen(e)]
-        return text + (_RIDGE if unseen else "")
-
-
-def _never_seen(estimate: Mapping[str, Any]) -> bool:
-    """Whether a temperature was never measured at a camera: a curve's tail alone was seen, which
-    tells a combination of its constants and its size, none of them by itself.
-    """
-    low, high = _EVER_MEASURED_C
-    return estimate.get("unit") == _OFFSET_C and not low <= estimate["value"] <= high
+        return f"{', '.join(moved) or 'the camera'} {verb} {self.node.words(said)}"
 
 
 def _say_constant(estimate: Mapping[str, Any], parameter: Parameter) -> str:
-    """Write an estimate; a positive constant that is not determined as about so much."""
+    """Write an estimate; one that is not determined as about so much."""
     value, sd = estimate["value"], estimate["sd"]
-    if _never_seen(estimate):
+    if sd is None:
         return f"about {value:.2g} {parameter.unit}"
     if parameter.log and sd is not None and not sd <= abs(value):
         return f"about {value:.3g} {parameter.unit}"
@@ -445,6 +452,94 @@ def formula_effect(text: str) -> Effect:
         )
 
     return OfFormula()
+
+
+def known_together(
+    text: str,
+    values: Mapping[str, float],
+    moved: Sequence[str],
+    covariance: Array,
+    temperatures: tuple[float, float, float],
+    exchanged: Sequence[str] = (),
+) -> dict[str, Any] | None:
+    """Return what is known of a formula whose constants are known only together; None of others.
+
+    values: its constants, then sizes and rates of each parameter that it moves (`moved`), whose
+    covariance is given; temperatures °C: the lowest, the mean, the highest; exchanged: constants
+    of which the data say nothing by themselves. Of others those are tied that correlate by 0.99
+    with another or with a size.
+
+    Slope and curvature are those of the parabola that is nearest over the range, at the mean: they
+    hold the rate, too, which trades with the formula's own slope. None for formulas that are no
+    function of a temperature.
+    """
+    names, x, P = list(values), np.array(list(values.values())), len(moved)
+    L = len(names) - 2 * P
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))[: L + P]
+    r = covariance[: L + P, : L + P] / np.maximum(np.outer(sd, sd), 1e-300)
+    most = np.abs(r - np.eye(L + P))[:L].max(axis=1, initial=0.0)
+    found = [n for n, one in zip(names[:L], most, strict=True) if one > _TOGETHER]
+    tied = list(dict.fromkeys([*exchanged, *found]))
+    if not tied:
+        return None
+    low, mean, high = temperatures
+    T = np.linspace(low, high, _ON_THE_CURVE)
+    parabola = np.linalg.pinv(np.vander(T - mean, 3, increasing=True))[1:] * [[1.0], [2.0]]
+    effect, constants = formula_effect(text), dict(zip(names, x[:L].tolist(), strict=False))
+
+    def shape(**changed: float) -> Array | None:
+        f = parse(text).bound({**constants, **changed}).steady(T)
+        return None if f is None else np.asarray(parabola @ f)
+
+    r_most = 1.0 if exchanged else min(float(most.max()), 1.0)
+    out: dict[str, Any] = {
+        "parameters": tied, "exchanged": bool(exchanged), "correlation": r_most
+    }  # fmt: skip
+    at = shape()
+    if at is None:
+        return out
+    by = np.zeros((2, L))
+    for i, (name, value) in enumerate(constants.items()):
+        step = effect.nonlinear[name].difference_step(value)
+        either = shape(**{name: value + step}), shape(**{name: value - step})
+        by[:, i] = np.diff(np.array(either)[::-1], axis=0)[0] / (2.0 * step)
+    sizes = dict(zip(moved, x[L : L + P].tolist(), strict=True))
+    for row, what in enumerate(("slope", "curvature")):
+        J = np.zeros((P, len(x)))
+        J[:, :L] = np.outer(x[L : L + P], by[row])
+        J[:, L : L + P] = at[row] * np.eye(P)
+        J[:, L + P :] = np.eye(P) * (row == 0)
+        sds = np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0)).tolist()
+        out[what] = {
+            p: {
+                "value": float(sizes[p] * at[row] + (0 if row else x[L + P + j])),
+                "sd": sds[j],
+                "unit": f"{PARAMETER_UNITS[p]}/{('K', 'K2')[row]}",
+            }
+            for j, p in enumerate(moved)
+        }
+    return {**out, "temperature": mean}
+
+
+def say_together(known: Mapping[str, Any]) -> str:
+    """Write what `known_together` found, as the end of a sentence."""
+    names = ", ".join(known["parameters"])
+    if known["exchanged"]:
+        text = f"{names} and the size are known only together, as others explain the same"
+    else:
+        r = known["correlation"]
+        text = f"{names} and the size are best known together, as they correlate by {r:.4f}"
+    if "slope" not in known:
+        return text
+    said = []
+    for name, slope in known["slope"].items():
+        factor, unit = (1e3, "µm") if slope["unit"] == "mm/K" else (1.0, slope["unit"][:-2])
+        both = [
+            with_sd(factor * e["value"], factor * e["sd"], f"{unit}/{per}")
+            for e, per in ((slope, "K"), (known["curvature"][name], "K²"))
+        ]
+        said.append(f"{name} {' and '.join(both)}")
+    return f"{text}: slope and curvature at {known['temperature']:.1f} °C are {', '.join(said)}"
 
 
 def is_formula(name: str) -> bool:

@@ -53,6 +53,8 @@ CAUSES_OF_SIGMA0 = (
     "it can be the noise of the image points, a test field worse than stated, or a lens that the "
     "distortion does not describe"
 )
+_TESTS_A_FIELD = 18  # redundant coordinates of a level: 16 targets
+_LEVEL_OF_FEW = 1.6  # error over sd of 12 to 14 targets whose field is 3 to 10 times worse
 _UNEVEN = 1.3  # times the noise in the middle
 _ROWS = 20_000  # of a table that are worked on at a time
 
@@ -271,6 +273,8 @@ class Epochs(Result):
                 for i in np.flatnonzero(~ok).tolist()
             ],
         }
+        if few := _few_targets(self.adjustment):
+            document["level_tested_by_targets"] = few
         if self.adjustment is not None and self.exterior == "series":
             document["stood_still"] = _stood_still(self.stillness)
         converted: dict[str, Any] = jsonable(document)
@@ -307,6 +311,12 @@ class Epochs(Result):
                 f"the targets are off by the same in all epochs, {ratio:.1f} times what the test "
                 "field's stated standard deviations allow: its coordinates, or a lens that the "
                 "distortion does not describe; the level is scaled by that"
+            )
+        if few := document.get("level_tested_by_targets"):
+            out.append(
+                f"{few} targets are too few to test the test field's coordinates: where these are "
+                f"worse than stated, the level is off by up to {_LEVEL_OF_FEW:g} times its "
+                "standard deviations; differences between epochs are not concerned"
             )
         if outer := document["outer_noise"]:
             out.append(
@@ -482,6 +492,15 @@ def _outer_noise(adjustment: SeriesAdjustment | None) -> dict[str, float] | None
     if not abs(value - 1.0) > max(3.0 * sd, _UNEVEN - 1.0):
         return None
     return {"value": value, "sd": sd}
+
+
+def _few_targets(adjustment: SeriesAdjustment | None) -> int | None:
+    """Return how many targets a level rests on that are too few to show a bad field."""
+    if adjustment is None or not np.isfinite(adjustment.offsets).any():
+        return None
+    seen = int(adjustment.observed.any(axis=0).sum())
+    free = len(adjustment.settings.free) + 6  # and the exterior orientation
+    return seen if 2 * seen - free < _TESTS_A_FIELD else None
 
 
 def _held_affinity(adjustment: SeriesAdjustment | None) -> dict[str, Any] | None:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import (
+    DEFAULT_FREE,
     IOP_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
@@ -34,10 +35,7 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 
-FREE_INTERIOR = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
-"""The interior orientation at T₀ that is estimated; the affinity is held."""
-
-_FREE = [IOP_NAMES.index(n) for n in FREE_INTERIOR]
+_FREE = [IOP_NAMES.index(n) for n in DEFAULT_FREE]
 _ITERATIONS = 8
 
 
@@ -80,7 +78,7 @@ def estimate_level(
 
     models: one per series, with a start; interior: whether the interior orientation is estimated
     too, or the series' orientation alone. Returns the models with both, and the covariance (8, 8)
-    that the test field's coordinates give the interior orientation, in the order FREE_INTERIOR.
+    that the test field's coordinates give the interior orientation, in the order DEFAULT_FREE.
     """
     n = len(_FREE) if interior else 0
     shared = models[0].interior.as_array()

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from thermocald.numbers import with_sd
+from thermocald.physics.formula import say_together
 from thermocald.physics.model import SURE
 from thermocald.store.recording.sense import doubt_lines
 
@@ -78,6 +79,7 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
             if isinstance(v, dict)
         ]
         lines.append(f"  {effect['effect']}: {', '.join(parts)}")
+    lines += [f"    {say_together(known)}" for known in document.get("known_together", ())]
     lines += [
         f"  {s['name']}: {s['epochs']} epochs{_on_means(s['means'])}, {s['rms_px']:.4f} px "
         f"left over beside {s['noise_px']:.4f} px of noise, thermometer "

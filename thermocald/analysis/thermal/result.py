@@ -18,7 +18,6 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from thermocald.analysis.thermal.level import (
-    FREE_INTERIOR,
     estimate_level,
     projected,
     series_means,
@@ -26,6 +25,7 @@ from thermocald.analysis.thermal.level import (
 from thermocald.analysis.thermal.terms import unknowns_of_base, unknowns_of_term
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
+    DEFAULT_FREE,
     EOP_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
@@ -33,6 +33,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.linalg import inverse_of_determined, scaled_inverse
 from thermocald.photogrammetry.series.normals import chunks
 from thermocald.physics import catalogue
+from thermocald.physics.formula import is_formula, known_together
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
 from thermocald.thermal.movement import detect_tremble
 from thermocald.thermal.scan import examine
@@ -139,7 +140,7 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
     return total
 
 
-_INTERIOR = [COLUMNS.index(n) for n in FREE_INTERIOR]
+_INTERIOR = [COLUMNS.index(n) for n in DEFAULT_FREE]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
 
@@ -248,7 +249,7 @@ class _Parts:
         Q[n:, n:] += unknowns
         scale = self.series[0].scale
         first = [u for u in self.unknowns if "@" not in u.name]
-        names = [*(f"interior.{p}" for p in FREE_INTERIOR), *(u.name for u in first)]
+        names = [*(f"interior.{p}" for p in DEFAULT_FREE), *(u.name for u in first)]
         R = np.zeros((len(names), n + size))
         R[:n, :n] = self.series[0].along[np.ix_(_INTERIOR, _INTERIOR)] / scale[_INTERIOR, None]
         for row, u in zip(R[n:], first, strict=True):
@@ -341,7 +342,27 @@ def fitted_camera(
     )  # fmt: skip
     sigma0 = sigma * float(np.sqrt(np.median(stated)))
     fitted = {"sigma0": sigma0, "band": not model.misses_an_effect, "series": fits}
+    if tied := _tied_constants(model):
+        fitted["known_together"] = tied
     return ThermalCamera(model, {**fitted, "prediction_test": []})
+
+
+def _tied_constants(model: ThermalModel) -> list[dict[str, Any]]:
+    """List what is known of formulas whose constants the data tie to each other or a size."""
+    low, high = next(iter(model.validity.values()))
+    found = []
+    for e in model.effects:
+        if not is_formula(e.name):
+            continue
+        kind = catalogue.get(e.name)
+        moved = [p for p in kind.linear if p in e.values]
+        rates = {f"rates.{p}": model.rates.get(p, 0.0) for p in moved}
+        own = {k: float(e.values[k]) for k in (*kind.nonlinear, *moved)}
+        Q = model.covariance_of([*(f"{e.name}.{k}" for k in own), *rates])
+        known = known_together(e.name, {**own, **rates}, moved, Q, (low, model.T0, high))
+        if known:
+            found.append({"effect": e.name, **known})
+    return found
 
 
 def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
 EOP_NAMES = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
 PARAMETER_NAMES = IOP_NAMES + EOP_NAMES
+DEFAULT_FREE = IOP_NAMES[:8]
+"""What is estimated of the interior orientation; the affinity is held."""
 
 IOP = slice(0, 10)
 """Interior orientation."""

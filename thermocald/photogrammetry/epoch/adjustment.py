@@ -23,6 +23,7 @@ import numpy as np
 
 from thermocald.errors import ConfigurationError, GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
+    DEFAULT_FREE,
     EOP,
     EOP_NAMES,
     IOP,
@@ -58,8 +59,6 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-
-DEFAULT_FREE = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
 
 _ROUNDS = 12  # of data snooping; each may reject several targets
 

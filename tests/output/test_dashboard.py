@@ -286,14 +286,10 @@ def test_the_token_leads_nowhere_else(client_of, path):
     assert urljoin("http://station.example/", location).startswith("http://station.example/")
 
 
-def test_another_host_name_is_refused(client_of):
-    client = client_of(base="http://evil.example")
-    assert client.get("/api/status").status_code == 400
-
-
 @pytest.mark.parametrize(
     ("base", "headers", "status"),
     [
+        ("http://evil.example", {}, 400),
         ("http://127.0.0.1.evil.com", {}, 400),
         ("http://[::1]:8437", {}, 200),
         ("http://LOCALHOST.:1", {}, 200),

@@ -12,7 +12,6 @@ Luhmann et al. (2014), section 5.4.5.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
@@ -52,7 +51,11 @@ _LEAST_CONTRAST = 3.0  # DN, root mean square
 
 
 class Templates:
-    """Measures control points (rows of `field`) in frames, from a reference frame and clicks."""
+    """Measures control points (rows of `field`) in frames, from a reference frame and clicks.
+
+    What does not change from frame to frame is kept: how a patch reacts to shift, affinity,
+    brightness and contrast.
+    """
 
     def __init__(self, reference: NDArray[Any], field: TestField, clicks: Observations) -> None:
         self._shape, self._field = reference.shape, field
@@ -65,7 +68,7 @@ class Templates:
         meant = [_meant(reference, point, sigma) for point, sigma in pairs]
         self._points = np.array([point for point, _ in meant]).reshape(-1, 2)
         self._defined = np.array([C for _, C in meant]).reshape(-1, 2, 2)
-        self._matching = Matching(reference, self._points)
+        self._prepare(reference)
         self.reset()
 
     @classmethod
@@ -101,7 +104,7 @@ class Templates:
         """Measure a frame; raises ImageError where it cannot be decoded."""
         if isinstance(image, EncodedImage):
             image = image.whole()  # it is given back: a gauge waits a minute for the next
-        status = inspect_frame(image, (self._shape[1], self._shape[0]))
+        status = inspect_frame(image, self.image_size)
         if not status.ok:
             return Measurement(Observations.none(), status)
         found = self._search(image)
@@ -112,112 +115,91 @@ class Templates:
 
     def _search(self, image: NDArray[Any]) -> Measurement:
         """Match all patches: near where the last frame had them, then farther away."""
-        start = self._points + self._shift
-        matched = self._matching.search(image, start, self._reach)
-        if self._reach < _SEARCH_PX and (lost := np.flatnonzero(~matched.ok)).size:
-            matched.take(lost, self._matching.search(image, start, _SEARCH_PX, lost))
-        ok = matched.ok
+        places, covariance, reasons = found = self._match(image, self._reach, slice(None))
+        if self._reach < _SEARCH_PX and (lost := np.flatnonzero(reasons != "")).size:
+            for column, again in zip(found, self._match(image, _SEARCH_PX, lost), strict=True):
+                column[lost] = again
+        ok = reasons == ""
         if ok.any():
-            self._shift = np.median((matched.points - self._points)[ok], axis=0)
-        own = matched.covariance[ok]
+            self._shift = np.median((places - self._points)[ok], axis=0)
+        own = covariance[ok]
         spread = np.sqrt(np.trace(own, axis1=1, axis2=2) / 2)
         seen = Observations.build(
-            self._rows[ok], matched.points[ok], own + self._defined[ok], {MATCHING_SD: spread}
+            self._rows[ok], places[ok], own + self._defined[ok], {MATCHING_SD: spread}
         )
-        missed = {int(self._rows[i]): matched.reasons[i] for i in np.flatnonzero(~ok)}
+        missed = dict(zip(self._rows[~ok].tolist(), reasons[~ok], strict=True))
         if len(seen) < _FEWEST:
             names = ", ".join(self._field.names[row] for row in missed)
             return Measurement(seen, FrameStatus("too_few", f"not recognised: {names}"), missed)
         self._reach = _TRACKED_PX
         return Measurement(seen, OK, missed)
 
-
-@dataclass(eq=False)
-class Matched:
-    """Where patches are: points (n, 2) px, covariance (n, 2, 2) px², and why one is nowhere."""
-
-    points: Array
-    covariance: Array
-    reasons: list[str]
-
-    @property
-    def ok(self) -> NDArray[np.bool_]:
-        """(n,)."""
-        return np.array([not why for why in self.reasons], dtype=bool)
-
-    def take(self, rows: NDArray[np.int64], others: Matched) -> None:
-        """Replace rows (k,) by k others."""
-        self.points[rows], self.covariance[rows] = others.points, others.covariance
-        for row, why in zip(rows, others.reasons, strict=True):
-            self.reasons[row] = why
-
-
-class Matching:
-    """Fits the patches about points (n, 2) px of a reference frame to images, all at a time.
-
-    What does not change from frame to frame is kept: how a patch reacts to shift, affinity,
-    brightness and contrast.
-    """
-
-    def __init__(self, reference: NDArray[Any], points: Array) -> None:
+    def _prepare(self, reference: NDArray[Any]) -> None:
+        """Cut out the patches, and calculate how they react."""
         v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
-        spline = Spline.through(reference, points, _HALF + 8)
-        unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(points), 1))
-        self.grey = spline.at(np.hstack([points, unturned]), u, v, np.arange(len(points)))
-        self._grid = u.ravel(), v.ravel()
+        spline = _spline(reference, self._points, _HALF + 8)
+        unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(self._points), 1))
+        grey = _sampled(*spline, np.hstack([self._points, unturned]), u, v)
+        self._grey, self._grid = grey, (u.ravel(), v.ravel())
         self._weight = np.exp(-0.5 * (u**2 + v**2) / (_HALF / 1.8) ** 2)
-        gy, gx = np.gradient(self.grey, axis=(1, 2)) if len(self.grey) else (self.grey, self.grey)
-        flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, self.grey, np.ones_like(self.grey)]
-        J = np.stack(flat, axis=-1).reshape(len(self.grey), self._weight.size, 8)
+        gy, gx = np.gradient(grey, axis=(1, 2)) if len(grey) else (grey, grey)
+        flat = [gx, gy, gx * u, gx * v, gy * u, gy * v, grey, np.ones_like(grey)]
+        J = np.stack(flat, axis=-1).reshape(len(grey), self._weight.size, 8)
         weighted = J * self._weight.reshape(-1, 1)
         N = np.linalg.pinv(np.swapaxes(weighted, -1, -2) @ J, rcond=1e-9, hermitian=True)
         self._step = N @ np.swapaxes(weighted, -1, -2)
         self._sandwich = (self._step @ np.swapaxes(self._step, -1, -2))[:, :2, :2]
 
-    def search(
-        self, image: NDArray[Any], start: Array, reach: int, rows: NDArray[np.int64] | None = None
-    ) -> Matched:
-        """Search patches (rows of them) within `reach` px of start (n, 2), and fit them."""
-        rows = np.arange(len(self.grey)) if rows is None else rows
-        places, reasons = start[rows], [""] * len(rows)
-        for k, row in enumerate(rows):
-            place = _searched(image, self.grey[row], places[k], reach)
+    def _match(
+        self, image: NDArray[Any], reach: int, rows: NDArray[np.int64] | slice
+    ) -> tuple[Array, Array, NDArray[Any]]:
+        """Search patches (rows of them) within `reach` px of where they should be, and fit them.
+
+        Returns places (n, 2) px, covariances (n, 2, 2) px², and why a patch is nowhere (n,).
+        """
+        places = self._points[rows] + self._shift
+        patches, reasons = self._grey[rows], np.full(len(places), "", dtype=object)
+        for k, patch in enumerate(patches):
+            place = _searched(image, patch, places[k], reach)
             if place is None:
                 reasons[k] = "outside the frame, or in the dark"
             else:
                 places[k] = place
-        seen = np.array([k for k, why in enumerate(reasons) if not why], dtype=np.int64)
-        covariance = np.zeros((len(rows), 2, 2))
-        matched = Matched(places, covariance, reasons)
-        matched.take(seen, self.match(image, places[seen], rows[seen]))
-        return matched
+        covariance = np.zeros((len(places), 2, 2))
+        seen = np.flatnonzero(reasons == "")
+        which = np.arange(len(self._grey))[rows][seen]
+        places[seen], covariance[seen], reasons[seen] = self._fit(image, places[seen], which)
+        return places, covariance, reasons
 
-    def match(self, image: NDArray[Any], start: Array, rows: NDArray[np.int64]) -> Matched:
-        """Fit patches (rows of them) to an image from their starts (n, 2) px.
+    def _fit(
+        self, image: NDArray[Any], start: Array, rows: NDArray[np.int64]
+    ) -> tuple[Array, Array, NDArray[Any]]:
+        """Fit patches (rows of them) to an image from their starts (n, 2) px; returns as `_match`.
 
         The covariance is that of the residuals, enlarged by their correlation between neighbours. A
         patch whose fit does not converge, or that is unlike, has a reason.
         """
         n, (u, v) = len(rows), self._grid
-        grey, weight = self.grey[rows].reshape(n, -1), self._weight.ravel() / self._weight.sum()
-        spline = Spline.through(image, start, _REACH)
+        grey, weight = self._grey[rows].reshape(n, -1), self._weight.ravel() / self._weight.sum()
+        coefficients, first = _spline(image, start, _REACH)
         p = np.hstack([start, np.tile([1.0, 0.0, 0.0, 1.0], (n, 1))])
-        r, alike, reasons = np.zeros(grey.shape), np.zeros(n), ["the match does not converge"] * n
+        r, alike = np.zeros(grey.shape), np.zeros(n)
+        reasons = np.full(n, "the match does not converge", dtype=object)
         mean = grey @ weight
         variance = ((grey - mean[:, None]) ** 2) @ weight
         todo = np.arange(n)
         for _ in range(_ITERATIONS):
             if not todo.size:
                 break
-            sampled, template = spline.at(p[todo], u, v, todo), grey[todo]
+            sampled = _sampled(coefficients[todo], first[todo], p[todo], u, v)
             # brightness and contrast first, then how the frame's patch lies against the template
-            common = (sampled * (template - mean[todo, None])) @ weight
+            common = (sampled * (grey[todo] - mean[todo, None])) @ weight
             gain = np.where(common > 0, common / np.maximum(variance[todo], 1e-12), 1.0)
             middle = sampled @ weight
             level = middle - gain * mean[todo]
             spread = ((sampled - middle[:, None]) ** 2) @ weight * variance[todo]
             alike[todo] = common / np.sqrt(np.maximum(spread, 1e-12))
-            r[todo] = (sampled - level[:, None]) / gain[:, None] - template
+            r[todo] = (sampled - level[:, None]) / gain[:, None] - grey[todo]
             step = (self._step[rows[todo]] @ r[todo][:, :, None])[:, :, 0]
             # inverse compositional: the step is the template's, and is undone in the frame
             a, b, c, d = step[:, 2:6].T + np.array([[1.0], [0.0], [0.0], [1.0]])
@@ -228,63 +210,51 @@ class Matching:
             size = np.linalg.det(A)
             away = np.abs(p[todo, :2] - start[todo]).max(axis=1) > _AWAY_PX
             away |= ~((size > 0.5) & (size < 2.0))
+            dark = common <= 0
             done = np.abs(step[:, :2]).max(axis=1) < _CONVERGED_PX
-            for k, is_away, is_dark in zip(todo, away, common <= 0, strict=True):
-                reasons[k] = "the match runs away" if is_away else reasons[k]
-                reasons[k] = "not recognised" if is_dark else reasons[k]
-            for k in todo[done & ~away & (common > 0)]:
-                reasons[k] = ""
-            todo = todo[~(done | away | (common <= 0))]
-        for k in np.flatnonzero(alike < _ALIKE):
-            reasons[k] = reasons[k] or "not recognised"
+            for which, why in ((done, ""), (away, "the match runs away"), (dark, "not recognised")):
+                reasons[todo[which]] = why
+            todo = todo[~(done | away | dark)]
+        reasons[(alike < _ALIKE) & (reasons == "")] = "not recognised"
         own = self._weight
         freedom = own.sum() ** 2 / (own**2).sum() - 8
         scale = (r**2 @ weight) * (1 + 8 / max(freedom, 1.0))
         scale *= _correlated(r.reshape(n, *own.shape))
         A = p[:, 2:].reshape(-1, 2, 2)
         covariance = A @ self._sandwich[rows] @ np.swapaxes(A, -1, -2) * scale[:, None, None]
-        return Matched(p[:, :2].copy(), covariance + _INTERPOLATED_PX**2 * np.eye(2), reasons)
+        return p[:, :2], covariance + _INTERPOLATED_PX**2 * np.eye(2), reasons
 
 
-@dataclass(frozen=True, eq=False)
-class Spline:
-    """Cubic splines through windows of an image: coefficients (n, m, m), first pixels (n, 2).
+def _spline(image: NDArray[Any], middle: Array, reach: int) -> tuple[Array, NDArray[np.int64]]:
+    """Cubic splines through windows of an image, `reach` px to each side of places (n, 2); the
+    image's edge goes on. Returns coefficients (n, m, m) and first pixels (n, 2).
 
     OpenCV's remap interpolates on 1/32 px only, and SciPy's package takes a daemon 20 MB.
 
     Source: Unser, M., Aldroubi, A., Eden, M. (1993): B-spline signal processing, IEEE Transactions
     on Signal Processing 41(2).
     """
+    first = np.round(middle).astype(np.int64) - reach
+    along = np.arange(2 * reach + 1)
+    x = np.clip(first[:, :1] + along, 0, image.shape[1] - 1)
+    y = np.clip(first[:, 1:] + along, 0, image.shape[0] - 1)
+    inverse = _spline_inverse(len(along))
+    return inverse @ image[y[:, :, None], x[:, None, :]] @ inverse.T, first
 
-    coefficients: Array
-    first: NDArray[np.int64]
 
-    @classmethod
-    def through(cls, image: NDArray[Any], middle: Array, reach: int) -> Self:
-        """Interpolate `reach` px to each side of places (n, 2); the image's edge goes on."""
-        first = np.round(middle).astype(np.int64) - reach
-        along = np.arange(2 * reach + 1)
-        x = np.clip(first[:, :1] + along, 0, image.shape[1] - 1)
-        y = np.clip(first[:, 1:] + along, 0, image.shape[0] - 1)
-        inverse = _spline_inverse(len(along))
-        return cls(inverse @ image[y[:, :, None], x[:, None, :]] @ inverse.T, first)
-
-    def at(self, p: Array, u: Array, v: Array, rows: NDArray[np.int64]) -> Array:
-        """Values (k, …) of windows (rows of them) at x = p0 + p2 u + p3 v, y = p1 + p4 u + p5 v.
-
-        p (k, 6).
-        """
-        size = self.coefficients.shape[1]
-        a = (p - np.pad(self.first[rows], [(0, 0), (0, 4)]))[(..., *[None] * u.ndim)]
-        x, y = a[:, 0] + a[:, 2] * u + a[:, 3] * v, a[:, 1] + a[:, 4] * u + a[:, 5] * v
-        (column, wx), (line, wy) = _basis(x, size), _basis(y, size)
-        window = rows[(..., *[None] * u.ndim)] * size**2
-        at, flat = window + line * size + column, self.coefficients.ravel()
-        values = np.zeros(at.shape)
-        for i in range(4):
-            row = sum(wx[j] * flat[i * size + j :].take(at) for j in range(4))
-            values += wy[i] * row
-        return values
+def _sampled(coefficients: Array, first: NDArray[np.int64], p: Array, u: Array, v: Array) -> Array:
+    """Values (n, …) of n splines at x = p0 + p2 u + p3 v, y = p1 + p4 u + p5 v; p (n, 6)."""
+    size, each = coefficients.shape[1], (..., *[None] * u.ndim)
+    a = (p - np.pad(first, [(0, 0), (0, 4)]))[each]
+    x, y = a[:, 0] + a[:, 2] * u + a[:, 3] * v, a[:, 1] + a[:, 4] * u + a[:, 5] * v
+    (column, wx), (line, wy) = _basis(x, size), _basis(y, size)
+    window = np.arange(len(p))[each] * size**2
+    at, flat = window + line * size + column, coefficients.ravel()
+    values = np.zeros(at.shape)
+    for i in range(4):
+        row = sum(wx[j] * flat[i * size + j :].take(at) for j in range(4))
+        values += wy[i] * row
+    return values
 
 
 @lru_cache(maxsize=16)
@@ -324,11 +294,10 @@ def _centre(
     # a click is a pixel or two off: the best start first
     offsets = np.arange(-np.floor(farthest), farthest + 0.5)
     starts = [click + np.array([dx, dy]) for dy in offsets for dx in offsets]
-    spline = Spline.through(image, click[None], half + 2 * math.ceil(farthest) + 4)
+    spline = _spline(image, click[None], half + 2 * math.ceil(farthest) + 4)
 
     def window(*at: float) -> Array:
-        p = np.array([[*at, 1.0, 0.0, 0.0, 1.0]])
-        values: Array = spline.at(p, u, v, np.zeros(1, dtype=np.int64))[0]
+        values: Array = _sampled(*spline, np.array([[*at, 1.0, 0.0, 0.0, 1.0]]), u, v)[0]
         return values
 
     windows = [window(*at) for at in starts]

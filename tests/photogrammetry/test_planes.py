@@ -45,6 +45,21 @@ def test_a_sheet_may_bulge():
     assert np.max(angle) < 3.0
 
 
+@pytest.mark.parametrize(
+    "columns, rows, step, bend", [(12, 9, 30, 2), (16, 12, 50, 50), (20, 14, 25, 20)]
+)
+def test_a_row_between_two_planes_of_a_bent_sheet_has_its_neighbours_normal(
+    columns, rows, step, bend
+):
+    x, y = (g.ravel() * step for g in np.meshgrid(np.arange(columns), np.arange(rows)))
+    u = 2 * x / x.max() - 1
+    z = bend * (1 - u**2) + np.random.default_rng(1).normal(0, 0.05, x.shape)
+    true = np.column_stack([4 * bend * u / x.max(), 0 * u, np.ones_like(u)])
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    cosine = np.abs(np.sum(target_normals(np.c_[x, y, z]) * true, axis=1))
+    assert np.degrees(np.arccos(cosine.clip(max=1))).max() < 4.0
+
+
 @pytest.mark.parametrize("points", [np.random.default_rng(4).uniform(0, 1000, (12, 3)), np.eye(3)])
 def test_scattered_and_few_targets_have_no_plane(points):
     assert np.isnan(target_normals(points)).all()

@@ -57,9 +57,8 @@ def target_normals(points: Array) -> Array:
     near, _ = _neighbours(points)
     reach = np.linalg.norm(points[near[:, :_PLATE]] - points[:, None], axis=2)
     spacing = float(np.median(reach[:, 1]))
-    labels = _sheets(points, 0.0)
-    normals = sheet_normals(points, labels, _LOCAL)
-    for row in np.flatnonzero(labels < 0):
+    normals = sheet_normals(points, _sheets(points, 0.0), _LOCAL)
+    for row in np.flatnonzero(np.isnan(normals[:, 0])):
         local = points[near[row, :_PLATE]]
         spread = local - local.mean(axis=0)
         _, size, axes = np.linalg.svd(spread)
@@ -74,20 +73,25 @@ def target_normals(points: Array) -> Array:
 
 def sheet_normals(points: Array, labels: NDArray[np.int64], nearest: int) -> Array:
     """Return unit normals (n, 3), of either sign, of targets by the nearest on the same sheet, so
-    many with the target itself; NaN for those on none (label -1).
+    many with the target itself; NaN for those on none (label -1), or on one that is a single row:
+    it does not say how its board is turned about it.
     """
     normals = np.full((len(points), 3), np.nan)
     for label in np.unique(labels[labels >= 0]):
         rows = np.flatnonzero(labels == label)
         if len(rows) < _PLATE:
             continue
-        whole = plane_fit(points[rows])[1][2]
+        centre, (_, across, whole), _ = plane_fit(points[rows])
+        width = np.ptp((points[rows] - centre) @ across)
         for row in rows:
             away = np.linalg.norm(points[rows] - points[row], axis=1)
-            near = points[rows[np.argsort(away, kind="stable")[:nearest]]]
+            order = np.argsort(away, kind="stable")[:nearest]
+            near = points[rows[order]]
             _, size, axes = np.linalg.svd(near - near.mean(axis=0))
-            # A single row of targets does not say how its board is turned about it.
-            normals[row] = axes[2] if size[1] > 0.1 * size[0] else whole
+            if size[1] > 0.1 * size[0]:
+                normals[row] = axes[2]
+            elif width > 0.5 * away[order[1]]:
+                normals[row] = whole
     return normals
 
 

@@ -125,13 +125,11 @@ def _robust_resection(
     if found is None:
         return None
     exterior, rows = _exterior(*found[:2]), found[2]
-    predicted = project(sensor, interior.as_array(), exterior.as_array(), X)
-    residuals = np.linalg.norm(np.nan_to_num(predicted - uv, nan=1e9), axis=1)
+    residuals = np.linalg.norm(_residuals(sensor, interior, exterior, X, uv), axis=1)
     if len(rows) <= _CLEAR * len(X):
         # A board seen obliquely: SQPnP of few pairs fails where that of the plane does not.
         whole = resection(sensor, interior, X, uv)[0][1]
-        predicted = project(sensor, interior.as_array(), whole.as_array(), X)
-        other = np.linalg.norm(np.nan_to_num(predicted - uv, nan=1e9), axis=1)
+        other = np.linalg.norm(_residuals(sensor, interior, whole, X, uv), axis=1)
         tolerance = _TOLERANCE * sensor.width
         if (other < tolerance).sum() > (residuals < tolerance).sum():
             return whole, other
@@ -188,6 +186,14 @@ def _ideal(sensor: Sensor, interior: InteriorOrientation, uv: Array) -> Array:
     return np.ascontiguousarray(direction[:, :2] / -direction[:, 2:] * [1.0, -1.0])
 
 
+def _residuals(
+    sensor: Sensor, interior: InteriorOrientation, pose: ExteriorOrientation, X: Array, uv: Array
+) -> Array:
+    """Computed minus measured (n, 2) px, large for points behind the camera."""
+    predicted = project(sensor, interior.as_array(), pose.as_array(), X)
+    return np.nan_to_num(predicted - uv, nan=1e6)
+
+
 def _exterior(R: NDArray[Any], t: NDArray[Any]) -> ExteriorOrientation:
     return ExteriorOrientation.from_rotation(R.T @ _FLIP, -R.T @ t)
 
@@ -210,12 +216,8 @@ def resection(
         _, rvec, tvec = cv2.solvePnP(X, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
         rvec, tvec = cv2.solvePnPRefineLM(X, ideal, np.eye(3), None, rvec, tvec)
         poses = [_exterior(cv2.Rodrigues(rvec)[0], tvec.ravel())]
-    solutions = []
-    for pose in poses:
-        predicted = project(sensor, interior.as_array(), pose.as_array(), X)
-        rms = float(np.sqrt(np.mean(np.nan_to_num(predicted - uv, nan=1e6) ** 2)))
-        solutions.append((rms, pose))
-    return sorted(solutions, key=lambda s: s[0])
+    rms = [float(np.sqrt(np.mean(_residuals(sensor, interior, p, X, uv) ** 2))) for p in poses]
+    return sorted(zip(rms, poses, strict=True), key=lambda s: s[0])
 
 
 def _direct_linear_transformation(sensor: Sensor, X: Array, uv: Array) -> float | None:
@@ -332,7 +334,6 @@ def refine(
     mille, so it is held loosely all the same.
     """
     size = sensor.width * sensor.pixel_pitch
-    n = len(points)
     # What a camera's parameters may be off from nominal, as sd; A1 r² of 5 % at the image's edge.
     radius2 = (size / 2) ** 2
     prior_sd = np.array(
@@ -343,10 +344,7 @@ def refine(
     prior = np.zeros(len(free))
     prior[:7] = (_KNOWN_BETTER if known else 1.0) ** 2 / prior_sd**2
     nominal = np.concatenate([interior.as_array(), exterior.as_array()])
-    p = nominal.copy()
-    weight = np.ones(n)
-    scale, last = 1.0, np.inf
-    damping = 1e-6
+    p, last = nominal.copy(), np.inf
     uv, A, _ = partials(sensor, p[:10], p[10:], points)
     for _ in range(_ITERATIONS):
         r = np.nan_to_num(image_points - uv, nan=1e3)
@@ -359,7 +357,7 @@ def refine(
         N = design.T @ weighted + np.diag(prior)
         b = weighted.T @ r.ravel() - prior * (p - nominal)[free]
         d = np.sqrt(np.maximum(np.diag(N), 1e-30))
-        step = np.linalg.solve(N / np.outer(d, d) + damping * np.eye(len(free)), b / d) / d
+        step = np.linalg.solve(N / np.outer(d, d) + 1e-6 * np.eye(len(free)), b / d) / d
         p[free] += step
         if p[0] <= 0 or not np.isfinite(p).all():
             p = nominal.copy()

@@ -19,8 +19,6 @@ from thermocald.errors import GeometryError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
-    CameraModel,
-    ExteriorOrientation,
     InteriorOrientation,
     Sensor,
 )
@@ -81,25 +79,6 @@ def codes_in(
     )
 
 
-def targets_in(
-    image: Image,
-    field: TestField,
-    normals: Array,
-    camera: CameraModel,
-    exterior: ExteriorOrientation,
-) -> Observations:
-    """Measure every target of a field in a photograph of known orientation, eccentricity included.
-
-    normals (n, 3), NaN where unknown. A circle that is not within some pixels of its place is
-    another one and is left out.
-    """
-    corners = measure_corners(image, locate_markers(image, field))
-    rows, maps = predict_circles(field, camera, exterior, normals)
-    fit = fit_circles(image, maps, have_rings(field, rows))
-    off = np.linalg.norm(fit.points - maps.centre, axis=1)
-    return corners.joined(fit.observations(rows, fit.good & (off < _GROSS_PX)))
-
-
 _ONE_SIZE = 0.15
 _NEAREST = 9  # of a target on its sheet, with itself
 
@@ -140,18 +119,6 @@ def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
     return result
 
 
-def _name_of(code: RingCode) -> str:
-    """Name a target of which nothing else is known."""
-    bits, number = code
-    return f"R{number}" if bits == 12 else f"R14-{number}"
-
-
-def _code_of(name: str) -> str:
-    """Return the code of a target of that name."""
-    number = name.rpartition("-")[2].lstrip("R")
-    return ring_code.write(14 if "-" in name else 12, int(number))
-
-
 def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> TestField:
     """Return the coded targets of a network as a field.
 
@@ -176,10 +143,11 @@ def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> 
     # one size for all where all agree, which is as they are printed
     if np.nanmax(np.abs(diameters / together - 1), initial=0.0) < _ONE_SIZE:
         diameters[:] = together
-    return TestField.build(
-        network.names, network.points, network.sigmas, diameters,
-        codes=[_code_of(name) for name in network.names],
-    )  # fmt: skip
+    codes = [
+        ring_code.write(14 if "-" in name else 12, int(name.rpartition("-")[2].lstrip("R")))
+        for name in network.names
+    ]
+    return TestField.build(network.names, network.points, network.sigmas, diameters, codes=codes)
 
 
 def surveyed_field(network: Network, template: TestField) -> TestField:
@@ -384,7 +352,9 @@ def _first_look(
             "no photograph shows a coded target: "
             + "; ".join(f"{name}: {words}" for name, words in said.items())
         )
-    names = tuple(map(_name_of, rows)) if nominal is None else nominal.names
+    # what `field_of_codes` reads the codes from
+    new = (f"R{number}" if bits == 12 else f"R14-{number}" for bits, number in rows)
+    names = tuple(new) if nominal is None else nominal.names
     named = {(photo, names[row]): radius for (photo, row), radius in sizes.items()}
     return sensor, names, seen, named, said
 
@@ -397,13 +367,22 @@ def _look_again(
     said: dict[str, str],
     progress: Callable[[str], None],
 ) -> dict[str, Observations]:
-    """Every oriented photograph measured with what is known of it."""
+    """Measure every target in the oriented photographs, eccentricity included.
+
+    normals (n, 3), NaN where unknown. A circle that is not within some pixels of its place is
+    another one and is left out.
+    """
     stations, photos = {s.photo: s for s in network.stations}, {}
     for name, load in pictures.items():
         if name not in stations:
             continue
         progress(f"targets in {name}")
-        seen = targets_in(load(), expected, normals, network.camera, stations[name].exterior)
+        image = load()
+        corners = measure_corners(image, locate_markers(image, expected))
+        rows, maps = predict_circles(expected, network.camera, stations[name].exterior, normals)
+        fit = fit_circles(image, maps, have_rings(expected, rows))
+        off = np.linalg.norm(fit.points - maps.centre, axis=1)
+        seen = corners.joined(fit.observations(rows, fit.good & (off < _GROSS_PX)))
         said[name] = f"{len(seen)} targets"
         if len(seen):
             photos[name] = seen

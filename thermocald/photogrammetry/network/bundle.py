@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from thermocald.errors import GeometryError
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.field.testfield import Observations
+
+    _Normals = tuple[Array, Array, Array, Array, Array]
 
 
 _N_IOP = len(IOP_NAMES)
@@ -120,7 +123,7 @@ class Bundle:
         interior[free] += cameras[: len(free)]
         return Bundle(
             interior,
-            _turn(pose[:, :3]) @ self.rotations,
+            np.array([cv2.Rodrigues(w)[0] for w in pose[:, :3]]) @ self.rotations,
             self.centres + pose[:, 3:],
             self.points + targets,
         )
@@ -146,27 +149,6 @@ class KnownTargets:
     def cost(self, bundle: Bundle) -> float:
         """The weighted sum of squares of the targets' corrections."""
         return float(np.sum(self.weights * (bundle.points - self.points) ** 2))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _NormalEquations:
-    """Normal equations: cameras (interior first, then six per photo) and targets."""
-
-    A: Array  # (u, u)
-    B: Array  # (u, 3m)
-    D: Array  # (m, 3, 3)
-    a: Array  # (u,)
-    d: Array  # (m, 3)
-
-    def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
-        """The matrix and right-hand side reduced by the targets, and their blocks' inverses."""
-        trace = np.trace(self.D, axis1=1, axis2=2)[:, None, None]
-        # a target without any weight left stays where it is
-        regular = self.D + (damping * trace + np.where(trace == 0, 1.0, 0.0)) * np.eye(3)
-        inverses = np.linalg.inv(regular)
-        B3 = self.B.reshape(len(self.B), len(inverses), 3)
-        BD = np.einsum("umi,mij->umj", B3, inverses).reshape(self.B.shape)
-        return self.A - BD @ self.B.T, self.a - BD @ self.d.ravel(), inverses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -271,7 +253,7 @@ class BundleAdjustment:
     def cofactors(self, bundle: Bundle) -> Cofactors:
         """Return the cofactors at the solution; GeometryError where it is undetermined."""
         normals = self._normal_equations(bundle, np.ones(len(self.rays)))
-        S, _, inverses = normals.reduced()
+        S, _, inverses = _reduce(normals)
         weakest: tuple[str, ...] = ()
         if self.known is None:
             null, _ = null_space(bundle.centres, bundle.points, len(self.free))
@@ -292,7 +274,7 @@ class BundleAdjustment:
                 Q = scaled_inverse(S)
             except np.linalg.LinAlgError:
                 raise GeometryError(_SEPARATE_NOTHING) from None
-        B3 = normals.B.reshape(len(Q), -1, 3)
+        B3 = normals[1].reshape(len(Q), -1, 3)
         follow = -np.einsum("mij,umj->umi", inverses, B3).reshape(len(Q), -1)
         return Cofactors(Q, Q @ follow, follow, inverses, weakest)
 
@@ -345,8 +327,11 @@ class BundleAdjustment:
             by_point = by_point * self.known.uncertain[rays.target, None, None]
         return v, root @ by_camera, root @ by_point
 
-    def _normal_equations(self, bundle: Bundle, weights: Array) -> _NormalEquations:
-        """The normal equations in blocks: camera and poses, targets, and between them."""
+    def _normal_equations(self, bundle: Bundle, weights: Array) -> _Normals:
+        """The normal equations in blocks: of the cameras (interior first, then six per photo) and
+        between them and the targets (u, u), (u, 3m), of the targets (m, 3, 3); right-hand sides
+        (u,) and (m, 3).
+        """
         v, by_camera, by_point = self._linearised(bundle, weights)
         rays, f = self.rays, len(self.free)
         by_interior, by_pose = np.split(by_camera, [f], axis=2)
@@ -379,15 +364,15 @@ class BundleAdjustment:
         if self.known is not None:
             D += self.known.weights[:, :, None] * np.eye(3)
             d += self.known.weights * (self.known.points - bundle.points)
-        return _NormalEquations(A, B, D, a, d)
+        return A, B, D, a, d
 
     def _step(
-        self, bundle: Bundle, normals: _NormalEquations, damping: float
+        self, bundle: Bundle, normals: _Normals, damping: float
     ) -> tuple[Array, Array, float] | None:
         """The damped step of cameras (u,) and targets (m, 3), and its size stepᵀ N step; None if
         the matrix is not positive definite.
         """
-        S, s, inverses = normals.reduced(damping)
+        S, s, inverses = _reduce(normals, damping)
         if self.known is None:
             null, _ = null_space(bundle.centres, bundle.points, len(self.free))
             scaled, scales, _ = _regularise(S, null)
@@ -399,9 +384,22 @@ class BundleAdjustment:
         except np.linalg.LinAlgError:
             return None
         dc = scales * np.linalg.solve(scaled, scales * s)
-        dp = np.einsum("mij,mj->mi", inverses, normals.d - (dc @ normals.B).reshape(-1, 3))
+        _, B, _, a, d = normals
+        dp = np.einsum("mij,mj->mi", inverses, d - (dc @ B).reshape(-1, 3))
         # the predicted decrease of the sum of squares, in its own unit
-        return dc, dp, float(dc @ normals.a + dp.ravel() @ normals.d.ravel())
+        return dc, dp, float(dc @ a + dp.ravel() @ d.ravel())
+
+
+def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Array]:
+    """The matrix and right-hand side reduced by the targets, and their blocks' inverses."""
+    A, B, D, a, d = normals
+    trace = np.trace(D, axis1=1, axis2=2)[:, None, None]
+    # a target without any weight left stays where it is
+    regular = D + (damping * trace + np.where(trace == 0, 1.0, 0.0)) * np.eye(3)
+    inverses = np.linalg.inv(regular)
+    B3 = B.reshape(len(B), len(inverses), 3)
+    BD = np.einsum("umi,mij->umj", B3, inverses).reshape(B.shape)
+    return A - BD @ B.T, a - BD @ d.ravel(), inverses
 
 
 def inner_constraints(bundle: Bundle, found: Cofactors, free: Index) -> tuple[Array, Array, Array]:
@@ -466,20 +464,6 @@ def _regularise(S: Array, null: Array) -> tuple[Array, Array, Array]:
     projector = basis @ basis.T
     scaled: Array = S * scales[:, None] * scales + projector
     return scaled, scales, projector
-
-
-def _turn(w: Array) -> Array:
-    """Rotation vectors (k, 3) → rotation matrices (k, 3, 3)."""
-    angle = np.linalg.norm(w, axis=1)[:, None, None]
-    K = np.zeros((len(w), 3, 3))
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -w[:, 2], w[:, 1], -w[:, 0]
-    K -= np.swapaxes(K, 1, 2)
-    small = angle < 1e-9
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 1.0, np.sin(safe) / safe)
-    second = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)
-    turned: Array = np.eye(3) + first * K + second * (K @ K)
-    return turned
 
 
 def _cauchy(v: Array) -> Array:

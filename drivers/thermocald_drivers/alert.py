@@ -270,30 +270,26 @@ class Watch:
         for condition in self.conditions:
             key = (device if condition.per_device else "", condition.name)
             found = condition.measure(result, failed, lost)
-            if math.isnan(found.beyond) and not (key in self._out and found.inside):
-                continue
-            if key in self._out and not math.isnan(found.beyond):
+            was_out, beyond = key in self._out, not math.isnan(found.beyond)
+            if was_out == beyond or not (beyond or found.inside):
                 continue
             self._out ^= {key}
-            state = "out" if key in self._out else "in"
-            changes.append(_alert(condition.name, state, found, result, device))
+            bounds = (b for b in (found.beyond, found.low, found.high) if not math.isnan(b))
+            utc, epoch = _number(result.get("frame_time")), moment[1]
+            changes.append(
+                Alert(
+                    device,
+                    condition.name,
+                    "out" if beyond else "in",
+                    f"{device}: {found.text}",
+                    found.value,
+                    next(bounds),
+                    str(result.get("series", "")),
+                    int(epoch) if isinstance(epoch, int) else None,
+                    None if math.isnan(utc) else utc,
+                )
+            )
         return changes
-
-
-def _alert(name: str, state: str, found: Measured, result: Mapping[str, Any], device: str) -> Alert:
-    utc, epoch = _number(result.get("frame_time")), result.get("epoch")
-    bounds = (bound for bound in (found.beyond, found.low, found.high) if not math.isnan(bound))
-    return Alert(
-        device,
-        name,
-        state,
-        f"{device}: {found.text}",
-        found.value,
-        next(bounds),
-        str(result.get("series", "")),
-        int(epoch) if isinstance(epoch, int) else None,
-        None if math.isnan(utc) else utc,
-    )
 
 
 def _number(value: object) -> float:

@@ -36,7 +36,7 @@ import io
 import math
 import re
 import time
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
@@ -189,7 +189,11 @@ class AndroidCamera(Camera):
             monotonic=monotonic,
             utc=utc,
             exposure=tags.get("exposure_s"),
-            settings=photograph_settings(tags),
+            settings={
+                name: float(tags[name])
+                for name in SETTINGS
+                if isinstance(tags.get(name), int | float) and math.isfinite(tags[name])
+            },
         )
 
     def _wake(self) -> None:
@@ -256,8 +260,10 @@ class AndroidCamera(Camera):
         # nothing can be compared with one that was still focusing
         self._first = None if "SCAN" in str(first.get("af_state", "")) else first
         refuse = self.options.refuse_unlocked
-        moved = image_moved(first, tags)
-        changed = exposure_changed(first, tags)
+        moved = _changed((*LENS, *FOCUS), first, tags)
+        if "SCAN" in str(tags.get("af_state", "")):
+            moved = f"autofocus is at work ({tags['af_state']})"
+        changed = _changed(EXPOSURE, first, tags)
         self._unchecked = "" if moved or changed else unreported(tags)
         why = {None: moved, True: moved or changed, False: ""}[refuse]
         if why:
@@ -319,11 +325,9 @@ def exposure_start(tags: Mapping[str, Any], zone: str) -> tuple[float, float] | 
         naive = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
     except ValueError:
         return None
-    sign = re.fullmatch(r"([-+])(\d\d):?(\d\d)", str(tags.get("zone", zone)))
-    offset = timedelta()
-    if sign:
-        offset = timedelta(hours=int(sign[2]), minutes=int(sign[3])) * (-1 if sign[1] == "-" else 1)
-    seconds = naive.replace(tzinfo=timezone(offset) if sign else UTC).timestamp()
+    seconds = naive.replace(tzinfo=UTC).timestamp()
+    if sign := re.fullmatch(r"([-+])(\d\d):?(\d\d)", str(tags.get("zone", zone))):
+        seconds -= int(f"{sign[1]}1") * (3600 * int(sign[2]) + 60 * int(sign[3]))
     digits = str(tags.get("subsecond", ""))
     if re.fullmatch(r"\d+", digits):
         return seconds + int(digits) / 10 ** len(digits), 10.0 ** -len(digits)
@@ -344,33 +348,12 @@ def focus_state(dump: str) -> dict[str, Any]:
     return found
 
 
-def image_moved(first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return what moved the image since the first photograph (focus, focal length, zoom), or ""."""
-    if "SCAN" in str(now.get("af_state", "")):
-        return f"autofocus is at work ({now['af_state']})"
-    return _changed((*LENS, *FOCUS), first, now)
-
-
-def photograph_settings(tags: Mapping[str, Any]) -> dict[str, float]:
-    """Return the numbers among SETTINGS that the photograph reports."""
-    found = {name: tags[name] for name in SETTINGS if name in tags}
-    return {
-        name: float(value)
-        for name, value in found.items()
-        if isinstance(value, int | float) and math.isfinite(value)
-    }
-
-
 def _changed(names: Iterable[str], first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return what differs from the first photograph, or ""."""
     for name in names:
         if name in first and now.get(name) != first[name]:
             return f"{name} was {first[name]} and is {now.get(name)}"
     return ""
-
-
-def exposure_changed(first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return what changed of the exposure since the first photograph, or ""."""
-    return _changed(EXPOSURE, first, now)
 
 
 def unreported(now: Mapping[str, Any]) -> str:

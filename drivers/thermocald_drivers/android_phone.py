@@ -50,13 +50,12 @@ class PhoneOptions(DriverOptions):
     timeout_s: support.Seconds
 
 
-def list_devices(timeout_s: float = 1.0) -> list[tuple[str, str]]:
+def list_devices() -> list[tuple[str, str]]:
     """Return (serial, state) of what a running adb server lists; [] without one."""
     adbutils = support.library("adbutils", "android")
     try:
-        nobody = PhoneOptions(serial="none", timeout_s=timeout_s, start_server=False)
-        AdbPhone(nobody).require_server()
-        return _devices(adbutils.AdbClient(socket_timeout=timeout_s))
+        AdbPhone(PhoneOptions(serial="none", timeout_s=1.0)).require_server()
+        return _devices(adbutils.AdbClient(socket_timeout=1.0))
     except (OSError, adbutils.AdbError):
         return []
 
@@ -110,21 +109,16 @@ class AdbPhone:
                 "the cable one that carries data?",
                 seen=self.seen,
             )
-        self._require(states[0])
-        self._device = client.device(serial=self.serial)
-        self.seen = True
-
-    def _require(self, state: str) -> None:
-        if state == "device":
-            return
-        if state == "unauthorized":
-            raise support.denied(f"{self.where}: {DENIED}", seen=self.seen)
-        if state == "offline":
-            raise DeviceGone(f"{self.where}: {OFFLINE}")
+        state = states[0]
+        if state in ("unauthorized", "offline"):
+            raise self._translated(state)
         if state == "no" or state.startswith("no perm"):  # "no permissions (…); see http…"
             message = f"{self.where}: no permissions; see the udev rules in systemd/"
             raise support.denied(message, seen=self.seen)
-        raise DeviceGone(f"{self.where}: its state is {state!r}; let it boot into Android")
+        if state != "device":
+            raise DeviceGone(f"{self.where}: its state is {state!r}; let it boot into Android")
+        self._device = client.device(serial=self.serial)
+        self.seen = True
 
     def require_server(self) -> None:
         """Raise a DeviceError unless an adb server answers; none is started."""

@@ -13,6 +13,7 @@ is opened again; so does the end of the programme. The options of both drivers:
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Annotated, Self
 
@@ -58,14 +59,6 @@ class HeatingProgramme:
         self.tripped = ""
         self._known_at = 0.0
 
-    def step_at(self, elapsed_s: float) -> HeatingStep | None:
-        """Return the current step; None after the last one."""
-        for step in self.options.programme:
-            elapsed_s -= step.seconds
-            if elapsed_s < 0:
-                return step
-        return None
-
     def decide(self, elapsed_s: float, temperature_c: float | None) -> bool:
         """Return whether to heat now; sets `tripped` (a sentence) once the limit was reached."""
         limit = self.options.limit_c
@@ -73,20 +66,18 @@ class HeatingProgramme:
             temperature_c = None
         if temperature_c is not None and temperature_c >= limit:
             self.tripped = f"{self.channel} {temperature_c:.2f} °C reached the limit {limit:g} °C"
-        step = self.step_at(elapsed_s)
-        self.heating = (
-            not self.tripped and step is not None and self._wanted(step, temperature_c, elapsed_s)
+        steps = self.options.programme
+        ends = itertools.accumulate(step.seconds for step in steps)
+        hold_c = next(
+            (s.hold_c for s, end in zip(steps, ends, strict=True) if elapsed_s < end), None
         )
-        return self.heating
-
-    def _wanted(self, step: HeatingStep, temperature_c: float | None, elapsed_s: float) -> bool:
         if temperature_c is not None:
             self._known_at = elapsed_s
-        if step.hold_c is None:
-            return False
-        if temperature_c is None:  # a missing value now and then does not stop a warm-up
-            return self.heating and elapsed_s - self._known_at < self.options.unknown_s
         half = self.options.hysteresis_k / 2
-        if temperature_c >= step.hold_c + half:
-            return False
-        return self.heating or temperature_c <= step.hold_c - half
+        if self.tripped or hold_c is None:
+            self.heating = False
+        elif temperature_c is None:  # a missing value now and then does not stop a warm-up
+            self.heating = self.heating and elapsed_s - self._known_at < self.options.unknown_s
+        elif temperature_c >= hold_c + half or temperature_c <= hold_c - half:
+            self.heating = temperature_c < hold_c
+        return self.heating

@@ -34,8 +34,8 @@ phones.
 from __future__ import annotations
 
 import errno
+import math
 import re
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -362,33 +362,21 @@ class ThermalZoneThermometer(_KernelThermometer):
         return value, self._idle(value)
 
 
-@dataclass(frozen=True)
-class _Family:
-    """Zones whose names match: the units seen, by the size of the number.
-
-    whole_c, tenths_c: the highest temperature in that unit that such a zone can have, °C; None if
-    the family does not use the unit. thousandths_from: the smallest |number| that is read as
-    1/1000 °C, below 1251 from which on it can be nothing else.
-    """
-
-    pattern: str
-    whole_c: float | None
-    tenths_c: float | None
-    thousandths_from: int
-
-
-_FAMILIES = (
+# Zones whose names match a pattern, the first counts: the highest temperature in whole degrees and
+# in tenths that such a zone can have, °C, -inf where the family does not use the unit; the smallest
+# |number| that is read as 1/1000 °C, below 1251, from which on it can be nothing else.
+_FAMILIES: tuple[tuple[str, float, float, int], ...] = (
     # qcom tsens: tenths on msm8909 … msm8998, whole degrees before
-    _Family(r"tsens_tz_sensor\d*", 105.0, HIGHEST_C, 1251),
+    (r"tsens_tz_sensor\d*", 105.0, HIGHEST_C, 1251),
     # power supply class: tenths; fuel gauges: thousandths; a battery above 70 °C is on fire
-    _Family(r"(?:.*[-_])?(?:batt?|battery|bms|maxfg|fg)(?:[-_].*)?", 70.0, 70.0, 500),
+    (r"(?:.*[-_])?(?:batt?|battery|bms|maxfg|fg)(?:[-_].*)?", 70.0, 70.0, 500),
     # MediaTek: thousandths, mtktsAP of some kernels whole degrees
-    _Family(r"mtkts(?:batt).*", 70.0, None, 126),
-    _Family(r"mtkts.*", 105.0, None, 126),
+    (r"mtkts(?:batt).*", 70.0, -math.inf, 126),
+    (r"mtkts.*", 105.0, -math.inf, 126),
     # qcom ADC thermistors of kernels 3.x: whole degrees
-    _Family(r".*_therm(?:\d|_.*)?", 105.0, None, 1251),
+    (r".*_therm(?:\d|_.*)?", 105.0, -math.inf, 1251),
+    (r"(?s:.*)", 105.0, HIGHEST_C, 500),
 )
-_ANY = _Family(r".*", 105.0, HIGHEST_C, 500)
 
 
 class UnitWatch:
@@ -457,15 +445,11 @@ def zone_scales(raw: Mapping[str, int], known: Mapping[str, float]) -> dict[str,
 
 def _candidates(name: str, value: int) -> list[float]:
     """Return the factors that make a possible temperature of a zone's number, by its name."""
-    family = next((f for f in _FAMILIES if re.fullmatch(f.pattern, name, re.IGNORECASE)), _ANY)
-    fits = []
-    if family.whole_c is not None and LOWEST_C <= value <= family.whole_c:
-        fits.append(1.0)
-    if family.tenths_c is not None and LOWEST_C <= value * 0.1 <= family.tenths_c:
-        fits.append(0.1)
-    if abs(value) >= family.thousandths_from and LOWEST_C <= value * 0.001 <= HIGHEST_C:
-        fits.append(0.001)
-    return fits
+    family = next(row for row in _FAMILIES if re.fullmatch(row[0], name, re.IGNORECASE))
+    _, whole_c, tenths_c, thousandths_from = family
+    thousandths_c = HIGHEST_C if abs(value) >= thousandths_from else -math.inf
+    highest = {1.0: whole_c, 0.1: tenths_c, 0.001: thousandths_c}
+    return [scale for scale, high_c in highest.items() if LOWEST_C <= value * scale <= high_c]
 
 
 def _among(value: int, fits: list[float], others: Iterable[float], whole: bool) -> float | None:

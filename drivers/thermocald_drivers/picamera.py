@@ -173,6 +173,7 @@ class Picamera2Camera(Camera):
         self._camera = camera
 
     def _configure(self, camera: Any) -> None:
+        focuses = "LensPosition" in camera.camera_controls
         if tuple(camera.sensor_resolution) != (self.options.width, self.options.height):
             have = "×".join(str(n) for n in camera.sensor_resolution)
             raise WrongDevice(
@@ -180,15 +181,14 @@ class Picamera2Camera(Camera):
                 f"{self.options.width}×{self.options.height}; "
                 "a scaled image has another interior orientation"
             )
-        if self.options.focus_dioptres is not None and "LensPosition" not in camera.camera_controls:
+        if self.options.focus_dioptres is not None and not focuses:
             raise WrongDevice(
                 f"{self.where}: this lens cannot be focused; leave focus_dioptres out"
             )
-        size = (self.options.width, self.options.height)
         camera.configure(
             camera.create_still_configuration(
-                main={"size": size, "format": "YUV420"},
-                controls=self._controls("LensPosition" in camera.camera_controls),
+                main={"size": (self.options.width, self.options.height), "format": "YUV420"},
+                controls=self._controls(focuses),
                 buffer_count=2,
             )
         )
@@ -231,12 +231,7 @@ class Picamera2Camera(Camera):
                 log.warning("%s", error)
 
     def warnings(self) -> list[str]:
-        options = ("exposure_s", "gain", "focus_dioptres", "colour_gains")
-        return [
-            f"{name}: auto lets the camera change it; every change is another camera"
-            for name in options
-            if getattr(self.options, name) == AUTO
-        ]
+        return support.automatic_warnings(dict(self.options))
 
     def identity(self) -> Mapping[str, str]:
         return {"camera": str(self.options.camera), "model": str(self.options.model or "")}

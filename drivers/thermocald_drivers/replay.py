@@ -18,7 +18,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import BadReading, DeviceFinished, DeviceGone, DeviceNotFound
+from thermocald.errors import BadReading, DeviceFinished, DeviceGone, DeviceNotFound, ImageError
 from thermocald.hal import Camera, Device, DriverOptions, Frame, Reading, Thermometer
 from thermocald_drivers import support
 
@@ -101,19 +101,18 @@ class ReplayCamera(_Replay, Camera):
         elif epoch.frame is None:
             raise BadReading(f"{self._path}: epoch {epoch.number} has no frame")
         if epoch.frame is not None:
+            from thermocald.photogrammetry.targets.image_file import decode_grey
+
             try:
                 encoded = epoch.frame.read_bytes()
+                if not encoded.startswith(b"\xff\xd8"):
+                    image, encoded = decode_grey(epoch.frame), None
             except OSError as error:
                 raise BadReading(f"{epoch.frame}: cannot be read: {error.strerror}") from error
-            if not encoded.startswith(b"\xff\xd8"):
-                image, encoded = _decoded(encoded, epoch.frame), None
+            except ImageError as error:
+                raise BadReading(str(error)) from error
         return Frame(
-            image,
-            monotonic,
-            utc,
-            sequence=epoch.number,
-            encoded=encoded,
-            observations=observations,
+            image, monotonic, utc, None, epoch.number, encoded=encoded, observations=observations
         )
 
 
@@ -127,17 +126,3 @@ class ReplayThermometer(_Replay, Thermometer):
             raise BadReading(f"{self._path}: epoch {epoch.number} has no temperature")
         monotonic, utc = self._times(epoch.temperature_time)
         return Reading(values, monotonic, utc)
-
-
-def _decoded(data: bytes, path: Path) -> Any:
-    """Return the grey values (H, W) of an image file; BadReading if it cannot be read."""
-    import cv2
-    import numpy as np
-
-    image = None
-    if data:
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if image is None:
-        raise BadReading(f"{path}: is not an image")
-    return image

@@ -294,11 +294,6 @@ class SerialThermometer(Thermometer):
             self._synchronous = True
         self._line = tail if mark else head + tail
 
-    def _match(self, line: bytes) -> re.Match[str] | None:
-        """Return the line against the pattern, in each encoding that it may have."""
-        matches = (self.pattern.fullmatch(text) for text in _decodings(line))
-        return next((match for match in matches if match is not None), None)
-
     def _next_match(self) -> tuple[re.Match[str], float]:
         """Return the next line that matches, and the machine's monotonic time."""
         deadline = time.monotonic() + self.options.timeout_s
@@ -313,7 +308,7 @@ class SerialThermometer(Thermometer):
                 line = line.strip(b"\0")
                 if not line or not whole or line.strip() == self.command.strip():
                     continue
-                match = self._match(line)
+                match = next(filter(None, map(self.pattern.fullmatch, _decodings(line))), None)
                 if match is None:
                     skipped.append(line.decode("ascii", "backslashreplace"))
                     continue

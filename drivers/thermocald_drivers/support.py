@@ -34,13 +34,11 @@ if TYPE_CHECKING:
     from thermocald.hal import Clock
 
 
-def _as_written(value: object) -> object:
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
 AUTO = "auto"
 """What a stanza says to leave a setting to the camera."""
-Text = Annotated[str, BeforeValidator(_as_written), Field(min_length=1)]
+Text = Annotated[
+    str, BeforeValidator(lambda v: str(v) if type(v) is int else v), Field(min_length=1)
+]
 """An option that is text; whole numbers are taken as written."""
 Seconds = Annotated[float, Field(ge=0.01, le=600.0)]
 """A time-out."""
@@ -75,6 +73,15 @@ def or_auto(low: float, high: float) -> AfterValidator:
         return value
 
     return AfterValidator(check)
+
+
+def automatic_warnings(options: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for each of some options that leaves its setting to the camera."""
+    return [
+        f"{name}: auto lets the camera change it; every change is another camera"
+        for name, value in options.items()
+        if value == AUTO
+    ]
 
 
 def absent(message: str, *, seen: bool) -> DeviceError:

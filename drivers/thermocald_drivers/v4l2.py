@@ -139,8 +139,8 @@ class V4l2Camera(Camera):
                 f"pixel_format: {o.pixel_format!r} is not one of {', '.join(known)}"
             )
         self.where = f"camera {o.device or o.serial}"
-        wanted = {lock.option: getattr(o, lock.option) for lock in LOCKS}
-        self._controls = CameraControls(self.where, wanted, o.controls)
+        self._wanted = {lock.option: getattr(o, lock.option) for lock in LOCKS}
+        self._controls = CameraControls(self.where, self._wanted, o.controls)
         self._stream: Stream | None = None
         self._seen = False
 
@@ -170,15 +170,19 @@ class V4l2Camera(Camera):
         return found
 
     def open(self) -> None:
-        path = self._path()
+        o, path = self.options, self._path()
         try:
-            self._stream = self._open_stream(path)
-            size = self.options.width, self.options.height
-            self._stream.set_format(self.options.pixel_format.ljust(4), *size)
+            try:
+                self._stream = (OpenCvStream if o.backend == "opencv" else LinuxpyStream)(path)
+            except DriverMissing:
+                if o.backend != "auto":
+                    raise
+                self._stream = OpenCvStream(path)
+            self._stream.set_format(o.pixel_format.ljust(4), o.width, o.height)
             card = self._stream.card
-            if self.options.card is not None and self.options.card not in card:
-                raise WrongDevice(f"{path}: this is {card!r}, not {self.options.card!r}")
-            self._controls.apply(self._stream, strict=self.options.strict)
+            if o.card is not None and o.card not in card:
+                raise WrongDevice(f"{path}: this is {card!r}, not {o.card!r}")
+            self._controls.apply(self._stream, strict=o.strict)
             self._stream.start()
         except DeviceError as error:
             self.close()
@@ -198,7 +202,7 @@ class V4l2Camera(Camera):
             stream.close()
 
     def warnings(self) -> list[str]:
-        return self._controls.warnings()
+        return support.automatic_warnings(self._wanted)
 
     def identity(self) -> Mapping[str, str]:
         card = self._stream.card if self._stream else ""
@@ -292,15 +296,6 @@ class V4l2Camera(Camera):
             )
         return str(links[0])
 
-    def _open_stream(self, path: str) -> Stream:
-        if self.options.backend != "opencv":
-            try:
-                return LinuxpyStream(path)
-            except DriverMissing:
-                if self.options.backend == "linuxpy":
-                    raise
-        return OpenCvStream(path)
-
 
 class CameraControls:
     """The settings of one camera, kept while it is closed and opened again.
@@ -317,14 +312,6 @@ class CameraControls:
         self._asked: dict[int, int] = {}
         self._automatic: list[Lock] = []
         self._available: dict[int, Control] = {}
-
-    def warnings(self) -> list[str]:
-        """Return a sentence for each automatic mode that the stanza asks for."""
-        return [
-            f"{lock.option}: auto lets the camera change it; every change is another camera"
-            for lock in LOCKS
-            if self._wanted.get(lock.option) == AUTO
-        ]
 
     def apply(self, stream: Stream, *, strict: bool) -> None:
         """Set all, automatic modes first; strict: raise where it does not read back."""

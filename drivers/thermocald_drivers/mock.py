@@ -51,11 +51,11 @@ from thermocald.hal import Camera, Device, DriverOptions, Frame, Output, Thermom
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-    from thermocald.hal import Clock, Reading
+    from thermocald.hal import Reading
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.model import Prediction, ThermalModel
     from thermocald.physics.scene import Scene
@@ -140,18 +140,20 @@ class OutputOptions(MockOptions):
     keep: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
 
 
-class Faults:
-    """The faults of one mock device."""
+class MockDevice(Device):
+    """What the mocks share: opening and closing, faults, and the time since the first opening.
 
-    def __init__(
-        self, where: str, clock: Clock, plan: Sequence[Fault], timeout_s: float = 1.0
-    ) -> None:
-        self._where = where
-        self._clock = clock
-        self._timeout_s = timeout_s
-        self._faults = list(plan)
+    name: for messages.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._faults: list[Fault] = list(self.options.faults)
         self._calls = 0
-        self.started: float | None = None
+        self._started: float | None = None
+        self._open = False
 
     def inject(self, kind: Kind, count: int = 1) -> None:
         """Let the next `count` calls fail."""
@@ -161,55 +163,12 @@ class Faults:
         """Remove all faults: the device is plugged in again."""
         self._faults.clear()
 
-    def on_open(self) -> None:
-        """Called by `open`: DeviceGone while unplugged; such an attempt counts as a call."""
-        if self.started is None:
-            self.started = self._clock.monotonic()
-        if self._kind(self._calls + 1) == "unplugged":
-            self._calls += 1
-            raise DeviceGone(f"{self._where}: unplugged")
-
-    def on_call(self) -> Kind | None:
-        """Called by every capture or reading.
-
-        Raises DeviceTimeout, after the time has passed, or DeviceGone. Returns a kind that the mock
-        itself must imitate, None without a fault.
-        """
-        self._calls += 1
-        kind = self._kind(self._calls)
-        if kind == "timeout":
-            self._clock.sleep_until(self._clock.monotonic() + self._timeout_s)
-            raise DeviceTimeout(f"{self._where}: no answer within {self._timeout_s:g} s")
-        if kind == "unplugged":
-            raise DeviceGone(f"{self._where}: unplugged")
-        return kind
-
-    def refuse(self, kind: Kind | None, unit: str) -> None:
-        """Raise BadReading for an answer that a driver must refuse."""
-        if kind in ("truncated", "wrong_size"):
-            what = "is cut off" if kind == "truncated" else "has the wrong size"
-            raise BadReading(f"{self._where}: the {unit} {what}")
-
-    def _kind(self, call: int) -> Kind | None:
-        elapsed = 0.0 if self.started is None else self._clock.monotonic() - self.started
-        return next((f.kind for f in self._faults if f.active(call, elapsed)), None)
-
-
-class MockDevice(Device):
-    """What the mocks share: opening and closing with faults, and the time since the first opening.
-
-    name: for messages.
-    """
-
-    name: ClassVar[str]
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self.faults = Faults(self.name, self.clock, self.options.faults, self.options.timeout_s)
-        self._open = False
-
     def open(self) -> None:
-        self.faults.on_open()
+        if self._started is None:
+            self._started = self.clock.monotonic()
+        if self._fault(self._calls + 1) == "unplugged":
+            self._calls += 1  # such an attempt counts as a call
+            raise DeviceGone(f"{self.name}: unplugged")
         self._open = True
 
     def close(self) -> None:
@@ -219,14 +178,34 @@ class MockDevice(Device):
         seed = getattr(self.options, "seed", 0)
         return {"name": self.name, "serial": f"mock-{seed}"}
 
-    def _require_open(self) -> None:
+    def _fault(self, call: int) -> Kind | None:
+        elapsed = self._elapsed(self.clock.monotonic())
+        return next((f.kind for f in self._faults if f.active(call, elapsed)), None)
+
+    def _call(self, unit: str, seconds: float = 0.0) -> bool:
+        """Let a capture or reading of so many seconds pass; return whether it is stuck.
+
+        Raises DeviceTimeout after the time has passed, DeviceGone, or BadReading for an answer (a
+        `unit`) that a driver must refuse.
+        """
         if not self._open:
             raise DeviceGone(f"{self.name}: it is not open")
+        self._calls += 1
+        kind, timeout_s = self._fault(self._calls), self.options.timeout_s
+        if kind == "unplugged":
+            raise DeviceGone(f"{self.name}: unplugged")
+        wait_s = timeout_s if kind == "timeout" else seconds
+        self.clock.sleep_until(self.clock.monotonic() + wait_s)
+        if kind == "timeout":
+            raise DeviceTimeout(f"{self.name}: no answer within {timeout_s:g} s")
+        if kind in ("truncated", "wrong_size"):
+            what = "is cut off" if kind == "truncated" else "has the wrong size"
+            raise BadReading(f"{self.name}: the {unit} {what}")
+        return kind == "stuck"
 
     def _elapsed(self, monotonic: float) -> float:
         """Return seconds from the first opening to a time of the monotonic clock; 0 before it."""
-        started = self.faults.started
-        return monotonic - (monotonic if started is None else started)
+        return monotonic - (monotonic if self._started is None else self._started)
 
     def _programme(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Times (n,) s and temperatures (n,) °C."""
@@ -287,15 +266,12 @@ class MockCamera(MockDevice, Camera):
         return self._model
 
     def capture(self) -> Frame:
-        self._require_open()
-        kind = self.faults.on_call()
-        self.clock.sleep_until(self.clock.monotonic() + self._latency_s)
-        self.faults.refuse(kind, "frame")
+        stuck = self._call("frame", self._latency_s)
         exposure = self.options.exposure_s
         monotonic = self.clock.monotonic() - 0.5 * exposure
         utc = self.clock.utc() - 0.5 * exposure
         self._sequence += 1
-        if kind != "stuck" or self._last is None:
+        if not stuck or self._last is None:
             self._last = self._picture(monotonic)
         return Frame(self._last, monotonic, utc, exposure=exposure, sequence=self._sequence)
 
@@ -332,12 +308,8 @@ class MockThermometer(MockDevice, Thermometer):
         return list(self.options.channels)
 
     def read(self) -> Reading:
-        self._require_open()
-        kind = self.faults.on_call()
         start, wait = self.clock.monotonic(), self.options.conversion_s
-        self.clock.sleep_until(start + wait)
-        self.faults.refuse(kind, "answer")
-        if kind != "stuck" or not self._last:
+        if not self._call("answer", wait) or not self._last:
             at = start + 0.5 * wait
             self._last = {
                 name: self._value(k, channel, at)
@@ -380,6 +352,5 @@ class MockOutput(MockDevice, Output):
         self.results: deque[dict[str, Any]] = deque(maxlen=self.options.keep)
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        self._require_open()
-        self.faults.refuse(self.faults.on_call(), "acknowledgement")
+        self._call("acknowledgement")
         self.results.append(dict(result))

@@ -119,11 +119,11 @@ def test_a_stuck_camera_shows_the_same_picture(clock, small):
 def test_injected_while_it_runs(clock):
     with open_device("thermometer", "mock", {}, clock) as device:
         assert outcomes(device, 1) == ["ok"]
-        device.faults.inject("timeout", 2)
+        device.inject("timeout", 2)
         assert outcomes(device, 3) == ["DeviceTimeout", "DeviceTimeout", "ok"]
-        device.faults.inject("unplugged", 1000)
+        device.inject("unplugged", 1000)
         assert outcomes(device, 1) == ["DeviceGone"]
-        device.faults.clear()
+        device.clear()
         assert outcomes(device, 1) == ["ok"]
 
 

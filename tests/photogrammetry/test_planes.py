@@ -46,7 +46,7 @@ def test_a_sheet_may_bulge():
 
 
 @pytest.mark.parametrize(
-    "columns, rows, step, bend", [(12, 9, 30, 2), (16, 12, 50, 50), (20, 14, 25, 20)]
+    ("columns", "rows", "step", "bend"), [(12, 9, 30, 2), (16, 12, 50, 50), (20, 14, 25, 20)]
 )
 def test_a_row_between_two_planes_of_a_bent_sheet_has_its_neighbours_normal(
     columns, rows, step, bend

@@ -181,7 +181,7 @@ class Camera(Result):
         """
         from thermocald.photogrammetry.camera.conversions import BROWN, convert, opencv
 
-        found = convert(self.sensor, BROWN, self.values, opencv(5)).values
+        found = convert(self.sensor, BROWN, self.values, opencv(5))[0]
         fx, fy, cx, cy = found[:4]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(found[4:])
 

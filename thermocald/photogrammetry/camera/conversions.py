@@ -66,20 +66,6 @@ class Family:
     to_brown: Callable[[Sensor, Array], InteriorOrientation]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Conversion:
-    """What a conversion gave: parameters in the target's order, its residuals over the image, the
-    covariance if one was given; statement: one line for the file.
-    """
-
-    values: Array
-    exact: bool
-    largest_px: float
-    rms_px: float
-    covariance: Array | None
-    statement: str
-
-
 def image_grid(sensor: Sensor, shape: tuple[int, int] = _GRID) -> Array:
     """Image points (n, 2) px that cover the whole image, its edges included."""
     x = np.linspace(-0.5, sensor.width - 0.5, shape[0])
@@ -94,15 +80,16 @@ def convert(
     values: Array,
     target: Family,
     covariance: Array | None = None,
-) -> Conversion:
+) -> tuple[Array, Array | None, bool, float, float]:
     """Convert a camera (values and covariance in the source's order) to another family.
 
-    Small changes of the source's parameters move pixels, and the target's follow by least squares:
-    so the covariance is carried over. Raises GeometryError where the source's distortion folds back
-    inside the image.
+    Returns values and covariance in the target's order, whether they are exact, and the largest and
+    RMS residual over the image, px. Small changes of the source's parameters move pixels, and the
+    target's follow by least squares: so the covariance is carried over. Raises GeometryError where
+    the source's distortion folds back inside the image.
     """
     if source is target:
-        return Conversion(values, True, 0.0, 0.0, covariance, "exact: it is our own model")
+        return values, covariance, True, 0.0, 0.0
     own = CameraModel(sensor, source.to_brown(sensor, values))
     grid, check = image_grid(sensor), image_grid(sensor, _CHECK_GRID)
     directions, checked = (_directions(own, source, values, pixels) for pixels in (grid, check))
@@ -123,13 +110,7 @@ def convert(
         J = _least_squares(G, F)
         carried = J @ covariance @ J.T
     size = np.linalg.norm(residual, axis=1)
-    largest, rms = float(size.max()), float(np.sqrt(np.mean(size**2)))
-    statement = (
-        "exact: both models give the same pixels"
-        if exact
-        else f"fitted over the image area: largest residual {largest:.3g} px, RMS {rms:.3g} px"
-    )
-    return Conversion(result, exact, largest, rms, carried, statement)
+    return result, carried, exact, float(size.max()), float(np.sqrt(np.mean(size**2)))
 
 
 def _directions(own: CameraModel, family: Family, values: Array, pixels: Array) -> Array:
@@ -287,17 +268,13 @@ def opencv(count: int) -> Family:
 
 
 def _project_opencv(_: Sensor, values: Array, directions: Array) -> Array:
-    """The formula of cv2.projectPoints."""
-    v = np.zeros(16)
-    v[: len(values)] = values
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = v
-    x, y = directions[:, 0], directions[:, 1]
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    prism_x, prism_y = r2 * (s1 + r2 * s2), r2 * (s3 + r2 * s4)
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + prism_x
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + prism_y
-    return np.column_stack([fx * xd + cx, fy * yd + cy])
+    import cv2
+
+    fx, fy, cx, cy, *distortion = values.tolist()
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    points, none = np.column_stack([directions, np.ones(len(directions))]), np.zeros(3)
+    found = cv2.projectPoints(points, none, none, K, np.array(distortion))[0]
+    return np.asarray(found, dtype=float)[:, 0]
 
 
 def _opencv_of_brown(model: CameraModel) -> Array:

@@ -100,14 +100,18 @@ def encode(
         raise UsageError(f"a covariance of shape {np.shape(covariance)}, not (10, 10)")
     chosen, sensor = _format(format), model.sensor
     family = chosen.family(model)
-    found = conversions.convert(
+    values, covariance, exact, largest, rms = conversions.convert(
         sensor, conversions.BROWN, model.interior.as_array(), family, covariance
     )
+    statement = f"fitted over the image area: largest residual {largest:.3g} px, RMS {rms:.3g} px"
+    if exact:
+        own = family is conversions.BROWN
+        statement = f"exact: {'it is our own model' if own else 'both models give the same pixels'}"
     record = CameraRecord(
-        (sensor.width, sensor.height), family, found.values, name, found.covariance,
-        sensor.pixel_pitch, found.statement, comment,
+        (sensor.width, sensor.height), family, values, name, covariance,
+        sensor.pixel_pitch, statement, comment,
     )  # fmt: skip
-    return chosen.encode(record), found.statement
+    return chosen.encode(record), statement
 
 
 def recognised(path: Path) -> str | None:
@@ -132,16 +136,13 @@ def read(
     try:
         record = chosen.decode(text)
         sensor = record.sensor(text, pixel_pitch)
-        found = conversions.convert(
+        values, covariance, exact, largest, rms = conversions.convert(
             sensor, record.family, record.values, conversions.BROWN, record.covariance
         )
     except (ConfigurationError, DataError) as cause:
         raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause
-    model = CameraModel(sensor, InteriorOrientation.from_array(found.values))
-    return ImportedCamera(
-        model, chosen.name, record.name, found.exact, found.largest_px, found.rms_px,
-        found.covariance,
-    )  # fmt: skip
+    model = CameraModel(sensor, InteriorOrientation.from_array(values))
+    return ImportedCamera(model, chosen.name, record.name, exact, largest, rms, covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

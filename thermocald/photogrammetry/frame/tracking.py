@@ -19,7 +19,7 @@ estimated with the rest and taken out of the step.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
@@ -134,13 +134,8 @@ _FEWEST = 4
 _MARGIN_PX = 3.0  # around the windows: how far the camera may move until all of a frame is decoded
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Circles:
-    """The circles that are tracked: rows of the field, their weights, and which are seen."""
-
-    rows: NDArray[np.int64]
-    weights: GradientWeights
-    seen: NDArray[np.bool_]
+_Circles: TypeAlias = "tuple[NDArray[np.int64], GradientWeights, NDArray[np.bool_]]"
+"""Those that are tracked: rows of the field, their weights, and which are seen."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,7 +219,7 @@ class Tracker:
         # A target that is hidden now keeps typical values for the time when it comes back.
         p = np.where(seen[:, None], fit.parameters, np.median(fit.parameters[seen], axis=0))
         p[~seen, :2] = maps.centre[~seen]
-        return _Circles(rows, GradientWeights.build(image, maps, coded, p, fit.noise), seen)
+        return rows, GradientWeights.build(image, maps, coded, p, fit.noise), seen
 
     def _track(self, image: Image, state: _State, farthest: float = np.inf) -> Measurement | None:
         """Measure in windows; None where too many targets are lost or moved by more than
@@ -252,10 +247,10 @@ def _boxes(circles: _Circles | None, markers: Corners | None) -> NDArray[np.int6
     """What is looked at in the next frame (n, 4) px: left, top, right and bottom (exclusive)."""
     centres, halves = [np.zeros((0, 2))], [np.zeros((0, 2))]
     if circles is not None:
-        p = circles.weights.parameters
-        centres.append(p[:, :2])
-        reach = window_reach(float(np.median(p[:, 5])))
-        halves.append(circles.weights.maps.half_extent + reach)
+        weights = circles[1]
+        centres.append(weights.parameters[:, :2])
+        reach = window_reach(float(np.median(weights.parameters[:, 5])))
+        halves.append(weights.maps.half_extent + reach)
     if markers is not None:
         centres.append(markers.places)
         halves.append(np.full((len(markers), 2), CORNER_REACH_PX))
@@ -265,12 +260,12 @@ def _boxes(circles: _Circles | None, markers: Corners | None) -> NDArray[np.int6
 
 
 def _track_circles(
-    image: Image, state: _Circles, missed: dict[int, str], farthest: float
+    image: Image, circles: _Circles, missed: dict[int, str], farthest: float
 ) -> tuple[Observations, _Circles, int] | None:
     """Return observations, the new state, and how many weights were renewed; None where all is
     lost, or where targets that have to be fitted again moved by more than `farthest` px.
     """
-    weights, seen = state.weights, state.seen
+    rows, weights, seen = circles
     fit = weights.apply(image)
     old, p, misfit = weights.parameters, fit.parameters, fit.misfit
     top = float(np.iinfo(image.dtype).max)
@@ -311,9 +306,9 @@ def _track_circles(
     else:
         renewed = 0
     if not good.all():
-        missed.update(fit.missed(state.rows))
+        missed.update(fit.missed(rows))
     fit = replace(fit, noise=fit.noise.scaled(factor))
-    return fit.observations(state.rows, good), _Circles(state.rows, weights, good), renewed
+    return fit.observations(rows, good), (rows, weights, good), renewed
 
 
 def _median(values: Array) -> Array:

@@ -166,12 +166,6 @@ class Cofactors:
     own: Array
     weakest: tuple[str, ...] = ()
 
-    def each_target(self) -> Array:
-        """The cofactors (m, 3, 3) of each target."""
-        follow, mixed = (a.reshape(len(a), -1, 3) for a in (self.follow, self.mixed))
-        result: Array = self.own + np.einsum("umi,umj->mij", follow, mixed)
-        return result
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleAdjustment:
@@ -210,8 +204,9 @@ class BundleAdjustment:
         damping = 1e-6 if gauge else 0.0
         v = self.residuals(bundle)
         for _ in range(iterations):
-            if robust:
-                w = _cauchy(v)
+            if robust:  # 1 for the good, falling with the square of the residual
+                size2 = np.sum(v * v, axis=1)
+                w = 1.0 / (1.0 + size2 / (9.0 * max(float(np.median(size2)) / MEDIAN_CHI2, 1e-12)))
             cost = self._cost(bundle, v, w)
             normals = self._normal_equations(bundle, w)
             fraction = 1.0
@@ -289,11 +284,13 @@ class BundleAdjustment:
         columns = np.concatenate([interior, pose], axis=1)[:, :, None]
         rows = 3 * self.rays.target[:, None] + np.arange(3)
         half = J @ found.mixed[columns, rows[:, None, :]] @ np.swapaxes(by_target, 1, 2)
+        follow, mixed = (a.reshape(len(a), -1, 3) for a in (found.follow, found.mixed))
+        of_targets = found.own + np.einsum("umi,umj->mij", follow, mixed)
         total: Array = (
             J @ found.cameras[columns, np.swapaxes(columns, 1, 2)] @ np.swapaxes(J, 1, 2)
             + half
             + np.swapaxes(half, 1, 2)
-            + by_target @ found.each_target()[self.rays.target] @ np.swapaxes(by_target, 1, 2)
+            + by_target @ of_targets[self.rays.target] @ np.swapaxes(by_target, 1, 2)
         )
         return total
 
@@ -464,11 +461,3 @@ def _regularise(S: Array, null: Array) -> tuple[Array, Array, Array]:
     projector = basis @ basis.T
     scaled: Array = S * scales[:, None] * scales + projector
     return scaled, scales, projector
-
-
-def _cauchy(v: Array) -> Array:
-    """Weights (n,) from whitened residuals (n, 2): 1 for the good, falling with the square."""
-    size2 = np.sum(v * v, axis=1)
-    scale2 = max(float(np.median(size2)) / MEDIAN_CHI2, 1e-12)
-    weights: Array = 1.0 / (1.0 + size2 / (9.0 * scale2))
-    return weights

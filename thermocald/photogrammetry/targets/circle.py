@@ -286,11 +286,13 @@ def fit_circles(
     for w in parts:
         begin = w.begin if start is None else start[w.rows]
         thin = w.thinned()
-        f = _step(thin, maps.select(w.rows), begin, noise, work, noise is None)
-        parameters[w.rows] = f.parameters
+        p, value, residual, *_, flat = _step(
+            thin, maps.select(w.rows), begin, noise, work, noise is None
+        )
+        parameters[w.rows] = p
         if noise is None:
-            greys.append(f.value[f.flat])
-            residuals.append(f.residual[f.flat])
+            greys.append(value[flat])
+            residuals.append(residual[flat])
     given = noise is not None
     if noise is None:
         noise = estimate_noise(np.concatenate(greys), np.concatenate(residuals), 3 * n)
@@ -300,17 +302,20 @@ def fit_circles(
     top = np.iinfo(image.dtype).max
     for w in parts:
         mine = maps.select(w.rows)
-        f = _step(w, mine, parameters[w.rows], noise, work)
+        p, value, residual, N, step, stands, _ = fitted = _step(
+            w, mine, parameters[w.rows], noise, work
+        )
         for _ in range(iterations - 1):  # only what does not stand yet goes on
-            left = np.flatnonzero(~f.stands)
+            left = np.flatnonzero(~stands)
             if not len(left):
                 break
-            some = w.select(left), mine.select(left), f.parameters[left]
-            f.put(left, _step(*some, noise, work))
-        parameters[w.rows], normal[w.rows], last_step[w.rows] = f.parameters, f.normal, f.step
+            again = _step(w.select(left), mine.select(left), p[left], noise, work)
+            for column, new in zip(fitted, again, strict=True):
+                column[left] = new
+        parameters[w.rows], normal[w.rows], last_step[w.rows] = p, N, step
         pixels[w.rows] = w.weight.sum(axis=1)
-        weight = w.weight / noise.variance(f.value)
-        square[w.rows] = np.sum(weight * f.residual * f.residual, axis=1)
+        weight = w.weight / noise.variance(value)
+        square[w.rows] = np.sum(weight * residual * residual, axis=1)
         saturation[w.rows] = np.sum(w.weight * (w.grey >= top), axis=1)
         cut[w.rows] = w.cut
     saturation /= np.maximum(pixels, 1)
@@ -328,22 +333,6 @@ def fit_circles(
     return replace(fit, reasons=_reasons(fit, maps, cut, pixels, last_step))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
-    parameters: Array
-    value: Single
-    residual: Single
-    normal: Array
-    step: Array
-    stands: NDArray[np.bool_]
-    flat: NDArray[np.bool_]
-
-    def put(self, rows: NDArray[np.int64], other: _Fit) -> None:
-        """Replace some targets' fits by others."""
-        for name in ("parameters", "value", "residual", "normal", "step", "stands"):
-            getattr(self, name)[rows] = getattr(other, name)
-
-
 def _step(
     w: Windows,
     maps: LocalMap,
@@ -351,8 +340,9 @@ def _step(
     noise: NoiseModel | None,
     work: Single,
     tells_noise: bool = False,
-) -> _Fit:
-    """One step of Gauss-Newton; value and residual are those after it.
+) -> tuple[Array, Single, Single, Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """One step of Gauss-Newton: parameters (n, 10), values and residuals (n, k) after it, normal
+    matrices (n, 10, 10), steps (n,) px, which stand now (n,), and which pixels tell the noise.
 
     work (2, m): memory for the partials; asking the system for it again costs more than the sums.
     """
@@ -373,14 +363,14 @@ def _step(
     p[:, 2:5] = np.clip(p[:, 2:5], -0.6, 0.6)
     p[:, :2] += w.origin
     change = (j.transpose(1, 2, 0) @ delta[..., None].astype(np.float32))[..., 0]
-    flat = np.zeros(0, dtype=bool)
+    flat = np.zeros(len(p), dtype=bool)
     if tells_noise:
         # Where a px of movement would change the grey value by next to nothing.
         slope = np.maximum(np.abs(j[0]), np.abs(j[1]))
         flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
     step = np.abs(delta[:, :2]).max(axis=1)
     stands = (step < _CONVERGED_PX) & (np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)
-    return _Fit(p, value + change, residual - change, N, step, stands, flat)
+    return p, value + change, residual - change, N, step, stands, flat
 
 
 def _reasons(

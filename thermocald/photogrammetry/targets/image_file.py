@@ -185,12 +185,6 @@ def _layout(data: bytes) -> _Layout | None:
     return _Layout(width, height, frame + 5, scan, unit, interval)
 
 
-def _headed(data: bytes, layout: _Layout, width: int, height: int) -> bytes:
-    """All before the coded bits, for an image of another size."""
-    size = height.to_bytes(2, "big") + width.to_bytes(2, "big")
-    return data[: layout.size_at] + size + data[layout.size_at + 4 : layout.scan]
-
-
 def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> NDArray[np.uint8] | None:
     """The image down to a row; below it is undefined."""
     height = -(-bottom // layout.unit[1]) * layout.unit[1]
@@ -229,7 +223,8 @@ def _by_segments(
     width, height = columns * tile_width, lines * tile_height
     if row[-1] == rows - 1:  # whose tile may have fewer rows of units than the others
         height -= rows * tile_height - layout.units[1] * layout.unit[1]
-    parts = [_headed(data, layout, width, height)]
+    size = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    parts = [data[: layout.size_at] + size + data[layout.size_at + 4 : layout.scan]]
     for k, i in enumerate(filled.tolist()):
         parts += [data[segments[i, 0] : segments[i, 1]], bytes((0xFF, 0xD0 + k % 8))]
     parts[-1] = bytes((0xFF, _EOI))

@@ -204,7 +204,12 @@ def detect_markers(
                     at = scale * corners.reshape(4, 2).astype(float) + (scale - 1) / 2
                     if _outlined(grey, at):
                         seen[number].append(np.roll(at, corner_shift(name), axis=0))
-        single = {number: at[0] for number, at in sorted(seen.items()) if _one_place(at)}
+        single = {}
+        for number, quads in sorted(seen.items()):
+            off = np.linalg.norm(np.mean(quads, axis=1) - quads[0].mean(axis=0), axis=1)
+            # OpenCV may report the inner and the outer outline of one marker
+            if off.max() < 0.1 * np.linalg.norm(quads[0][0] - quads[0][2]):
+                single[number] = quads[0]
         if len(single) > len(best):
             best, best_border = single, border
         if len(best) > 0.5 * (len(expected) if expected is not None else 0) and best:
@@ -230,13 +235,6 @@ def _outlined(grey: NDArray[np.uint8], quad: Array) -> bool:
         return np.asarray(grey[y, x], dtype=float)
 
     return bool(np.median(at(places + step) - at(places - step)) > _LEAST_STEP_DN)
-
-
-def _one_place(found: list[Array]) -> bool:
-    """Whether all finds of one number are the same find (OpenCV may report inner and outer)."""
-    first = found[0]
-    size = np.linalg.norm(first[0] - first[2])
-    return all(bool(np.linalg.norm(f.mean(0) - first.mean(0)) < 0.1 * size) for f in found[1:])
 
 
 def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:

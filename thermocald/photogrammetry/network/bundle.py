@@ -50,7 +50,6 @@ _SEPARATE_NOTHING = (
     "the normal matrix is singular: these photographs do not separate the parameters; take some "
     "from other directions or hold parameters fixed"
 )
-_LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma alongside others with one
 BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
 _CONTROLLED = 1e-3  # cofactor of a residual below which nothing else controls it
@@ -130,28 +129,6 @@ class Bundle:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KnownTargets:
-    """What is known of the targets beforehand: places (m, 3) mm with weights (m, 3) mm⁻², and which
-    of them (m,) are uncertain; the others are held.
-    """
-
-    points: Array
-    weights: Array
-    uncertain: NDArray[np.bool_]
-
-    @classmethod
-    def build(cls, points: Array, sigmas: Array) -> KnownTargets:
-        """From places and standard deviations (m, 3) mm, 0 for what is exact."""
-        uncertain = np.asarray((sigmas > 0).any(axis=1))
-        weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
-        return cls(points, weights, uncertain)
-
-    def cost(self, bundle: Bundle) -> float:
-        """The weighted sum of squares of the targets' corrections."""
-        return float(np.sum(self.weights * (bundle.points - self.points) ** 2))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Cofactors:
     """Cofactors (sigma0 = 1) of a bundle, of a free one in an arbitrary datum.
 
@@ -171,14 +148,15 @@ class Cofactors:
 class BundleAdjustment:
     """Image points of one camera, adjusted by interior orientation, poses and targets.
 
-    free: which of `IOP_NAMES` are unknown (indices); known: what is known of the targets, None for
-    a free network, in which position, orientation and scale are free.
+    free: which of `IOP_NAMES` are unknown (indices); known: of the targets beforehand, places
+    (m, 3) mm with weights (m, 3) mm⁻² and which of them (m,) are uncertain, the others being held;
+    None for a free network, in which position, orientation and scale are free.
     """
 
     sensor: Sensor
     rays: ImageRays
     free: Index
-    known: KnownTargets | None = None
+    known: tuple[Array, Array, NDArray[np.bool_]] | None = None
 
     def residuals(self, bundle: Bundle) -> Array:
         """Return whitened residuals (n, 2), measured minus computed; `BEHIND` for a target behind
@@ -207,7 +185,7 @@ class BundleAdjustment:
             if robust:  # 1 for the good, falling with the square of the residual
                 size2 = np.sum(v * v, axis=1)
                 w = 1.0 / (1.0 + size2 / (9.0 * max(float(np.median(size2)) / MEDIAN_CHI2, 1e-12)))
-            cost = self._cost(bundle, v, w)
+            cost = self.cost(bundle, v, w)
             normals = self._normal_equations(bundle, w)
             fraction = 1.0
             for _attempt in range(12):
@@ -216,7 +194,7 @@ class BundleAdjustment:
                     trial = bundle.moved(fraction * step[0], fraction * step[1], self.free)
                     if trial.interior[0] > 0:
                         v_new = self.residuals(trial)
-                        new = self._cost(trial, v_new, w)
+                        new = self.cost(trial, v_new, w)
                         if new <= cost * (1 + 1e-12):
                             break
                 elif not gauge:
@@ -294,9 +272,12 @@ class BundleAdjustment:
         )
         return total
 
-    def _cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
-        prior = 0.0 if self.known is None else self.known.cost(bundle)
-        return float(weights @ np.sum(v * v, axis=1)) + prior
+    def cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
+        """Return the weighted sum of squares of residuals (n, 2) and targets' corrections."""
+        total = float(weights @ np.sum(v * v, axis=1))
+        if self.known is not None:
+            total += float(np.sum(self.known[1] * (bundle.points - self.known[0]) ** 2))
+        return total
 
     def _linearised(self, bundle: Bundle, weights: Array) -> tuple[Array, Array, Array]:
         """Return whitened residuals (n, 2), and their partials by camera and pose (n, 2, f + 6) and
@@ -321,7 +302,7 @@ class BundleAdjustment:
         by_camera = np.concatenate([by_interior, by_point @ cross, -by_point], axis=2)
         v = (root @ np.nan_to_num(rays.points - computed[:, 0])[..., None])[..., 0]
         if self.known is not None:
-            by_point = by_point * self.known.uncertain[rays.target, None, None]
+            by_point = by_point * self.known[2][rays.target, None, None]
         return v, root @ by_camera, root @ by_point
 
     def _normal_equations(self, bundle: Bundle, weights: Array) -> _Normals:
@@ -359,8 +340,9 @@ class BundleAdjustment:
         np.add.at(D, rays.target, np.swapaxes(by_point, 1, 2) @ by_point)
         np.add.at(d, rays.target, np.einsum("nai,na->ni", by_point, v))
         if self.known is not None:
-            D += self.known.weights[:, :, None] * np.eye(3)
-            d += self.known.weights * (self.known.points - bundle.points)
+            places, weights, _ = self.known
+            D += weights[:, :, None] * np.eye(3)
+            d += weights * (places - bundle.points)
         return A, B, D, a, d
 
     def _step(

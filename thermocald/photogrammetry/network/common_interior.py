@@ -34,7 +34,6 @@ from thermocald.photogrammetry.network.bundle import (
     Bundle,
     BundleAdjustment,
     ImageRays,
-    KnownTargets,
     point_tests,
 )
 
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
 _ITERATIONS = 60
 _ROUNDS = 10
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
+_LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma alongside others with one
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +88,15 @@ def adjust_common_interior(
     seen = np.unique(np.concatenate([o.targets for o in photographs]))
     rays = ImageRays.collect(photographs)
     rays = replace(rays, target=np.searchsorted(seen, rays.target))
-    known = KnownTargets.build(testfield.points[seen], testfield.sigmas[seen])
+    places, sigmas = testfield.points[seen], testfield.sigmas[seen]
+    uncertain = (sigmas > 0).any(axis=1)
+    weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
+    known = places, weights, uncertain
     bundle = Bundle(
         interior.as_array(),
         np.array([e.rotation for e in exteriors]),
         np.array([e.centre for e in exteriors]),
-        known.points,
+        places,
     )
     used = np.ones(len(rays), dtype=bool)
     if fitting is not None and s.snooping_alpha > 0:
@@ -120,7 +123,7 @@ def adjust_common_interior(
             f"{n} image points in {len(photographs)} photographs leave a redundancy of "
             f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
         )
-    variance = (float(np.sum(v[used] ** 2)) + known.cost(bundle)) / redundancy
+    variance = every.cost(bundle, v[used], np.ones(n)) / redundancy
     Q = found.cameras * variance
     covariance = np.zeros((16, 16))
     covariance[np.ix_(free, free)] = Q[: len(free), : len(free)]
@@ -135,7 +138,7 @@ def adjust_common_interior(
         redundancy,
         tuple(np.split(used, ends)),
         tuple(np.split(replace(every, rays=rays.in_pixels()).residuals(bundle), ends)),
-        tuple(_weaknesses(sensor, bundle.interior, eops, known, rays.select(used), covariance, s)),
+        tuple(_weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)),
     )
 
 
@@ -167,7 +170,7 @@ def _weaknesses(
     sensor: Sensor,
     values: Array,
     eops: Array,
-    known: KnownTargets,
+    places: Array,
     rays: ImageRays,
     covariance: Array,
     s: AdjustmentSettings,
@@ -176,7 +179,7 @@ def _weaknesses(
     reasons: list[str] = []
     if not s.free:
         return reasons
-    _, axes, flat = plane_fit(known.points[np.unique(rays.target)])
+    _, axes, flat = plane_fit(places[np.unique(rays.target)])
     if flat and "c" in s.free:
         angles = [obliqueness_deg(eop, axes[2]) for eop in eops]
         if max(angles) < _LARGEST_OBLIQUENESS_NEEDED_DEG:

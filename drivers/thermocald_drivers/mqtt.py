@@ -267,20 +267,17 @@ class MqttOutput(_Broker):
     def emit(self, result: Mapping[str, Any]) -> None:
         self.require_connected()
         device = str(result.get("device", self.options.device))
-        if device not in self._announced:
-            self._announce(device)
-        topic = f"{self.options.topic}/{node_of(device)}/result"
-        self.publish(topic, encode(result), retain=False)
-
-    def _announce(self, device: str) -> None:
         o = self.options
-        if o.discovery:
-            messages = discovery_messages(o.discovery, o.topic, device, o.device)
-            for topic, message in messages.items():
+        if device not in self._announced:
+            found = (
+                discovery_messages(o.discovery, o.topic, device, o.device) if o.discovery else {}
+            )
+            for topic, message in found.items():
                 self.publish(topic, json.dumps(message).encode(), retain=True)
-        for name in dict.fromkeys((o.device, device)):
-            self.publish(self._available_topic(name), b"online", retain=True)
-        self._announced |= {o.device, device}
+            for name in dict.fromkeys((o.device, device)):
+                self.publish(self._available_topic(name), b"online", retain=True)
+            self._announced |= {o.device, device}
+        self.publish(f"{o.topic}/{node_of(device)}/result", encode(result), retain=False)
 
     def _available_topic(self, device: str) -> str:
         return f"{self.options.topic}/{node_of(device)}/available"

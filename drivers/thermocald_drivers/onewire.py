@@ -87,10 +87,8 @@ def is_power_on(pad: bytes, family: str) -> bool:
     raw = int.from_bytes(pad[:2], "little")
     if family == "3b" and pad[4] & 0x80:
         raw &= ~3
-    if raw == (0x00AA if family == "10" else 0x0550):
-        return True
-    counterfeit = pad[5] != 0xFF or pad[7] != 0x10
-    return family == "28" and raw == 0x0190 and counterfeit
+    counterfeit = family == "28" and (pad[5] != 0xFF or pad[7] != 0x10)
+    return raw == (0x00AA if family == "10" else 0x0550) or (counterfeit and raw == 0x0190)
 
 
 def _kernel_millidegrees(pad: bytes, family: str) -> int:

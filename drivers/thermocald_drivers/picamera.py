@@ -251,7 +251,11 @@ class Picamera2Camera(Camera):
             raise
         if plane is None:
             raise BadReading(f"{self.where}: no frame that began after the call")
-        self._verify(metadata)
+        for name, value in (self._held | self._stated).items():
+            # libcamera delivers what it can, not what was asked
+            if not agrees(value, got := metadata.get(name), self.options.tolerance):
+                shown = f"{value:g}" if isinstance(value, int | float) else f"{value}"
+                raise BadReading(f"{self.where}: {name} was set to {shown} and is {got}")
         exposure = metadata["ExposureTime"] * 1e-6
         sleep_s = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()  # since booting
         middle = metadata["SensorTimestamp"] * 1e-9 - sleep_s - exposure / 2.0
@@ -286,14 +290,6 @@ class Picamera2Camera(Camera):
         if rows < self.options.height * 3 // 2 or stride < self.options.width:
             raise BadReading(f"{self.where}: partial frame, {stride}×{rows} bytes")
         return np.array(array[: self.options.height, : self.options.width], np.uint8)
-
-    def _verify(self, metadata: Mapping[str, Any]) -> None:
-        """Libcamera delivers what it can, not what was asked: BadReading where they differ."""
-        for name, value in (self._held | self._stated).items():
-            got = metadata.get(name)
-            if not agrees(value, got, self.options.tolerance):
-                shown = f"{value:g}" if isinstance(value, int | float) else f"{value}"
-                raise BadReading(f"{self.where}: {name} was set to {shown} and is {got}")
 
     def _modes(self, metadata: Mapping[str, Any]) -> dict[str, float]:
         """Which settings are left to the camera, as 1.0 and 0.0."""

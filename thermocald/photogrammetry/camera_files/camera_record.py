@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import CameraModel
 
 
-def yaml_mapping(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> dict[Any, Any]:
+def yaml_mapping(text: str) -> dict[Any, Any]:
     """What a YAML text holds; ConfigurationError for a text that is not YAML, or holds no keys."""
     try:
-        document = yaml.load(text, loader)
+        document = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as cause:
         raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
     if not isinstance(document, dict):

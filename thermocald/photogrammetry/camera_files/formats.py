@@ -37,12 +37,12 @@ one sensor is read too, its covariance included.
 from __future__ import annotations
 
 import ast
+import re
 import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
 
 import numpy as np
-import yaml
 
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.conversions import METASHAPE as METASHAPE_FRAME
@@ -78,25 +78,10 @@ def _encode_opencv(record: CameraRecord) -> str:
     return begin + mark + record.head() + rest
 
 
-class _OpenCVLoader(yaml.SafeLoader):
-    """YAML with OpenCV's matrices."""
-
-
-def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> dict[Any, Any]:
-    if not isinstance(node, yaml.MappingNode):
-        raise ConfigurationError("an opencv-matrix has no rows, cols, and data")
-    return loader.construct_mapping(node, deep=True)
-
-
-# OpenCV 5 writes vectors as the second kind
-for _kind in ("opencv-matrix", "opencv-nd-matrix"):
-    _OpenCVLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", _opencv_matrix)
-
-
 def _decode_opencv(text: str) -> CameraRecord:
     # not with cv2.FileStorage: a damaged file makes it crash the process (OpenCV 5.0.0)
-    document = yaml_mapping(text.partition("\n")[2], _OpenCVLoader)
-    return _of_matrices(document, (0, 4, 5, 8, 12, 14))
+    plain = re.sub("!!opencv-(nd-)?matrix", "", text.partition("\n")[2])  # the second by OpenCV 5
+    return _of_matrices(yaml_mapping(plain), (0, 4, 5, 8, 12, 14))
 
 
 def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRecord:

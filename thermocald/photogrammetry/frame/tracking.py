@@ -138,27 +138,17 @@ _Circles: TypeAlias = "tuple[NDArray[np.int64], GradientWeights, NDArray[np.bool
 """Those that are tracked: rows of the field, their weights, and which are seen."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _State:
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    seen: int
-    circles: _Circles | None
-    markers: Corners | None
-    boxes: NDArray[np.int64]  # what is looked at in the next frame
-
-
 class Tracker:
     """Measures the frames of one camera and one test field, one after the other."""
 
     def __init__(self, testfield: TestField, prior: Prior | None = None) -> None:
         self._testfield = testfield
         self._prior = prior or Prior()
-        self._state: _State | None = None
+        self.reset()
 
     def reset(self) -> None:
         """Forget what was tracked: the next frame is searched."""
-        self._state = None
+        self._shape: tuple[int, ...] | None = None  # of the frames, while something is tracked
 
     def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement:
         """Measure a frame (H, W), grey, 8 or 16 bit.
@@ -166,34 +156,33 @@ class Tracker:
         Never raises for what a camera delivers, but ImageError where `image` is encoded and cannot
         be decoded.
         """
-        state = self._state
         if isinstance(image, EncodedImage):
-            if state is not None and state.dtype == np.uint8:
-                parts = image.around(state.boxes, state.shape)
-                found = None if parts is None else self._track(parts, state, _MARGIN_PX)
+            if self._shape is not None and self._dtype == np.uint8:
+                parts = image.around(self._boxes, self._shape)
+                found = None if parts is None else self._track(parts, _MARGIN_PX)
                 if found is not None:
                     return found
             image = image.whole()
-        if state is None:
+        if self._shape is None:
             return self._search(image, "nothing is tracked yet")
-        if image.shape != state.shape:
-            status = inspect_frame(image, (state.shape[1], state.shape[0]))
+        if image.shape != self._shape:
+            status = inspect_frame(image, (self._shape[1], self._shape[0]))
             return Measurement(Observations.none(), status)
-        if image.dtype != state.dtype:
-            return self._search(image, f"the frame is {image.dtype}, it was {state.dtype}")
-        return self._track(image, state) or self._search(
-            image, f"too many of {state.seen} targets were lost"
+        if image.dtype != self._dtype:
+            return self._search(image, f"the frame is {image.dtype}, it was {self._dtype}")
+        return self._track(image) or self._search(
+            image, f"too many of {self._seen} targets were lost"
         )
 
     def _search(self, image: NDArray[Any], why: str) -> Measurement:
         found = measure(image, self._testfield, self._prior)
         # A frame that shows nothing says nothing about where the targets are: keep what is known.
         if found.status.ok:
-            circles, markers = self._begin(image, found), found.markers or None
-            self._state = _State(
-                image.shape, image.dtype, len(found.observations), circles, markers,
-                _boxes(circles, markers),
-            )  # fmt: skip
+            self._shape, self._dtype, self._seen = image.shape, image.dtype, len(found.observations)
+            self._circles, self._markers = self._begin(image, found), found.markers or None
+            self._boxes = _boxes(
+                self._circles, self._markers
+            )  # what the next frame is looked at in
         return replace(found, searched=why)
 
     def _begin(self, image: Image, found: Measurement) -> _Circles | None:
@@ -221,13 +210,13 @@ class Tracker:
         p[~seen, :2] = maps.centre[~seen]
         return rows, GradientWeights.build(image, maps, coded, p, fit.noise), seen
 
-    def _track(self, image: Image, state: _State, farthest: float = np.inf) -> Measurement | None:
+    def _track(self, image: Image, farthest: float = np.inf) -> Measurement | None:
         """Measure in windows; None where too many targets are lost or moved by more than
         `farthest` px.
         """
         missed: dict[int, str] = {}
-        found, circles, renewed = Observations.none(), state.circles, 0
-        markers = state.markers
+        found, circles, renewed = Observations.none(), self._circles, 0
+        markers = self._markers
         if markers is not None:
             found = measure_corners(image, markers, missed)
             markers = markers.moved(found)
@@ -236,10 +225,11 @@ class Tracker:
             if tracked is None:
                 return None
             found, circles, renewed = found.joined(tracked[0]), *tracked[1:]
-        if len(found) < max(_FEWEST, (1 - _LOST_SHARE) * state.seen):
+        if len(found) < max(_FEWEST, (1 - _LOST_SHARE) * self._seen):
             return None
-        boxes = _boxes(circles, markers) if renewed or markers is not None else state.boxes
-        self._state = replace(state, seen=len(found), circles=circles, markers=markers, boxes=boxes)
+        self._seen, self._circles, self._markers = len(found), circles, markers
+        if renewed or markers is not None:
+            self._boxes = _boxes(circles, markers)
         return Measurement(found, OK, missed, None, markers, "", renewed)
 
 

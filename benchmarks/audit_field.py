@@ -14,9 +14,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
     project,
 )
-from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.field.testfield import Distance, Observations, TestField
 from thermocald.photogrammetry.network.adjustment import adjust_network
-from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.survey import surveyed_field
 
 if TYPE_CHECKING:

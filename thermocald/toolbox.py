@@ -325,7 +325,7 @@ def survey_testfield(
     from thermocald.analysis.camera.photographs import images_of
     from thermocald.api import read_testfield
     from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-    from thermocald.photogrammetry.network.datum import Distance
+    from thermocald.photogrammetry.field.testfield import Distance
     from thermocald.photogrammetry.survey import survey
     from thermocald.photogrammetry.targets.image_file import decode_grey
     from thermocald.store.recording.board_file import read_distances

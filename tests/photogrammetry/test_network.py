@@ -8,8 +8,8 @@ import pytest
 from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import CameraModel
+from thermocald.photogrammetry.field.testfield import Distance
 from thermocald.photogrammetry.network.adjustment import adjust_network, advice
-from thermocald.photogrammetry.network.datum import Distance
 
 
 def _survey(field, stations, sigma, seed, distances=None, **options):

@@ -10,8 +10,7 @@ from tests.photogrammetry import network_cases as cases
 from thermocald.errors import GeometryError, ImageError
 from thermocald.output.testfield.layout import Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
-from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.network.datum import Distance
+from thermocald.photogrammetry.field.testfield import Distance, TestField
 from thermocald.photogrammetry.survey import survey
 from thermocald.physics.scene import Scene
 

@@ -23,10 +23,9 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
 )
 from thermocald.photogrammetry.field.planes import field_sheets, sheet_normals, target_normals
-from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.field.testfield import Distance, Observations, TestField
 from thermocald.photogrammetry.frame.measurement import predict_circles
 from thermocald.photogrammetry.network.adjustment import Network, adjust_network, advice
-from thermocald.photogrammetry.network.datum import Distance
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.photogrammetry.targets.circle import fit_circles
 from thermocald.photogrammetry.targets.corner import measure_corners

@@ -118,6 +118,16 @@ class TestField:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Distance:
+    """A measured distance between two targets, mm, with its standard deviation."""
+
+    a: str
+    b: str
+    length: float
+    sigma: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """Image points of one epoch.

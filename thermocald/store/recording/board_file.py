@@ -11,14 +11,13 @@ import numpy as np
 
 from thermocald.errors import TestFieldError, UsageError
 from thermocald.files import QuantityReader, read_yaml
-from thermocald.photogrammetry.network.datum import Distance
+from thermocald.photogrammetry.field.testfield import Distance, TestField
 from thermocald.photogrammetry.targets import boards
 from thermocald.store.recording.table import Table
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from thermocald.photogrammetry.field.testfield import TestField
 
 _MOST_LINES = 20_000
 _MOST_ROWS = 1000

@@ -114,14 +114,6 @@ def encode(
     return chosen.encode(record), statement
 
 
-def recognised(path: Path) -> str | None:
-    """The format that a file's content tells, None where it is of none, or cannot be read."""
-    try:
-        return _recognised(_text(path), path).name
-    except ConfigurationError:
-        return None
-
-
 def read(
     path: Path,
     format: str | None = None,  # noqa: A002
@@ -219,8 +211,12 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
     of another program (OpenCV, ROS, Metashape, …) is read as what it is; pixel_pitch: mm, where it
     does not say it.
     """
-    if recognised(path) is not None:
-        found = read(path, pixel_pitch=pixel_pitch)
+    try:
+        known = _recognised(_text(path), path).name
+    except ConfigurationError:  # of none of the formats: our own YAML
+        known = None
+    if known is not None:
+        found = read(path, known, pixel_pitch)
         model = found.model
         return CameraSpec(found.name, model.sensor, model.interior.c, model.interior)
     reader = QuantityReader(path, read_yaml(path, ConfigurationError))

@@ -139,7 +139,8 @@ class Templates:
         v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
         spline = _spline(reference, self._points, _HALF + 8)
         unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(self._points), 1))
-        grey = _sampled(*spline, np.hstack([self._points, unturned]), u, v)
+        every = np.arange(len(self._points))
+        grey = _sampled(spline, every, np.hstack([self._points, unturned]), u, v)
         self._grey, self._grid = grey, (u.ravel(), v.ravel())
         self._weight = np.exp(-0.5 * (u**2 + v**2) / (_HALF / 1.8) ** 2)
         gy, gx = np.gradient(grey, axis=(1, 2)) if len(grey) else (grey, grey)
@@ -181,7 +182,7 @@ class Templates:
         """
         n, (u, v) = len(rows), self._grid
         grey, weight = self._grey[rows].reshape(n, -1), self._weight.ravel() / self._weight.sum()
-        coefficients, first = _spline(image, start, _REACH)
+        spline = _spline(image, start, _REACH)
         p = np.hstack([start, np.tile([1.0, 0.0, 0.0, 1.0], (n, 1))])
         r, alike = np.zeros(grey.shape), np.zeros(n)
         reasons = np.full(n, "the match does not converge", dtype=object)
@@ -191,7 +192,7 @@ class Templates:
         for _ in range(_ITERATIONS):
             if not todo.size:
                 break
-            sampled = _sampled(coefficients[todo], first[todo], p[todo], u, v)
+            sampled = _sampled(spline, todo, p[todo], u, v)
             # brightness and contrast first, then how the frame's patch lies against the template
             common = (sampled * (grey[todo] - mean[todo, None])) @ weight
             gain = np.where(common > 0, common / np.maximum(variance[todo], 1e-12), 1.0)
@@ -242,13 +243,19 @@ def _spline(image: NDArray[Any], middle: Array, reach: int) -> tuple[Array, NDAr
     return inverse @ image[y[:, :, None], x[:, None, :]] @ inverse.T, first
 
 
-def _sampled(coefficients: Array, first: NDArray[np.int64], p: Array, u: Array, v: Array) -> Array:
-    """Values (n, …) of n splines at x = p0 + p2 u + p3 v, y = p1 + p4 u + p5 v; p (n, 6)."""
+def _sampled(
+    spline: tuple[Array, NDArray[np.int64]], rows: NDArray[np.int64], p: Array, u: Array, v: Array
+) -> Array:
+    """Values (k, …) of splines (rows of them) at x = p0 + p2 u + p3 v, y = p1 + p4 u + p5 v.
+
+    p (k, 6).
+    """
+    coefficients, first = spline
     size, each = coefficients.shape[1], (..., *[None] * u.ndim)
-    a = (p - np.pad(first, [(0, 0), (0, 4)]))[each]
+    a = (p - np.pad(first[rows], [(0, 0), (0, 4)]))[each]
     x, y = a[:, 0] + a[:, 2] * u + a[:, 3] * v, a[:, 1] + a[:, 4] * u + a[:, 5] * v
     (column, wx), (line, wy) = _basis(x, size), _basis(y, size)
-    window = np.arange(len(p))[each] * size**2
+    window = rows[each] * size**2
     at, flat = window + line * size + column, coefficients.ravel()
     values = np.zeros(at.shape)
     for i in range(4):
@@ -297,7 +304,8 @@ def _centre(
     spline = _spline(image, click[None], half + 2 * math.ceil(farthest) + 4)
 
     def window(*at: float) -> Array:
-        values: Array = _sampled(*spline, np.array([[*at, 1.0, 0.0, 0.0, 1.0]]), u, v)[0]
+        p = np.array([[*at, 1.0, 0.0, 0.0, 1.0]])
+        values: Array = _sampled(spline, np.zeros(1, dtype=np.int64), p, u, v)[0]
         return values
 
     windows = [window(*at) for at in starts]

@@ -274,7 +274,7 @@ def _project_opencv(_: Sensor, values: Array, directions: Array) -> Array:
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     points, none = np.column_stack([directions, np.ones(len(directions))]), np.zeros(3)
     found = cv2.projectPoints(points, none, none, K, np.array(distortion))[0]
-    return np.asarray(found, dtype=float)[:, 0]
+    return np.asarray(found, dtype=float).reshape(-1, 2)
 
 
 def _opencv_of_brown(model: CameraModel) -> Array:

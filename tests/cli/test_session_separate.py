@@ -7,8 +7,11 @@ import yaml
 
 from tests.commands import answer
 from thermocald.config import parse_config
+from thermocald.daemon.desk import Watch, take_on_the_desk
 from thermocald.daemon.plan import mock_config
 from thermocald.daemon.session import Session
+from thermocald.discovery.experiment import Separation
+from thermocald.store.database.store import Store
 
 RELAY = {
     "name": "lamp", "driver": "relay", "pin": 17, "limit_c": 45.0,
@@ -69,3 +72,35 @@ def test_without_a_heater_there_is_nothing_to_plan(config, tmp_path):
 def test_a_session_that_is_too_short_is_refused(config):
     result = answer("session", "start", "--epochs", 50, "--until-separated", "creep,slip")
     assert "50 epochs of 0.4 s are 0 min; heat needs 15 min" in str(result.exception)
+
+
+@pytest.mark.slow
+def test_the_session_heats_and_ends_when_they_are_separated(config, tmp_path, monkeypatch):
+    from gpiozero import Device
+
+    camera = config.cameras[0].name
+    session = Session(
+        camera=camera, series="M1", epochs=60, check=False,
+        programme=[{"seconds": 600.0, "hold_c": 44.0}],
+    )  # fmt: skip
+    seen, heated = [], []
+    monkeypatch.setattr("thermocald.daemon.desk._FEWEST", 4)
+    watch = Watch(config.store.path, session, ("creep", "slip"), None, print)
+
+    def compared():
+        with Store.open(config.store.path) as store:
+            seen.append(store.last_epoch(store.find_series(camera, "M1")))
+        heated.append(Device.pin_factory.pin(17).state)
+        return Separation("creep", "slip", 55.0, 14.0, True)
+
+    monkeypatch.setattr(watch, "_compare", compared)
+    take_on_the_desk(config, session, print, watch)
+    watch.close()
+
+    with Store.open(config.store.path) as store:
+        taken = store.last_epoch(store.find_series(camera, "M1"))
+    assert seen
+    assert 4 <= taken < 60
+    assert heated == [1]
+    assert Device.pin_factory.pin(17).state == 0
+    assert watch.ended

@@ -5,9 +5,12 @@ As users run it: `run --recording R --fast`, `export` of the store; `replay R`, 
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import shutil
+import sqlite3
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
@@ -117,15 +120,12 @@ def test_frames_of_crooked_planes(program, tmp_path):
     assert abs(error - error.mean()).max() < 5 * np.median(column(live, "sd_c"))
 
 
-def test_a_part_of_a_real_camera(shared, program, tmp_path):
-    """Every other target and the last sixty epochs: no recording is one that was seen before."""
-    part = tmp_path / "part"
-    shutil.copytree(shared / "data" / "aviary-cam1", part)
-    table = rows(part / "observations.csv")
-    heads = rows(part / "epochs.csv")[-60:]
-    epochs = {r["epoch"] for r in heads}
-    names = sorted({r["target"] for r in table})
-    kept = set(names[::2])
+def part_of(recording: Path, part: Path, first: int, every: int = 1) -> Path:
+    """A recording of every so many targets of another one, from one of its epochs on."""
+    shutil.copytree(recording, part)
+    heads = [r for r in rows(part / "epochs.csv") if int(r["epoch"]) >= first]
+    table, epochs = rows(part / "observations.csv"), {r["epoch"] for r in heads}
+    kept = set(sorted({r["target"] for r in table})[::every])
     for name, content in (
         ("epochs.csv", heads),
         ("observations.csv", [r for r in table if r["epoch"] in epochs and r["target"] in kept]),
@@ -134,8 +134,88 @@ def test_a_part_of_a_real_camera(shared, program, tmp_path):
             writer = csv.DictWriter(out, content[0])
             writer.writeheader()
             writer.writerows(content)
+    return part
+
+
+def test_a_part_of_a_real_camera(shared, program, tmp_path):
+    """Every other target and the last sixty epochs: no recording is one that was seen before."""
+    part = part_of(shared / "data" / "aviary-cam1", tmp_path / "part", 42, every=2)
     live, replayed, _ = live_and_replayed(program, part, tmp_path)
     agree(live, replayed)
+
+
+def played(program: list[str], recording: Path, store: Path, kill_at: int = 0) -> None:
+    """Play a recording into a store; kill the program as soon as it holds so many epochs."""
+    process = subprocess.Popen(
+        [*program, "run", "--recording", recording, "--fast", "--store", store],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        while kill_at and process.poll() is None and stored(store) < kill_at:
+            time.sleep(0.02)
+        if kill_at:
+            assert process.poll() is None, "it ended before it was killed"
+            return
+        assert process.wait(600) == 0
+    finally:
+        process.kill()
+        process.wait()
+
+
+def stored(store: Path) -> int:
+    """How many epochs a store holds that another process writes."""
+    try:
+        with contextlib.closing(sqlite3.connect(f"file:{store}?mode=ro", uri=True)) as database:
+            return int(database.execute("SELECT count(*) FROM epoch").fetchone()[0])
+    except sqlite3.OperationalError:
+        return 0  # not yet there
+
+
+def restarted(program: list[str], recording: Path, folder: Path, kill_at: int) -> np.ndarray:
+    """By how many standard deviations (epochs, 6) the epochs after a kill are others than those
+    without: c, x0, y0 of each epoch by itself, and in its series.
+    """
+    tables = []
+    for name, kill in (("whole", 0), ("killed", kill_at)):
+        store = folder / f"{name}.db"
+        played(program, recording, store, kill)
+        if kill:
+            first = int(rows(recording / "epochs.csv")[stored(store)]["epoch"])
+            played(program, part_of(recording, folder / "rest", first), store)
+        assert call("export", store, "--extra", "-o", folder / f"{name}.csv").returncode == 0
+        tables.append({r["frame_time"]: r for r in rows(folder / f"{name}.csv")})
+    whole, killed = tables
+    assert list(whole) == list(killed)
+    rest = list(whole)[kill_at:]
+    assert [whole[t]["status"] for t in rest] == [killed[t]["status"] for t in rest]
+    assert len(rest) > 10
+    return np.array(
+        [
+            [
+                (float(killed[t][f"{of}{n}"]) - float(whole[t][f"{of}{n}"]))
+                / np.hypot(float(whole[t][f"sd_{of}{n}"]), float(whole[t].get(level + n) or 0.0))
+                for of, level in (("", ""), ("series_", "level_sd_"))
+                for n in MAIN
+            ]
+            for t in rest
+            if whole[t]["status"] == "ok"
+        ]
+    )
+
+
+def test_killed_in_the_middle_the_rest_is_the_same(program, tmp_path):
+    """The program goes on with the epochs of its store as if it had never been away."""
+    crooked.write(tmp_path / "trembling", "trembling", seed=2, epochs=36)
+    apart = restarted(program, tmp_path / "trembling", tmp_path, 18)
+    assert np.abs(apart).max() <= 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["aviary-cam0", "aviary-cam2"])
+def test_a_real_camera_killed_in_the_middle(shared, program, tmp_path, camera):
+    part = part_of(shared / "data" / camera, tmp_path / "part", 62)
+    apart = restarted(program, part, tmp_path, 20)
+    assert np.abs(apart).max() <= 0.1
 
 
 @pytest.fixture(scope="module")

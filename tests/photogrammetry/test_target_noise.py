@@ -51,6 +51,33 @@ def test_as_many_good_points_fail_as_stated(epochs, spread):
     assert outside / tried > 0.5 * alpha or epochs < 100
 
 
+@pytest.mark.parametrize("epochs", [4, 6, 9])
+@pytest.mark.parametrize("spread", [0.0, 0.3, 0.8])
+def test_few_epochs_whose_offsets_take_one_of_them(epochs, spread):
+    """No more good points fail than stated, and targets measured alike are hardly told apart."""
+    alpha, outside, tried, apart = 0.002, 0, 0, []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        residuals, weights, used, true = drawn(rng, epochs, spread)
+        residuals -= residuals.mean(axis=0)
+        ratio, freedom = noise_ratios(residuals, weights, used, 1.0, 1)
+        apart.append(np.log(ratio).std())
+        further = np.sqrt(true)[:, None] * rng.standard_normal((10, TARGETS, 2))
+        tests = (further**2 / ratio).sum(axis=2)
+        outside += int((tests > limit_2d(alpha, 1.0 / freedom)).sum())
+        tried += tests.size
+    assert outside / tried < 1.35 * alpha
+    assert spread > 0 or np.mean(apart) < 0.15
+
+
+def test_a_target_seen_once_is_measured_as_the_others():
+    residuals, weights, used, _ = drawn(np.random.default_rng(3), 6, 0.5)
+    used[1:, 0] = False
+    ratio, freedom = noise_ratios(residuals, weights, used, 1.0, 1)
+    assert ratio[0] == pytest.approx(np.exp(np.log(ratio).mean(axis=0)), rel=0.5)
+    assert freedom[0] == pytest.approx(freedom[1] - 5.0)
+
+
 def test_a_few_jumps_do_not_raise_a_targets_noise():
     rng = np.random.default_rng(8)
     residuals, weights, used, _ = drawn(rng, 40, 0.3)

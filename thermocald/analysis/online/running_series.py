@@ -470,7 +470,8 @@ class RunningSeries:
             self._sensor, self._field.subset(seen), grid.targets(seen), start, s,
             field_variance=field_variance,
         )  # fmt: skip
-        return _Together(seen, found, result(found).spread(seen, len(self._field)), moved)
+        sample = result(found, affinity=False).spread(seen, len(self._field))
+        return _Together(seen, found, sample, moved)
 
     def _moved_level(self, kept: list[_Kept], sample: SeriesAdjustment) -> Array:
         """By how much (16,) the epochs as adjusted now differ from what was reported of them."""

@@ -42,7 +42,6 @@ from thermocald.photogrammetry.series.covariances import (
     typical_sensitivity,
 )
 from thermocald.photogrammetry.series.estimator import (
-    ENOUGH_FOR_NOISE,
     FEW_EPOCHS,
     NOISE_SHOWN,
     Estimate,
@@ -212,8 +211,11 @@ def adjusted(
     return Adjusted(series, estimate, use, why)
 
 
-def result(found: Adjusted) -> SeriesAdjustment:
-    """Judge the epochs and scale the covariances."""
+def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
+    """Judge the epochs and scale the covariances.
+
+    affinity: whether to say what a held affinity does to the level.
+    """
     series, estimate, use = found.series, found.estimate, found.use
     finite = np.isfinite(estimate.values).all(axis=1)
     system = replace(estimate.system, good=estimate.system.good & finite)
@@ -250,7 +252,7 @@ def result(found: Adjusted) -> SeriesAdjustment:
         G = typical_sensitivity(system)
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
     slow, pairs = np.zeros((16, 16)), None
-    if s.target_noise and len(use) >= ENOUGH_FOR_NOISE:
+    if s.target_noise and len(use) >= FEW_EPOCHS:
         pairs = series.pairs(estimate, use)
         if len(pairs):
             relative += of_correlated(system, pairs)
@@ -285,7 +287,8 @@ def result(found: Adjusted) -> SeriesAdjustment:
         np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
         _sds(by_perspective(system) * pooled), float(np.sqrt(series.field_variance)),
         _outer_noise(series, estimate),
-        _noise_ratio(sigma0, sound), of_held_affinity(system), movement, found.choice, slow, pairs,
+        _noise_ratio(sigma0, sound), of_held_affinity(system) if affinity else np.zeros(16),
+        movement, found.choice, slow, pairs,
     )  # fmt: skip
 
 

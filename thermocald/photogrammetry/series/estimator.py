@@ -42,15 +42,13 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.result import SeriesSettings
 
-ENOUGH_FOR_NOISE = 10
-"""Epochs that show the noise of single targets."""
-
 FEW_EPOCHS = 10
 """Epochs below which targets that wander slowly look like targets that lie elsewhere."""
 
 NOISE_SHOWN = 0.5
 """Share of the redundancy below which residuals show the priors, not the noise: of one epoch."""
 
+_ENOUGH_FOR_NOISE = 4  # epochs that show the noise of single targets
 _GUESSED = 10.0  # degrees of freedom with which stated noise tells that of a single target
 _MANY = 10.0  # observations for each common unknown: their priors hardly matter any more
 _ITERATIONS = 15
@@ -119,7 +117,7 @@ class SeriesEstimator:
         if s.snooping_alpha > 0:
             estimate, use = series.snoop(estimate, use, offered)
             first_look = self.grid.weights is self.stated
-            if s.target_noise and len(use) >= ENOUGH_FOR_NOISE and first_look:
+            if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE and first_look:
                 series = series.with_target_noise(estimate, use)
                 estimate = series.solve(estimate, use, 1.0)
                 estimate, use = series.snoop(estimate, use, offered)
@@ -216,8 +214,10 @@ class SeriesEstimator:
 
     def with_target_noise(self, estimate: Estimate, use: Mask) -> SeriesEstimator:
         """The series with every target's weights from the scatter of its own residuals."""
+        # where epochs are few, what their offsets take of the targets' residuals counts
+        lost = int(self.has_offsets and len(use) < FEW_EPOCHS)
         ratios, freedom = noise_ratios(
-            estimate.residuals, self.grid.weights, use, self.redundancy_share(use)
+            estimate.residuals, self.grid.weights, use, self.redundancy_share(use), lost
         )
         weights = self.grid.weights.copy(order="K")
         weights[..., :2] /= ratios

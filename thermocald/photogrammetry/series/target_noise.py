@@ -40,18 +40,23 @@ _CLIP = 60.0  # times the median square: beyond it is not scatter but a jump
 
 
 def noise_ratios(
-    residuals: Array, weights: Array, used: Mask, redundancy_share: float
+    residuals: Array, weights: Array, used: Mask, redundancy_share: float, lost: int = 0
 ) -> tuple[Array, Array]:
     """Variance (T, 2) of each target's coordinates in units of its a-priori variance, and the
     degrees of freedom (T,) with which it is known.
 
     residuals (E, T, 2) px; weights (E, T, 3) px⁻²; used (E, T); redundancy_share: redundancy over
-    observations. Robust: medians of squares, of a few epochs their means, which jumps do not
-    reach; drawn to what the targets have in common: strongly where their variances differ no more
-    than so many epochs leave them uncertain (Smyth, 2004).
+    observations; lost: epochs of each target that its offset takes up. Robust: medians of squares,
+    of a few epochs their means, which jumps do not reach; drawn to what the targets have in common:
+    strongly where their variances differ no more than so many epochs leave them uncertain (Smyth,
+    2004).
     """
     squares = np.where(used[..., None], residuals**2 * weights[..., :2], np.nan) / redundancy_share
     n = used.sum(axis=0)[:, None].astype(np.float64)
+    if lost:
+        left = np.maximum(n - lost, 0.0)
+        squares *= np.divide(n, left, out=np.full_like(n, np.nan), where=left > 0)
+        n = left
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # targets that take no part
         middle = np.nanmedian(squares, axis=0) / _MEDIAN_CHI2_1

@@ -31,6 +31,12 @@ def test_an_instant_on_the_clock_is_not_off_by_a_pause(pauses):
     assert on_utc == pytest.approx(utc - 1.0, abs=0.002)
 
 
+@pytest.mark.parametrize("text", ["2_5.0", "nan", "inf", "1e300", "٢٥", "0x19", "", "1,5", "--1"])
+def test_texts_that_are_not_numbers(text):
+    with pytest.raises(ValueError, match="not a plain decimal number"):
+        support.parse_number(text)
+
+
 @pytest.mark.parametrize("points", [[[0, 1e300]], [[0, -300]], [[0, "nan"]], [[0, float("inf")]]])
 def test_programmes_of_temperatures_that_do_not_exist(points):
     with pytest.raises(ConfigurationError, match="programme"):

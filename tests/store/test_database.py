@@ -175,6 +175,25 @@ def test_the_file_itself_refuses_changes(filled, store_path, table, verb):
     database.close()
 
 
+def test_an_epoch_without_a_whole_number_is_damage(filled, store_path):
+    store, series = filled
+    with closing(sqlite3.connect(store_path)) as other:
+        other.executescript("DROP TRIGGER epoch_update; UPDATE epoch SET number = x'ff' WHERE id=2")
+    with pytest.raises(StoreError, match=r"has the number b'\\xff': the store is damaged"):
+        store.last_epoch(series)
+
+
+@pytest.mark.parametrize("table", ["epoch", "detail"])
+def test_rows_that_a_trigger_swallows_are_not_kept_and_said(
+    filled, store_path, make_epoch, make_result, table
+):
+    with closing(sqlite3.connect(store_path)) as other:
+        other.execute(f"CREATE TRIGGER x BEFORE INSERT ON {table} BEGIN SELECT RAISE(IGNORE); END")
+    store, series = filled
+    with pytest.raises(StoreError, match=f"keeps rows out of {table}"):
+        store.append(series, make_epoch(21), make_result(21))
+
+
 def test_a_failed_epoch_leaves_nothing(filled, make_epoch, make_result):
     store, series = filled
     before = list(store._db.iterdump())

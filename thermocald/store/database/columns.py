@@ -19,6 +19,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import sqlite3
 import struct
 import zlib
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,6 @@ from thermocald.errors import StoreError
 from thermocald.store.schema import EPOCH_NUMBERS, EPOCH_TEXTS
 
 if TYPE_CHECKING:
-    import sqlite3
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
@@ -111,7 +111,9 @@ def next_id(connection: sqlite3.Connection, table: str) -> int:
 def insert_row(connection: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
     """Insert a row, all columns but `checksum` given; within the caller's transaction."""
     numbers, texts = ([row[name] for name in names] for names in KEPT[table])
-    connection.execute(_INSERT[table], (*numbers, *texts, row_checksum(numbers, texts)))
+    values = (*numbers, *texts, row_checksum(numbers, texts))
+    if connection.execute(_INSERT[table], values).rowcount != 1:
+        raise sqlite3.IntegrityError(f"a trigger that is not ours keeps rows out of {table}")
 
 
 def select_rows(

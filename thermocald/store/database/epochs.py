@@ -17,6 +17,7 @@ import hashlib
 import json
 import logging
 import math
+import sqlite3
 import struct
 from dataclasses import dataclass
 from functools import partial
@@ -50,7 +51,6 @@ from thermocald.store.schema import sql_name
 from thermocald.store.series import NOT_CALIBRATED, EpochResult, StoredEpoch, StoredSeries
 
 if TYPE_CHECKING:
-    import sqlite3
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
@@ -217,7 +217,9 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
         "detail_checksum": row_checksum((), data=b"".join(data for _, data in parts)),
     }
     insert_row(connection, "epoch", row)
-    connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts)
+    kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts).rowcount
+    if parts and kept != len(parts):
+        raise sqlite3.IntegrityError("a trigger that is not ours keeps rows out of detail")
 
 
 def _parts(

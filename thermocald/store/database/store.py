@@ -122,7 +122,12 @@ class Store(SeriesReader):
     def last_epoch(self, series: StoredSeries) -> int | None:
         """The number of the last epoch kept, None if there is none: where to resume."""
         found = self._value("SELECT max(number) FROM epoch WHERE series_id = ?", series.id)
-        return None if found is None else int(found)
+        if found is not None and not isinstance(found, int):
+            raise columns.DamageError(
+                f"{self.path}: an epoch of {series.head.series} has the number {found!r}: the "
+                "store is damaged; restore a backup"
+            )
+        return found
 
     def _epochs(
         self, series: StoredSeries, first: int, last: int | None, details: bool

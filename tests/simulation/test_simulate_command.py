@@ -9,12 +9,18 @@ import pytest
 
 from tests.commands import answer
 from thermocald.errors import ThermocaldError
-from thermocald.physics.presets import preset_simulation
+from thermocald.physics.presets import PRESETS, preset_simulation
 from thermocald.store.recording.reader import read_recording
 
 
 def run(*arguments):
     return answer("simulate", *arguments)
+
+
+def test_the_list_as_a_document():
+    listed = json.loads(run("--list", "--json", "-").stdout)
+    assert {one["preset"] for one in listed["presets"]} == set(PRESETS)
+    assert len(listed["effects"]) == 20
 
 
 def test_preset_to_recording_and_json(tmp_path):

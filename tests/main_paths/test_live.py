@@ -211,8 +211,9 @@ def test_killed_in_the_middle_the_rest_is_the_same(program, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_real_camera_killed_in_the_middle(shared, program, tmp_path):
-    part = part_of(shared / "data" / "aviary-cam2", tmp_path / "part", 62)
+@pytest.mark.parametrize("camera", ["aviary-cam0", "aviary-cam2"])
+def test_a_real_camera_killed_in_the_middle(shared, program, tmp_path, camera):
+    part = part_of(shared / "data" / camera, tmp_path / "part", 62)
     apart = restarted(program, part, tmp_path, 20)
     assert np.abs(apart).max() <= 0.1
 

@@ -371,6 +371,9 @@ class RunningSeries:
         whole = self._series.epoch(row)
         if not self._offsets:
             return None, whole
+        last = self._own_looks()[0]
+        if self._each is None and last < self.epochs:  # the program was started again
+            self._each = self._look_at_each(last)
         due = self._each is None or self.epochs >= self._look_at[0]
         if not due and whole.status not in _AGAINST:
             return self._further(newest.grid, whole), whole
@@ -445,12 +448,24 @@ class RunningSeries:
             self._series = self._together(still, start, s, moved)
         return row
 
-    def _look_at_each(self) -> _Together:
-        """Adjust the kept epochs with an orientation of their own."""
+    def _own_looks(self) -> tuple[int, int]:
+        """The last and the next epoch at which all are adjusted by themselves: the same ones
+        however often the program is started.
+        """
+        if len(self._kept) == self._kept.maxlen:
+            return self.epochs, self.epochs + int(_SELDOM * len(self._kept))
+        last = following = 1
+        while following <= self.epochs:
+            last, following = following, following + max(int(_OFTEN * following), 1)
+        return last, following
+
+    def _look_at_each(self, first: int | None = None) -> _Together:
+        """Adjust the kept epochs, or the first ones, with an orientation of their own."""
         assert self._series is not None
         kept, grid, start, _ = self._laid_out()
         moved = self._series.moved
         grid = taken_off(grid, moved).reject(self._gross())
+        kept, grid = kept[:first], ObservationGrid(grid.points[:first], grid.weights[:first])
         s = replace(self._own, drift_period=self._period)
         if self._binds:
             # the series has tested every point: only what is far off is left to a second test
@@ -458,7 +473,7 @@ class RunningSeries:
         # epochs by themselves do not show how well the field is known
         each = self._together(grid, start, s, moved, self.field_variance)
         self._level = self._moved_level(kept, each.sample)
-        self._look_at[0] = self._again(_OFTEN)
+        self._look_at[0] = self._own_looks()[1]
         return each
 
     def _together(

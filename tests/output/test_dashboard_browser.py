@@ -92,8 +92,8 @@ def page_with(tmp_path):
         server.communicate()
 
 
-def test_the_chosen_camera_rules_the_whole_page(page_with, page_of):
-    cameras = 12
+@pytest.mark.parametrize("cameras", [2, 12])
+def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     url, start = page_with(cameras)
     page = page_of(url)
     # the curves are there before the daemon says which cameras it has

@@ -28,7 +28,7 @@ Targets that cannot be measured get a reason instead of a number.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -310,7 +310,7 @@ def fit_circles(
             if not len(left):
                 break
             again = _step(w.select(left), mine.select(left), p[left], noise, work)
-            for column, new in zip(fitted, again, strict=True):
+            for column, new in zip(cast("tuple[NDArray[Any], ...]", fitted), again, strict=True):
                 column[left] = new
         parameters[w.rows], normal[w.rows], last_step[w.rows] = p, N, step
         pixels[w.rows] = w.weight.sum(axis=1)

@@ -7,13 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.audit_camera import Scene
+from benchmarks.audit_thermal import seen
 from tests.commands import answer as run
 from thermocald.analysis.thermal.camera_fit import type_model
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import ConfigurationError, DataError
-from thermocald.photogrammetry.camera.camera_model import project
+from thermocald.photogrammetry.camera.camera_model import (
+    ExteriorOrientation,
+    InteriorOrientation,
+    project,
+)
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.presets import preset_simulation
@@ -239,6 +245,27 @@ def test_correct_images_command(folder, pair):
     difference = corrected[40:-40, 40:-40] - expected[40:-40, 40:-40]
     raw = cv2.imread(str(folder / "hot.png"), cv2.IMREAD_GRAYSCALE)[40:-40, 40:-40]
     assert difference.std() < 0.1 * (raw - expected[40:-40, 40:-40]).std()
+
+
+@pytest.mark.parametrize(("depth", "said"), [("corner", False), ("wall", True)])
+def test_rates_are_doubted_before_a_field_that_hardly_shows_c(depth, said):
+    """Before one wall they are off by 4 to 19 standard deviations, before a corner by 1.2."""
+    scene = Scene(np.random.default_rng(3), 0.01, camera='1/4", 62°', depth=depth)
+    s = simulated(7, listed=())
+    model = replace(
+        s.model, sensor=scene.sensor, interior=InteriorOrientation.from_array(scene.iop),
+        exterior=ExteriorOrientation.from_array(scene.eop),
+    )  # fmt: skip
+    device, true = replace(s.device, sensor=scene.sensor), replace(scene.field, points=scene.points)
+    source = seen(replace(s, model=model, device=device, field=true))
+    known = replace(source, field=scene.field, interior=model.interior)
+    found = fit_thermal_model([for_fit(known)], [])
+    off = [
+        (found.model.rates[n] - r) / found.model.sd(f"rates.{n}") for n, r in model.rates.items()
+    ]
+    assert said or np.abs(off).max() < 3.0
+    assert ("rates_hang_on_c" in found.as_dict()) is said
+    assert ("rates hang on it" in " ".join(found.lines())) is said
 
 
 def test_constants_that_go_together_are_said_by_slope_and_curvature():

@@ -72,6 +72,12 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
     for name, rate in document["rates"].items():
         shown = with_sd(1e3 * rate["value"], 1e3 * rate.get("sd", math.nan), "µm/K")
         lines.append(f"  {name:>4}: {shown}")
+    if hang := document.get("rates_hang_on_c"):
+        lines.append(
+            f"  the field hardly shows c (to {hang['c_known_to']:.2%}), and the rates hang on it: "
+            "they may be off by several of their standard deviations; use a field with depth, as "
+            "three walls that meet"
+        )
     for effect in document["effects"]:
         parts = [
             f"{k} = {with_sd(v['value'], v.get('sd', math.nan), v['unit'])}"

@@ -140,6 +140,7 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
     return total
 
 
+_MATERIAL_SDS = 0.5  # of a rate: what c lets it be off by
 _INTERIOR = [COLUMNS.index(n) for n in DEFAULT_FREE]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
@@ -344,6 +345,11 @@ def fitted_camera(
     fitted = {"sigma0": sigma0, "band": not model.misses_an_effect, "series": fits}
     if tied := _tied_constants(model):
         fitted["known_together"] = tied
+    # an image shows the change of c as a share of c: the rates are as wrong as c itself
+    share = sd["interior.c"] / model.interior.c
+    carried = {p: abs(r) * share / sd[f"rates.{p}"] for p, r in model.rates.items() if r}
+    if max(carried.values(), default=0.0) > _MATERIAL_SDS:
+        fitted["rates_hang_on_c"] = {"c_known_to": share, "sds": carried}
     return ThermalCamera(model, {**fitted, "prediction_test": []})
 
 

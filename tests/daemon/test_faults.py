@@ -77,9 +77,9 @@ def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, dev
     assert "hung" in daemon.events()
 
 
-def test_a_store_that_cannot_be_written_waits_in_memory(daemon, measured):
+def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     """What a card that fails does to a running daemon: no write beyond a file size gets through."""
-    daemon.configure(**measured)
+    daemon.configure(**devices())
     daemon.start()
     daemon.until(lambda: len(daemon.results()) > 3)
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)

@@ -60,24 +60,24 @@ def test_own_model_and_field(tmp_path, camera):
 
 
 def test_faults(camera):
-    camera.faults.inject("timeout")
+    camera.inject("timeout")
     with pytest.raises(DeviceTimeout):
         camera.capture()
-    camera.faults.clear()
+    camera.clear()
     for kind in ("truncated", "wrong_size"):
-        camera.faults.inject(kind)
+        camera.inject(kind)
         with pytest.raises(BadReading):
             camera.capture()
-        camera.faults.clear()
-    camera.faults.inject("unplugged", 2)
+        camera.clear()
+    camera.inject("unplugged", 2)
     with pytest.raises(DeviceGone):
         camera.capture()
     with pytest.raises(DeviceGone):
         camera.open()
-    camera.faults.clear()
+    camera.clear()
     camera.open()
     a = camera.capture()
-    camera.faults.inject("stuck")
+    camera.inject("stuck")
     b = camera.capture()
     assert np.array_equal(a.image, b.image)
     assert b.monotonic > a.monotonic

@@ -255,7 +255,7 @@ def _movement(d: Discovery) -> Figure:
             arrows=Arrows(places, vectors, frame, colour, longest),
         )
         for (misfit, vectors), title, colour in zip(
-            drawn, ("Before", "After") if len(drawn) > 1 else ("Left over",), (_BASE, _FOUND),
+            drawn, ("Before", "After") if len(drawn) > 1 else ("Left",), (_BASE, _FOUND),
             strict=False,
         )
     )  # fmt: skip

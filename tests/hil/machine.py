@@ -21,6 +21,7 @@ BOOT_S = 240.0
 # The least that NumPy and OpenCV want (x86-64-v2). With "max", which has AVX too, Python and NumPy
 # crashed now and then in the emulation (QEMU 7.2).
 CPU = "Nehalem"
+_SSH_FAILED = 255  # no status of a command of ours
 STORE_SIZE = "48M"  # so that a little frees enough for observations again (20 MB)
 WRITES_BYTES = 4 << 30  # sparse
 
@@ -132,9 +133,9 @@ class Machine:
             time.sleep(0.05)
 
     def run(
-        self, command: str, *, check: bool = True, timeout_s: float = 120.0
+        self, command: str, *, check: bool = True, timeout_s: float = 120.0, tries: int = 3
     ) -> subprocess.CompletedProcess[str]:
-        """A shell command in the guest, as root."""
+        """A shell command in the guest, as root; again where a busy guest refuses us."""
         quiet = subprocess.DEVNULL
         ssh = [*self._ssh(), command]
         try:
@@ -145,6 +146,9 @@ class Machine:
             if check:
                 raise
             return subprocess.CompletedProcess(ssh, 124, "", "timed out")
+        if check and done.returncode == _SSH_FAILED and tries > 1:
+            time.sleep(1.0)
+            return self.run(command, timeout_s=timeout_s, tries=tries - 1)
         if check and done.returncode:
             raise RuntimeError(f"{command}: status {done.returncode}\n{done.stdout}{done.stderr}")
         return done

@@ -107,6 +107,8 @@ def differences(
 
 def _beside(document: dict[str, Any], key: str) -> float:
     """The standard deviation that belongs to an entry, the largest of a column; 0 without."""
+    if key.endswith("_sigmas"):
+        return 1.0  # it counts standard deviations
     own = document.get("sd" if key == "value" else f"sd_{key}")
     if own is None and key in ("mean", "change", "last_minus_first", "scatter"):
         own = document.get("stated_sd")

@@ -69,6 +69,7 @@ def test_a_number_that_moved_is_seen():
     assert list(differences(before, {"c": 3.04}, bound)) == [": without sd_c, text, n"]
 
 
+@pytest.mark.timeout(1800)
 @pytest.mark.slow
 def test_the_blind_corpus_is_as_it_was_and_right():
     different, outcomes = check("blind")

@@ -162,7 +162,10 @@ class CommonSums:
         q, width, prior = len(design.common), design.width, design.prior_matrix()
         sums = np.array(list(self.patterns.values())).reshape(-1, 3 + p + 3 * len(design.at.A))
         count, times, squares = sums[:, :3].T
-        right, weights = sums[:, 3 : 3 + p], sums[:, 3 + p :].reshape(len(sums), -1, 3)
+        right, weights = (
+            sums[:, 3 : 3 + p],
+            sums[:, 3 + p :].reshape(len(sums), len(design.at.A), 3),
+        )
         kinds = _typical(design, weights / count[:, None, None])
         gradient = self.gradient + design.common_pull(known.pose, known.offsets)
         mean, tilt = np.zeros((2, p, width))

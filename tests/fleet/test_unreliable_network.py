@@ -46,6 +46,9 @@ def forwarded(server, folder, stations, per_process, epochs, kills, cut_every_s)
             time.sleep(0.5)
             server.start()
         recovered = time.monotonic()
+        # a busy machine connects late: the network fails until it has cut something
+        while proxy.cuts < stations and any(process.poll() is None for process in processes):
+            time.sleep(0.1)
         time.sleep(1)
         proxy.calm()
         for process in processes:

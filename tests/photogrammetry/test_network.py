@@ -48,6 +48,19 @@ def test_bent_sheet_from_twelve_rolled_stations(with_nominal):
     assert np.all(np.abs(interior) < 3.5 * np.sqrt(np.diag(network.interior_covariance)))
 
 
+def _distance_squares(network, truth, pairs):
+    """Squared errors of distances of 30 targets over their stated variance."""
+    squares = []
+    for a, b in pairs:
+        e = (truth[b] - truth[a]) / np.linalg.norm(truth[b] - truth[a])
+        h = np.zeros(90)
+        h[3 * b : 3 * b + 3], h[3 * a : 3 * a + 3] = e, -e
+        difference = np.linalg.norm(network.points[b] - network.points[a])
+        error = difference - np.linalg.norm(truth[b] - truth[a])
+        squares.append(error**2 / (h @ network.covariance @ h))
+    return squares
+
+
 @pytest.mark.slow
 def test_standard_deviations_and_correlations_are_true():
     """Scatter over stated sd of targets, interior orientation, distances: 100 repetitions.
@@ -71,13 +84,7 @@ def test_standard_deviations_and_correlations_are_true():
         interiors.append(network.camera.interior.as_array() - cases.INTERIOR.as_array())
         interior_variances.append(np.diag(network.interior_covariance))
         sigma0.append(network.sigma0)
-        for a, b in pairs:
-            e = (truth[b] - truth[a]) / np.linalg.norm(truth[b] - truth[a])
-            h = np.zeros(90)
-            h[3 * b : 3 * b + 3], h[3 * a : 3 * a + 3] = e, -e
-            difference = np.linalg.norm(network.points[b] - network.points[a])
-            error = difference - np.linalg.norm(truth[b] - truth[a])
-            squares.append(error**2 / (h @ network.covariance @ h))
+        squares += _distance_squares(network, truth, pairs)
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(variances))
     assert 0.9 < ratio < 1.1
     per_axis = np.sqrt(np.mean(np.square(errors), axis=(0, 1)) / np.mean(variances, axis=(0, 1)))
@@ -105,13 +112,7 @@ def test_full_covariance_predicts_distances():
         network, truth, _ = _survey(
             field, stations, 0.05, seed, loss=0.0, nominal=field, interior=cases.INTERIOR
         )
-        for a, b in pairs:
-            e = (truth[b] - truth[a]) / np.linalg.norm(truth[b] - truth[a])
-            h = np.zeros(90)
-            h[3 * b : 3 * b + 3], h[3 * a : 3 * a + 3] = e, -e
-            difference = np.linalg.norm(network.points[b] - network.points[a])
-            error = difference - np.linalg.norm(truth[b] - truth[a])
-            squares.append(error**2 / (h @ network.covariance @ h))
+        squares += _distance_squares(network, truth, pairs)
     assert 0.8 < np.sqrt(np.mean(squares)) < 1.2
 
 

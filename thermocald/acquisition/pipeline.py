@@ -141,18 +141,20 @@ class Pipeline:
     def submit(self, frame: Frame) -> None:
         """Take a frame over; returns at once."""
         with self._changed:
-            # a machine that stalls for seconds costs no frame
-            held = sum(
-                len(i.frame.encoded or b"") + (0 if i.frame.image is None else i.frame.image.nbytes)
-                for i in self._items
-            )
-            most = _MOST_WAITING if held <= _MOST_BYTES else 2 * self._depth
-            if len(self._items) > most:
+            if len(self._items) > 2 * self._depth and self._is_full():
                 self._lose("it cannot be kept fast enough")
                 return
             self._items.append(AcquiredEpoch(self.next_number, frame, self._trusted()))
             self.next_number += 1
             self._changed.notify_all()
+
+    def _is_full(self) -> bool:
+        """Return whether no frame more may wait: a machine that stalls for seconds costs none."""
+        frames = [i.frame for i in self._items]
+        held = sum(
+            len(f.encoded or b"") + (0 if f.image is None else f.image.nbytes) for f in frames
+        )
+        return len(frames) > _MOST_WAITING or held > _MOST_BYTES
 
     def _lose(self, why: str) -> None:
         self.lost += 1

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
-"""The interior parameters whose standard deviations are predicted."""
 _USED = [PARAMETER_NAMES.index(name) for name in (*DEFAULT_FREE, *EOP_NAMES)]
 CELLS = (4, 3)
 """The image is divided into so many columns and rows to see whether it is filled."""

@@ -161,15 +161,15 @@ def describe_proposal(
     number = len(found.best.terms) - 1
     term = found.best.terms[number]
     estimates = estimate_term(fit, number, found.fitter.series[0])
-    trade_off = find_trade_off(found.fitter, fit, number)
+    trade_off = None
     tied = find_tied_constants(found.fitter, fit, number)
     if tied and tied["exchanged"]:  # what the inverse says of them is of the others held
         estimates = {
             k: {**v, "sd": None} if k in tied["parameters"] or k.startswith("a_") else v
             for k, v in estimates.items()
         }
-    elif trade_off is not None:
-        tied = None
+    else:
+        trade_off = find_trade_off(found.fitter, fit, number)
     sentence = catalogue.get(term.effect).sentence(estimates)
     evidence = {k: v for k, v in described.evidence.items() if k != "bridge"}
     by_m1, by_m2 = found.closed
@@ -188,12 +188,12 @@ def describe_proposal(
         },
         "absolute_test": jsonable(x.adequacy),
     }
-    if tied:
-        evidence["not_separable"] = tied
-        sentence += f"; {say_together(tied)}"
-    elif trade_off is not None:
+    if trade_off is not None:
         evidence["not_separable"], said = trade_off
         sentence += said
+    elif tied:
+        evidence["not_separable"] = tied
+        sentence += f"; {say_together(tied)}"
     return replace(
         described,
         statement=f"{sentence}; no effect of the catalogue, proposed from what was recorded",

@@ -76,17 +76,6 @@ def _has_mrcal():
     return subprocess.run(probe, capture_output=True, check=False).returncode == 0
 
 
-_PYTHON = Path("/usr/bin/python3")
-
-
-@cache
-def _has_mrcal():
-    if not _PYTHON.exists():
-        return False
-    probe = [_PYTHON, "-c", "import mrcal"]
-    return subprocess.run(probe, capture_output=True, check=False).returncode == 0
-
-
 def _mrcal(path, camera, view):
     """Debian's python3-mrcal in the system's own interpreter."""
     if not _has_mrcal():

@@ -371,9 +371,8 @@ class RunningSeries:
         whole = self._series.epoch(row)
         if not self._offsets:
             return None, whole
-        last = self._own_looks()[0]
-        if self._each is None and last < self.epochs:  # the program was started again
-            self._each = self._look_at_each(last)
+        if self._each is None and (last := self._own_looks()[0]) < self.epochs:
+            self._each = self._look_at_each(last)  # the program was started again
         due = self._each is None or self.epochs >= self._look_at[0]
         if not due and whole.status not in _AGAINST:
             return self._further(newest.grid, whole), whole
@@ -453,7 +452,7 @@ class RunningSeries:
         however often the program is started.
         """
         if len(self._kept) == self._kept.maxlen:
-            return self.epochs, self.epochs + int(_SELDOM * len(self._kept))
+            return self.epochs, self._again(_OFTEN)
         last = following = 1
         while following <= self.epochs:
             last, following = following, following + max(int(_OFTEN * following), 1)

@@ -30,7 +30,7 @@ UNITS = {"mm": 1.0, "m": 1000.0}
 """Lengths that control points and planes may be given in, in mm."""
 
 _LEAST_EXTENT_MM = 50.0  # of a gauge's points: metres read as mm, or degrees, lie nearer together
-_LEAST_OF_A_GRID_MM = 1000.0  # of points that a hundred times as much lies between and the origin
+_LEAST_OF_A_GRID_MM = 1000.0  # of points more than a hundred times as far from the origin
 _LARGEST_EXTENT_MM = 2e6  # beyond it mm were read as metres
 _FITS = 3.0  # sigma0 of points that were mirrored back
 _ROUND_MM = 1e6  # coordinates count from a round number near the points

@@ -125,8 +125,6 @@ def _complete(camera: FleetCamera, state: StationState | None, now: float) -> No
     known = [t for e in recent if math.isfinite(t := e.temperatures.get(reference, math.nan))]
     on_the_way = [e.received - e.frame_time for e in recent if math.isfinite(e.received)]
     camera.state = state
-    if state is not None:
-        camera.waiting, camera.clock_s, camera.version = state.waiting, state.clock, state.version
     sensor = camera.head.camera.sensor
     # what the camera says that it is, else what its images are like
     model = str(camera.identity.get("model") or camera.identity.get("card") or "").strip()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections import defaultdict, namedtuple
+from collections import defaultdict
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -86,14 +86,14 @@ class FleetCamera:
     temperature: °C, the last of the reference, NaN without; shift_px: how far c, x0 or y0 has left
     its own line lately, and in standard deviations; odd: the probability that a camera of this type
     is as unlike the others, NaN where that is not known; findings: what a person should look at:
-    kind, one word, see `fleet.overview`, and text, a sentence; waiting, clock_s, version: rows at
-    its station, its clock minus the server's, its program.
+    kind, one word, see `fleet.overview`, and text, a sentence.
     """
 
     JSON: ClassVar = {
         "head": "", "identity": "", "last_time": "last_epoch", "last_ok": "", "range": "",
         "copied": "", "recent": "", "samples": "", "state": "", "calibrated_range":
-        "temperature_range", "shift_sds": "", "odd": "odd_p",
+        "temperature_range", "shift_sds": "", "odd": "odd_p", "waiting": "waiting",
+        "clock_s": "clock_s", "version": "version",
     }  # fmt: skip
 
     station: str
@@ -120,9 +120,6 @@ class FleetCamera:
     shift_sds: float = math.nan
     odd: float = math.nan
     findings: list[dict[str, str]] = field(default_factory=list)
-    waiting: int | None = None
-    clock_s: float | None = None
-    version: str | None = None
 
     @property
     def name(self) -> str:
@@ -133,14 +130,41 @@ class FleetCamera:
         """`range`, None without a result."""
         return self.range if math.isfinite(self.range[0]) else None
 
+    @property
+    def waiting(self) -> int | None:
+        """How many rows wait at its station."""
+        return None if self.state is None else self.state.waiting
 
-_Series = namedtuple(
-    "_Series", "key station camera name head identity first last epochs results last_ok low high "
-    "sampled",
-)  # fmt: skip
-"""A series, and what the summary says of it: first and last epoch (s UTC), how many epochs,
-results, and slots with a sample.
-"""
+    @property
+    def clock_s(self) -> float | None:
+        """Its station's clock minus the server's."""
+        return None if self.state is None else self.state.clock
+
+    @property
+    def version(self) -> str | None:
+        """Its station's program."""
+        return None if self.state is None else self.state.version
+
+
+class _Series(NamedTuple):
+    """A series, and what the summary says of it: first and last epoch (s UTC), how many epochs,
+    results, and slots with a sample.
+    """
+
+    key: Any
+    station: str
+    camera: str
+    name: str
+    head: str
+    identity: str
+    first: float
+    last: float
+    epochs: int
+    results: int
+    last_ok: float | None
+    low: float | None
+    high: float | None
+    sampled: int
 
 
 class FleetReader(Connected):

@@ -45,6 +45,7 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
     "null": audit_null.null,
     "named": audit_null.named,
     "thermal": audit_thermal.thermal,
+    "lenses": audit_thermal.other_cameras,
     "distortion": audit_thermal.distortion,
     "delay": audit_thermal.delay,
     "thermometer": audit_thermal.thermometer,

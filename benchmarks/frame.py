@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import simplejpeg
-from thermocald_drivers import pixel_formats
+from thermocald_drivers import support
 
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR, corner_field, draw, station
@@ -134,7 +134,7 @@ def main() -> int:
     planar = [memoryview(np.concatenate([image.ravel(), chroma])) for image in grey]
 
     def luminance(number: int) -> np.ndarray:
-        return pixel_formats.decode(planar[number], "YU12", PI_SENSOR.width, PI_SENSOR.height)[0]
+        return support.decode(planar[number], "YU12", PI_SENSOR.width, PI_SENSOR.height)[0]
 
     def encoded(files: list[bytes]) -> Callable[[int], EncodedImage]:
         return lambda number: TimedImage(files[number])

@@ -19,7 +19,7 @@ from thermocald.store.database.epochs import pack_covariance, pack_observations
 from thermocald.store.recording.head import CameraSpec, Channel, Head, head_document
 from thermocald.store.recording.testfield_file import testfield_csv
 from thermocald.store.series import StoredSeries
-from thermocald.store.server.writer import series_key
+from thermocald.store.server.reader import series_key
 
 if TYPE_CHECKING:
     from psycopg import Connection

@@ -72,7 +72,6 @@ def measure(preset: str, seed: int = 1) -> Row:
     ]
     series = reduce_series(
         epochs_input(first.head, first.field, list(first.epochs()), "M1"),
-        affinity=False,
         strict=False,
     )
     about_mean, uncorrected, base = _errors(series, [], second)

@@ -43,7 +43,7 @@ def fitted() -> tuple[ThermalCamera, bool]:
         epochs = list(s.epochs())
         begin = time.thread_time()
         source = epochs_input(s.head, s.field, epochs, f"M{k}")
-        series.append(reduce_series(source, affinity=False, strict=False))
+        series.append(reduce_series(source, strict=False))
         reducing += time.thread_time() - begin
     listed = [
         ModelEffect("permanent_set", {"x0": 0.0, "y0": 0.0}),

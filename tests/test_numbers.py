@@ -17,3 +17,7 @@ from thermocald.numbers import typeset_powers, with_sd
 def test_powers_are_raised_and_names_are_left(text, set_):
     assert typeset_powers(text) == set_
     assert with_sd(-7.49e-7, 0.47e-7, "mm-1/K") == "(−7.49 ± 0.47)·10⁻⁷ mm⁻¹/K"
+
+
+def test_nothing_is_no_negative_nothing():
+    assert with_sd(-1e-9, 1e-6) == "(0.0 ± 1.0)·10⁻⁶"

@@ -86,8 +86,7 @@ def import_photographs(
     6
     """
     from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.photographs import read_photographs
-    from thermocald.store.logger.series import read_series, write_photographs
+    from thermocald.store.logger.photographs import read_photographs, read_series, write_photographs
     from thermocald.store.logger.temperatures import log_options
 
     recording, _ = read_series(
@@ -277,9 +276,7 @@ def fit(
         if effects or model is not None or T0 is not None:
             raise UsageError(f"type {kind.camera}: effects and T0 are the type's; give no others")
     listed, T0 = _structure(effects, model, T0)
-    reduced = [
-        reduce_series(one.observed(progress, jobs), affinity=False, strict=False) for one in series
-    ]
+    reduced = [reduce_series(one.observed(progress, jobs), strict=False) for one in series]
     check_names(listed, reduced)
     if isinstance(kind, ThermalModel):
         camera = fit_camera_of_type(reduced, kind)
@@ -448,10 +445,14 @@ def simulate(
 
 def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[str]:
     """Return what is doubtful in some series, with the source of each where they are several."""
+    from thermocald.thermal.reduce import mean_misclosure
+
     return [
         text if len(series) == 1 else f"{one.source}: {text}"
         for one, found in zip(series, reduced, strict=True)
-        for text in one.doubts(interior=found.at.iop)
+        for text in one.doubts(
+            interior=found.at.iop, offsets=mean_misclosure(found.source, found.at)
+        )
     ]
 
 

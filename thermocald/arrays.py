@@ -1,7 +1,7 @@
-"""Names of array types, and arrays that are used again.
+"""Names of array types, rows that stand for all, and arrays that are used again.
 
 The system gives fresh memory page by page, which for an 8 MP frame takes longer than the arithmetic
-done in it. Only for what does not leave the function that asked.
+done in it. `scratch` is only for what does not leave the function that asked.
 """
 
 from __future__ import annotations
@@ -20,6 +20,11 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 _KEPT = threading.local()  # by name
+
+
+def spread_rows(count: int, most: int) -> Index:
+    """Return so many rows of `count` at most, spread evenly from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

@@ -60,14 +60,12 @@ class Section(BaseModel):
         if isinstance(data, dict) and cls.model_config["extra"] == "forbid":
             for key in data:
                 if key not in cls.model_fields:
-                    raise _unknown(str(key), list(cls.model_fields))
+                    raise _of_key(str(key), f"unknown{nearest(str(key), list(cls.model_fields))}")
         for key, value in data.items() if isinstance(data, dict) else ():
             known = cls.model_fields.get(key)
             if isinstance(value, bool) and known and _is_number(known.annotation):
                 message = f"is {value}, as YAML reads yes, no, on, off; a number is needed"
-                raise PydanticCustomError(
-                    "unknown_key", "{message}", {"message": message, "key": key}
-                )
+                raise _of_key(key, message)
         return data
 
 
@@ -81,10 +79,9 @@ def wrong(message: str) -> PydanticCustomError:
     return PydanticCustomError("thermocald", "{message}", {"message": message})
 
 
-def _unknown(key: str, known: list[str]) -> PydanticCustomError:
-    return PydanticCustomError(
-        "unknown_key", "{message}", {"message": f"unknown{nearest(key, known)}", "key": key}
-    )
+def _of_key(key: str, message: str) -> PydanticCustomError:
+    """Return an error of ours about one key of a section, for a validator of the whole."""
+    return PydanticCustomError("of_key", "{message}", {"message": message, "key": key})
 
 
 def nearest(key: str, known: list[str]) -> str:
@@ -101,7 +98,7 @@ def in_words(path: Path | str, error: ValidationError) -> str:
     ).lstrip(".")
     place = f"{path}: " if str(path) else ""
     context = first.get("ctx", {})
-    if first["type"] == "unknown_key":
+    if first["type"] == "of_key":
         where = f"{where}.{_key(context['key'])}".lstrip(".")
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     message = without_secrets(first["msg"])
@@ -109,7 +106,7 @@ def in_words(path: Path | str, error: ValidationError) -> str:
         message = "is missing"
     elif first["type"] == "value_error":  # of a check that is shared with others
         message = str(context["error"])
-    elif first["type"] not in ("thermocald", "unknown_key"):
+    elif first["type"] not in ("thermocald", "of_key"):
         given = "a secret" if is_secret(where.rpartition(".")[2]) else _short(first["input"])
         message = f"is {given}; {message[0].lower()}{message[1:]}"
     return f"{place}{where + ': ' if where else ''}{message}{more}"

@@ -36,6 +36,8 @@ BAND = 1.96  # standard deviations: 95 % on every page
 _MOST_POINTS = 800
 _PANEL_INCHES = (3.4, 2.5)
 _LEGEND_LETTERS = 43  # in a line above a panel
+_MATRIX_LETTERS = 13  # of a row's name
+_TITLE_LETTERS = 11  # in an inch
 _FEW_ARROWS = 25
 _DECADES = 3.0  # that an axis must span to be logarithmic
 _STYLE: dict[str, Any] = {
@@ -403,9 +405,9 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
     """A matrix of correlation coefficients (n, n) in colours with its numbers; NaN stays grey."""
     with drawing_style():
         n = len(names)
-        short = [shortened(name, 18) for name in names]
+        short = [shortened(name, _MATRIX_LETTERS) for name in names]
         size = 1.3 + 0.31 * n
-        drawing = new_drawing(size, size)
+        drawing = new_drawing(size, size + 0.3)
         axis = drawing.subplots()
         axis.set_facecolor("#dddddd")
         # Not an image: cells of an SVG stay sharp and can be edited.
@@ -416,8 +418,8 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
             if np.isfinite(r):
                 shade = "white" if abs(r) > 0.6 else "black"
                 axis.text(
-                    column + 0.5, row + 0.5, coefficient(r), ha="center", va="center", fontsize=7,
-                    color=shade,
+                    column + 0.5, row + 0.5, coefficient(r).replace("0.", "."), ha="center",
+                    va="center", fontsize=7, color=shade,
                 )  # fmt: skip
         axis.set_xticks(np.arange(n) + 0.5, short, rotation=60, ha="right")
         axis.set_yticks(np.arange(n) + 0.5, short)
@@ -425,5 +427,7 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
         axis.set_aspect("equal")
         axis.grid(visible=False)
         axis.tick_params(length=0)
-        axis.set_title(shortened(title, 44), loc="left")
+        drawing.suptitle(
+            shortened(title, int(_TITLE_LETTERS * size)), x=0.01, ha="left", size=10, weight="bold"
+        )
         return drawing

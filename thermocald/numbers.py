@@ -75,7 +75,7 @@ def with_sd(value: float, sd: float, unit: str = "") -> str:
     scale = 0 if -3 <= exponent < 4 else exponent
     v, s = value / 10**scale, sd / 10**scale
     decimals = max(0, 1 - math.floor(math.log10(s)))
-    body = f"{v:.{decimals}f} ± {s:.{decimals}f}".replace("-", _MINUS)
+    body = f"{v:z.{decimals}f} ± {s:.{decimals}f}".replace("-", _MINUS)
     if scale:
         body = f"({body})·10{superscript(scale)}"
     return typeset_powers(f"{body} {unit}").rstrip()

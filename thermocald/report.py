@@ -26,9 +26,10 @@ _Record = TypeVar("_Record")
 _TEMPLATES = Path(__file__).parent / "templates"
 _A_YEAR = 31_557_600.0
 _RIGHT_TO_LEFT = "\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc"
-# no line ends between a number, its standard deviation and their unit
+# no line ends between a number, its standard deviation and their unit, or within an option
 _PROSE = re.compile(r"<(p|li|figcaption)\b[^>]*>.*?</\1>", re.DOTALL)
 _BEFORE_UNIT = re.compile(r"(?<=[\d)]) (?=±|%|°|(?:px|mm|µm|cm|m|K|s|min|h|σ)\b)|(?<=±) ")
+_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 _WORDS_TO_LEFT = re.compile(
     f"[{_RIGHT_TO_LEFT}](?:[{_RIGHT_TO_LEFT}\\s\u200c\u200d-]*[{_RIGHT_TO_LEFT}])?"
 )
@@ -117,7 +118,12 @@ def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> st
         style=(_TEMPLATES / "report.css").read_text(encoding="utf-8"),
         script=(_TEMPLATES / "report.js").read_text(encoding="utf-8"),
     )
-    return _PROSE.sub(lambda m: _BEFORE_UNIT.sub("\u00a0", m[0]), page)
+    return _PROSE.sub(lambda m: _kept_together(m[0]), page)
+
+
+def _kept_together(prose: str) -> str:
+    """Return prose in which no line ends within an option or before a unit."""
+    return _OPTION.sub(r'<span class="option">\g<0></span>', _BEFORE_UNIT.sub("\u00a0", prose))
 
 
 def as_sentence(text: str) -> str:

@@ -17,7 +17,7 @@ from thermocald.discovery import result as discoveries
 from thermocald.discovery.entries import effects_of
 from thermocald.discovery.result import build_model, field_lines, mount_lines, say_adequate
 from thermocald.errors import DataError
-from thermocald.numbers import UNITS, plain, with_sd
+from thermocald.numbers import UNITS, plain, typeset_powers, with_sd
 from thermocald.output.study.summary import study_document, study_lines
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.model_file import write_effects, write_model
@@ -301,7 +301,7 @@ def discovery_lines(found: Discovery) -> list[str]:
     if found.verdict == "adequate":
         lines.append(say_adequate(found.examination))
     for effect in found.effects:
-        lines.append(f"{effect.effect}: {effect.statement}")
+        lines.append(f"{effect.effect}: {typeset_powers(effect.statement)}")
         for name, e in effect.estimates.items():
             if isinstance(e["value"], float):
                 sd = math.nan if e["sd"] is None else e["sd"]

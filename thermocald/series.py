@@ -15,14 +15,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.series.drift import with_drifts
-from thermocald.analysis.series.recorded import recorded_table, replay_into, table_of_stored
+from thermocald.analysis.series.recorded import (
+    misplaced_doubts,
+    recorded_table,
+    replay_into,
+    table_of_stored,
+)
 from thermocald.analysis.study.measured import measured_series
+from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE, IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
+from thermocald.photogrammetry.field.testfield import FAR_ELSEWHERE
 from thermocald.photogrammetry.series.result import EXTERIOR_CHOICES
 from thermocald.store.recording.reader import Recording, open_recording
-from thermocald.store.recording.sense import interior_doubts
+from thermocald.store.recording.sense import interior_doubts, target_doubts
 from thermocald.store.server.connection import is_server
 from thermocald.store.sources import StoredRecording, open_source, require_source, source_name
 from thermocald.thermal.source import series_input
@@ -43,6 +50,8 @@ if TYPE_CHECKING:
 
     Progress = Callable[[int], None] | None
     Say = Callable[[str], None] | None
+
+_LOOKED_AT = 25  # epochs that tell where the targets are
 
 
 class Series:
@@ -186,21 +195,34 @@ class Series:
         tell = progress or (lambda _: None)
         return replay_into(path, self._measured, settings, exterior, tell, jobs)
 
-    def doubts(self, epochs: Epochs | None = None, interior: Array | None = None) -> list[str]:
+    def doubts(
+        self,
+        epochs: Epochs | None = None,
+        interior: Array | None = None,
+        offsets: Array | None = None,
+    ) -> list[str]:
         """Return what cannot have been meant in what was recorded, a sentence each.
 
-        epochs: as calibrated, for what their interior orientation tells of the camera; interior:
-        that itself, c, x0, y0 in mm and what follows.
+        epochs: as calibrated, for what they tell of the camera and its field; interior: c, x0, y0
+        in mm and what follows; offsets (T, 2) px: by how much targets are seen elsewhere than one
+        mean camera expects.
 
         >>> tc.open("M1").doubts()
         []
         """
         found = self._measured.doubts() if isinstance(self._measured, Recording) else []
-        if epochs is not None and epochs.ok.any():
-            interior = np.median(epochs.values[epochs.ok, :3], axis=0)
+        good = np.zeros(0, dtype=np.int64) if epochs is None else np.flatnonzero(epochs.ok)
+        if epochs is not None and len(good):
+            interior = np.median(epochs.values[good, :3], axis=0)
         if interior is not None:
             c, x0, y0 = interior[:3].tolist()
             found = [*found, *interior_doubts(self.head.camera, c, x0, y0)]
+            if offsets is not None:
+                c_px = c / self.head.camera.sensor.pixel_pitch
+                found += target_doubts(self.testfield.names, offsets, c_px, FAR_ELSEWHERE)
+        if epochs is not None and len(good) and isinstance(self._measured, Recording):
+            some = good[spread_rows(len(good), _LOOKED_AT)]
+            found = [*found, *misplaced_doubts(self._measured, some, epochs.values[some])]
         return found
 
     def measured(
@@ -227,7 +249,7 @@ class Series:
             source.head.require_calibrated(source.title)
             table, observations = _adjust(source, settings, exterior, None, jobs)
             found = measured_series(source, table, observations, label or usual, thermometer_sd)
-        return replace(found, doubts=tuple(self.doubts(interior=found.mean)))
+        return replace(found, doubts=tuple(self.doubts(table, found.mean)))
 
     def observed(self, progress: Progress = None, jobs: int = 1, say: Say = None) -> SeriesInput:
         """Return the series as a thermal model and discovery read it; frames are measured.

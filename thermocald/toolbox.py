@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.analysis.thermal.model_log import read_model_log
+from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
 from thermocald.photogrammetry import camera_files
@@ -20,8 +20,7 @@ from thermocald.store.logger.temperatures import LogOptions, log_options
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from thermocald.analysis.camera.camera import Camera
-    from thermocald.analysis.camera.difference import CameraDifference
+    from thermocald.analysis.camera.camera import Camera, CameraDifference
     from thermocald.analysis.field import FieldCheck
     from thermocald.analysis.thermal.places import Places
     from thermocald.analysis.thermal.predictions import Prediction
@@ -68,7 +67,7 @@ def compare_cameras(
     >>> found.rms_px > 0, found.has_sd
     (True, True)
     """
-    from thermocald.analysis.camera.difference import CameraDifference
+    from thermocald.analysis.camera.camera import CameraDifference
 
     a, b = (camera_files.read(source_of(p), pixel_pitch=pixel_pitch) for p in (first, second))
     names = str(first), str(second)
@@ -147,7 +146,7 @@ def correct(
     >>> done.points
     2
     """
-    from thermocald.analysis.thermal.timed_rows import first_times
+    from thermocald.analysis.thermal.correction import first_times
     from thermocald.output.corrected import Correction
 
     thermal, path = _thermal(model), source_of(points)
@@ -194,8 +193,8 @@ def measure(
     thermocald.errors.UsageError: --length-unit km: mm or m
     """
     from thermocald.analysis.thermal.control_points import UNITS, ControlPoints
+    from thermocald.analysis.thermal.correction import first_times, row_blocks, seconds_of
     from thermocald.analysis.thermal.places import measure_places, read_surface
-    from thermocald.analysis.thermal.timed_rows import first_times, row_blocks, seconds_of
 
     if unit not in UNITS:
         raise UsageError(f"--length-unit {unit}: mm or m")

@@ -51,7 +51,7 @@ from thermocald.errors import (
     WrongDevice,
 )
 from thermocald.hal import Camera, Found, Frame
-from thermocald_drivers import pixel_formats, support
+from thermocald_drivers import support
 from thermocald_drivers.android_phone import ADB_CLASSES, AdbPhone, PhoneOptions, list_devices
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ class AndroidCamera(Camera):
         tags |= focus_state(self.phone.shell("dumpsys media.camera"))
         self._require_lock(tags)
         start = self._exposure_start(tags, triggered)
-        image, _ = pixel_formats.decode(
+        image, _ = support.decode(
             memoryview(jpeg), "JPEG", self.options.width, self.options.height
         )
         if self.options.delete:
@@ -240,7 +240,7 @@ class AndroidCamera(Camera):
             for name, size in new.items():
                 if size > 0 and size == last_size:
                     jpeg = self.phone.pull(f"{self.folder}/{name}")
-                    if len(jpeg) == size and pixel_formats.jpeg_end(jpeg):
+                    if len(jpeg) == size and support.jpeg_end(jpeg):
                         return f"{self.folder}/{name}", jpeg
                     short = f"{name} has {len(jpeg)} of {size} bytes and no end"
                 last_size = size

@@ -2,30 +2,65 @@
 
 Uses adbutils, which implements the adb server's protocol (127.0.0.1:5037). The server is Android's
 own (`adb start-server`); one server serves several phones by their serial numbers.
+
+The thermometers of an Android phone: battery, thermal service, thermal zones.
+
+    thermometers:
+      - name: pixel
+        driver: android
+        serial: 0A1B2C3D4E            # as `adb devices` lists it
+        sensors: {temperature: battery, skin: "thermal:skin", soc: "zone:cpu-0-0"}
+        units: {soc: thousandths}     # of a battery or zone: degC, tenths, thousandths
+        timeout_s: 5
+        host: 127.0.0.1               # of the adb server
+        port: 5037
+        start_server: true            # if none runs
+
+A sensor that the phone does not report, that is frozen, or whose unit is not known is absent from
+the reading; the reason names the option that states the unit. A unit that was certain once is kept
+until the phone is closed; a number that fits the last one in another unit only is refused. What
+sensors give that are not fitted (see `chips`) needs a recent reading within 5 K.
+
+`dumpsys battery`: tenths of a degree, but whole degrees on boards that also give whole volts, and
+on some that give millivolts: up to 70 it may be either. It is refused where the phone has no
+battery (`present: false`, or 0 °C at a voltage that no cell has) and where its values are frozen or
+forged (`UPDATES STOPPED`, after `dumpsys battery unplug` or `set`).
+
+`dumpsys thermalservice`: only the live section "Current temperatures from HAL" is used; the cache
+before it may be hours old. The section also lists volts, currents and percent (types 6 to 8), and
+differences or flags in any unit (type −1); 0.0 is a sensor that is not fitted, and `lmh-dcvs` is a
+limit of the processor. Thermal zones: see `kernel`.
+Source: android.hardware.thermal TemperatureType, AOSP BatteryService; dumps of eleven phones.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import socket
 import stat
 import struct
 import time
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
 
 from thermocald.errors import (
     BadReading,
+    ConfigurationError,
     DeviceError,
     DeviceGone,
     DeviceNotFound,
     DeviceTimeout,
     WrongDevice,
 )
-from thermocald.hal import DriverOptions
-from thermocald_drivers import support
+from thermocald.hal import DriverOptions, Found, Thermometer
+from thermocald_drivers import chips, kernel, support
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
+
+    from thermocald.hal import Reading
+
 
 DENIED = (
     "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); "
@@ -220,3 +255,213 @@ class AdbPhone:
         if "chunk missing" in message or "Invalid sync" in message:
             return DeviceGone(f"{self.where}: a transfer broke off ({message})")
         return BadReading(f"{self.where}: {message}")
+
+
+ZONES = 'for z in /sys/class/thermal/thermal_zone*; do echo "$(cat $z/type) $(cat $z/temp)"; done'
+DUMPS = {"battery": "dumpsys battery", "thermal": "dumpsys thermalservice", "zone": ZONES}
+PHONE_RANGE_C = (-30.0, 125.0)
+STATE_UNIT = "write units: {{{channel}: degC}}, tenths or thousandths"
+NO_BATTERY = (
+    "no battery temperature: not fitted, frozen (`dumpsys battery reset` ends that), or in an "
+    "unknown unit ({state})"
+)
+TYPES = {
+    0: "CPU", 1: "GPU", 2: "BATTERY", 3: "SKIN", 4: "USB_PORT", 5: "POWER_AMPLIFIER",
+    6: "BCL_VOLTAGE", 7: "BCL_CURRENT", 8: "BCL_PERCENTAGE", 9: "NPU", 10: "TPU", 11: "DISPLAY",
+    12: "MODEM", 13: "SOC", 14: "WIFI", 15: "CAMERA", 16: "FLASHLIGHT", 17: "SPEAKER",
+    18: "AMBIENT", 19: "POGO",
+}  # fmt: skip
+NOT_TEMPERATURES = {6, 7, 8}
+LIVE_SECTION = "Current temperatures from HAL:"
+WHOLE_VOLTS = range(1, 100)
+CELL_MV = range(2500, 4600)
+COLDEST_BATTERY_C, HOTTEST_BATTERY_C = -30.0, 70.0
+
+_FIELD = re.compile(
+    r"^[ \t]*(temperature|voltage|present):[ \t]*(-?[0-9]{1,9}|true|false)[ \t]*$", re.MULTILINE
+)
+_RECORD = re.compile(
+    r"Temperature\{mValue=(?P<value>[^,]*), mType=(?P<type>-?[0-9]+), "
+    r"mName=(?P<name>(?:(?!Temperature\{).)*?), mStatus=[0-9]+\}",
+    re.DOTALL,
+)
+_HEADING = re.compile(r"^[^\s,}][^{}\n]*:[ \t]*$", re.MULTILINE)
+
+
+class ThermometerOptions(PhoneOptions):
+    """sensors: {channel: battery, thermal:NAME or zone:TYPE}; units: {channel: unit}."""
+
+    sensors: dict[str, str] = {"temperature": "battery"}  # noqa: RUF012 - pydantic copies it
+    units: dict[str, Literal["degC", "tenths", "thousandths"]] = {}  # noqa: RUF012
+    timeout_s: support.Seconds = 5.0
+
+
+class AndroidThermometer(Thermometer):
+    """Battery, thermal service and thermal zones of a phone, in one shell call each."""
+
+    device_classes = ADB_CLASSES
+    Options = ThermometerOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.phone = AdbPhone(self.options)
+        self.sensors: dict[str, str] = self.options.sensors
+        for channel, source in self.sensors.items():
+            kind, _, name = source.partition(":")
+            if kind not in DUMPS or (kind != "battery") != bool(name):
+                raise ConfigurationError(
+                    f"sensors.{channel}: {source!r} is neither battery, thermal:NAME nor zone:TYPE"
+                )
+        for channel in self.options.units:
+            if self.sensors.get(channel, "").partition(":")[0] not in ("battery", "zone"):
+                raise ConfigurationError(
+                    f"units.{channel}: there is no battery or zone of that name in sensors"
+                )
+        self._watch = kernel.UnitWatch(self.clock)
+        self._believed = support.Channels(self.clock, *PHONE_RANGE_C)
+        self._scales = self._stated()
+
+    @classmethod
+    def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
+        """List the phones of the adb server."""
+        return [Found({"serial": serial}, f"{serial} {state}") for serial, state in list_devices()]
+
+    def open(self) -> None:
+        self.phone.connect()
+
+    def close(self) -> None:
+        self.phone.disconnect()
+        self._believed.clear()
+        self._scales = self._stated()
+
+    def named_channels(self) -> list[str]:
+        return list(self.sensors)
+
+    def identity(self) -> Mapping[str, str]:
+        return {"serial": self.phone.serial}
+
+    def read(self) -> Reading:
+        start = self.clock.monotonic()
+        kinds = {source.partition(":")[0] for source in self.sensors.values()}
+        texts = {kind: self.phone.shell(DUMPS[kind]) for kind in sorted(kinds)}
+        found = self._battery(texts) | self._service(texts) | self._zones(texts)
+        measures = {
+            channel: (source, partial(self._judge, channel, source, found.get(source)))
+            for channel, source in self.sensors.items()
+        }
+        return self._believed.reading(measures, start)
+
+    def _judge(self, channel: str, source: str, value: float | str | None) -> float:
+        where = f"{self.phone.where}: {source}"
+        if value is None:
+            raise BadReading(f"{where}: the phone does not report it")
+        if isinstance(value, str):
+            state = STATE_UNIT.format(channel=channel)
+            raise BadReading(f"{where}: {value.format(state=state)}")
+        idle = "as of a sensor that is not fitted" if chips.is_idle("", value) else ""
+        return self._believed.judge(source, value, where, idle)
+
+    def _stated(self) -> dict[str, float]:
+        """Return {source: factor to °C} of the units in the stanza."""
+        return {
+            self.sensors[channel]: kernel.UNITS[unit]
+            for channel, unit in self.options.units.items()
+        }
+
+    def _in_unit(self, source: str, number: float, scale: float) -> float | str:
+        """°C, or why the unit is not believed; a unit that is certain is kept until `close`."""
+        if self._watch.switched(source, number, scale):
+            return f"{number:g} fits the last reading in another unit only: it has switched"
+        return round(number * scale, 6)
+
+    def _battery(self, texts: Mapping[str, str]) -> dict[str, float | str]:
+        if "battery" not in texts:
+            return {}
+        known = self._scales.get("battery")
+        unit = next((word for word, scale in kernel.UNITS.items() if scale == known), "")
+        found = battery(texts["battery"], unit)
+        if found is None:
+            return {"battery": NO_BATTERY}
+        self._scales["battery"] = found[1]
+        return {"battery": self._in_unit("battery", *found)}
+
+    def _service(self, texts: Mapping[str, str]) -> dict[str, float | str]:
+        found = thermalservice(texts.get("thermal", ""))
+        return {f"thermal:{name}": value for name, value in found.items()}
+
+    def _zones(self, texts: Mapping[str, str]) -> dict[str, float | str]:
+        raw = kernel.raw_zones(texts.get("zone", ""))
+        known = {s.removeprefix("zone:"): f for s, f in self._scales.items() if s != "battery"}
+        scales = kernel.zone_scales(raw, known)
+        self._scales |= {f"zone:{name}": scale for name, scale in scales.items()}
+        found: dict[str, float | str] = {}
+        for name, value in raw.items():
+            source = f"zone:{name}"
+            if name in scales:
+                found[source] = self._in_unit(source, value, scales[name])
+            elif not kernel.is_temperature(name):
+                found[source] = f"{value} is not a temperature; if it is, {{state}}"
+            elif value == 0:
+                found[source] = "0, as of a sensor not fitted; if not, {state}"
+            else:
+                found[source] = f"the unit of {value} is not known; {{state}}"
+        return found
+
+
+def battery(text: str, unit: str = "") -> tuple[float, float] | None:
+    """Return (number, factor to °C) of `dumpsys battery`; None where there is none to be believed.
+
+    unit: a word of UNITS, where it is known.
+    """
+    text = text.replace("\r", "")
+    if "UPDATES STOPPED" in text:
+        return None
+    fields: dict[str, str] = {}
+    for name, value in _FIELD.findall(text):
+        fields.setdefault(name, value)  # the first is current; log lines may repeat the word
+    raw, volts = _whole(fields.get("temperature")), _whole(fields.get("voltage"))
+    if raw is None or fields.get("present") == "false" or (raw == 0 and not volts):
+        return None
+    if unit:
+        scale = kernel.UNITS[unit]
+        return (raw, scale) if abs(raw) * scale <= HOTTEST_BATTERY_C else None
+    if raw == 0 and volts not in CELL_MV:  # a board that runs from the mains
+        return None
+    degrees = COLDEST_BATTERY_C <= raw <= HOTTEST_BATTERY_C
+    if volts in WHOLE_VOLTS and degrees:
+        return raw, 1.0
+    lowest = 2 * HOTTEST_BATTERY_C if volts in WHOLE_VOLTS else 10 * COLDEST_BATTERY_C
+    # up to 70 it is tenths, or whole degrees: some boards give them beside mV
+    tenths = not degrees and lowest <= raw <= 10 * HOTTEST_BATTERY_C
+    return (raw, 0.1) if tenths else None
+
+
+def _whole(text: str | None) -> int | None:
+    return int(text) if text is not None and text not in ("true", "false") else None
+
+
+def thermalservice(text: str) -> dict[str, float]:
+    """Return {sensor: °C} of the live section; empty where the phone does not print one."""
+    text = text.replace("\r", "")
+    _, found, rest = text.partition(LIVE_SECTION)
+    if not found or "HAL Ready: false" in text:
+        return {}
+    heading = _HEADING.search(rest)
+    section = rest[: heading.start()] if heading else rest
+    values: dict[str, float] = {}
+    ambiguous = set()
+    for record in _RECORD.finditer(section):
+        kind = int(record["type"])
+        if kind not in TYPES or kind in NOT_TEMPERATURES:
+            continue
+        try:
+            value = support.parse_number(record["value"])
+        except ValueError:
+            continue  # NaN
+        name = " ".join(record["name"].split())
+        # 0.0 is the HAL's way to say "not fitted"
+        if value == 0.0 or kernel.is_limit(name):
+            continue
+        if values.setdefault(name, value) != value:
+            ambiguous.add(name)
+    return {name: value for name, value in values.items() if name not in ambiguous}

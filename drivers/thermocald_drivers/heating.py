@@ -1,4 +1,4 @@
-"""The heating programme of `relay` and `android_load`, with a hard limit.
+"""The heating programme of `relay` and `android_load`, with a hard limit; `android_load` itself.
 
 A pure decision: (elapsed time, temperature) → heat or not. The limit switches off until the device
 is opened again; so does the end of the programme. The options of both drivers:
@@ -9,18 +9,41 @@ is opened again; so does the end of the programme. The options of both drivers:
       - {seconds: 600, hold_c: null}
       - {seconds: 1500, hold_c: 45}
     hysteresis_k: 0.5
+
+`android_load` warms a phone up by processor load, for experiments with a cold and a warm phone:
+
+    outputs:
+      - name: warm-pixel
+        driver: android_load
+        serial: 0A1B2C3D4E
+        limit_c: 42                   # of the battery, which this driver reads itself
+        programme: [{seconds: 600, hold_c: null}, {seconds: 1800, hold_c: 38}]
+        processes: 4
+        lease_s: 30
+        timeout_s: 5
+        host: 127.0.0.1               # of the adb server
+        port: 5037
+        start_server: true            # if none runs
+
+The load ends by itself `lease_s` after it was last renewed, so that a phone whose cable falls out
+cools down.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from thermocald.errors import ConfigurationError
-from thermocald.hal import DriverOptions, HeatingStep
+from thermocald.errors import BadReading, ConfigurationError, DeviceError
+from thermocald.hal import DriverOptions, HeatingStep, Output
+from thermocald_drivers.android_phone import ADB_CLASSES, AdbPhone, PhoneOptions, battery
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 
 class HeatingOptions(DriverOptions):
@@ -81,3 +104,67 @@ class HeatingProgramme:
         elif temperature_c >= hold_c + half or temperature_c <= hold_c - half:
             self.heating = temperature_c < hold_c
         return self.heating
+
+
+MARK = "thermocald_load"
+
+
+class LoadOptions(HeatingOptions, PhoneOptions):
+    """As above; a battery above 50 °C is in danger."""
+
+    limit_c: Annotated[float, Field(ge=0.0, le=50.0)]
+    processes: Annotated[int, Field(ge=1, le=16)] = 4
+    lease_s: Annotated[float, Field(ge=2.0, le=120.0)] = 30.0
+    timeout_s: Annotated[float, Field(ge=0.1, le=60.0)] = 5.0
+
+
+class AndroidLoadOutput(Output):
+    """Busy loops on the phone while the programme asks for heat."""
+
+    device_classes = ADB_CLASSES
+    heats = True
+    Options = LoadOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.phone = AdbPhone(self.options)
+        self.programme = HeatingProgramme(self.options, "battery")
+
+    def open(self) -> None:
+        self.phone.connect()
+        self.programme.reset()
+        self._started = self.clock.monotonic()
+        self._renewed = float("-inf")
+        self._stop()  # what a crashed program left behind
+
+    def close(self) -> None:
+        with contextlib.suppress(DeviceError):  # out of reach: the lease ends the load
+            self._stop()
+        self.phone.disconnect()
+
+    def emit(self, result: Mapping[str, Any]) -> None:  # noqa: ARG002 - it reads the phone
+        found = battery(self.phone.shell("dumpsys battery"))
+        celsius = None if found is None else found[0] * found[1]
+        was_tripped = self.programme.tripped
+        now = self.clock.monotonic()
+        if not self.programme.decide(now - self._started, celsius):
+            self._stop()
+            if self.programme.tripped and not was_tripped:
+                raise BadReading(f"{self.phone.where}: off for good, {self.programme.tripped}")
+            return
+        if now - self._renewed >= self.options.lease_s / 2.0:
+            self._stop()
+            self._start()
+            self._renewed = now
+
+    def _start(self) -> None:
+        loop = f"{MARK}=1; while :; do :; done"
+        for _ in range(self.options.processes):
+            self.phone.shell(
+                f"timeout {self.options.lease_s:g} sh -c '{loop}' >/dev/null 2>&1 </dev/null &"
+            )
+
+    def _stop(self) -> None:
+        # [t]: the pattern must not match the shell that carries it
+        self.phone.shell(f"pkill -f '[{MARK[0]}]{MARK[1:]}'")
+        self._renewed = float("-inf")

@@ -15,10 +15,19 @@ of measurements gives frames without an image, with `observations`.
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermocald.errors import BadReading, DeviceFinished, DeviceGone, DeviceNotFound, ImageError
+from thermocald.errors import (
+    BadReading,
+    DataError,
+    DeviceFinished,
+    DeviceGone,
+    DeviceNotFound,
+    ImageError,
+    PermanentDeviceError,
+)
 from thermocald.hal import Camera, Device, DriverOptions, Frame, Reading, Thermometer
 from thermocald_drivers import support
 
@@ -34,6 +43,15 @@ class ReplayOptions(DriverOptions):
 
     recording: support.Text | Path
     loop: bool = False
+
+
+@contextmanager
+def _for_good() -> Iterator[None]:
+    """What is wrong with a file stays so: asking again does not help."""
+    try:
+        yield
+    except DataError as error:
+        raise PermanentDeviceError(str(error)) from error
 
 
 class _Replay(Device):
@@ -55,7 +73,8 @@ class _Replay(Device):
         if self._recording is None:
             from thermocald.store.recording.reader import open_recording
 
-            self._recording = open_recording(self._path)
+            with _for_good():
+                self._recording = open_recording(self._path)
             self._epochs = self._recording.iter_epochs()
         self._open = True
 
@@ -71,7 +90,8 @@ class _Replay(Device):
     def _next(self) -> Epoch:
         if not self._open or self._epochs is None or self._recording is None:
             raise DeviceGone(f"{self._path}: it is not open")
-        epoch = next(self._epochs, None)
+        with _for_good():
+            epoch = next(self._epochs, None)
         if epoch is None and self.options.loop:
             times = self._recording.columns.frame_time
             self._shift_s += float(times[-1] - times[0]) + self._recording.head.interval

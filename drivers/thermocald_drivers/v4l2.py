@@ -51,7 +51,7 @@ from thermocald.errors import (
     WrongDevice,
 )
 from thermocald.hal import Camera, DriverOptions, Found, Frame
-from thermocald_drivers import pixel_formats, support
+from thermocald_drivers import support
 from thermocald_drivers.support import AUTO
 from thermocald_drivers.v4l2_stream import BUFFERS, OLDEST_S, LinuxpyStream, OpenCvStream
 
@@ -133,7 +133,7 @@ class V4l2Camera(Camera):
         o = self.options
         if (o.device is None) == (o.serial is None):
             raise ConfigurationError("write either device: (/dev/v4l/by-id/…) or serial:")
-        known = ["MJPG", *(name.strip() for name in pixel_formats.FORMATS)]
+        known = ["MJPG", *(name.strip() for name in support.FORMATS)]
         if o.pixel_format not in known:
             raise ConfigurationError(
                 f"pixel_format: {o.pixel_format!r} is not one of {', '.join(known)}"

@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import BadReading, DeviceGone, DeviceTimeout, WrongDevice
-from thermocald_drivers import pixel_formats, support
+from thermocald_drivers import support
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from concurrent.futures import Future
 
-    from thermocald_drivers.pixel_formats import Grey
+    from thermocald_drivers.support import Grey
 
     Accept = Callable[[float | None, bool], bool]
 
@@ -131,7 +131,7 @@ class LinuxpyStream:
                 )
             used = memoryview(self._capture.buffer.buffers[buffer.index])[: buffer.bytesused]
             try:
-                image, encoded = pixel_formats.decode(used, self._fourcc, *self._size, self._stride)
+                image, encoded = support.decode(used, self._fourcc, *self._size, self._stride)
             finally:
                 used.release()
         finally:
@@ -232,7 +232,7 @@ class OpenCvStream:
             raise DeviceGone(f"{self._path}: OpenCV gets no frame (unplugged?)")
         stamp = self._capture.get(self._cv2.CAP_PROP_POS_MSEC) / 1000.0
         data = memoryview(raw.reshape(-1).view("u1"))
-        image, encoded = pixel_formats.decode(data, self._fourcc, *self._size)
+        image, encoded = support.decode(data, self._fourcc, *self._size)
         return Grab(image, encoded, stamp if stamp > 0 else None, False, None)
 
     def close(self) -> None:

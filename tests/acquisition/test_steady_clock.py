@@ -88,3 +88,21 @@ def test_the_rhythm_does_not_notice_any_of_it(make):
             machine.step_utc(3600.0 if k == 3 else -3600.0)
         clock.check()
     assert ticks == [10.0 * k for k in range(12)]
+
+
+def test_a_thread_that_had_to_wait_between_two_clocks_moves_no_time_stamp():
+    """74 ms between UTC and monotonic time were in every time stamp of a daemon."""
+
+    class Busy(VirtualClock):
+        waits = 3
+
+        def utc(self):
+            now = super().utc()
+            if self.waits:
+                self.waits -= 1
+                self.advance(0.074)
+            return now
+
+    machine = Busy(utc=1.75e9)
+    clock = SteadyClock(machine, synchronised=lambda: True)
+    assert clock.utc() == pytest.approx(1.75e9 + machine.monotonic(), abs=1e-6)

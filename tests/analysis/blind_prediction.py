@@ -74,7 +74,7 @@ def predict_case(
     (said,) = stated["series"]
     fitted = read_model(model)
     source = series_input(read_recording(folder / "M2"))
-    second = reduce_series(source, affinity=False, strict=False)
+    second = reduce_series(source, strict=False)
     true = predicted_error(_with_true_noise(fitted, truth), second, READING_SD)
     return Tested(name, seed, said["rms_px"] / true.floor_px, said["coverage"], said["rms_px"])
 

@@ -19,10 +19,10 @@ from scipy.ndimage import map_coordinates, spline_filter
 from tests.analysis.test_gauge import NAMES, POSE, RATES, SD, SD_RATE, START, thermal_camera
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project, rotation
 from thermocald.analysis.thermal.control_points import ControlPoints
+from thermocald.analysis.thermal.correction import RowBlock
 from thermocald.analysis.thermal.gauge import GaugeCalibrator
 from thermocald.analysis.thermal.places import Places, measure_places
 from thermocald.analysis.thermal.scene import follow_scene
-from thermocald.analysis.thermal.timed_rows import RowBlock
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.epoch.measuring import Plane, place_on
 from thermocald.photogrammetry.field.testfield import Observations, TestField

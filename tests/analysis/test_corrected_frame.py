@@ -14,7 +14,7 @@ from PIL import Image
 from tests.analysis.test_gauge import START, thermal_camera
 from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.analysis.camera.undistortion import Maps
-from thermocald.analysis.thermal.corrected_frame import FrameCorrector
+from thermocald.analysis.thermal.correction import FrameCorrector
 from thermocald.epoch import Epoch
 from thermocald.errors import ImageError
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project

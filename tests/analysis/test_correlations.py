@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermocald.analysis.statistics.significance import correlations_of, median_correlations
+from thermocald.analysis.statistics.dependence import correlations_of, median_correlations
 
 
 def test_correlations_of_a_covariance_with_a_held_parameter():

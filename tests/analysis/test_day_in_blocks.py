@@ -96,6 +96,6 @@ def test_the_fit(day):
     for size in (DAY, 500):
         short = condensed(series, day.blocks(size), TOGETHER)
         assert len(short.frame_times) < DAY / 2
-        fitted = fit_thermal_model([reduce_series(short, affinity=False, strict=False)], [])
+        fitted = fit_thermal_model([reduce_series(short, strict=False)], [])
         rates.append([fitted.model.rates[name] for name in ("c", "x0", "y0")])
     np.testing.assert_allclose(rates[1], rates[0], rtol=SAME)

@@ -19,7 +19,7 @@ def test_the_noise_of_readings_between_the_frames(interval):
     found = []
     for seed in range(1, 7):
         source = read_apart(simulated(seed, ()), 0.0, interval)
-        e = calibrate_thermometers([reduce_series(source, affinity=False, strict=False)])[0]
+        e = calibrate_thermometers([reduce_series(source, strict=False)])[0]
         found.append(e.thermometers[e.history.reference].noise)
     # eighty readings know it to 8 %, six series to 3.3 %; the lamp's kinks add 4 %
     assert 0.90 < np.mean(found) / 0.05 < 1.14
@@ -44,6 +44,8 @@ def test_a_clock_that_is_wrong_by_any_interval_of_the_readings(interval):
     off = []
     for seed, late in enumerate(np.linspace(-90.0, 90.0, 12), start=40):
         f = fitted(read_apart(switched(seed), float(late), interval), DELAY)
+        assert ("read_seldom" in f.fitted) >= (interval == 60.0)
+        assert interval > 15.0 or "the temperature turns between" not in " ".join(f.lines())
         off.append((f.model.effects[0].values["d"] + late) / f.model.sd("time_offset.d"))
     assert np.max(np.abs(off)) < 3.5
     # of twelve draws a root mean square of 1 scatters by 0.2

@@ -90,12 +90,12 @@ def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
 def test_what_the_series_say_does_not_hang_on_an_effect(effect):
     """The basis is asked before any hypothesis is."""
     for seed in SEEDS[:3]:
-        reduced = reduce_series(seen(simulated(seed, (effect,))), affinity=False, strict=False)
+        reduced = reduce_series(seen(simulated(seed, (effect,))), strict=False)
         assert choose_distortion([reduced])[0] == "angle"
 
 
 def test_series_change_their_basis_and_back():
-    e = reduce_series(seen(simulated(1, ())), affinity=False, strict=False)
+    e = reduce_series(seen(simulated(1, ())), strict=False)
     other = e.in_basis("image")
     same = other.in_basis("angle")
     assert other.distortion == "image"

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import stats
 
-from thermocald.analysis.statistics.significance import (
+from thermocald.analysis.statistics.dependence import (
     moving_f_test,
     moving_mean,
     moving_variance,

@@ -1,5 +1,7 @@
 """The study of a camera: series together, drawn from, and propagated."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -20,6 +22,12 @@ def test_labels_make_cameras_and_series_are_pooled(warm_up):
     assert cold.correlations.epochs == 300
     assert cold.sds[1] == pytest.approx(0.0194 * 0.2527, rel=0.01)
     assert warm.montecarlo.overall_mean < 0.6 * cold.montecarlo.overall_mean
+
+
+def test_series_of_one_name_are_told_apart_by_where_they_are(warm_up):
+    pair = [replace(warm_up(seed=k)("M1", "cold"), source=f"/data/{k}") for k in (1, 2)]
+    (camera,) = study(pair, StudySettings(sets=100)).cameras
+    assert [one.series.name for one in camera.series] == ["M1 in 1", "M1 in 2"]
 
 
 def test_first_order_agrees_where_errors_are_small(warm_up):

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from tests.commands import call
-from thermocald.analysis.camera.difference import CameraDifference
+from thermocald.analysis.camera.camera import CameraDifference
 from thermocald.analysis.thermal.calibrations import Calibration, fit_calibrations
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import (

@@ -172,7 +172,7 @@ def test_times_from_names(place):
 @pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
 def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path, zone):
     """The readers that both commands use for their --log and for the points."""
-    from thermocald.analysis.thermal.timed_rows import row_blocks
+    from thermocald.analysis.thermal.correction import row_blocks
     from thermocald.store.logger.clock import device_clock
     from thermocald.store.logger.temperatures import LogOptions, read_log
 

@@ -14,7 +14,7 @@ import pytest
 
 from thermocald.analysis.online.equilibrium import Equilibrium
 from thermocald.cli import run
-from thermocald.output.status_text import WIDTH, status_lines
+from thermocald.cli.run import WIDTH, status_lines
 
 LONG = "/srv/recordings/2026/under-the-old-bridge/second-arch/thermocald-left-bank.db"
 

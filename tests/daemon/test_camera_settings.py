@@ -11,6 +11,7 @@ import pytest
 
 from thermocald.acquisition.device_loop import Link
 from thermocald.acquisition.pipeline import AcquiredEpoch
+from thermocald.cli.run import status_warnings
 from thermocald.config import parse_config
 from thermocald.daemon.epoch_keeper import EpochKeeper
 from thermocald.daemon.plan import plan_cameras
@@ -18,7 +19,6 @@ from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.hal import Camera, Frame, VirtualClock
-from thermocald.output.status_text import status_warnings
 from thermocald.store.series import EpochResult
 
 CAMERA = {"name": "river", "driver": "v4l2", "device": "/dev/video0", "width": 64, "height": 48}

@@ -19,13 +19,13 @@ from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.sources import StoredRecording
 
-EPOCHS, WHEN = 44, 27
+EPOCHS, WHEN = 34, 23
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory, forker):
-    """One daemon, five cameras that see the same until epoch 27."""
+    """One daemon, five cameras that see the same until epoch 23."""
     folder = tmp_path_factory.mktemp("changes")
     taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4, interval=10.0))
     field, sensor = taken.testfield, taken.camera.sensor
@@ -114,7 +114,7 @@ def test_every_epoch_has_its_own_result_before_and_after_a_knock(store):
     assert moved == pytest.approx(2.0, abs=4 * np.hypot(*columns["sd_X0"][[WHEN - 2, -1]]))
 
 
-@pytest.mark.parametrize("epochs", [40, pytest.param(600, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("epochs", [24, pytest.param(600, marks=pytest.mark.slow)])
 def test_the_mock_at_half_a_second_tells_nothing_and_every_column_is_ours(daemon, devices, epochs):
     """No knock that nobody put in; and no name of a column can be a channel's, which loses it."""
     daemon.configure(**devices(period_s=0.5))

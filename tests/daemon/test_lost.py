@@ -17,12 +17,11 @@ from tests.daemon.conftest import make_recording
 from tests.daemon.test_store_file import guard, path  # noqa: F401
 from thermocald.acquisition.pipeline import Pipeline
 from thermocald.acquisition.thermometers import Thermometers
-from thermocald.cli.run import status
+from thermocald.cli.run import status, status_warnings
 from thermocald.daemon.live_state import LiveState
 from thermocald.errors import DataError, StoreError
 from thermocald.hal import Frame, SystemClock
 from thermocald.output.dashboard.view import View
-from thermocald.output.status_text import status_warnings
 from thermocald.store.database.store import Store
 
 
@@ -154,3 +153,18 @@ def test_an_alert_says_so_and_takes_it_back():
     alerts = [(r["epoch"], a.state, a.text) for r in rows for a in watch.changes(r, "cam")]
     assert [(n, state) for n, state, _ in alerts] == [(2, "out"), (3, "in"), (4, "out"), (5, "in")]
     assert alerts[2][2] == "cam: 3 epochs were taken and not kept (limit 1)"
+
+
+@pytest.mark.parametrize("table", ["epochs.csv", "observations.csv"])
+def test_a_recording_that_breaks_ends_the_command(tmp_path, table):
+    """It would have been opened again for ever; what came before the broken row is kept."""
+    recording, store = make_recording(tmp_path / "small", 20), tmp_path / "t.db"
+    lines = (recording / table).read_text().splitlines()
+    number = len(lines) - 1
+    lines[number - 1] = lines[number - 1].replace(lines[number - 1].split(",")[3], "x3", 1)
+    (recording / table).write_text("\n".join(lines) + "\n")
+    done = call("run", "--recording", recording, "--fast", "--store", store)
+    assert done.returncode == 1
+    assert f"{table}, line {number}" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert store.exists() == (table == "observations.csv")

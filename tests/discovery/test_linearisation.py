@@ -40,7 +40,7 @@ def series_of(epochs):
 
 
 def test_the_rates_of_a_large_range():
-    reduced = reduce_series(series_of(300), affinity=False, strict=False)
+    reduced = reduce_series(series_of(300), strict=False)
     fitted = fit_thermal_model([reduced], [])
     for column, name in enumerate(NAMES):
         assert fitted.model.rates[name] == pytest.approx(RATES[column], rel=3e-6)
@@ -56,7 +56,7 @@ def test_the_scatter_of_long_series(tmp_path):
         write_long_recording(path, 30_000, 21, seed=seed)
         series = tc.open(path).observed()
         assert series.counts is not None  # on means
-        fitted = fit_thermal_model([reduce_series(series, affinity=False, strict=False)], [])
+        fitted = fit_thermal_model([reduce_series(series, strict=False)], [])
         sds = fitted.model.sds
         ratios.append([(fitted.model.rates[n] - RATES[k]) / sds[f"rates.{n}"]
                        for k, n in enumerate(NAMES)])  # fmt: skip

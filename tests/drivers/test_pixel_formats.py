@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from thermocald_drivers.pixel_formats import BAYER_ORDERS, FORMATS, decode
+from thermocald_drivers.support import BAYER_ORDERS, FORMATS, decode
 
 from thermocald.errors import BadReading
 
@@ -73,7 +73,7 @@ def pack_10(values):
 
 
 def test_packed_ten_bits_come_back():
-    from thermocald_drivers.pixel_formats import unpack_10
+    from thermocald_drivers.support import unpack_10
 
     values = rng.integers(0, 1024, (HEIGHT, WIDTH), np.uint16)
     assert np.array_equal(unpack_10(pack_10(values)), values)

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from thermocald_drivers import chips
-from thermocald_drivers.android_thermometer import battery
+from thermocald_drivers.android_phone import battery
 from thermocald_drivers.kernel import HwmonThermometer, IioThermometer
 from thermocald_drivers.serial_line import UNITS, SerialThermometer
 

@@ -15,7 +15,7 @@ import psycopg
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from tests.commands import succeed
 from thermocald.store.server.connection import ServerAddress
-from thermocald.store.server.writer import ServerWriter
+from thermocald.store.server.reader import ServerWriter
 
 # an epoch a minute for two days: temperatures of 16 K
 BASE = GeneratedCamera("", epochs=2880, interval=60.0)

@@ -22,8 +22,7 @@ import psycopg
 from tests.fleet.conftest import address, count, execute
 from thermocald.store.schema import COLUMN_NAMES
 from thermocald.store.server.connection import ServerAddress, grant, is_server
-from thermocald.store.server.reader import ServerStore
-from thermocald.store.server.writer import ServerWriter
+from thermocald.store.server.reader import ServerStore, ServerWriter
 
 
 def test_a_last_report_that_is_lost_is_sent_again(filled, server, monkeypatch):

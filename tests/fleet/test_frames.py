@@ -68,7 +68,7 @@ def test_a_day_has_a_limit_and_the_next_goes_on(server, station):
 
 def test_it_goes_on_where_the_network_failed(server, station, monkeypatch):
     from thermocald.errors import ServerGone
-    from thermocald.store.server.writer import ServerWriter
+    from thermocald.store.server.reader import ServerWriter
 
     store, folder = station
     send, calls = ServerWriter.write_frame, []
@@ -110,7 +110,7 @@ def test_a_frame_that_leads_out_of_its_folder_is_not_read(server, station, tmp_p
 def test_the_server_refuses_a_frame_that_is_not_what_was_read(server, station, monkeypatch):
     store, folder = station
     wrong = SimpleNamespace(sha256=hashlib.md5)
-    monkeypatch.setattr("thermocald.store.server.writer.hashlib", wrong)
+    monkeypatch.setattr("thermocald.store.server.reader.hashlib", wrong)
     forwarder = Forwarder(store, address(server), "bank", frames=FrameRule(folder, "events"))
     done = forwarder.send_waiting()
     assert (done.sent["frame"], done.refused) == (0, 2)

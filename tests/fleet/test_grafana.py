@@ -15,7 +15,7 @@ import psycopg
 from benchmarks.generated_fleet import STORE, GeneratedCamera, add_camera
 from tests.commands import succeed
 from thermocald.store.server.connection import ServerAddress, grant
-from thermocald.store.server.writer import ServerWriter
+from thermocald.store.server.reader import ServerWriter
 
 # what Grafana's PostgreSQL source puts in the place of its macros and variables
 MACROS = {

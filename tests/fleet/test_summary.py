@@ -15,7 +15,7 @@ import psycopg
 from benchmarks.generated_fleet import GeneratedCamera, add_camera
 from tests.fleet.conftest import address, execute
 from thermocald.store.server.fleet_reader import SPREAD, FleetReader
-from thermocald.store.server.writer import ServerWriter
+from thermocald.store.server.reader import ServerWriter
 
 SLOT_S = 21600.0
 VALUES = ("c", "sd_c", "x0", "sd_x0", "y0", "sd_y0")

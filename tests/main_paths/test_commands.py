@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 from datetime import UTC, datetime
 from pathlib import Path
@@ -158,3 +159,94 @@ def test_calibrate_photographs(photographs, tmp_path):
     )  # fmt: skip
     assert [p["status"] for p in document["photographs"]] == ["ok"] * 3
     assert truth["c"].min() - 0.002 < document["interior"]["c"] < truth["c"].max() + 0.002
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory):
+    """A camera that warms up, and a copy of it with rows that are left out or changed."""
+    folder = tmp_path_factory.mktemp("odd")
+    run("simulate", "--preset", "rpi-v2.1-heating", "--out", folder / "plain", "--seed", 5)
+
+    def write(name, table, change):
+        out = folder / name
+        shutil.copytree(folder / "plain", out)
+        with (out / table).open() as file:
+            before = list(csv.DictReader(file))
+        kept = [row for k, row in enumerate(before) if change(k, row)]
+        with (out / table).open("w", newline="") as file:
+            writer = csv.DictWriter(file, before[0])
+            writer.writeheader()
+            writer.writerows(kept)
+        return out
+
+    return folder, write
+
+
+def rate_of_c(recording: Path, out: Path) -> tuple[float, float]:
+    """The fitted rate of c and its standard deviation, µm/K."""
+    said = run("fit", recording, "-o", out).stdout
+    line = next(line for line in said.splitlines() if line.strip().startswith("c:"))
+    words = line.replace("−", "-").split()
+    return float(words[1]), float(words[3])
+
+
+def test_epochs_of_few_targets_among_others_of_many(odd, tmp_path):
+    """They carry no weight, and took what hidden targets have in common off the others."""
+    folder, write = odd
+    few = write("few", "observations.csv", lambda k, row: int(row["epoch"]) % 3 != 0 or k % 16 == 0)
+    (whole, sd), (part, sd_part) = (
+        rate_of_c(one, tmp_path / "camera.yaml") for one in (folder / "plain", few)
+    )
+    assert abs(part - whole) < 2 * np.hypot(sd, sd_part)
+    assert sd_part < 2 * sd
+    run("discover", few)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_epochs_of_the_same_time(odd, tmp_path):
+    """A rate over no time is not infinite."""
+    _, write = odd
+    times: list[str] = []
+
+    def change(k, row):
+        times.append(row["frame_time"])
+        row["frame_time"] = times[min(k, 10) if k < 15 else k]
+        return True
+
+    same = write("same", "epochs.csv", change)
+    rate_of_c(same, tmp_path / "camera.yaml")
+    run("discover", same)
+
+
+def test_names_of_targets_that_are_exchanged(odd, tmp_path):
+    """They are said where the series is read, and tell nothing of the camera."""
+    folder, write = odd
+
+    def change(k, row):
+        row["target"] = {"x22": "y37", "y37": "x22"}.get(row["target"], row["target"])
+        return True
+
+    exchanged = write("exchanged", "observations.csv", change)
+    (whole, sd), (found, sd_found) = (
+        rate_of_c(one, tmp_path / "camera.yaml") for one in (folder / "plain", exchanged)
+    )
+    assert abs(found - whole) < sd
+    assert sd_found < 1.5 * sd
+    for command in ("check", "replay", "study", "fit", "discover"):
+        out = ("-o", tmp_path / "camera.yaml") if command == "fit" else ()
+        done = run(command, exchanged, *out)
+        said = " ".join((done.stdout + done.stderr).split())
+        exchange = re.search(r"x22 4\d\d px, y37 4\d\d px off; their names look exchanged", said)
+        assert exchange, command
+    assert "elsewhere" not in run("check", folder / "plain").stdout
+
+
+def test_a_thermometer_that_never_answered(odd, tmp_path):
+    _, write = odd
+
+    def change(k, row):
+        row["board_temperature"] = ""
+        return True
+
+    rate_of_c(write("silent", "epochs.csv", change), tmp_path / "camera.yaml")
+    assert "board_temperature" not in (tmp_path / "camera.yaml").read_text()

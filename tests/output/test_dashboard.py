@@ -173,6 +173,21 @@ def test_the_camera_of_now_in_opencv_terms_and_for_ros(client_of, folders):
     assert "degC" in client.get("/camera.yaml").text
 
 
+def test_a_weak_epoch_of_whose_variance_rounding_left_nothing(folders):
+    """A complex number ended the daemon: its status could not be written."""
+    from thermocald.daemon.live_state import LiveState
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.camera.conversions import opencv_terms
+
+    values = np.array([3.04, 0.012, -0.021, -6e-3, 0, 0, 0, 0, 0, 0])
+    variances = np.array([1e-8, -1e-18, 1e-8, 0, 0, 0, 0, 0, 0, 0])
+    terms = opencv_terms(Sensor(3280, 2464, 0.00112), values, np.diag(variances))
+    assert terms["sd_fx"] > 0
+    assert np.isnan(terms["sd_cx"])
+    LiveState(folders[1]).write_epoch("weak", {"opencv": terms}, None, None)
+    assert json.loads((folders[1] / "weak.json").read_text())["row"]["opencv"]["sd_cx"] is None
+
+
 def test_status_last_epoch_frame_and_events(client_of):
     client = client_of()
     assert client.get("/api/status").json()["cameras"]["rpi"]["last"]["epoch"] == 1200

@@ -16,7 +16,7 @@ from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.thermal.control_points import ControlPoints
 from thermocald.errors import DataError
-from thermocald.output.pyorc import opencv_pose, renew_configuration
+from thermocald.output.series_export import opencv_pose, renew_configuration
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from tests.photogrammetry.fields import corner_field
-from thermocald.photogrammetry.field.planes import field_normals, field_sheets, target_normals
-from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.field.testfield import (
+    TestField,
+    field_normals,
+    field_sheets,
+    target_normals,
+)
 
 
 @pytest.mark.parametrize(

@@ -238,8 +238,27 @@ def test_what_a_held_affinity_does_to_the_level_is_said(held, moved):
     plain = {"target_noise": False, "snooping_alpha": 0.0}
     r = scene.adjusted_series(field, observations, **plain)
     off = np.abs(r.values.mean(axis=0)[:3] - truth[:3])
-    assert off[moved] == pytest.approx(r.affinity_bias[moved], rel=0.02)
-    assert (off < 1.02 * r.affinity_bias[:3]).all()
+    which = r.affinity.names.index(held)
+    assert r.affinity.differences == pytest.approx(1e-4 * np.eye(2)[which], abs=3e-6)
+    assert r.affinity.differences[which] > 5 * r.affinity.sds[which]
+    moves = 1e-4 * np.abs(r.affinity.moves[which, :3])
+    assert off[moved] == pytest.approx(moves[moved], rel=0.02)
+    assert (off < 1.02 * moves + 1e-6).all()
     r = scene.adjusted_series(field, observations, free=(*DEFAULT_FREE, "C1", "C2"), **plain)
-    assert not r.affinity_bias.any()
+    assert not r.affinity.names
     assert abs(r.values.mean(axis=0)[moved] - truth[moved]) < 0.1 * off[moved]
+
+
+@pytest.mark.parametrize("exterior", ["per_epoch", "series"])
+def test_frames_that_are_all_the_same_keep_a_variance(exterior):
+    """A camera that gives its last frame again: errors of whole markers then seem to correlate."""
+    plain, _, observations = series(np.random.default_rng(4), 45, coordinate_error=0.02, hidden=0.0)
+    names = [f"{i // 4}.{i % 4}" for i in range(len(plain))]
+    field = TestField.build(names, plain.points, 0.02, kinds="marker_corner")
+    frames = [*observations, *(observations[-1:] * 90)]
+    r = scene.adjusted_series(field, frames, exterior=exterior)
+    assert r.pairs is not None
+    own = list(OWN)
+    least = np.linalg.eigvalsh(r.covariance[r.ok][:, own][:, :, own])[:, 0]
+    assert r.ok.sum() > 100
+    assert (least > 0).all()

@@ -92,7 +92,7 @@ def test_every_effect_is_here():
 def test_parameters_are_found_again(tmp_path, name):
     true, known = CASES[name]
     simulation, recording = record(tmp_path, ModelEffect(name, true))
-    series = reduce_series(series_input(recording), affinity=False, strict=False)
+    series = reduce_series(series_input(recording), strict=False)
     kind = catalogue.get(name)
     start = {**dict.fromkeys(kind.usual, 0.0), **known}
     fitted = fit_thermal_model([series], [ModelEffect(name, start)], T0=simulation.model.T0)
@@ -115,7 +115,7 @@ def test_a_lag_is_found_again(tmp_path):
     """The quick one of the above."""
     true = ModelEffect("thermal_lag", {"tau": 84.0})
     simulation, recording = record(tmp_path, true, seed=11)
-    series = reduce_series(series_input(recording), affinity=False, strict=False)
+    series = reduce_series(series_input(recording), strict=False)
     fitted = fit_thermal_model(
         [series], [ModelEffect("thermal_lag", {"tau": 10.0})], T0=simulation.model.T0
     )

@@ -24,7 +24,7 @@ from thermocald.files import read_yaml
 from thermocald.photogrammetry.camera_files import read_camera
 from thermocald.photogrammetry.camera_files.camera_record import number
 from thermocald.photogrammetry.targets.image_file import decode_grey, image_size
-from thermocald.store.logger.photographs import read_photograph
+from thermocald.store.logger.photographs import find_copies, read_photograph
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.table import Table
 from thermocald.store.recording.testfield_file import read_testfield
@@ -158,3 +158,10 @@ def test_damaged_exif_is_no_warning(tmp_path):
         except ThermocaldError:
             refused += 1
     assert refused
+
+
+def test_a_file_that_cannot_be_read_hides_no_copy(tmp_path):
+    for name in ("a.jpg", "c.jpg"):
+        (tmp_path / name).write_bytes(b"the same")
+    paths = [tmp_path / name for name in ("a.jpg", "gone.jpg", "c.jpg")]
+    assert find_copies(paths) == {2: 0}

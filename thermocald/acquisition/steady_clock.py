@@ -14,7 +14,7 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from thermocald.hal import Clock, SystemClock
+from thermocald.hal import Clock, SystemClock, read_together
 from thermocald.machine import NOT_BEFORE, machine_clock_trusted
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class SteadyClock:
     ) -> None:
         self._machine = machine or SystemClock()
         self._synchronised = synchronised or machine_clock_trusted
-        self._offset = self._machine.utc() - self._machine.monotonic()
+        self._offset = _offset(self._machine)
         self._seen = self._offset
         self._seen_at = float("-inf")
         self._was_synchronised = self._synchronised()
@@ -87,7 +87,7 @@ class SteadyClock:
     def check(self) -> ClockStep | None:
         """Look whether the machine's clock was stepped, or a step has stood for long enough."""
         now = self._machine.monotonic()
-        offset = self._machine.utc() - now
+        offset = _offset(self._machine)
         learned = not self._was_synchronised and self._synchronised()
         self._was_synchronised = self._synchronised()
         step = offset - self._seen
@@ -127,3 +127,9 @@ class SteadyClock:
         """Whether ages may be judged by this clock: it is trusted, and has not leapt for a day."""
         since_leap = self._machine.monotonic() - self._leapt_at
         return self.trusted() and since_leap >= _SETTLE_S and self.utc() >= NOT_BEFORE
+
+
+def _offset(machine: Clock) -> float:
+    """UTC minus monotonic time, s."""
+    monotonic, utc = read_together(machine.monotonic, machine.utc)
+    return utc - monotonic

@@ -62,8 +62,7 @@ def import_(
     """
     from thermocald.daemon.soundness import calibration_doubts
     from thermocald.store.logger.clock import device_clock
-    from thermocald.store.logger.photographs import read_photographs
-    from thermocald.store.logger.series import read_series, write_photographs
+    from thermocald.store.logger.photographs import read_photographs, read_series, write_photographs
     from thermocald.store.recording.reader import read_recording
     from thermocald.store.recording.sense import doubt_lines
     from thermocald.store.recording.testfield_file import read_testfield

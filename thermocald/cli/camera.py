@@ -134,13 +134,13 @@ def at(
     --reference clicked.jpg --frame now.jpg -o warm.json
     """
     import thermocald as tc
-    from thermocald.output import pyorc
+    from thermocald.output import series_export
 
     if (to == "pyorc") != (renew is not None) or (renew is not None and out is None):
         raise UsageError("--to pyorc needs --renew, its camera configuration, and --out")
     thermal = tc.load_camera(model)
     if renew is not None:
-        thermal = thermal.for_images(*pyorc.image_size(renew))
+        thermal = thermal.for_images(*series_export.image_size(renew))
     warned(thermal)
     with warnings_said():
         found = tc.predict(thermal, temperature, extrapolate=extrapolate)
@@ -151,7 +151,7 @@ def at(
         if renew is None:
             statement = found.state.write(out, to, comment)
         else:
-            renewed = pyorc.renew_configuration(renew, found.state, reference, frame)
+            renewed = series_export.renew_configuration(renew, found.state, reference, frame)
             if renewed.control.assumed:
                 say(renewed.control.assumed)
             statement = renewed.write(out)

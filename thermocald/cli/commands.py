@@ -51,7 +51,7 @@ class Entry(NamedTuple):
 PANELS = {
     "Measure": {
         "demo": Entry("demo", "Try it all on a rendered camera, without hardware"),
-        "devices": Entry("check", "List attached cameras, thermometers and outputs"),
+        "devices": Entry("run", "List attached cameras, thermometers and outputs"),
         "session": Entry("session", "Take one measurement series, from check to report", True),
         "run": Entry("run", "Acquire, calibrate and keep epochs until told to end"),
         "status": Entry("run", "Say how the daemon is doing"),
@@ -61,8 +61,8 @@ PANELS = {
         "simulate": Entry("demo", "Make a recording of a simulated camera that warms up"),
     },
     "Analyse": {
-        "replay": Entry("replay", "Calibrate every epoch of a recording, and say how it drifts"),
-        "export": Entry("replay", "Write one row per epoch as CSV, JSON or Parquet"),
+        "replay": Entry("study", "Calibrate every epoch of a recording, and say how it drifts"),
+        "export": Entry("study", "Write one row per epoch as CSV, JSON or Parquet"),
         "study": Entry("study", "Test how the camera changes with its temperature; report it"),
         "discover": Entry("study", "Find which effect a model misses, name it, prove it"),
         "fit": Entry("study", "Fit a thermal model to all series of a camera"),
@@ -84,8 +84,8 @@ PANELS = {
         "server": Entry("server", "Make a server's tables, and let stations write to them", True),
     },
     "Look after": {
-        "doctor": Entry("check", "Say what this machine lacks, and what mends it"),
-        "check": Entry("check", "Say whether a recording, configuration or store is sound"),
+        "doctor": Entry("run", "Say what this machine lacks, and what mends it"),
+        "check": Entry("run", "Say whether a recording, configuration or store is sound"),
         "backup": Entry("archive", "Copy a store that is in use, and verify the copy"),
         "archive": Entry("archive", "Write a store's series as recordings; delete old frames"),
         "convert": Entry("archive", "Rewrite a recording's observations as Parquet or CSV"),

@@ -1,15 +1,29 @@
-"""`thermocald demo` and `simulate`: a camera that warms up, without hardware."""
+"""`thermocald demo` and `simulate`: a camera that warms up, without hardware.
+
+The demo is the daemon on a virtual clock: frames of a corner field, a thermometer, 25 minutes of
+heating and cooling, an effect hidden in it; what was put in stands beside what was found.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import typer
 
+import thermocald as tc
 from thermocald.cli.commands import expert
 from thermocald.cli.common import JsonOption, SeedOption, progress, say, show, write_json
-from thermocald.errors import UsageError
+from thermocald.errors import DataError, UsageError
+from thermocald.files import make_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from thermocald.arrays import Array
+    from thermocald.daemon.station import Station
 
 
 def demo(
@@ -27,8 +41,6 @@ def demo(
 
     Example: thermocald demo --out /tmp/demo
     """
-    from thermocald.demonstration import discover_hidden_effect, run_demo
-
     say(f"a rendered camera (3280 × 2464) looks at a corner field for {epochs} epochs of 10 s")
     with progress(epochs, "epochs") as advance:
         document = run_demo(out, epochs, seed, advance)
@@ -125,3 +137,116 @@ def simulate(
     assert made.simulation is not None
     document = {**made.simulation.as_dict(), "recording": out}
     show(document, json, f"{out}: {made.simulation.lines()[0]}")
+
+
+_NAMES = ("c", "x0", "y0")  # the first of the interior orientation
+_HIDDEN = "thermal_lag"
+_TAU_S = 75.0
+
+
+def run_demo(out: Path, epochs: int, seed: int, advance: Callable[[int], None]) -> dict[str, Any]:
+    """Take epochs of a rendered camera into a store and a recording; return what `demo` writes.
+
+    advance: receives how many epochs are done. Raises DataError where the folder is not empty.
+    """
+    if out.exists() and any(out.iterdir()):
+        raise DataError(f"{out}: exists and is not empty; give another folder with --out")
+    series, truth = _acquire(out, epochs, seed, advance)
+    table = series.calibrate(exterior="series")
+    ok, temperature = table.ok, table.temperature
+    return {
+        "format": "thermocald-demo/1",
+        "epochs": epochs,
+        "ok": int(ok.sum()),
+        "targets": len(series.testfield),
+        "sigma0": float(np.median(table.sigma0[ok])),
+        "temperature": [float(np.nanmin(temperature)), float(np.nanmax(temperature))],
+        "parameters": _compare(table, truth, series.head.camera.sensor.pixel_pitch),
+        "store": out / "demo.db",
+        "recording": out / "M1",
+    }
+
+
+def _acquire(
+    out: Path, epochs: int, seed: int, advance: Callable[[int], None]
+) -> tuple[tc.Series, Array]:
+    """Have the daemon take the epochs on a virtual clock, then write their recording.
+
+    Returns what was taken, and the true interior orientation (E, 10) at the frames' times.
+    """
+    from thermocald.daemon.plan import demo_config
+    from thermocald.daemon.service import Service
+    from thermocald.daemon.systemd import set_up_logging
+    from thermocald.hal import VirtualClock, open_device
+    from thermocald.store.database.archive import archive_series
+    from thermocald.store.database.store import Store
+
+    make_folder(out)
+    config = demo_config(out, seed)
+    clock = VirtualClock()
+    begin = clock.utc() - clock.monotonic()
+    taken = 0
+    set_up_logging("warning")
+
+    def look(station: Station) -> bool:
+        nonlocal taken
+        run = station.cameras[0].run
+        now = 0 if run is None else run.taken
+        advance(now - taken)
+        taken = now
+        return False
+
+    Service(config, epochs=epochs, until_finished=True, on_turn=look, clock=clock).run()
+    advance(epochs - taken)
+    with Store.open(config.store.path) as store:
+        archive_series(store, store.find_series(), out / "M1")
+    series = tc.open(config.store.path)
+    with open_device("camera", "mock", {"seed": seed}, VirtualClock()) as camera:
+        return series, np.array([camera.truth(float(t) - begin).iop[0] for t in series.frame_time])
+
+
+def _compare(table: tc.Epochs, truth: Array, pitch: float) -> list[dict[str, Any]]:
+    """Per kelvin and over the series: the drift put in and the drift found; pitch: of a pixel."""
+    ok = table.ok & np.isfinite(table.temperature)
+    t = table.temperature[ok] - table.temperature[ok].mean()
+    hottest = int(np.argmax(table.temperature[ok]))
+    rows = []
+    for k, name in enumerate(_NAMES):
+        found, sd, true = table.values[ok, k], table.sd[ok, k], truth[ok, k]
+        error = (found - found.mean()) - (true - true.mean())
+        drifts = {
+            "drift_in": float(true[hottest] - true[0]),
+            "drift_found": float(found[hottest] - found[0]),
+            "sd_drift_found": float(np.hypot(sd[hottest], sd[0])),
+        }
+        rows.append(
+            {
+                "name": name,
+                **{f"{key}_mm": drift for key, drift in drifts.items()},
+                **{f"{key}_px": drift / pitch for key, drift in drifts.items()},
+                "rate_in_mm_per_k": float(true @ t / (t @ t)),
+                "rate_found_mm_per_k": float(found @ t / (t @ t)),
+                "scatter_over_sd": float(np.sqrt(np.mean(error**2) / np.mean(sd**2))),
+            }
+        )
+    return rows
+
+
+def discover_hidden_effect(out: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Simulate a hidden lag, discover it on M1, prove it on M2; return the document."""
+    say(f"hiding an effect: the camera follows the thermometer with a lag of {_TAU_S:.0f} s")
+    folder = out / "discovery"
+    make_folder(folder)
+    M1, M2 = (
+        tc.simulate(
+            "rpi-v2.1-heating", effects={_HIDDEN: {"tau": _TAU_S}}, own_effects=False,
+            seed=seed + number, series=name, out=folder / name,
+        )
+        for number, name in enumerate(("M1", "M2"))
+    )  # fmt: skip
+    say("discovering: where do model and measurement disagree, and why?")
+    found = tc.discover(M1, verify=[M2], say=say)
+    document = found.as_dict()
+    document["model"] = str(found.save(folder / "camera.thermal.yaml"))
+    document["hidden"] = {"effect": _HIDDEN, "tau_s": _TAU_S}
+    return document

@@ -20,14 +20,14 @@ from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, S
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
-from thermocald.store.recording.reader import read_testfield
+from thermocald.store.recording.head import CameraSpec, Channel, Head
+from thermocald.store.recording.reader import open_recording, read_testfield
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from thermocald.analysis.online.running_series import RunningSeries
-    from thermocald.analysis.thermal.corrected_frame import FrameCorrector
+    from thermocald.analysis.thermal.correction import FrameCorrector
     from thermocald.analysis.thermal.gauge import GaugeCalibrator
     from thermocald.config import CalibrationConfig, CameraConfig, Config
     from thermocald.hal import Camera, Clock, Frame
@@ -97,7 +97,7 @@ def _plan_gauge(
     one: CameraConfig, calibration: CalibrationConfig, camera: Camera, *, corrected: bool
 ) -> CameraPlan:
     """Plan a camera that is predicted by its thermal model, and posed by control points."""
-    from thermocald.analysis.thermal.corrected_frame import FrameCorrector
+    from thermocald.analysis.thermal.correction import FrameCorrector
     from thermocald.analysis.thermal.gauge import plan_gauge
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 
@@ -247,8 +247,8 @@ def demo_config(folder: Path, seed: int) -> Config:
 
 
 def recording_config(path: Path) -> Config:
-    """Return a recording as camera and thermometer."""
-    head = read_head(path)
+    """Return a recording as camera and thermometer; RecordingError where it cannot be played."""
+    head = open_recording(path).head
     sensor = head.camera.sensor
     replay = {"driver": "replay", "recording": str(path.absolute())}
     period = max(0.05, head.interval)

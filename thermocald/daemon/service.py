@@ -205,6 +205,12 @@ class Service:
         store = self._guard.status()
         return f"{store['lost']} epochs were lost: {store['lost_why']}" if store["lost"] else ""
 
+    @property
+    def failed(self) -> str:
+        """Which cameras failed that were to be read to their end, and why; empty where none did."""
+        links = [line.link for line in self._station.cameras if self._until_finished]
+        return "; ".join(f"{one.name}: {one.why}" for one in links if one.state == "failed")
+
     def _loop(self) -> None:
         interval = watchdog_interval_s()
         turn_s = _TURN_S if interval is None else min(_TURN_S, interval)

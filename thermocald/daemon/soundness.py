@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
 
@@ -192,20 +193,21 @@ def _examine_recording(path: Path) -> dict[str, Any]:
 
 
 def calibration_doubts(recording: Recording) -> list[str]:
-    """Return what is doubtful in the interior orientation that some epochs give."""
+    """Return what is doubtful in the cameras that some epochs give, and in their test field."""
     from thermocald.acquisition.calibrator import Calibrator
+    from thermocald.analysis.series.recorded import misplaced_doubts
     from thermocald.store.recording.sense import interior_doubts
 
     calibrator = Calibrator.of_recording(recording)
-    last = len(recording) - 1
-    tried = [
-        calibrator.calibrate(recording.epochs[row]).adjustment
-        for row in np.unique(np.linspace(0, last, _TRIED).astype(int)).tolist()
-    ]
-    found = [a.values[:3] for a in tried if a.ok]
-    if not found:
+    rows = spread_rows(len(recording), _TRIED)
+    tried = [calibrator.calibrate(recording.epochs[row]).adjustment for row in rows.tolist()]
+    good = np.array([a.ok for a in tried])
+    if not good.any():
         return [f"none of {len(tried)} epochs can be calibrated: {tried[0].reason}"]
-    return interior_doubts(recording.camera, *np.median(found, axis=0).tolist())
+    found = np.array([a.values for a in tried if a.ok])
+    c, x0, y0 = np.median(found[:, :3], axis=0).tolist()
+    of_camera = interior_doubts(recording.camera, c, x0, y0)
+    return [*of_camera, *misplaced_doubts(recording, rows[good], found)]
 
 
 def _examine_config(path: Path, probe: bool) -> dict[str, Any]:

@@ -54,7 +54,7 @@ def describe_unnamed(x: Examination, gap: Gap) -> EffectFound:
     T = e.history.temperature()  # on all epochs; the rows may be blocks of them
     recorded: dict[str, Array] = {
         "temperature": e.averaged(T),
-        "rate of temperature": e.averaged(np.gradient(T, e.history.times)),
+        "rate of temperature": e.averaged(_rate(T, e.history.times)),
         "time": e.times,
         "sigma0": e.sigma0,
     }
@@ -240,7 +240,7 @@ def describe_misfit(x: Examination) -> dict[str, Any]:
     trajectories: dict[str, Array] = {
         "time": e.times - e.times.mean(),
         "temperature, bent": e.averaged((T - T.mean()) ** 2),
-        "rate of temperature": e.averaged(np.gradient(T, e.history.times)),
+        "rate of temperature": e.averaged(_rate(T, e.history.times)),
     }
     for name in e.history.readings:
         if name != e.history.reference:
@@ -285,3 +285,10 @@ def _measure_regions(e: ReducedSeries) -> list[dict[str, Any]]:
                 ratio = float(np.sqrt(np.mean(v**2)) / e.sigma_px)
                 out.append({"row": i, "column": j, "noise_ratio": ratio})
     return out
+
+
+def _rate(T: Array, times: Array) -> Array:
+    """Rate (E,) of a temperature, K/s, also where epochs have the same time."""
+    distinct, first = np.unique(times, return_index=True)
+    rate: Array = np.interp(times, distinct, np.gradient(T[first], distinct))
+    return rate

@@ -27,7 +27,7 @@ from thermocald.files import write_text
 from thermocald.names import FileFolder
 from thermocald.store.database.columns import KEPT
 from thermocald.store.database.store import Store
-from thermocald.store.server.writer import ServerWriter
+from thermocald.store.server.reader import ServerWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.field import CELLS, FieldCheck
+from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel
 from thermocald.numbers import UNITS, coefficient, parameter_label, percent, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, Sensor, project
@@ -121,7 +122,7 @@ def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
     """Measured minus adjusted image points of all photographs, as arrows; there may be none."""
     points, residuals = _used(result)
     lengths = np.linalg.norm(residuals, axis=1)
-    rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MOST_ARROWS)).astype(int))
+    rows = spread_rows(len(points), _MOST_ARROWS)
     arrows = Arrows(
         points[rows], residuals[rows], (sensor.width, sensor.height), PALETTE[0],
         max(1.5 * float(np.percentile(lengths, 95)), 1e-9) if len(rows) else 1.0,

@@ -11,16 +11,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.analysis.thermal.correction import (
+    STANDARD_INPUT,
     ImageCorrection,
+    RowBlock,
     correct_points,
     image_corrections,
+    row_blocks,
 )
-from thermocald.analysis.thermal.timed_rows import STANDARD_INPUT, RowBlock, row_blocks
 from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import make_folder, new_file, write_parts
 from thermocald.photogrammetry.targets.image_file import EncodedImage, with_metadata
 from thermocald.result import document_of
-from thermocald.store.logger.series import iso
+from thermocald.store.logger.photographs import iso
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -6,6 +6,7 @@ would cost the daemon 20 MB.
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,15 @@ if TYPE_CHECKING:
 
 MAD_TO_SD = 1.4826
 """Median absolute deviation of a normal distribution to its standard deviation."""
+
+_SMALL = 32  # rows
+
+
+def median_known(values: Array) -> Array:
+    """Median over the first axis without NaN; NaN where nothing is known."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=0))
 
 
 def diagonal_scale(N: Array) -> Array:
@@ -107,14 +117,26 @@ def inverse_of_determined(N: Array) -> Array:
     scale = diagonal_scale(N)
     both = np.outer(scale, scale)
     try:
-        factor = np.linalg.cholesky(N * both)
+        factor = np.linalg.cholesky(N * both).astype(np.float64, copy=False)
         if factor.diagonal().min() > 1e-6:
-            triangle = np.linalg.inv(factor)
+            triangle = _inverse_of_triangle(factor)
             regular: Array = (triangle.T @ triangle) * both
             return regular
     except np.linalg.LinAlgError:
         pass
     inverse: Array = np.linalg.pinv(N * both, rcond=1e-13, hermitian=True) * both
+    return inverse
+
+
+def _inverse_of_triangle(L: Array) -> Array:
+    """Inverse of a lower triangle, by halves: a quarter of the time of an inverse of any matrix."""
+    half = len(L) // 2
+    if half < _SMALL:
+        return np.linalg.inv(L).astype(np.float64, copy=False)
+    inverse = np.zeros_like(L)
+    upper = inverse[:half, :half] = _inverse_of_triangle(L[:half, :half])
+    lower = inverse[half:, half:] = _inverse_of_triangle(L[half:, half:])
+    inverse[half:, :half] = -(lower @ L[half:, :half]) @ upper
     return inverse
 
 

@@ -22,8 +22,14 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.field.planes import field_sheets, sheet_normals, target_normals
-from thermocald.photogrammetry.field.testfield import Distance, Observations, TestField
+from thermocald.photogrammetry.field.testfield import (
+    Distance,
+    Observations,
+    TestField,
+    field_sheets,
+    sheet_normals,
+    target_normals,
+)
 from thermocald.photogrammetry.frame.measurement import predict_circles
 from thermocald.photogrammetry.network.adjustment import Network, adjust_network, advice
 from thermocald.photogrammetry.targets import ring_code

@@ -427,10 +427,11 @@ class _OfFormula(Effect):
 def _say_constant(estimate: Mapping[str, Any], parameter: Parameter) -> str:
     """Write an estimate; one that is not determined as about so much."""
     value, sd = estimate["value"], estimate["sd"]
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     if sd is None:
-        return f"about {value:.2g} {parameter.unit}"
-    if parameter.log and sd is not None and not sd <= abs(value):
-        return f"about {value:.3g} {parameter.unit}"
+        return f"about {value:.2g}{unit}"
+    if parameter.log and not sd <= abs(value):
+        return f"about {value:.3g}{unit}"
     return say_estimate(estimate)
 
 

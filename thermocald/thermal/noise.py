@@ -218,6 +218,7 @@ def _slope_jumps(series: ReducedSeries, direction: Array) -> Array:
     """Return by how much (E,) K/s the slope of the temperature that the images show jumps."""
     precision = np.einsum("p,epq,q->e", direction, series.N, direction)
     rows = np.flatnonzero(precision > 0)
+    rows = rows[np.diff(series.times[rows], prepend=-np.inf) > 0]  # one epoch of each time
     out = np.zeros(len(precision))
     if len(rows) < 4:
         return out

@@ -19,7 +19,6 @@ angle, the image follows the principal distance in straight lines.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -29,14 +28,19 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust, cold_start
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
-from thermocald.photogrammetry.field.planes import plane_fit
-from thermocald.photogrammetry.field.testfield import Observations
-from thermocald.photogrammetry.linalg import MAD_TO_SD
+from thermocald.photogrammetry.field.testfield import (
+    FAR_ELSEWHERE,
+    Observations,
+    find_misplaced,
+    plane_fit,
+)
+from thermocald.photogrammetry.linalg import MAD_TO_SD, median_known
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     Partials,
     linearise,
     normal_matrices,
+    often_shown,
     right_hand_sides,
     sums_of_squares,
 )
@@ -211,32 +215,29 @@ _MEAN_IMAGE_PX, _SHARPEST_PX = 0.1, 1e-4  # standard deviation of the mean image
 _ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
 
-def _free_all(source: SeriesInput, affinity: bool) -> AdjustmentSettings:
-    """Free all parameters: where C1 or C2 is held, the principal point makes up for it, and the
-    partials are those of another camera. Weak ones stay near zero.
-    """
+def _free(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSettings:
+    """Free some parameters of the interior orientation. Weak ones stay near zero."""
     c = source.principal_distance or source.sensor.width * source.sensor.pixel_pitch
     spreads = (0.3 / c**2, 0.3 / c**4, 0.3 / c**6, 0.02 / c, 0.02 / c, 0.02, 0.02)
-    free = IOP_NAMES if affinity else IOP_NAMES[:-2]
-    priors = {n: (0.0, sd) for n, sd in zip(IOP_NAMES[3:], spreads, strict=True) if n in free}
-    return AdjustmentSettings(free, priors, max_rejected=0.9, bounds=_ANY_GEOMETRY)
+    priors = {n: (0.0, sd) for n, sd in zip(IOP_NAMES[3:], spreads, strict=True) if n in names}
+    return AdjustmentSettings(names, priors, max_rejected=0.9, bounds=_ANY_GEOMETRY)
 
 
-def linearise_series(source: SeriesInput, affinity: bool) -> Partials:
+def linearise_series(source: SeriesInput) -> Partials:
     """Linearise at one camera for the mean image of the series."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        mean = np.nanmedian(source.grid.points, axis=0)
+    mean = median_known(source.grid.points)
     # targets seen in half of the epochs that show any carry the orientation
     looked = int(source.grid.observed.any(axis=1).sum())
     often = source.grid.observed.sum(axis=0) >= 0.5 * max(looked, 1)
     rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
     seen = Observations(rows, mean[rows], np.full((len(rows), 2), _MEAN_IMAGE_PX))
-    settings = _free_all(source, affinity)
-    found = cold_start(
-        source.sensor, source.field, seen, settings, source.principal_distance,
-        None if affinity else source.interior,
-    )  # fmt: skip
+    # where C1 or C2 is held, the principal point makes up for it, and the partials are those of
+    # another camera; but before one wall all together may lead nowhere
+    settings, held = _free(source, IOP_NAMES), _free(source, IOP_NAMES[:-2])
+    c = source.principal_distance
+    found = cold_start(source.sensor, source.field, seen, settings, c)
+    if found.interior is None:
+        found = cold_start(source.sensor, source.field, seen, held, c, source.interior)
     if found.interior is None or found.exterior is None:
         raise DataError(
             f"{source.name}: the camera cannot be oriented on its mean image: {found.reason}"
@@ -259,14 +260,13 @@ def reduce_series(
     T0: float | None = None,
     scale: Array | None = None,
     *,
-    affinity: bool = True,
     strict: bool = True,
 ) -> ReducedSeries:
     """Check a series and reduce it.
 
     T0 °C: the reference temperature, by default the mean of the series; scale (19,): px per unit of
-    the columns, of another series of the camera; affinity: whether C1 and C2 are free where the
-    projection is linearised; strict: whether the series must carry a discovery, else only a fit.
+    the columns, of another series of the camera; strict: whether the series must carry a
+    discovery, else only a fit.
 
     Raises DataError where the data cannot carry it: it says what is missing.
     """
@@ -301,7 +301,17 @@ def reduce_series(
     )
     if strict:
         require_change(source, reference, instruments[reference])
-    return _reduce(source, times, history, instruments, linearise_series(source, affinity), scale)
+    at = linearise_series(source)
+    offsets = mean_misclosure(source, at)
+    bad = find_misplaced(offsets, at.iop[0] / source.sensor.pixel_pitch, FAR_ELSEWHERE)
+    if bad.any():
+        source = replace(source, grid=source.grid.reject(source.grid.observed & bad))
+    return _reduce(source, times, history, instruments, at, scale)
+
+
+def mean_misclosure(source: SeriesInput, at: Partials) -> Array:
+    """Return by how much each target (T, 2) px is seen elsewhere than the mean camera expects."""
+    return often_shown(source.grid.points - at.predicted)  # of points without weight too
 
 
 def reduce_together(inputs: Sequence[SeriesInput], T0: float | None = None) -> list[ReducedSeries]:
@@ -355,6 +365,11 @@ def _reduce(
     loss = 1.0 - 2 * int(used.sum()) / max(2 * int(count.sum()), 1)
     sigma0 = np.sqrt(np.maximum(lPl - yy, 0) / free / loss)
     enough = count >= criteria.MIN_TARGETS
+    if not enough.any():
+        raise DataError(
+            f"without gross errors no epoch has {criteria.MIN_TARGETS} targets or more: show more "
+            "targets"
+        )
     variance = float(np.median(sigma0[enough]) ** 2)
     v = np.where((seen & ~bad)[..., None], v, np.nan)
     weak = ~enough
@@ -379,7 +394,10 @@ def _reduce(
         variance=variance,
         correlation=_measure_slowness(v),
         gross=int(bad.sum()),
-        hidden=group_hidden_targets(w / variance, misclosure - offsets, A),
+        # epochs without weight say nothing of what is hidden in others either
+        hidden=group_hidden_targets(
+            np.where(enough[:, None, None], w, 0.0) / variance, misclosure - offsets, A
+        ),
         distortion=distortion,
     )
 

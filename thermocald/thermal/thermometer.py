@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.normals import spread_windows
@@ -53,6 +54,18 @@ class Thermometer:
     mixing: csr_array
     real: NDArray[np.bool_]
     noise: float
+
+    @property
+    def bulge(self) -> float:
+        """By how much the curves between readings run ahead of straight lines between them, as a
+        share of the time from one reading to the next: h/12τ where the temperature settles with τ.
+        """
+        known = np.isfinite(self.trajectory)
+        t, T, read = self.times[known], self.trajectory[known], self.times[self.real]
+        ahead = T - np.interp(t, read, self.trajectory[self.real])
+        slope = np.gradient(T, t)
+        power = float(trapezoid(slope**2, t)) * float(np.median(np.diff(read)))
+        return abs(float(trapezoid(ahead * slope, t))) / power if power > 0 else 0.0
 
     def _jumps(self) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return the readings' times (R,) s, by how much the slope K/s changes around each interval

@@ -158,9 +158,7 @@ def calibrate_photographs(
     measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
     prior = Prior(camera.sensor, camera.interior, principal_distance=camera.principal_distance)
-    copies: dict[int, int] = {}
-    with suppress(OSError):  # said below, of the photograph
-        copies = find_copies(paths)
+    copies = find_copies(paths)
     for k, path in enumerate(paths):
         try:
             if k in copies:

@@ -23,6 +23,7 @@ Estimation with Applications to Tracking and Navigation, section 5.4.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -181,6 +182,8 @@ _THERMOMETER_SD = 0.05  # K
 _WANDER_PX = 0.003  # of c, x0, y0 per √epoch beyond the thermal model
 _LAG = 0.5  # share of a change of temperature that may reach the camera later
 _ALPHA = 1e-6  # error probability of one test
+_HISTORY, _FEWEST = 100, 10  # epochs that show how much a camera moves anyway
+_USUAL, _BEYOND = 0.9, 3.0  # quantile of their chi-squares, and times that to be an event
 _RATE_SD_PX = 5.0  # prior sd of the rates per kelvin
 _UNKNOWN_STEP = 0.3  # K from epoch to epoch where there is no thermometer
 
@@ -228,6 +231,7 @@ class OnlineFilter:
         self._surprised = 0
         self._rise = self._rise_variance = 0.0
         self._readings, self._warmed = 0, False
+        self._history: deque[float] = deque(maxlen=_HISTORY)
 
     def update(
         self, adjustment: Adjustment, temperature: float, errors: EpochErrors | None = None,
@@ -388,7 +392,8 @@ class OnlineFilter:
         common = K * self._common
         S, cross = self._innovation(H, K, common, R)
         chi2 = float(v @ np.linalg.solve(S, v))
-        bound = chi2_quantile(1.0 - _ALPHA, n)
+        bound = self._bound(n)
+        self._history.append(chi2)
         change: Change = ""
         if chi2 > bound:
             self._surprised += 1
@@ -403,6 +408,17 @@ class OnlineFilter:
         self._update_covariance(H, K, common, R, gain)
         self.epochs += 1
         return Innovation(chi2, bound, n, change)
+
+    def _bound(self, n: int) -> float:
+        """Chi-square (n) beyond which an epoch is a surprise.
+
+        A mount in the wind sways by more than the normal distribution has: what it did in a tenth
+        of the epochs is nothing to report.
+        """
+        bound = chi2_quantile(1.0 - _ALPHA, n)
+        if len(self._history) < _FEWEST:
+            return bound
+        return max(bound, _BEYOND * float(np.quantile(self._history, _USUAL)))
 
     def _innovation(self, H: Array, K: Array, common: Array, R: Array) -> tuple[Array, Array]:
         """Covariance (n, n) of the innovation, and of the state with it (n + 3, n)."""

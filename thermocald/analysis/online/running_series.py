@@ -31,11 +31,12 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     project,
 )
+from thermocald.photogrammetry.field.testfield import find_misplaced
 from thermocald.photogrammetry.series.adjustment import adjusted, result
 from thermocald.photogrammetry.series.field_motion import taken_off
 from thermocald.photogrammetry.series.long_series import KnownSeries
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period
-from thermocald.photogrammetry.series.normals import ObservationGrid
+from thermocald.photogrammetry.series.normals import ObservationGrid, misplaced_targets
 from thermocald.photogrammetry.series.result import SeriesSettings
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ _TURNED_PX, _STAYS = 30.0, 2  # beyond one linearisation, and for so many epochs
 _USUAL_TREMBLE_PX = 0.08  # the most that mounts of the real cameras do that were looked at
 _LEFT = 0.01  # of the error probability of the series' test of a point, for a second one
 _AGAINST = ("too_many_rejected", "global_test")  # what a series says of an epoch it contradicts
+_MOST_SAID = 6  # targets by name
 _DOUBTED = 5  # epochs in a row that carry a result of their own and have none in the series
 
 _ESTIMATED = PARAMETER_NAMES[PRINCIPAL]
@@ -186,7 +188,7 @@ class RunningSeries:
         self._each: _Together | None = None
         self._series: _Together | None = None
         self._level = np.zeros(16)
-        self._shown = np.zeros(len(self._field), dtype=bool)
+        self._shown = self._wrong = np.zeros(len(self._field), dtype=bool)
         self._doubts = self._away = 0
 
     @property
@@ -256,6 +258,7 @@ class RunningSeries:
             own = replace(whole, covariance=whole.covariance + level)
         else:
             self._kept[-1].reported = values
+        wrong = self._wrong & self._kept[-1].grid.observed[0]
         return (
             replace(
                 alone,
@@ -267,7 +270,7 @@ class RunningSeries:
                 sigma0=own.sigma0,
                 redundancy=own.redundancy,
                 residuals=own.residuals[alone.targets],
-                rejected=tuple(np.flatnonzero(own.rejected).tolist()),
+                rejected=tuple(np.flatnonzero(own.rejected | wrong).tolist()),
             ),
             columns,
         )
@@ -298,6 +301,9 @@ class RunningSeries:
             )
         else:
             said = "each epoch has its own orientation, as configured"
+        if self._wrong.any():
+            names = [self._field.names[t] for t in np.flatnonzero(self._wrong)[:_MOST_SAID]]
+            said += f"; left out, seen elsewhere than the test field says: {', '.join(names)}"
         if self._restarted:
             said += f"; begun again after epoch {self._restarted}"
         return said
@@ -360,12 +366,12 @@ class RunningSeries:
         """The last epoch's own result, None where epochs share nothing that changes it, and that
         in the series.
         """
-        newest, n = self._kept[-1], len(self._kept)
-        known = self._series is not None and not self._shows_more(newest.grid)
+        newest, n = self._without_wrong(self._kept[-1].grid), len(self._kept)
+        known = self._series is not None and not self._shows_more(newest)
         if self._series is not None and known and self.epochs < self._look_at[1]:
-            whole = self._series.further(newest.grid, n)
+            whole = self._series.further(newest, n)
             if whole.status not in _AGAINST:
-                return self._further(newest.grid, whole), whole
+                return self._further(newest, whole), whole
         row = self._look()
         assert self._series is not None
         whole = self._series.epoch(row)
@@ -375,7 +381,7 @@ class RunningSeries:
             self._each = self._look_at_each(last)  # the program was started again
         due = self._each is None or self.epochs >= self._look_at[0]
         if not due and whole.status not in _AGAINST:
-            return self._further(newest.grid, whole), whole
+            return self._further(self._without_wrong(self._kept[-1].grid), whole), whole
         self._each = self._look_at_each()
         own = self._each.epoch(row)
         return replace(own, rejected=own.rejected | self._gross()[row]), whole
@@ -432,7 +438,15 @@ class RunningSeries:
         self._shown = np.asarray(grid.observed.any(axis=0))
         self._offsets = self._asked.target_offsets and self._shown.sum() <= _MOST_TARGETS
         s = replace(self._asked, drift_period=self._period, target_offsets=self._offsets)
-        self._series = series = self._together(grid, start, s, ())
+        alone, c_px = np.array([k.alone for k in kept]), start[0] / self._sensor.pixel_pitch
+        self._wrong = misplaced_targets(self._sensor, self._field, grid, alone)
+        while True:  # once, but where targets elsewhere drew the start to themselves
+            self._series = series = self._together(self._without_wrong(grid), start, s, ())
+            drawn = find_misplaced(series.sample.offsets, c_px)
+            if not drawn.any():
+                break
+            self._wrong = self._wrong | drawn
+        grid = self._without_wrong(grid)
         share = _OFTEN if self._hurried else 0.0 if self.epochs < _EACH else _SOON
         self._look_at[1] = self._again(share)
         if len(kept) < FEWEST_EPOCHS:
@@ -446,6 +460,10 @@ class RunningSeries:
         if moved:
             self._series = self._together(still, start, s, moved)
         return row
+
+    def _without_wrong(self, grid: ObservationGrid) -> ObservationGrid:
+        """Observations without targets that are elsewhere than the field has them."""
+        return grid.reject(np.broadcast_to(self._wrong, grid.observed.shape))
 
     def _own_looks(self) -> tuple[int, int]:
         """The last and the next epoch at which all are adjusted by themselves: the same ones
@@ -462,15 +480,16 @@ class RunningSeries:
         """Adjust the kept epochs, or the first ones, with an orientation of their own."""
         assert self._series is not None
         kept, grid, start, _ = self._laid_out()
-        moved = self._series.moved
-        grid = taken_off(grid, moved).reject(self._gross())
-        kept, grid = kept[:first], ObservationGrid(grid.points[:first], grid.weights[:first])
-        s = replace(self._own, drift_period=self._period)
-        if self._binds:
-            # the series has tested every point: only what is far off is left to a second test
-            s = replace(s, snooping_alpha=_LEFT * s.snooping_alpha)
-        # epochs by themselves do not show how well the field is known
-        each = self._together(grid, start, s, moved, self.field_variance)
+        each = self._series
+        if self._binds or first is not None:
+            grid = taken_off(self._without_wrong(grid), each.moved).reject(self._gross())
+            kept, grid = kept[:first], ObservationGrid(grid.points[:first], grid.weights[:first])
+            s = replace(self._own, drift_period=self._period)
+            if self._binds:
+                # the series has tested every point: only what is far off is left to a second test
+                s = replace(s, snooping_alpha=_LEFT * s.snooping_alpha)
+            # epochs by themselves do not show how well the field is known
+            each = self._together(grid, start, s, each.moved, self.field_variance)
         self._level = self._moved_level(kept, each.sample)
         self._look_at[0] = self._own_looks()[1]
         return each

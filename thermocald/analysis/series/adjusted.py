@@ -19,7 +19,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
     InteriorOrientation,
 )
-from thermocald.photogrammetry.field.planes import field_sheets
+from thermocald.photogrammetry.field.testfield import field_sheets, find_misplaced
 from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.field_motion import (
     FEWEST_EPOCHS,
@@ -36,6 +36,7 @@ from thermocald.photogrammetry.series.normals import (
     WithoutTargets,
     gathered,
     linearise,
+    misplaced_targets,
     spread_windows,
 )
 from thermocald.thermal.reduce import find_spikes
@@ -85,6 +86,7 @@ def still_field(
 
 
 _SOME = 20_000  # epochs that tell the start values
+_LOOKED_AT = 60  # that tell where the targets are
 _AS_READ = ("number", "frame_time", "temperature")
 
 
@@ -111,6 +113,22 @@ def table_of_series(
         raise DataError(f"{head.name}: no epoch has a result; most often: {why}")
     if start is None:
         start = np.median(apart.values[rows[:: max(len(rows) // _SOME, 1)]], axis=0)
+    wrong = np.zeros(0, dtype=np.int64)
+    few = spread_windows(len(source), _LOOKED_AT)
+    own = np.where(apart.ok[:, None], apart.values, np.nan)[np.r_[few]]
+    if np.isfinite(own).any():  # epochs of a long series are not calibrated one by one
+        far = misplaced_targets(head.camera.sensor, testfield, gathered(source, few), own)
+        wrong = np.flatnonzero(far)
+
+    def left_out() -> Epochs:
+        """The table without targets that are wrong, which count as rejected."""
+        fewer = WithoutTargets(source, wrong)
+        table = table_of_series(head, testfield, apart, fewer, settings, start, jobs, advance)
+        counts = [grid.observed[:, wrong].sum(axis=1) for _, grid in source.blocks()]
+        return replace(table, n_rejected=table.n_rejected + np.concatenate(counts))
+
+    if len(wrong):
+        return left_out()
     apart = replace(apart, head=head)
     settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
     if len(source) > together_at_most(len(testfield)):
@@ -118,6 +136,10 @@ def table_of_series(
     grid = gathered(source, [slice(0, len(source))])
     found = _as_one(testfield, apart, start, grid, settings)
     assert found.adjustment is not None
+    c_px = start[0] / head.camera.sensor.pixel_pitch
+    wrong = np.flatnonzero(find_misplaced(found.adjustment.offsets, c_px))
+    if len(wrong):  # they had drawn the start to themselves
+        return left_out()
     moved, still = still_field(
         head.camera.sensor, testfield, grid, found.adjustment, start, apart.number,
         apart.frame_time,

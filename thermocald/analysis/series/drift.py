@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.series.epochs import LEVEL, Course
+from thermocald.analysis.series.course import LEVEL, Course
 from thermocald.analysis.statistics.dependence import holm, slope_noise, slope_p_value
 from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PRINCIPAL

@@ -14,15 +14,16 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.acquisition.calibrator import calibrated_epochs
+from thermocald.analysis.series.course import Course, table_of
 from thermocald.errors import DataError, DriverMissing
 from thermocald.figures import BAND
 from thermocald.files import write_parts
-from thermocald.numbers import parameter_label, signed
+from thermocald.numbers import parameter_label, with_sd
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.covariances import AFFINITY
 from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
@@ -54,6 +55,7 @@ CAUSES_OF_SIGMA0 = (
     "distortion does not describe"
 )
 _TESTS_A_FIELD = 18  # redundant coordinates of a level: 16 targets
+_SHOWN_SDS = 5.0  # of an affinity that the targets show
 _LEVEL_OF_FEW = 1.6  # error over sd of 12 to 14 targets whose field is 3 to 10 times worse
 _UNEVEN = 1.3  # times the noise in the middle
 _ROWS = 20_000  # of a table that are worked on at a time
@@ -71,71 +73,6 @@ _EXTERIOR_WORDS = {
     "mount": "of the series with movements of the mount",
 }
 _DRAWN = ("c", "x0", "y0")
-LEVEL = 0.01
-"""A change that chance gives more rarely is a drift."""
-
-
-@dataclass(frozen=True, slots=True)
-class Course:
-    """One parameter over a series, in its own unit.
-
-    mean; scatter: standard deviation over the epochs; sd: stated by the adjustments, RMS; change:
-    of a straight line from the first to the last epoch, with sd_change; p: that chance gives as
-    much, corrected for the number of parameters; drifts: p below 1 %, with and without any single
-    group of targets; rests_on: the group without which there would be no drift;
-    per_kelvin, sd_per_kelvin, p_temperature: slope on the reference temperature, its standard
-    deviation and its p-value, corrected, NaN where that is constant or not known;
-    last_minus_first: between the first and the last epoch; sd_by_perspective: of that, if the
-    mount could stand anywhere in each: a mount that moves slowly is excluded no better.
-    """
-
-    JSON: ClassVar = {
-        "sd": "stated_sd", "sd_by_perspective": "sd_last_minus_first_by_perspective", "drifts": "",
-        "moves": "drift", "scatter_over_sd": "scatter_over_sd",
-    }  # fmt: skip
-
-    name: str
-    mean: float
-    scatter: float
-    sd: float
-    change: float
-    sd_change: float
-    p: float
-    drifts: bool
-    rests_on: str | None = None
-    per_kelvin: float = float("nan")
-    p_temperature: float = float("nan")
-    last_minus_first: float = float("nan")
-    sd_last_minus_first: float = float("nan")
-    sd_per_kelvin: float = float("nan")
-    sd_by_perspective: float = float("nan")
-
-    @property
-    def moves(self) -> bool:
-        """Whether the camera moved: in time, or with its temperature."""
-        return self.drifts or self.p_temperature < LEVEL
-
-    @property
-    def in_words(self) -> str:
-        """How much it moves, or `none`."""
-        if self.p_temperature < LEVEL:
-            return self.movement
-        if self.moves:
-            return f"in time (p {self.p:.1g})"
-        return f"none (only target {self.rests_on} moves)" if self.rests_on else "none"
-
-    @property
-    def movement(self) -> str:
-        """How much it moves: by the kelvin where it follows the temperature, else altogether."""
-        if self.p_temperature < LEVEL:
-            return signed(1e3 * self.per_kelvin, 1e3 * self.sd_per_kelvin, "µm/K")
-        moved = signed(1e3 * self.last_minus_first, 1e3 * self.sd_last_minus_first, "µm")
-        return f"{moved} from the first epoch to the last"
-
-    @property
-    def scatter_over_sd(self) -> float:
-        """How much more the parameter scatters than its standard deviations state."""
-        return self.scatter / self.sd
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -325,11 +262,19 @@ class Epochs(Result):
             )
         if held := document["held_affinity"]:
             label, micrometres = parameter_label(held["parameter"]), 1e3 * held["level_mm"]
-            out.append(
-                f"C1 and C2 are held: an affinity of {AFFINITY:g} would move the level of {label} "
-                f"by {micrometres:.2f} µm, {held['sds']:.1f} of its standard deviations; "
-                "differences between epochs are not concerned"
+            off = (
+                f"the level of {label} by {micrometres:.2f} µm, {held['sds']:.1f} of its standard "
             )
+            off += "deviations; differences between epochs are not concerned"
+            if shown := held.get("shown"):
+                differs = with_sd(shown["value"], shown["sd"])
+                out.append(
+                    f"{shown['name']} is held, and the targets show that it differs by {differs}, "
+                    f"which moves {off}: add {shown['name']} to --free, or state it in the camera "
+                    "file"
+                )
+            else:
+                out.append(f"C1 and C2 are held: an affinity of {AFFINITY:g} would move {off}")
         if document["exterior_choice"]:
             out.append(f"--exterior {self.exterior}: {document['exterior_choice']}")
         out += [f"{moved.sentence}; corrected for" for moved in self.field_movements]
@@ -337,7 +282,7 @@ class Epochs(Result):
             f"left out: target {name}, which moves by itself, and what belongs to it"
             for name in self.left_out
         ]
-        out += _table_of(self.drifts)
+        out += table_of(self.drifts)
         if limits := [c for c in self.drifts if isfinite(c.sd_by_perspective)]:
             sds = ", ".join(f"{c.name} ± {1e3 * c.sd_by_perspective:.3f}" for c in limits)
             out.append(
@@ -504,16 +449,27 @@ def _few_targets(adjustment: SeriesAdjustment | None) -> int | None:
 
 
 def _held_affinity(adjustment: SeriesAdjustment | None) -> dict[str, Any] | None:
-    """Return the parameter whose level a held affinity moves by most sds; None below one."""
-    if adjustment is None:
+    """Return the parameter whose level a held affinity moves by most sds; None below one.
+
+    It is the affinity that the targets show, with its difference and sd, or else `AFFINITY`.
+    """
+    held = None if adjustment is None else adjustment.affinity
+    if adjustment is None or held is None or not held.names:
         return None
+    size = np.abs(held.differences)
+    shown = (size > _SHOWN_SDS * held.sds) & (size > AFFINITY)
+    size = np.where(shown, size, 0.0 if shown.any() else AFFINITY)
     sd = np.where(adjustment.level_sd > 0, adjustment.level_sd, np.inf)[: len(_DRAWN)]
-    sds = adjustment.affinity_bias[: len(_DRAWN)] / sd
-    worst = int(np.argmax(sds))
-    if not sds[worst] > 1.0:
+    moved = np.abs(held.moves[:, : len(_DRAWN)]) * size[:, None]
+    which, worst = np.unravel_index(int(np.argmax(moved / sd)), moved.shape)
+    mm, sds = float(moved[which, worst]), float((moved / sd)[which, worst])
+    if not sds > 1.0:
         return None
-    mm = float(adjustment.affinity_bias[worst])
-    return {"parameter": PARAMETER_NAMES[worst], "level_mm": mm, "sds": float(sds[worst])}
+    found: dict[str, Any] = {"parameter": PARAMETER_NAMES[worst], "level_mm": mm, "sds": sds}
+    if shown.any():
+        difference = {"value": float(held.differences[which]), "sd": float(held.sds[which])}
+        found["shown"] = {"name": held.names[which], **difference}
+    return found
 
 
 def _imported(module: str) -> Any:
@@ -537,28 +493,6 @@ def _stood_still(stillness: Array) -> dict[str, Any]:
         "largest_chi2": float(values.max(initial=0.0)),
         "bound": limit,
     }
-
-
-def _table_of(drifts: Sequence[Course]) -> list[str]:
-    """A line for each parameter below a line of titles; nothing without parameters."""
-    titles = ("", "mean mm", "scatter µm", "sd µm", "ratio", "line µm ± sd",
-              "last - first µm ± sd", "drift")  # fmt: skip
-    rows = [
-        (
-            c.name, f"{c.mean:.5f}", f"{1e3 * c.scatter:.3f}", f"{1e3 * c.sd:.3f}",
-            f"{c.scatter_over_sd:.2f}", f"{1e3 * c.change:+.3f} ± {1e3 * c.sd_change:.3f}",
-            f"{1e3 * c.last_minus_first:+.3f} ± {1e3 * c.sd_last_minus_first:.3f}", c.in_words,
-        )
-        for c in drifts
-    ]  # fmt: skip
-    if not rows:
-        return []
-    rows = [titles, *rows]
-    width = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        " ".join([f"{name:<{width[0]}}", *map(str.rjust, right, width[1:])])
-        for name, *right in rows
-    ]
 
 
 def calibrate_epochs(

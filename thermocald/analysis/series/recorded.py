@@ -16,12 +16,15 @@ from thermocald.acquisition.calibrator import EPOCHS_OF_A_BLOCK, Calibrator, cal
 from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.epochs import Epochs, calibrate_epochs
+from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError
-from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, project
+from thermocald.photogrammetry.linalg import median_known
 from thermocald.photogrammetry.series.long_series import together_at_most
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.store.database.store import Store
+from thermocald.store.recording.sense import target_doubts
 from thermocald.store.series import EpochResult
 from thermocald.store.sources import StoredRecording
 
@@ -31,7 +34,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations
     from thermocald.store.recording.reader import Recording
@@ -75,7 +78,7 @@ def recorded_table(
 def _start(recording: Recording, calibrator: Calibrator) -> Array:
     """Parameters (16,) to start from: medians over some epochs from first to last."""
     found, reasons = [], []
-    for row in np.unique(np.linspace(0, len(recording) - 1, _STARTS).astype(np.int64)).tolist():
+    for row in spread_rows(len(recording), _STARTS).tolist():
         seen = recording.observations(row)
         if seen is None or not len(seen):
             continue
@@ -89,6 +92,23 @@ def _start(recording: Recording, calibrator: Calibrator) -> Array:
         raise DataError(f"{recording.head.name}: no epoch has a result; most often: {why}")
     start: Array = np.median(found, axis=0)
     return start
+
+
+def misplaced_doubts(recording: Recording, rows: Index, values: Array) -> list[str]:
+    """Return what is doubtful in the places of targets, from some epochs' own cameras.
+
+    rows (n,): the epochs; values (n, 16): their cameras.
+    """
+    if not recording.has_observations:
+        return []
+    sensor, targets = recording.camera.sensor, recording.testfield
+    found = np.full((len(rows), len(targets), 2), np.nan)
+    for at, row, camera in zip(found, rows.tolist(), values, strict=True):
+        if (seen := recording.observations(row)) is not None:
+            expected = project(sensor, camera[:10], camera[10:], targets.points)
+            at[seen.targets] = seen.points - expected[seen.targets]
+    c_px = float(np.median(values[:, 0])) / sensor.pixel_pitch
+    return target_doubts(targets.names, median_known(found), c_px)
 
 
 def _not_calibrated(recording: Recording) -> Epochs:

@@ -19,6 +19,14 @@ warm-up, or of heating and cooling, they are 0.9 of it for white noise, 0.9 to 1
 between 0.65 and 1.35. Noise whose memory is more than a seventh of the series leaves an order of
 magnitude (1.3 to 1.5 for phi = 0.99); where that is likely, `too_short` is set.
 
+Whether a parameter's variation is larger than its standard deviations explain the reference
+(section 4.1) asks with the two-sided moving variance over n consecutive measurements and the moving
+average of their squared standard deviations, by an F-test at each epoch, and gives the fraction of
+epochs at which it succeeds. Neighbouring windows have n-1 of n measurements in common, so these
+tests are not independent and their fraction has no p-value; `noise_models` gives one for the whole
+series. Of the correlations of the interior orientation it takes (section 4.3) the median of every
+coefficient over all epochs and both series, and calls their scatter the noise of the coefficients.
+
 Sources: Whittle (1953), Estimation and information in stationary time series; Harville (1974),
 Biometrika 61, 383-385, for the restricted likelihood; Pyper & Peterman (1998), Can. J. Fish. Aquat.
 Sci. 55, 2127-2140, for the effective sample size; for a straight line through points whose both
@@ -30,8 +38,8 @@ line. Am. J. Phys. 72, 367-375, for uncorrelated errors. With equal weights this
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -44,9 +52,9 @@ from thermocald.analysis.statistics.noise_models import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array, Mask
 
@@ -356,3 +364,135 @@ def correlation_matrix(columns: Sequence[Array]) -> Array:
             r = np.dot(a, b) / np.sqrt(np.dot(a, a) * np.dot(b, b))
             matrix[i, j] = matrix[j, i] = np.clip(r, -1.0, 1.0)
     return matrix
+
+
+_CHUNK = 1 << 15
+# A window is broken by gaps when it lasts this much longer than n regular measurements.
+_STRETCH = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class MovingFTest:
+    """The F-test of every epoch of a series.
+
+    index: epochs (m,) that are window centres; ratio (m,): of the moving variance over the moving
+    mean of the squared standard deviations; critical (m,): of it at the level; degrees_sd (m,): of
+    freedom of the mean squared standard deviations.
+    """
+
+    index: NDArray[np.int64]
+    ratio: Array
+    critical: Array
+    degrees_sd: NDArray[np.int32]
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Where the variance is significantly the greater one (m,)."""
+        return np.asarray(self.ratio > self.critical)
+
+    @property
+    def success_ratio(self) -> float:
+        """Fraction of epochs with success; NaN where nothing could be tested."""
+        return float(np.mean(self.success)) if len(self.index) else float("nan")
+
+
+def moving_mean(values: Array, window: int) -> Array:
+    """Return means of `window` consecutive values (n,) → (n - window + 1,)."""
+    return _moving(values, window, np.mean)
+
+
+def moving_variance(values: Array, window: int) -> Array:
+    """Return sample variances (n-1) of `window` consecutive values (n,) → (n - window + 1,)."""
+    return _moving(values, window, partial(np.var, ddof=1))
+
+
+def _moving(values: Array, window: int, statistic: Callable[..., Any]) -> Array:
+    if len(values) < window:
+        return np.empty(0)
+    views = np.lib.stride_tricks.sliding_window_view(values, window)
+    # In chunks: running sums would cancel where the drift is large against the noise.
+    parts = (views[start : start + _CHUNK] for start in range(0, len(views), _CHUNK))
+    return np.concatenate([statistic(part, axis=1) for part in parts])
+
+
+def unbroken_windows(time_s: Array, window: int) -> NDArray[np.int64]:
+    """First indices of the windows of consecutive measurements that no gap breaks."""
+    n = len(time_s)
+    if n < window:
+        return np.empty(0, dtype=np.int64)
+    interval = float(np.median(np.diff(time_s)))
+    span = time_s[window - 1 :] - time_s[: n - window + 1]
+    return np.flatnonzero(span <= _STRETCH * (window - 1) * interval)
+
+
+def moving_f_test(
+    values: Array,
+    sds: Array,
+    redundancy: Array,
+    time_s: Array,
+    window: int = 31,
+    alpha: float = 0.05,
+) -> MovingFTest:
+    """The reference's F-test at every epoch.
+
+    values, sds (n,): parameter and its standard deviations, finite; redundancy (n,): degrees of
+    freedom of each standard deviation (those of its adjustment); time_s (n,): finds gaps; window:
+    odd number of measurements; alpha: level of the one-sided test. The squared standard deviations
+    of a window carry the sum of its redundancies as degrees of freedom.
+    """
+    from scipy.stats import f
+
+    if window < 3 or window % 2 == 0:
+        raise ValueError(f"the window must be an odd number of at least 3, not {window}")
+    starts = unbroken_windows(time_s, window)
+    degrees = np.rint(moving_mean(redundancy, window)[starts] * window)
+    degrees_sd = np.maximum(degrees, 0).astype(np.int32)
+    # one quantile for every number of degrees that occurs, looked up
+    different = np.flatnonzero(np.bincount(degrees_sd))
+    quantiles = np.zeros(int(different.max(initial=0)) + 1)
+    quantiles[different] = f.isf(alpha, window - 1, np.maximum(different, 1.0))
+    ratio = moving_variance(values, window)[starts] / moving_mean(sds**2, window)[starts]
+    return MovingFTest(starts + window // 2, ratio, quantiles[degrees_sd], degrees_sd)
+
+
+@dataclass(frozen=True, eq=False)
+class IopCorrelations:
+    """Median (10, 10) and noise (10, 10) of the coefficients; 0 where a parameter is held fixed.
+
+    noise: standard deviation of a coefficient over the epochs, within its series; largest: the
+    largest deviation from the median; epochs: how many matrices were used.
+    """
+
+    JSON: ClassVar = {"largest": "largest_deviation"}
+
+    median: Array
+    noise: Array
+    largest: Array
+    epochs: int
+
+
+def correlations_of(covariances: Array) -> Array:
+    """Covariances (n, k, k) → correlations; 0 for parameters held fixed, 1 on the diagonal."""
+    sd = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+    inverse = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
+    r = covariances * inverse[..., :, None] * inverse[..., None, :]
+    k = r.shape[-1]
+    r[..., np.arange(k), np.arange(k)] = 1.0
+    return np.asarray(np.clip(r, -1.0, 1.0))
+
+
+def median_correlations(series: list[Array]) -> IopCorrelations:
+    """Medians over the correlation matrices (n_i, k, k) of several series together.
+
+    Raises ValueError where there is no matrix at all.
+    """
+    matrices = [m for m in series if len(m)]
+    if not matrices:
+        raise ValueError("no epoch has a covariance matrix")
+    every = np.concatenate(matrices)
+    median = np.median(every, axis=0)
+    within = np.concatenate([m - m.mean(axis=0) for m in matrices])
+    degrees = max(1, len(within) - len(matrices))
+    noise = np.sqrt(np.sum(within**2, axis=0) / degrees)
+    largest = np.max(np.abs(every - median), axis=0)
+    return IopCorrelations(median, noise, largest, len(every))

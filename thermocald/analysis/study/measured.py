@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.significance import correlations_of
+from thermocald.analysis.statistics.dependence import correlations_of
+from thermocald.arrays import spread_rows
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.store.recording.readings import interpolate_readings
@@ -163,7 +164,7 @@ def measured_series(
     if isinstance(source, StoredRecording) and adjustment is None:
         redundancy = source.store.series_columns(source.series, ["redundancy"])["redundancy"]
         exterior = str(source.series.settings.get("exterior", table.exterior))
-        rows = _spread(int(ok.sum()))
+        rows = spread_rows(int(ok.sum()), _MOST_MATRICES)
         numbers = table.number[ok][rows].tolist()
         covariances = source.store.covariances(source.series, numbers)[:, :10, :10]
         have = np.isfinite(covariances).all(axis=(1, 2))
@@ -173,7 +174,7 @@ def measured_series(
         redundancy, exterior = table.redundancy, table.exterior
         of = np.arange(len(ok)) if table.sampled is None else table.sampled
         some = np.flatnonzero(ok[of] & adjustment.ok)
-        some = some[_spread(len(some))]
+        some = some[spread_rows(len(some), _MOST_MATRICES)]
         rows = (np.cumsum(ok) - 1)[of[some]]
         covariances = adjustment.covariance[some][:, :10, :10]
     time_s = table.frame_time[ok]
@@ -215,11 +216,6 @@ def _thermometers(
         noise = estimate_reading_noise(read, readings, channel.resolution) if sd is None else sd
         found.append(Thermometer(name, values, noise))
     return tuple(found)
-
-
-def _spread(count: int) -> NDArray[np.int64]:
-    """Return some thousand rows at most, evenly over `count`."""
-    return np.unique(np.linspace(0, count - 1, min(count, _MOST_MATRICES)).astype(np.int64))
 
 
 def _clip(

@@ -25,6 +25,7 @@ import numpy as np
 
 from thermocald.analysis.camera.undistortion import ideal_points, image_grid
 from thermocald.analysis.statistics.dependence import correlation_matrix
+from thermocald.arrays import spread_rows
 from thermocald.errors import GeometryError
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import (
@@ -362,7 +363,7 @@ def trajectories(
 
 def _distances(one: MeasuredSeries, reference: str, distance_mm: float, size: int) -> Array:
     """Distances (e, k) mm on the plane of image points (k,) at epochs (e,)."""
-    rows = np.unique(np.linspace(0, len(one) - 1, min(len(one), _MOST_EPOCHS)).astype(int))
+    rows = spread_rows(len(one), _MOST_EPOCHS)
     fixed = {"first": one.values[0], "mean": one.mean, "last": one.values[-1]}[reference]
     points = image_grid(one.sensor, size)
     errors = plane_errors(one.sensor, fixed, one.values[rows], points, distance_mm)

@@ -25,9 +25,10 @@ from thermocald.analysis.statistics.dependence import (
     correlation_matrix,
     dependence,
     holm,
+    moving_f_test,
+    unbroken_windows,
 )
 from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
-from thermocald.analysis.statistics.significance import moving_f_test, unbroken_windows
 from thermocald.errors import GeometryError
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project

@@ -6,12 +6,14 @@ from both. The reference treats a cold- and a warm-started camera as two; so do 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.statistics.significance import IopCorrelations, median_correlations
+from thermocald.analysis.statistics.dependence import IopCorrelations, median_correlations
 from thermocald.analysis.study.montecarlo import (
     DistanceLaw,
     MonteCarlo,
@@ -84,6 +86,13 @@ def study(
 ) -> Study:
     """Study every camera; `progress` receives how many sets of IOP were simulated."""
     s = settings or StudySettings()
+    count = Counter((one.label, one.name) for one in series)
+    series = [
+        one
+        if count[one.label, one.name] == 1
+        else replace(one, name=f"{one.name} in {Path(one.source).name}")
+        for one in series
+    ]
     labels = dict.fromkeys(one.label for one in series)
     cameras = [
         study_camera(label, [one for one in series if one.label == label], s, progress)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from thermocald.analysis.camera.difference import CameraDifference
+from thermocald.analysis.camera.camera import CameraDifference
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry import camera_files

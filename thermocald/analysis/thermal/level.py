@@ -2,7 +2,8 @@
 
 The drifts say nothing of it and are taken off: every target's mean over a series, compared with
 the model's projection, is adjusted for the interior orientation that all series share and one
-exterior orientation of each. The affinity is held, as it can hardly be separated from the rest.
+exterior orientation of each. The affinity is as stated, or none, unless the targets show another
+one; that it is not known better counts in the covariance.
 
 Of targets that a user says have moved it is known when, and by how much against the camera that the
 others show.
@@ -16,7 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import (
-    DEFAULT_FREE,
     IOP_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 
-_FREE = [IOP_NAMES.index(n) for n in DEFAULT_FREE]
+AFFINITY_SD = 3e-3  # of C1 and C2: fx and fy of phones differ by 1e-4 to 3e-3
+_AFFINITY = [IOP_NAMES.index("C1"), IOP_NAMES.index("C2")]
+_SHOWN = 13.8  # of χ² with two degrees of freedom, 0.1 %: below it C1 and C2 are as stated
 _ITERATIONS = 8
 
 
@@ -77,10 +79,10 @@ def estimate_level(
     """Estimate the level from the targets' means, by Gauss-Newton.
 
     models: one per series, with a start; interior: whether the interior orientation is estimated
-    too, or the series' orientation alone. Returns the models with both, and the covariance (8, 8)
-    that the test field's coordinates give the interior orientation, in the order DEFAULT_FREE.
+    too, or the series' orientation alone. Returns the models with both, and the covariance
+    (10, 10) that the test field's coordinates give the interior orientation.
     """
-    n = len(_FREE) if interior else 0
+    n = len(IOP_NAMES) if interior else 0
     shared = models[0].interior.as_array()
     eops = []
     for m in models:
@@ -106,19 +108,32 @@ def estimate_level(
             mean, weight, _ = series_means(s, prediction)
             at = linearise(s.source.sensor, s.source.field, prediction.iop.mean(axis=0), eops[k])
             columns = np.concatenate([np.arange(n), n + 6 * k + np.arange(6)])
-            A = at.A[:, :, [*(_FREE if interior else []), *range(10, 16)]]
+            A = at.A[:, :, 10 - n :]
             PA = A * weight[..., None]
             M[np.ix_(columns, columns)] += np.einsum("tci,tcj->ij", PA, A)
             g[columns] += np.einsum("tci,tc->i", PA, mean)
             lever[columns] += np.einsum("tci,tcx->itx", PA, at.B).reshape(len(columns), -1)
+        if interior:
+            M[_AFFINITY, _AFFINITY] += AFFINITY_SD**-2
+            g[_AFFINITY] -= shared[_AFFINITY] / AFFINITY_SD**2
         inverse = inverse_of_determined(M)
         step = inverse @ g
-        shared[_FREE[:n]] += step[:n]
+        shared[:n] += step[:n]
         eops = [e + d for e, d in zip(eops, step[n:].reshape(-1, 6), strict=True)]
         if step @ M @ step < 1e-4:  # a hundredth of a standard deviation
             break
     moved = inverse[:n] @ (lever * field.sigmas.ravel())
-    return tuple(placed(m, k) for k, m in enumerate(models)), moved @ moved.T
+    of_field = moved @ moved.T
+    if interior:
+        stated = series[0].source.interior or models[0].interior.with_values(C1=0.0, C2=0.0)
+        off = shared[_AFFINITY] - stated.as_array()[_AFFINITY]
+        noise = inverse[np.ix_(_AFFINITY, _AFFINITY)]
+        if off @ np.linalg.solve(noise + of_field[np.ix_(_AFFINITY, _AFFINITY)], off) < _SHOWN:
+            step = -inverse[:, _AFFINITY] @ np.linalg.solve(noise, off)
+            shared[:n] += step[:n]
+            shared[_AFFINITY] = stated.as_array()[_AFFINITY]  # exactly
+            eops = [e + d for e, d in zip(eops, step[n:].reshape(-1, 6), strict=True)]
+    return tuple(placed(m, k) for k, m in enumerate(models)), of_field
 
 
 _GROSS = 6.0  # standard deviations from the neighbours in time

@@ -78,6 +78,12 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
             "they may be off by several of their standard deviations; use a field with depth, as "
             "three walls that meet"
         )
+    if seldom := document.get("read_seldom"):
+        lines.append(
+            f"  {', '.join(seldom['effects'])}: the temperature turns between two readings, and "
+            "how is not known: times may be off by several standard deviations; read the "
+            "thermometer more often"
+        )
     for effect in document["effects"]:
         parts = [
             f"{k} = {with_sd(v['value'], v.get('sd', math.nan), v['unit'])}"

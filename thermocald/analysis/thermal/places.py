@@ -10,6 +10,7 @@ profiles at one time are where the water touches them: together they are its lev
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.analysis.thermal.control_points import ControlPoints
+    from thermocald.analysis.thermal.correction import RowBlock
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-    from thermocald.analysis.thermal.timed_rows import RowBlock
     from thermocald.arrays import Array
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.store.logger.temperatures import TemperatureLog
@@ -311,6 +312,7 @@ def _levels(
         variance = 1.0 / float(weights.sum())
         level = variance * float((weights @ Z).sum())
         left, freedom = Z - level, len(rows) - 1
-        sigma0 = float(left @ weights @ left / freedom) ** 0.5 if freedom else 0.0
-        found.append(Level(time, level, variance**0.5, len(rows), sigma0))
+        squares = max(float(left @ weights @ left), 0.0)  # rounding may leave less
+        sigma0 = math.sqrt(squares / freedom) if freedom else 0.0
+        found.append(Level(time, level, math.sqrt(variance), len(rows), sigma0))
     return tuple(found)

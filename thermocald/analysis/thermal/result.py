@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from thermocald.analysis.thermal.level import (
+    AFFINITY_SD,
     estimate_level,
     projected,
     series_means,
@@ -25,8 +26,8 @@ from thermocald.analysis.thermal.level import (
 from thermocald.analysis.thermal.terms import unknowns_of_base, unknowns_of_term
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
-    DEFAULT_FREE,
     EOP_NAMES,
+    IOP_NAMES,
     ExteriorOrientation,
     InteriorOrientation,
 )
@@ -67,7 +68,7 @@ def examine_rest(
     free: columns of the interior orientation that take the rest up. Returns whether an effect is
     missing, None where a series was not examined and no other misses one, with the RMS px of the
     smooth rest and its significance, of the worst series; and what the rest adds to the covariance
-    of the fit's unknowns (K + L, K + L) and of the interior orientation (8, 8), px-scaled.
+    of the fit's unknowns (K + L, K + L) and of the interior orientation (10, 10), px-scaled.
     """
     size = len(fit.covariance)
     unknowns, parameters = np.zeros((size, size)), np.zeros((len(free), len(free)))
@@ -140,8 +141,9 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
     return total
 
 
+_SELDOM = 0.05  # of a reading's interval that the course between two of them makes of a delay
 _MATERIAL_SDS = 0.5  # of a rate: what c lets it be off by
-_INTERIOR = [COLUMNS.index(n) for n in DEFAULT_FREE]
+_INTERIOR = [COLUMNS.index(n) for n in IOP_NAMES]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
 
@@ -241,8 +243,8 @@ class _Parts:
     ) -> tuple[list[str], Array]:
         """Return names and covariance of interior, drifts, and the first series' own numbers.
 
-        unknowns, parameters: what the rest adds, as of `examine_rest`; field (8, 8): what the test
-        field's coordinates add to the interior orientation.
+        unknowns, parameters: what the rest adds, as of `examine_rest`; field (10, 10): what the
+        test field's coordinates add to the interior orientation.
         """
         n, size = len(_INTERIOR), len(self.fit.covariance)
         Q = scaled_inverse(_joint_normal(self.fitter, self.fit))[: n + size, : n + size]
@@ -250,7 +252,7 @@ class _Parts:
         Q[n:, n:] += unknowns
         scale = self.series[0].scale
         first = [u for u in self.unknowns if "@" not in u.name]
-        names = [*(f"interior.{p}" for p in DEFAULT_FREE), *(u.name for u in first)]
+        names = [*(f"interior.{p}" for p in IOP_NAMES), *(u.name for u in first)]
         R = np.zeros((len(names), n + size))
         R[:n, :n] = self.series[0].along[np.ix_(_INTERIOR, _INTERIOR)] / scale[_INTERIOR, None]
         for row, u in zip(R[n:], first, strict=True):
@@ -325,7 +327,9 @@ def fitted_camera(
     if found and any(map(detect_tremble, series)):
         verdict["trembles"] = True
     first = models[0]
-    channels = dict.fromkeys(c for s in series for c in s.source.readings)
+    channels = dict.fromkeys(
+        c for s in series for c, read in s.source.readings.items() if np.isfinite(read).any()
+    )
     model = replace(
         first,
         effects=tuple(_with_sds(e, sd, series[0]) for e in first.effects),
@@ -345,6 +349,14 @@ def fitted_camera(
     fitted = {"sigma0": sigma0, "band": not model.misses_an_effect, "series": fits}
     if tied := _tied_constants(model):
         fitted["known_together"] = tied
+    delays = [
+        e.name
+        for e in model.effects
+        if any(p.role == "delay" for p in catalogue.get(e.name).nonlinear.values())
+    ]
+    bulge = max(s.thermometers[s.history.reference].bulge for s in fitter.series)
+    if delays and bulge > _SELDOM:
+        fitted["read_seldom"] = {"effects": delays, "bulge": bulge}
     # an image shows the change of c as a share of c: the rates are as wrong as c itself
     share = sd["interior.c"] / model.interior.c
     carried = {p: abs(r) * share / sd[f"rates.{p}"] for p, r in model.rates.items() if r}
@@ -372,7 +384,7 @@ def _tied_constants(model: ThermalModel) -> list[dict[str, Any]]:
 
 
 def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
-    """Normal matrix of interior (8) at T₀, the fit's unknowns (K + L), exteriors (6 each), px.
+    """Normal matrix of interior (10) at T₀, the fit's unknowns (K + L), exteriors (6 each), px.
 
     The thermometers' errors are eliminated from all of them alike.
     """
@@ -393,6 +405,8 @@ def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
         M += T.T @ own @ T
     for row, (_, information) in enumerate(fitter.prior_terms(fit), n + K):
         M[row, row] += information
+    affinity = [IOP_NAMES.index("C1"), IOP_NAMES.index("C2")]
+    M[affinity, affinity] += (AFFINITY_SD * fitter.series[0].scale[affinity]) ** -2
     empty = np.diag(M) <= 0
     M[empty, empty] = 1e12  # a coefficient of a series that takes no part
     return M

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, GREY, PALETTE, Arrows, Curve, Figure, Panel, draw_matrix, thin
 from thermocald.numbers import UNITS, parameter_label, percent, plain, superscript
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
@@ -114,7 +115,7 @@ def principal_point_figure(camera: CameraStudy) -> Figure | None:
     for study, colour in _coloured(camera):
         s = study.series
         x, y = ((s.values[:, k] - s.values[0, k]) / s.sensor.pixel_pitch for k in (1, 2))
-        rows = np.unique(np.linspace(0, len(s) - 1, min(len(s), 600)).astype(int))
+        rows = spread_rows(len(s), 600)
         curves.append(Curve(s.name, x[rows], y[rows], "line", colour))
         curves.append(Curve("", x[:1], y[:1], "points", "#000000"))
         words.append(f"{s.name}: {_direction(float(x[-1]), float(y[-1]))}")
@@ -256,7 +257,7 @@ def _fitted(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Cu
     t, v = s.thermometers[0].values[known], value[known]
     ends = np.array([t.min(), t.max()])
     slope = scale * study.channels[0].dependences[name].slope
-    rows = np.unique(np.linspace(0, len(t) - 1, min(len(t), _DRAWN)).astype(int))
+    rows = spread_rows(len(t), _DRAWN)
     return [
         Curve(s.name, t[rows], v[rows], "points", colour),
         Curve("", ends, v.mean() + slope * (ends - t.mean()), "line", colour),

@@ -25,6 +25,7 @@ cameras"; Luhmann, T. et al. (2014): Close-Range Photogrammetry and 3D Imaging, 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -236,7 +237,8 @@ def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, 
     for name, value, partial in zip(family.parameters, terms, partials, strict=True):
         j = np.zeros(10)
         j[list(partial)] = list(partial.values())
-        found |= {name: value, f"sd_{name}": float(j @ covariance @ j) ** 0.5}
+        variance = float(j @ covariance @ j)  # of a weak epoch, rounding may have left nothing
+        found |= {name: value, f"sd_{name}": math.sqrt(variance) if variance >= 0 else math.nan}
     return {**found, "exact": float(C1 == 0 and C2 == 0)}
 
 

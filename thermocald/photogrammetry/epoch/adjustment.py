@@ -49,7 +49,7 @@ from thermocald.photogrammetry.epoch.snooping import (
     point_tests,
     snoop,
 )
-from thermocald.photogrammetry.field.planes import plane_fit
+from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.orientation import approximate_orientation, resection
 
 if TYPE_CHECKING:

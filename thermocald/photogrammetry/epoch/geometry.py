@@ -19,7 +19,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     Sensor,
     rotation,
 )
-from thermocald.photogrammetry.field.planes import plane_fit
+from thermocald.photogrammetry.field.testfield import plane_fit
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable

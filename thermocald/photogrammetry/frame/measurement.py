@@ -24,8 +24,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
-from thermocald.photogrammetry.field.planes import field_normals
-from thermocald.photogrammetry.field.testfield import Observations, TestField
+from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.orientation import Orientation, orient, refine
 from thermocald.photogrammetry.targets.boards import find_chessboards, predict_corners

@@ -17,7 +17,7 @@ adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56);
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.field.testfield import Observations
 
-    _Normals = tuple[Array, Array, Array, Array, Array]
-
 
 _N_IOP = len(IOP_NAMES)
 # Eigenvalues of the scaled matrix below this are rounding errors of its elements.
@@ -55,6 +53,28 @@ BEHIND = 1e6
 _CONTROLLED = 1e-3  # cofactor of a residual below which nothing else controls it
 MEDIAN_CHI2 = 1.386
 """Of two degrees of freedom."""
+
+
+class KnownTargets(NamedTuple):
+    """What is known of the targets beforehand: places (m, 3) mm, weights (m, 3) mm⁻², and which
+    of them (m,) are uncertain, the others being held.
+    """
+
+    places: Array
+    weights: Array
+    uncertain: NDArray[np.bool_]
+
+
+class _Normals(NamedTuple):
+    """Normal equations in blocks: of the cameras (u, u), interior first, then six per photograph,
+    between them and the targets (u, 3m), of the targets (m, 3, 3); right-hand sides (u,), (m, 3).
+    """
+
+    cameras: Array
+    between: Array
+    targets: Array
+    camera_side: Array
+    target_side: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,15 +168,14 @@ class Cofactors:
 class BundleAdjustment:
     """Image points of one camera, adjusted by interior orientation, poses and targets.
 
-    free: which of `IOP_NAMES` are unknown (indices); known: of the targets beforehand, places
-    (m, 3) mm with weights (m, 3) mm⁻² and which of them (m,) are uncertain, the others being held;
-    None for a free network, in which position, orientation and scale are free.
+    free: which of `IOP_NAMES` are unknown (indices); known: None for a free network, in which
+    position, orientation and scale are free.
     """
 
     sensor: Sensor
     rays: ImageRays
     free: Index
-    known: tuple[Array, Array, NDArray[np.bool_]] | None = None
+    known: KnownTargets | None = None
 
     def residuals(self, bundle: Bundle) -> Array:
         """Return whitened residuals (n, 2), measured minus computed; `BEHIND` for a target behind
@@ -247,7 +266,7 @@ class BundleAdjustment:
                 Q = scaled_inverse(S)
             except np.linalg.LinAlgError:
                 raise GeometryError(_SEPARATE_NOTHING) from None
-        B3 = normals[1].reshape(len(Q), -1, 3)
+        B3 = normals.between.reshape(len(Q), -1, 3)
         follow = -np.einsum("mij,umj->umi", inverses, B3).reshape(len(Q), -1)
         return Cofactors(Q, Q @ follow, follow, inverses, weakest)
 
@@ -276,7 +295,7 @@ class BundleAdjustment:
         """Return the weighted sum of squares of residuals (n, 2) and targets' corrections."""
         total = float(weights @ np.sum(v * v, axis=1))
         if self.known is not None:
-            total += float(np.sum(self.known[1] * (bundle.points - self.known[0]) ** 2))
+            total += float(np.sum(self.known.weights * (bundle.points - self.known.places) ** 2))
         return total
 
     def _linearised(self, bundle: Bundle, weights: Array) -> tuple[Array, Array, Array]:
@@ -302,14 +321,10 @@ class BundleAdjustment:
         by_camera = np.concatenate([by_interior, by_point @ cross, -by_point], axis=2)
         v = (root @ np.nan_to_num(rays.points - computed[:, 0])[..., None])[..., 0]
         if self.known is not None:
-            by_point = by_point * self.known[2][rays.target, None, None]
+            by_point = by_point * self.known.uncertain[rays.target, None, None]
         return v, root @ by_camera, root @ by_point
 
     def _normal_equations(self, bundle: Bundle, weights: Array) -> _Normals:
-        """The normal equations in blocks: of the cameras (interior first, then six per photo) and
-        between them and the targets (u, u), (u, 3m), of the targets (m, 3, 3); right-hand sides
-        (u,) and (m, 3).
-        """
         v, by_camera, by_point = self._linearised(bundle, weights)
         rays, f = self.rays, len(self.free)
         by_interior, by_pose = np.split(by_camera, [f], axis=2)
@@ -340,10 +355,9 @@ class BundleAdjustment:
         np.add.at(D, rays.target, np.swapaxes(by_point, 1, 2) @ by_point)
         np.add.at(d, rays.target, np.einsum("nai,na->ni", by_point, v))
         if self.known is not None:
-            places, weights, _ = self.known
-            D += weights[:, :, None] * np.eye(3)
-            d += weights * (places - bundle.points)
-        return A, B, D, a, d
+            D += self.known.weights[:, :, None] * np.eye(3)
+            d += self.known.weights * (self.known.places - bundle.points)
+        return _Normals(A, B, D, a, d)
 
     def _step(
         self, bundle: Bundle, normals: _Normals, damping: float

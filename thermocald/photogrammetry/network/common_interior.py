@@ -27,13 +27,14 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
 from thermocald.photogrammetry.epoch.snooping import chi2_2d
-from thermocald.photogrammetry.field.planes import plane_fit
+from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.network.bundle import (
     BEHIND,
     MEDIAN_CHI2,
     Bundle,
     BundleAdjustment,
     ImageRays,
+    KnownTargets,
     point_tests,
 )
 
@@ -91,7 +92,7 @@ def adjust_common_interior(
     places, sigmas = testfield.points[seen], testfield.sigmas[seen]
     uncertain = (sigmas > 0).any(axis=1)
     weights = np.where(uncertain[:, None], np.maximum(sigmas, _LEAST_SIGMA_MM) ** -2, 1.0)
-    known = places, weights, uncertain
+    known = KnownTargets(places, weights, uncertain)
     bundle = Bundle(
         interior.as_array(),
         np.array([e.rotation for e in exteriors]),

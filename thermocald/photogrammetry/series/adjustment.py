@@ -42,7 +42,6 @@ from thermocald.photogrammetry.series.covariances import (
     typical_sensitivity,
 )
 from thermocald.photogrammetry.series.estimator import (
-    FEW_EPOCHS,
     NOISE_SHOWN,
     Estimate,
     SeriesEstimator,
@@ -65,6 +64,7 @@ from thermocald.photogrammetry.series.result import (
 from thermocald.photogrammetry.series.snooping import point_tests
 from thermocald.photogrammetry.series.system import State
 from thermocald.photogrammetry.series.target_noise import (
+    FEW_EPOCHS,
     excess_scatter,
     noise_by_radius,
     slow_errors,
@@ -92,8 +92,7 @@ def choose(
     """The series with the exterior orientation that a first estimate allows, and why."""
     good = int(estimate.system.good.sum())
     if asked == "auto" and good < FEWEST_EPOCHS:
-        own = replace(series, s=replace(series.s, exterior="per_epoch"), bound=None)
-        return own, f"{good} epochs do not show how the mount moves, {FEWEST_EPOCHS} would"
+        return of_few_epochs(series, good)
     movement = observed_movement(series, estimate)
     px = movement.image_px(estimate.system.design.at.A)
     noise = movement.noise_px(estimate.system.design.at.A)
@@ -109,6 +108,12 @@ def choose(
     if movement.jumps:
         how += f", with jumps at row {', '.join(map(str, movement.jumps))}"
     return mount, f"the mount moves by {px:.3f} px about its mean pose{how}"
+
+
+def of_few_epochs(series: SeriesEstimator, good: int) -> tuple[SeriesEstimator, str]:
+    """The series with an exterior orientation for each of its few good epochs, and why."""
+    own = replace(series, s=replace(series.s, exterior="per_epoch"), bound=None)
+    return own, f"{good} epochs do not show how the mount moves, {FEWEST_EPOCHS} would"
 
 
 def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
@@ -197,7 +202,9 @@ def adjusted(
     series = SeriesEstimator(
         sensor, testfield, grid, grid.weights, s, windows=windows, field_variance=field_variance
     )
-    if s.exterior in ("mount", "auto"):
+    if s.exterior == "auto" and len(use) < FEWEST_EPOCHS:
+        series, why = of_few_epochs(series, len(use))
+    elif s.exterior in ("mount", "auto"):
         # Loosely bound at first, so that no movement is taken for gross errors.
         bound = loose_bound(series, start)
         loose = replace(series, s=replace(s, exterior="mount"), bound=bound)
@@ -238,6 +245,11 @@ def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
     # What priors contribute is known as well as they are, not as the epoch.
     bound = of_priors(system)
     relative[block] -= bound
+    pairs = series.pairs(estimate, use) if s.target_noise and len(use) >= FEW_EPOCHS else None
+    if pairs is not None and len(pairs):
+        relative += of_correlated(system, pairs, pooled)
+    else:
+        pairs = None
     relative *= epoch_variance(least, redundancy, pooled)[:, None, None]
     relative[block] += pooled * bound
     level *= pooled
@@ -251,13 +263,8 @@ def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
             relative[block] += of_common(system, movement.covariance)
         G = typical_sensitivity(system)
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
-    slow, pairs = np.zeros((16, 16)), None
+    slow = np.zeros((16, 16))
     if s.target_noise and len(use) >= FEW_EPOCHS:
-        pairs = series.pairs(estimate, use)
-        if len(pairs):
-            relative += of_correlated(system, pairs)
-        else:
-            pairs = None
         slow = of_slow_targets(
             system, slow_errors(estimate.residuals, use), series.testfield.groups
         )
@@ -287,7 +294,12 @@ def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
         np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
         _sds(by_perspective(system) * pooled), float(np.sqrt(series.field_variance)),
         _outer_noise(series, estimate),
-        _noise_ratio(sigma0, sound), of_held_affinity(system) if affinity else np.zeros(16),
+        _noise_ratio(sigma0, sound),
+        of_held_affinity(
+            series.sensor, series.testfield, system, estimate, estimate.residuals,
+            series.field_variance,
+        )
+        if affinity and sound.any() else None,
         movement, found.choice, slow, pairs,
     )  # fmt: skip
 

@@ -5,21 +5,25 @@ Two kinds are kept apart: what differs between epochs, and the level, which all 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import inverse_2x2, inverse_of_determined, root_of
-from thermocald.photogrammetry.series.normals import among_all, cofactors
+from thermocald.photogrammetry.series.normals import among_all, cofactors, linearise
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
-    from thermocald.photogrammetry.series.system import SeriesSystem
+    from thermocald.photogrammetry.camera.camera_model import Sensor
+    from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.series.system import SeriesSystem, State
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
 AFFINITY = 1e-4  # of a good lens: fx and fy of phones differ by 1e-4 to 3e-3
 C1, C2 = PARAMETER_NAMES.index("C1"), PARAMETER_NAMES.index("C2")
+_STEPS = 4  # of Gauss-Newton, from the adjusted series
 _MOST_TAKEN_OFF = 0.6  # of the variance of a combination of parameters
 
 
@@ -95,10 +99,13 @@ def of_slow_targets(system: SeriesSystem, errors: Array, group: Index) -> Array:
     return out
 
 
-def of_correlated(system: SeriesSystem, pairs: CorrelatedPairs) -> Array:
-    """What correlated errors add to the covariance (E, 16, 16) of own parameters."""
+def of_correlated(system: SeriesSystem, pairs: CorrelatedPairs, variance: float) -> Array:
+    """What correlated errors add to the cofactors (E, 16, 16) of own parameters.
+
+    variance: of unit weight of the series, in which the pairs were found.
+    """
     design = system.design
-    extra = pairs.normal_matrices(system.used(), design.at.A[..., design.own])
+    extra = pairs.normal_matrices(system.used(), design.at.A[..., design.own]) / variance
     own = system.Q @ extra @ system.Q
     # Covariances from epochs that do not see the same targets may be indefinite together: at most
     # three fifths are taken off the variance of any combination.
@@ -141,25 +148,71 @@ def by_perspective(system: SeriesSystem) -> Array:
     return out
 
 
-def of_held_affinity(system: SeriesSystem) -> Array:
-    """How far the level (16,) lies off, at most, where an affinity or shear of `AFFINITY` is held.
+@dataclass(frozen=True)
+class HeldAffinity:
+    """Of C1 and C2, where they are held: by how much the targets say that they differ, with sds
+    (k,), and by how much 1 would move the level (k, 16).
+    """
 
-    The mean image of all epochs is adjusted with and without it; the targets' offsets take part.
+    names: tuple[str, ...]
+    differences: Array
+    sds: Array
+    moves: Array
+
+
+def of_held_affinity(
+    sensor: Sensor,
+    field: TestField,
+    system: SeriesSystem,
+    found: State,
+    residuals: Array,
+    field_variance: float,
+) -> HeldAffinity:
+    """Estimate from the mean image of all epochs how far C1 and C2 are from what they are held at.
+
+    residuals (E, T, 2) px; field_variance: by which the field's stated covariance was multiplied,
+    perhaps for that very affinity: here it is as stated, and the sds follow what misfit is left.
     """
     design, A = system.design, system.design.at.A
-    out = np.zeros(16)
     free = np.union1d(design.own, design.common)
-    weights = system.used(system.good).sum(axis=0)
+    held = np.setdiff1d([C1, C2], free)
+    both = np.concatenate([free, held])
+    used = system.used(system.good)
+    weights = used.sum(axis=0)
     seen = (weights[:, :2] > 0).all(axis=1)
-    V = inverse_2x2(_full(weights[seen]))
+    noise, of_field = inverse_2x2(_full(weights[seen])), np.zeros((2, 2))
     if design.offset_prior is not None:
-        V += inverse_2x2(_full(design.offset_prior[seen]))
-    W = inverse_2x2(V)
-    N = np.einsum("tki,tkl,tlj->ij", A[seen], W, A[seen], optimize=True)
-    Q = inverse_of_determined(N[free[:, None], free])
-    for held in np.setdiff1d([C1, C2], free):
-        out[free] = np.maximum(out[free], np.abs(Q @ N[free, held]) * AFFINITY)
-    return out
+        of_field = inverse_2x2(_full(design.offset_prior[seen]))
+    N = _normals(A[seen], inverse_2x2(noise + of_field))
+    moves = np.zeros((len(held), 16))
+    moves[:, free] = -N[np.ix_(held, free)] @ inverse_of_determined(N[np.ix_(free, free)])
+    (wx, wy, wxy) = used[:, seen].T
+    (vx, vy) = np.nan_to_num(residuals[system.good][:, seen]).T
+    sums = np.stack([(wx * vx + wxy * vy).sum(axis=1), (wxy * vx + wy * vy).sum(axis=1)], axis=1)
+    state = start = found.values[system.good].mean(axis=0)
+    image = linearise(sensor, field, start[:10], start[10:]).predicted + np.nan_to_num(
+        found.offsets
+    )
+    image[seen] += np.einsum("tkl,tl->tk", noise, sums)
+    W = inverse_2x2(noise + of_field / field_variance)
+    for _ in range(_STEPS):
+        at = linearise(sensor, field, state[:10], state[10:])
+        left = np.nan_to_num(image - at.predicted)[seen]
+        b = np.einsum("tki,tkl,tl->i", at.A[seen], W, left)[both]
+        Q = inverse_of_determined(_normals(at.A[seen], W)[np.ix_(both, both)])
+        state = state.copy()
+        state[both] += Q @ b
+    redundancy = 2 * int(seen.sum()) - len(both)
+    rest = float(np.einsum("tk,tkl,tl->", left, W, left) - b @ Q @ b)
+    scale = max(rest / redundancy, 1.0) if redundancy > 0 else np.inf
+    sds = np.sqrt(scale * np.diag(Q)[len(free) :])
+    names = tuple(PARAMETER_NAMES[k] for k in held)
+    return HeldAffinity(names, (state - start)[held], sds, moves)
+
+
+def _normals(A: Array, W: Array) -> Array:
+    N: Array = np.einsum("tki,tkl,tlj->ij", A, W, A, optimize=True)
+    return N
 
 
 def _full(weights: Array) -> Array:

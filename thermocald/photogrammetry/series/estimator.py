@@ -31,6 +31,7 @@ from thermocald.photogrammetry.series.snooping import (
 )
 from thermocald.photogrammetry.series.system import Design, SeriesSystem, State, offset_weights
 from thermocald.photogrammetry.series.target_noise import (
+    FEW_EPOCHS,
     MEDIAN_WORTH,
     CorrelatedPairs,
     correlated_pairs,
@@ -41,9 +42,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.series.result import SeriesSettings
-
-FEW_EPOCHS = 10
-"""Epochs below which targets that wander slowly look like targets that lie elsewhere."""
 
 NOISE_SHOWN = 0.5
 """Share of the redundancy below which residuals show the priors, not the noise: of one epoch."""

@@ -361,14 +361,15 @@ class KnownSeries:
         # What priors contribute is known as well as they are, not as the epoch.
         bound = of_priors(system) if system.design.own_prior.any() else 0.0
         mine -= bound
+        if self.pairs is not None:
+            for rows, one, _ in kinds:
+                mine[rows] += of_correlated(one, self.pairs, self.unit)[0][np.ix_(own, own)]
         mine *= unit[:, None, None]
         mine += self.unit * bound
-        for rows, one, G in kinds:
-            if s.exterior == "series" and self.movement.covariance.any():
+        if s.exterior == "series" and self.movement.covariance.any():
+            for rows, _, G in kinds:
                 swayed = G[:, :6]
                 mine[rows] += swayed @ self.movement.covariance @ swayed.T
-            if self.pairs is not None:
-                mine[rows] += of_correlated(one, self.pairs)[0][np.ix_(own, own)]
         mine += np.diag(self.excess[own])
         mine[~system.good] = 0.0
         return among_all(mine, own)

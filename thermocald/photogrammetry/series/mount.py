@@ -78,12 +78,11 @@ def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
     _, evidence[:, 0] = _fit(power, count, np.stack([drift]))
     (_, trembling), likelihood = _fit(power, count, np.stack([drift, one]))
     evidence[:, 1] = likelihood - _WHITE_COST
-    swaying = []
-    for k, phi in enumerate(memories):
-        sway = (1 - phi**2) / (1 - 2 * phi * np.cos(omega) + phi**2)
-        sizes, likelihood = _fit(power, count, np.stack([drift, one, sway]))
-        evidence[k, 2] = likelihood - _WHITE_COST - _SLOW_COST
-        swaying.append(sizes)
+    phi = memories[:, None]
+    sway = (1 - phi**2) / (1 - 2 * phi * np.cos(omega) + phi**2)
+    shapes = np.stack(np.broadcast_arrays(drift, one, sway), axis=1)
+    swaying, likelihood = _fit(power, count, shapes)
+    evidence[:, 2] = likelihood - _WHITE_COST - _SLOW_COST
     evidence -= evidence.max(axis=(0, 1))
     plausible = np.exp(evidence)
     each = plausible.sum(axis=1)  # of a memory, by direction; the mount has one memory for all
@@ -92,8 +91,8 @@ def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
     of_memory /= of_memory.sum()
     plausible *= of_memory[:, None, None] / each[:, None]
     white = plausible[:, 1].sum(axis=0) * trembling
-    white += sum(p * sizes[1] for p, sizes in zip(plausible[:, 2], swaying, strict=True))
-    by_memory = np.array([p * sizes[2] for p, sizes in zip(plausible[:, 2], swaying, strict=True)])
+    white += (plausible[:, 2] * swaying[:, 1]).sum(axis=0)
+    by_memory = plausible[:, 2] * swaying[:, 2]
     by_memory *= np.array([1.0 - mean_variance(phi, n) for phi in memories])[:, None]
     if not period:  # without a drift of the camera, whatever wanders is the mount
         missing = (count @ power) / n - 1.0 - white - by_memory.sum(axis=0)
@@ -177,22 +176,26 @@ def _pooled(power: Array, omega: Array) -> tuple[Array, Array, Array]:
 
 
 def _fit(power: Array, count: Array, shapes: Array) -> tuple[Array, Array]:
-    """Fit the sizes (components, k) of spectra (components, m) alongside white noise of variance 1.
+    """Fit the sizes (..., components, k) of spectra (..., components, m) alongside white noise of
+    variance 1: power (m, k), count (m,).
 
-    Returns them and the likelihood (k,).
+    Returns them and the likelihood (..., k).
     """
     weight = count[:, None]
     # Spectra are steep: start where each alone would give the power of its own frequencies.
-    share = shapes * weight[:, 0] / np.maximum((shapes * weight[:, 0]).sum(axis=1), 1e-300)[:, None]
-    peak = (shapes * share).sum(axis=1)[:, None]
-    sizes = (share @ power) / np.maximum(peak, 1e-300) / len(shapes)
+    share = shapes * count
+    share /= np.maximum(share.sum(axis=-1, keepdims=True), 1e-300)
+    peak = (shapes * share).sum(axis=-1, keepdims=True)
+    sizes = (share @ power) / np.maximum(peak, 1e-300) / shapes.shape[-2]
+    across, counted = np.swapaxes(shapes, -1, -2), weight * power
     for _ in range(_UPDATES):
-        model = 1.0 + shapes.T @ sizes
-        up = shapes @ (weight * power / model**2)
-        down = shapes @ (weight / model)
+        model = 1.0 + across @ sizes
+        inverse = 1.0 / model
+        up = shapes @ (counted * inverse**2)
+        down = shapes @ (weight * inverse)
         sizes = sizes * np.sqrt(up / np.maximum(down, 1e-300))
-    model = 1.0 + shapes.T @ sizes
-    likelihood = -0.5 * (weight * (np.log(model) + power / model)).sum(axis=0)
+    model = 1.0 + across @ sizes
+    likelihood = -0.5 * (weight * (np.log(model) + power / model)).sum(axis=-2)
     return sizes, likelihood
 
 

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, Sensor, partials, project
-from thermocald.photogrammetry.linalg import stacked_inverses
+from thermocald.photogrammetry.field.testfield import FAR_ELSEWHERE, find_misplaced
+from thermocald.photogrammetry.linalg import median_known, stacked_inverses
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
+_LOOKED_AT = 60  # epochs that tell where targets are
+_OFTEN = 0.2  # of them, to tell it of a target
 _CHUNK_POINTS = 20_000  # worked on at a time, in the processor's cache
 
 
@@ -346,6 +349,33 @@ class WithoutTargets:
             mask = np.zeros(grid.observed.shape, dtype=bool)
             mask[:, self.targets] = True
             yield first, grid.reject(mask)
+
+
+def often_shown(misclosure: Array) -> Array:
+    """Median over epochs of misclosures (E, T, 2), NaN for targets that few of them show.
+
+    Such a target may lie where no other one tells of the distortion.
+    """
+    shown = np.isfinite(misclosure[..., 0]).mean(axis=0)
+    return np.where(shown[:, None] < _OFTEN, np.nan, median_known(misclosure))
+
+
+def misplaced_targets(
+    sensor: Sensor, testfield: TestField, grid: ObservationGrid, cameras: Array
+) -> NDArray[np.bool_]:
+    """Find targets (T,) that are far from where the epochs' own cameras (E, 16) expect them.
+
+    NaN for a camera that is not known.
+    """
+    rows = np.flatnonzero(np.isfinite(cameras).all(axis=1))
+    rows = rows[:: max(len(rows) // _LOOKED_AT, 1)]
+    if not len(rows):
+        return np.zeros(len(testfield), dtype=bool)
+    expected = project(sensor, cameras[rows, IOP], cameras[rows, EOP], testfield.points)
+    misclosure = np.where(grid.observed[rows, :, None], grid.points[rows] - expected, np.nan)
+    offsets = often_shown(misclosure)
+    c_px = float(np.median(cameras[rows, 0])) / sensor.pixel_pitch
+    return find_misplaced(offsets, c_px, FAR_ELSEWHERE)
 
 
 def spread_windows(epochs: int, most: int, count: int = 12) -> tuple[slice, ...]:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.photogrammetry.series.covariances import HeldAffinity
     from thermocald.photogrammetry.series.normals import ObservationGrid
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
@@ -147,10 +148,9 @@ class SeriesAdjustment:
     has its own exterior orientation anyway; field_ratio: the standard deviations of the field's
     coordinates over those stated, 1 where no more are shown; outer_noise: noise of the outermost
     target over that in the image's middle, and its standard deviation; noise_ratio: the noise found
-    over the one stated; affinity_bias (16,): of the level, by an affinity of 1e-4 that is held
-    (`of_held_affinity`); movement: of the mount; choice: how the exterior orientation was estimated
-    and why; slow (16, 16): covariance of a straight line from slow errors of targets; pairs: of
-    coordinates that err together.
+    over the one stated; affinity: of C1 and C2 where they are held; movement: of the mount;
+    choice: how the exterior orientation was estimated and why; slow (16, 16): covariance of a
+    straight line from slow errors of targets; pairs: of coordinates that err together.
     """
 
     settings: SeriesSettings
@@ -172,7 +172,7 @@ class SeriesAdjustment:
     field_ratio: float = 1.0
     outer_noise: tuple[float, float] = (float("nan"), float("nan"))
     noise_ratio: float = 1.0
-    affinity_bias: Array = field(default_factory=lambda: np.zeros(16))
+    affinity: HeldAffinity | None = None
     movement: Movement = STILL
     choice: str = ""
     slow: Array = field(default_factory=lambda: np.zeros((16, 16)))

@@ -12,6 +12,7 @@ method.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -106,6 +107,17 @@ class Design:
         out[np.arange(q), np.arange(q)] = self.common_prior
         if self.offset_prior is not None:
             _add_blocks(out[q:, q:], self.offset_prior)
+        return out
+
+    def by_prior(self, Q: Array) -> Array:
+        """Q (width, width) times the priors' weights."""
+        q = len(self.common)
+        out: Array = np.empty_like(Q)
+        out[:, :q] = Q[:, :q] * self.common_prior
+        if self.offset_prior is not None:
+            (wx, wy, wxy), T = self.offset_prior.T, len(self.offset_prior)
+            x, y = Q[:, q : q + T], Q[:, q + T :]
+            out[:, q : q + T], out[:, q + T :] = x * wx + y * wxy, x * wxy + y * wy
         return out
 
     def common_matrix(self, N: Array, weights: Array) -> Array:
@@ -323,8 +335,7 @@ class SeriesSystem:
 
     def common_share(self) -> float:
         """How many of the observations the common unknowns use up."""
-        held = np.einsum("ij,ji->", self.Q_common, self.design.prior_matrix())
-        return float(self.design.width - held)
+        return self.design.width - self._held[0]
 
     def prior_share(self) -> float:
         """How much of the redundancy rests on priors of the common unknowns being as stated.
@@ -332,8 +343,13 @@ class SeriesSystem:
         Along a direction of which the prior tells the share h, that is h - h² of an observation: of
         one epoch alone a wrong prior and another noise look the same, and many tell them apart.
         """
-        held = self.Q_common @ self.design.prior_matrix()
-        return float(np.trace(held) - np.einsum("ij,ji->", held, held))
+        return self._held[0] - self._held[1]
+
+    @cached_property
+    def _held(self) -> tuple[float, float]:
+        """Traces of how far priors hold the common unknowns, Q P, and of its square."""
+        held = self.design.by_prior(self.Q_common)
+        return float(np.trace(held)), float(np.einsum("ij,ji->", held, held))
 
 
 def _used(weights: Array, use: Mask) -> Array:

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 MEDIAN_WORTH = 0.37
 """Degrees of freedom of a mean that a median of squares is worth, for each square."""
 
+FEW_EPOCHS = 10
+"""Epochs below which targets that wander slowly look like targets that lie elsewhere."""
+
 _MEDIANS_FROM = 10.0  # degrees of freedom of a target's median; one of fewer is luck
 _CUT = 2.5  # standard deviations: beyond it a residual counts as this one
 _LEFT_OF_CUT = 0.9776  # of the mean square of a normal distribution cut there
@@ -197,7 +200,7 @@ def slow_errors(residuals: Array, used: Mask) -> Array:
     sxx = np.maximum((x * x).sum(axis=0), 1e-12)
     slope = (x * v).sum(axis=0) / sxx
     variance = ((v - slope * x) ** 2).sum(axis=0) / np.maximum(n - 2, 1.0) / sxx
-    enough = (n > 10) & (sxx > 0.01 * E)
+    enough = (n >= FEW_EPOCHS) & (sxx > 0.01 * E)
     left = np.sqrt(np.maximum(1 - variance / np.maximum(slope**2, 1e-300), 0.0))
     slow: Array = np.where(enough, slope * left, 0.0)
     return slow

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from thermocald.photogrammetry.field.testfield import ELSEWHERE, find_misplaced
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
@@ -38,6 +40,7 @@ _APART, _APART_S = 5.0, 60.0  # of a frame and its reading, intervals and s
 _HOT_C = 65.0  # no lens is made for that
 _DISTANCES = (0.8, 1.25)  # fitted to stated principal distance
 _CENTRE = 0.1  # of the image's diagonal
+_MOST_SAID = 6  # targets by name
 _PITCH_OPTION = "--pixel-pitch, or pixel_pitch in recording.yaml or the camera file"
 
 
@@ -282,6 +285,22 @@ def interior_doubts(camera: CameraSpec, c: float, x0: float, y0: float) -> list[
             f"{W} × {H} px: {why}"
         )
     return found
+
+
+def target_doubts(
+    names: Sequence[str], offsets: Array, c_px: float, least: float = ELSEWHERE
+) -> list[str]:
+    """Return what is doubtful in the places of targets, as `find_misplaced` takes them."""
+    rows = np.flatnonzero(find_misplaced(offsets, c_px, least)).tolist()
+    if not rows:
+        return []
+    size = np.hypot(*np.asarray(offsets)[rows].T)
+    each = [f"{names[r]} {s:.0f} px" for r, s in zip(rows, size, strict=True)]
+    said = ", ".join(each[:_MOST_SAID])
+    said += f" and {len(each) - _MOST_SAID} more" if len(each) > _MOST_SAID else ""
+    opposite = len(rows) == 2 and bool(np.hypot(*offsets[rows].sum(axis=0)) < 0.1 * size.sum())
+    why = "their names look exchanged" if opposite else "are names exchanged, or coordinates wrong?"
+    return [f"targets are seen elsewhere than the test field has them: {said} off; {why}"]
 
 
 def pitch_doubts(pitch: float, known: float | None) -> list[str]:

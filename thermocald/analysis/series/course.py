@@ -1,0 +1,99 @@
+"""The course of one parameter over a series: whether it drifts, in numbers and in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from thermocald.numbers import signed
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+LEVEL = 0.01
+"""A change that chance gives more rarely is a drift."""
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """One parameter over a series, in its own unit.
+
+    mean; scatter: standard deviation over the epochs; sd: stated by the adjustments, RMS; change:
+    of a straight line from the first to the last epoch, with sd_change; p: that chance gives as
+    much, corrected for the number of parameters; drifts: p below 1 %, with and without any single
+    group of targets; rests_on: the group without which there would be no drift;
+    per_kelvin, sd_per_kelvin, p_temperature: slope on the reference temperature, its standard
+    deviation and its p-value, corrected, NaN where that is constant or not known;
+    last_minus_first: between the first and the last epoch; sd_by_perspective: of that, if the
+    mount could stand anywhere in each: a mount that moves slowly is excluded no better.
+    """
+
+    JSON: ClassVar = {
+        "sd": "stated_sd", "sd_by_perspective": "sd_last_minus_first_by_perspective", "drifts": "",
+        "moves": "drift", "scatter_over_sd": "scatter_over_sd",
+    }  # fmt: skip
+
+    name: str
+    mean: float
+    scatter: float
+    sd: float
+    change: float
+    sd_change: float
+    p: float
+    drifts: bool
+    rests_on: str | None = None
+    per_kelvin: float = float("nan")
+    p_temperature: float = float("nan")
+    last_minus_first: float = float("nan")
+    sd_last_minus_first: float = float("nan")
+    sd_per_kelvin: float = float("nan")
+    sd_by_perspective: float = float("nan")
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moved: in time, or with its temperature."""
+        return self.drifts or self.p_temperature < LEVEL
+
+    @property
+    def in_words(self) -> str:
+        """How much it moves, or `none`."""
+        if self.p_temperature < LEVEL:
+            return self.movement
+        if self.moves:
+            return f"in time (p {self.p:.1g})"
+        return f"none (only target {self.rests_on} moves)" if self.rests_on else "none"
+
+    @property
+    def movement(self) -> str:
+        """How much it moves: by the kelvin where it follows the temperature, else altogether."""
+        if self.p_temperature < LEVEL:
+            return signed(1e3 * self.per_kelvin, 1e3 * self.sd_per_kelvin, "µm/K")
+        moved = signed(1e3 * self.last_minus_first, 1e3 * self.sd_last_minus_first, "µm")
+        return f"{moved} from the first epoch to the last"
+
+    @property
+    def scatter_over_sd(self) -> float:
+        """How much more the parameter scatters than its standard deviations state."""
+        return self.scatter / self.sd
+
+
+def table_of(drifts: Sequence[Course]) -> list[str]:
+    """A line for each parameter below a line of titles; nothing without parameters."""
+    titles = ("", "mean mm", "scatter µm", "sd µm", "ratio", "line µm ± sd",
+              "last - first µm ± sd", "drift")  # fmt: skip
+    rows = [
+        (
+            c.name, f"{c.mean:.5f}", f"{1e3 * c.scatter:.3f}", f"{1e3 * c.sd:.3f}",
+            f"{c.scatter_over_sd:.2f}", f"{1e3 * c.change:+.3f} ± {1e3 * c.sd_change:.3f}",
+            f"{1e3 * c.last_minus_first:+.3f} ± {1e3 * c.sd_last_minus_first:.3f}", c.in_words,
+        )
+        for c in drifts
+    ]  # fmt: skip
+    if not rows:
+        return []
+    rows = [titles, *rows]
+    width = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        " ".join([f"{name:<{width[0]}}", *map(str.rjust, right, width[1:])])
+        for name, *right in rows
+    ]

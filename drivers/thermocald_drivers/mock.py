@@ -41,10 +41,10 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
 from thermocald.hal import Camera, Device, DriverOptions, Frame, Output, Thermometer
@@ -71,6 +71,14 @@ class Fault(DriverOptions):
     count: Annotated[int, Field(ge=1)] = 1
     at_s: Annotated[float, Field(ge=0.0, le=1e9)] | None = None
     for_s: Annotated[float, Field(ge=0.0, le=1e9)] = 0.0
+
+    @model_validator(mode="after")
+    def _calls_or_seconds(self) -> Self:
+        if (self.at_s is None) != ("for_s" not in self.model_fields_set):
+            raise ValueError("`at_s` and `for_s` belong together")
+        if self.at_s is not None and self.model_fields_set & {"at", "count"}:
+            raise ValueError("either `at` and `count`, or `at_s` and `for_s`")
+        return self
 
     def active(self, call: int, elapsed_s: float) -> bool:
         if self.at_s is not None:

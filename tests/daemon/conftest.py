@@ -80,11 +80,11 @@ class Daemon:
         lines = path.read_text().split("\n")[:-1]  # what follows the last line end is half a line
         return [json.loads(line) for line in lines]
 
-    def until(self, condition, timeout_s: float = 120.0) -> None:  # busy machines
+    def until(self, condition, timeout_s: float = 120.0, alive: bool = True) -> None:
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, f"timed out; log:\n{self.log()}"
-            assert self.process.poll() is None, f"the daemon ended; log:\n{self.log()}"
+            assert not alive or self.process.poll() is None, f"it ended; log:\n{self.log()}"
             time.sleep(0.05)
 
     def stored(self) -> tuple[list[int], list[str]]:

@@ -76,6 +76,10 @@ class Forked:
     def said(self, timeout_s: float | None = 120.0) -> str:
         """Wait for its end, and return what it has printed."""
         self.wait(timeout_s)
+        return self.printed()
+
+    def printed(self) -> str:
+        """What it has printed so far."""
         return self._log.read_text()
 
     def send_signal(self, number: int) -> None:

@@ -50,7 +50,7 @@ def test_a_thermometer_alone_is_stored_and_archived(daemon, devices):
 def test_a_thermometer_of_no_camera_is_stored_and_a_paired_one_while_the_camera_is_away(
     daemon, devices
 ):
-    sections = devices(camera=[{"kind": "unplugged", "at": 3, "for_s": 2.0}])
+    sections = devices(camera=[{"kind": "unplugged", "at_s": 0.5, "for_s": 2.0}])
     sections["thermometers"].append({**sections["thermometers"][0], "name": "air", "seed": 7})
     daemon.configure(**sections)
     daemon.start()

@@ -135,6 +135,8 @@ def test_injected_while_it_runs(clock):
         ([{"kind": "timeout", "at": 0}], r"faults\[0\].at: is 0; .* greater"),
         ([{"kind": "timeout", "at": 1.5}], "valid integer"),
         ([{"kind": "timeout", "at_s": -1}], r"faults\[0\].at_s: is -1"),
+        ([{"kind": "timeout", "at": 3, "for_s": 2}], r"faults\[0\]: .*belong together"),
+        ([{"kind": "timeout", "at": 3, "at_s": 1, "for_s": 2}], "either `at`"),
         (["timeout"], r"faults\[0\]: is 'timeout'"),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -94,6 +95,10 @@ PANELS = {
 COMMANDS = {name: entry for panel in PANELS.values() for name, entry in panel.items()}
 
 
+_TYPE = re.compile(r"<(?:list\[)?(Path|path|str|int|float)(?: range)?\]?>")
+_SAID = {"Path": "path", "path": "path", "str": "text", "int": "number", "float": "number"}
+
+
 class Command(TyperCommand):
     """A command whose help has its expert's options in a section of their own.
 
@@ -113,7 +118,8 @@ class Command(TyperCommand):
             if (record := parameter.get_help_record(ctx)) is not None:
                 usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
                 title = getattr(parameter, "rich_help_panel", None) or usual
-                sections.setdefault(title, []).append(record)
+                name = _TYPE.sub(lambda found: f"<{_SAID[found[1]]}>", record[0])
+                sections.setdefault(title, []).append((name, record[1]))
         for title in sorted(sections, key=["Arguments", "Options", ADVANCED].index):
             with formatter.section(title):
                 formatter.write_dl(sections[title])

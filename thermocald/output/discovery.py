@@ -515,7 +515,8 @@ def _misfit_table(d: Discovery) -> Table:
     def number(value: Any, decimals: int) -> str:
         if not isinstance(value, float):
             return str(value)
-        return f"{value:z.{decimals}f}".replace("-", "−") if math.isfinite(value) else "–"
+        shown = 0 if abs(value) >= 100.0 else decimals
+        return f"{value:z,.{shown}f}".replace("-", "−") if math.isfinite(value) else "–"
 
     return Table.of(
         "Misfit of the base model",

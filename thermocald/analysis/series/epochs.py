@@ -225,7 +225,8 @@ class Epochs(Result):
         moving = [f"{parameter_label(c.name)} moves by {c.movement}" for c in drawn if c.moves]
         still = [parameter_label(c.name) for c in drawn if not c.moves]
         if still:
-            moving.append(f"{', '.join(still)} {'do' if len(still) > 1 else 'does'} not drift")
+            verb = "show" if len(still) > 1 else "shows"
+            moving.append(f"{', '.join(still)} {verb} no significant drift")
         seen = self.temperature[self.ok & np.isfinite(self.temperature)]
         within = f"between {seen.min():.0f} and {seen.max():.0f} °C " if len(seen) else ""
         return f"In {len(self)} epochs {within}{'; '.join(moving)}"

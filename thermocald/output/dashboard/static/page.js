@@ -26,6 +26,11 @@ function fixed(value, digits) {
   return value === null || value === undefined ? "–" : Number(value).toFixed(digits).replace("-", "−");
 }
 
+function measured(value, digits, unit) {
+  const number = fixed(value, digits);
+  return number === "–" ? number : `${number} ${unit}`;
+}
+
 function counted(count, noun) { return `${count} ${noun}${count === 1 ? "" : "s"}`; }
 
 function time(utc) {
@@ -83,10 +88,10 @@ function showCamera(camera) {
   state.className = good ? last.state : "failed";
   state.textContent = good ? (online.sentence || last.state) : `${last.status}: ${last.reason}`;
   const figures = [["Epoch", String(last.epoch), time(last.frame_time) + " UTC"],
-    ["Temperature", fixed(last.temperature, 2) + " °C", ""]];
+    ["Temperature", measured(last.temperature, 2, "°C"), ""]];
   for (const [name, label] of [["c", "c"], ["x0", "x₀"], ["y0", "y₀"]]) {
     const sd = online["sd_" + name] ?? last["sd_" + name];
-    figures.push([label, `${fixed(online[name] ?? last[name], 5)} mm`,
+    figures.push([label, measured(online[name] ?? last[name], 5, "mm"),
       sd ? `± ${fixed(sd, 5)}; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : ""]);
   }
   figures.push(["σ₀", fixed(last.sigma0, 3), `${counted(last.n_observations, "target")}, ${last.n_rejected} rejected`]);

@@ -75,7 +75,8 @@ _PASSES = 2
 
 def replace_moved_boards(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:
     """Find the boards that moved, and put them back to where they were."""
-    found = board_movements(_field_series(evidence))
+    series = _field_series(evidence)
+    found = board_movements(series, wandering_targets(series))
     if not found:
         return [], evidence
     still = _put_boards_back(evidence, found)

@@ -77,10 +77,12 @@ def still_field(
         time_s - time_s[0], residuals, weights, at.A, at.B, testfield.points,
         field_sheets(testfield), testfield.names, numbers,
     )  # fmt: skip
-    boards = board_movements(series)
+    single = wandering_targets(series)
+    boards = board_movements(series, single)
     for m in boards:
         series = put_back(series, m)
-    single = wandering_targets(series)
+    if boards:
+        single = wandering_targets(series)
     moved = (*boards, *single)
     return moved, taken_off(grid, moved) if moved else grid
 

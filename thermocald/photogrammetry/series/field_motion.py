@@ -222,7 +222,7 @@ def _often_seen(s: FieldSeries) -> NDArray[np.bool_]:
 def _slow_power(s: FieldSeries) -> Array:
     """χ² (T,) of the slow residuals of each target."""
     v = np.nan_to_num(s.residuals) * np.sqrt(s.w)
-    out: Array = np.sum(np.einsum("je,etk->jtk", cosines(s.times), v) ** 2, axis=(0, 2))
+    out: Array = np.sum(np.tensordot(cosines(s.times), v, 1) ** 2, axis=(0, 2))
     return out
 
 
@@ -242,7 +242,7 @@ def _own_power(s: FieldSeries, w: Array, bent: bool) -> Array:
     seen = np.isfinite(s.residuals)
     level = np.nan_to_num(s.residuals).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     v = np.where(seen, s.residuals - level, 0.0) * root
-    slow = np.einsum("je,etk,tkl->jtl", cosines(s.times), v, vectors)
+    slow = np.einsum("jtk,tkl->jtl", np.tensordot(cosines(s.times), v, 1), vectors)
     out: Array = np.sum(slow**2 / np.maximum(values, _LEAST_FREE), axis=(0, 2))
     return out
 
@@ -329,11 +329,14 @@ _TRIES = 400  # times of a knock
 _SETTLING = (0.08, 0.3)  # of the duration: time constants
 
 
-def board_movements(s: FieldSeries) -> list[FieldMovement]:
-    """Boards that were knocked or creep, the largest first; each with the others in place."""
+def board_movements(s: FieldSeries, wandering: Sequence[FieldMovement]) -> list[FieldMovement]:
+    """Boards that were knocked or creep, the largest first; each with the others in place.
+
+    wandering: single targets, which would pull at the cameras, and they at the boards.
+    """
     if len(s.times) < FEWEST_EPOCHS:
         return []
-    for single in wandering_targets(s):  # it would pull at the cameras, and they at the boards
+    for single in wandering:
         s = without(s, single.rows)
     seen = s.used.any(axis=0)
     boards = {}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.audit import HEADER, SECTIONS, ratio, share, with_rows
+from tests.marks import mostly_slow
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "standard-deviations.md"
 
@@ -40,7 +41,7 @@ def lines_of_the_page(section: str) -> list[tuple[str, list[str]]]:
     return found
 
 
-@pytest.mark.parametrize("section", SECTIONS)
+@pytest.mark.parametrize("section", mostly_slow(SECTIONS, *(set(SECTIONS) - {"cameras"})))
 def test_page_and_audit_have_the_same_rows(section):
     """The figures are those of 200 draws."""
     rows = SECTIONS[section](2, np.random.default_rng(1))

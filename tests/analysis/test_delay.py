@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.audit_thermal import NAMES, fitted, read_apart, simulated, switched
+from tests.marks import mostly_slow
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal.noise import calibrate_thermometers
 from thermocald.thermal.reduce import reduce_series
@@ -38,7 +39,7 @@ def test_a_clock_that_is_wrong(late):
             assert abs(off) < 3.5 * f.model.sd(f"rates.{name}")
 
 
-@pytest.mark.parametrize("interval", [10.0, 15.0, 30.0, 60.0])
+@pytest.mark.parametrize("interval", mostly_slow([10.0, 15.0, 30.0, 60.0], 15.0))
 def test_a_clock_that_is_wrong_by_any_interval_of_the_readings(interval):
     """Between readings the temperature bends: a straight line would be a delay of h²/12τ."""
     off = []

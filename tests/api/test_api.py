@@ -16,6 +16,7 @@ import pytest
 import thermocald as tc
 from tests.commands import call
 from tests.golden.workshop import PROGRAMME
+from tests.marks import mostly_slow
 from thermocald.errors import DataError, StoreError, UsageError
 
 DOCUMENTED = (
@@ -145,20 +146,29 @@ def test_epochs_as_a_dataset_written_and_read(epochs, tmp_path):
         assert read.covariance.dims == ("epoch", "parameter", "parameter_2")
 
 
-def test_one_result_prints_documents_draws_and_reports(epochs, M1, M2, camera, tmp_path, world):
-    study = tc.study(M1, M2, sets=200, f_number=2.0)
-    found = tc.discover(M1, verify=[M2])
-    for k, result in enumerate((epochs, study, found, camera, camera.at(35.0))):
-        assert str(result).count("\n") >= 3
-        assert json.loads(json.dumps(result.as_dict(), allow_nan=False))
-        assert result._repr_html_().startswith("<pre>")
-        assert "at 0x" not in repr(result)
-        assert len(repr(result)) < 200
-        result.plot().savefig(tmp_path / f"{k}.png")
-        assert result.report(tmp_path / f"{k}.html").stat().st_size > 1000
-    assert found.verdict == "effects_found"
-    found.save(tmp_path / "found.yaml")
-    assert tc.load_camera(tmp_path / "found.yaml").model.effects
+RESULTS = {
+    "epochs": lambda epochs, camera, M1, M2: epochs,
+    "study": lambda epochs, camera, M1, M2: tc.study(M1, M2, sets=200, f_number=2.0),
+    "camera": lambda epochs, camera, M1, M2: camera,
+    "camera_at": lambda epochs, camera, M1, M2: camera.at(35.0),
+    "discovery": lambda epochs, camera, M1, M2: tc.discover(M1, verify=[M2]),
+}
+
+
+@pytest.mark.parametrize("name", mostly_slow(RESULTS, *(set(RESULTS) - {"discovery"})))
+def test_one_result_prints_documents_draws_and_reports(name, epochs, camera, M1, M2, tmp_path):
+    result = RESULTS[name](epochs, camera, M1, M2)
+    assert str(result).count("\n") >= 3
+    assert json.loads(json.dumps(result.as_dict(), allow_nan=False))
+    assert result._repr_html_().startswith("<pre>")
+    assert "at 0x" not in repr(result)
+    assert len(repr(result)) < 200
+    result.plot().savefig(tmp_path / "drawn.png")
+    assert result.report(tmp_path / "report.html").stat().st_size > 1000
+    if name == "discovery":
+        assert result.verdict == "effects_found"
+        result.save(tmp_path / "found.yaml")
+        assert tc.load_camera(tmp_path / "found.yaml").model.effects
 
 
 def test_a_result_is_what_the_command_says(epochs, world):

@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+from tests.marks import mostly_slow
 from thermocald.files import read_json
 from thermocald.store.database.store import Store
 
@@ -101,7 +102,7 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     assert daemon.log().count("can be written again") == 1
 
 
-@pytest.mark.parametrize("failing", ["write", "sync"])
+@pytest.mark.parametrize("failing", mostly_slow(["write", "sync"], "write"))
 def test_a_disk_that_fails_beneath_the_store_loses_nothing(
     daemon, measured, preloaded, tmp_path, failing
 ):

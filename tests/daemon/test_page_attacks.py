@@ -96,6 +96,7 @@ def page_of(tmp_path):
 CSV = "/api/series.csv?camera=rpi&series=M1"
 
 
+@pytest.mark.slow
 def test_slow_and_silent_clients_take_no_memory_and_hold_nobody_up(tmp_path, page_of):
     make_store(tmp_path / "s.db", 6000)
     page = page_of(tmp_path / "s.db")

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import call
+from tests.marks import mostly_slow
 from thermocald.daemon.live_state import LiveState, read_state
 from thermocald.output.dashboard.view import View
 
@@ -83,7 +84,7 @@ def filled_and_emptied(daemon, disk: Path, fill=fill, empty=empty, **environment
     assert "store_out" in daemon.events()
 
 
-@pytest.mark.parametrize("kind", ["small_disk", "small_card"])
+@pytest.mark.parametrize("kind", mostly_slow(["small_disk", "small_card"], "small_disk"))
 def test_a_full_disk_is_said_and_waited_for(daemon, measured, kind, request):
     made = request.getfixturevalue(kind)
     disk = made(40) if kind == "small_disk" else made
@@ -117,7 +118,7 @@ def quota(daemon, tmp_path, preloaded):
     return Quota(folder)
 
 
-@pytest.mark.parametrize("late", [{}, {"QUOTA_LATE": "1"}])
+@pytest.mark.parametrize("late", mostly_slow([{}, {"QUOTA_LATE": "1"}], {}))
 def test_a_quota_is_said_and_waited_for(daemon, measured, quota, late):
     """QUOTA_LATE: the flush fails too, as where blocks are allocated late."""
     daemon.configure(**measured)
@@ -167,7 +168,7 @@ def test_a_command_under_a_quota_says_so_and_leaves_nothing_half(
     assert not [path for path in out.parent.rglob("*") if path.is_file()]
 
 
-@pytest.mark.parametrize("room", [1, 4095, 8193, 30_000])
+@pytest.mark.parametrize("room", mostly_slow([1, 4095, 8193, 30_000], 1))
 def test_what_was_reported_kept_is_kept_where_a_quota_leaves_a_little(
     daemon, measured, quota, room
 ):
@@ -207,6 +208,7 @@ def test_what_waits_when_it_is_ended_on_a_full_disk_is_counted(daemon, measured,
     ended_when_full(daemon, measured, disk)
 
 
+@pytest.mark.slow
 def test_what_waits_when_it_is_ended_under_a_quota_is_counted(daemon, measured, quota):
     home = daemon.store.parent
     ended_when_full(daemon, measured, home, quota.reach, quota.lift, **quota.environment)

@@ -72,6 +72,7 @@ def test_an_outside_influence_gets_no_name(evidence_of, seed):
     assert found.effects[0].evidence["bridge"]["transferable"] is False
 
 
+@pytest.mark.slow
 def test_a_small_lag_and_a_small_delay_stay_alternatives(evidence_of):
     evidence, truth = evidence_of("thermal_lag", px=0.03, seed=0)
     assert truth["effects"][0][0]["tau"] < 3

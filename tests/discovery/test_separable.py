@@ -22,6 +22,7 @@ def test_the_recording_decides_whether_shift_and_tilt_are_separable(evidence_of,
     assert ("not separable" in found.statement) is not separable
 
 
+@pytest.mark.slow
 def test_a_mount_that_bends_late_is_named(evidence_of):
     evidence, truth = evidence_of("mount_motion", px=0.1, seed=3)
 

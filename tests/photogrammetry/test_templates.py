@@ -71,6 +71,7 @@ def test_centres_of_crosses_are_better_than_the_clicks_and_have_true_sds():
     assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.3
 
 
+@pytest.mark.slow
 def test_patches_are_found_again_with_true_sds():
     """A camera that turns and zooms a little, in other light: error over sd from frame to frame."""
     ratio = []

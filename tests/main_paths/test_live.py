@@ -164,6 +164,16 @@ def test_a_part_of_a_real_camera(shared, program, tmp_path):
     agree(live, replayed)
 
 
+def test_epochs_too_weak_by_themselves(shared, program, tmp_path):
+    """14 targets leave y0 of an epoch unknown by 80 px; together the epochs carry it."""
+    part = part_of(shared / "data" / "aviary-cam1", tmp_path / "part", 62, every=5)
+    checked = call("check", part)
+    assert "none of 3 epochs can be calibrated by itself" in checked.stdout
+    live, replayed, _ = live_and_replayed(program, part, tmp_path)
+    assert len(good(replayed)) == 40
+    assert len(good(live)) >= 38
+
+
 def test_names_of_targets_that_are_exchanged(shared, program, tmp_path):
     """Live and replay leave both out, as if nobody had seen them; replay had no epoch at all."""
     real = part_of(shared / "data" / "aviary-cam2", tmp_path / "part", 41)

@@ -104,7 +104,7 @@ class Calibrator:
     @classmethod
     def of_recording(cls, recording: Any, settings: AdjustmentSettings | None = None) -> Self:
         """The calibrator of a recording's (store.recording.reader) camera before its test field."""
-        camera: CameraSpec = recording.camera
+        camera: CameraSpec = recording.head.camera
         return cls(
             camera.sensor,
             recording.testfield,

@@ -203,7 +203,9 @@ def calibration_doubts(recording: Recording) -> list[str]:
     tried = [calibrator.calibrate(recording.epochs[row]).adjustment for row in rows.tolist()]
     good = np.array([a.ok for a in tried])
     if not good.any():
-        return [f"none of {len(tried)} epochs can be calibrated: {tried[0].reason}"]
+        weak = all(a.status == "weak_geometry" for a in tried)
+        by_itself = " by itself" if weak else ""
+        return [f"none of {len(tried)} epochs can be calibrated{by_itself}: {tried[0].reason}"]
     found = np.array([a.values for a in tried if a.ok])
     c, x0, y0 = np.median(found[:, :3], axis=0).tolist()
     of_camera = interior_doubts(recording.camera, c, x0, y0)

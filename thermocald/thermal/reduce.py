@@ -108,8 +108,7 @@ def _no_temperature(source: SeriesInput, reference: str) -> DataError:
     """Make the error for a reference temperature that was hardly ever read."""
     return DataError(
         f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
-        f"than {criteria.MIN_EPOCHS} readings. Discovery compares the camera with a thermometer; "
-        "record one"
+        f"than {criteria.MIN_EPOCHS} readings. Record the camera's temperature with its frames"
     )
 
 

@@ -6,13 +6,11 @@ first adjustment, which a second one does without.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     IOP,
@@ -104,16 +102,12 @@ def table_of_series(
 ) -> Epochs:
     """Return the series adjusted together, from the table of its epochs one by one.
 
-    start (16,): where the adjustment begins, by default the medians of the epochs one by one. A
-    series of more epochs than are adjusted at once goes in blocks, on `jobs` processes, and tells
-    `advance` how many epochs are done. Raises DataError where no epoch has a result to start from.
+    start (16,): where the adjustment begins, by default the medians of the epochs one by one, of
+    which some must have a result. A series of more epochs than are adjusted at once goes in blocks,
+    on `jobs` processes, and tells `advance` how many epochs are done.
     """
-    rows = np.flatnonzero(apart.ok)
-    if start is None and not len(rows):
-        counts = Counter(reason for reason in apart.reasons if reason)
-        why = max(counts, key=lambda reason: counts[reason], default="-")
-        raise DataError(f"{head.name}: no epoch has a result; most often: {why}")
     if start is None:
+        rows = np.flatnonzero(apart.ok)
         start = np.median(apart.values[rows[:: max(len(rows) // _SOME, 1)]], axis=0)
     wrong = np.zeros(0, dtype=np.int64)
     few = spread_windows(len(source), _LOOKED_AT)

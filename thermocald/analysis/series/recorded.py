@@ -63,33 +63,38 @@ def recorded_table(
     calibrator = Calibrator.of_recording(recording, settings)
     head, targets = recording.head, recording.testfield
     if recording.has_observations and len(recording) > together_at_most(len(targets)):
-        start = _start(recording, calibrator)
+        start = _start(recording, recording.observations, calibrator)
         apart = _not_calibrated(recording)
         table = table_of_series(head, targets, apart, recording, adjusted, start, jobs, advance)
         return table, recording.observations
     apart, observations = calibrate_epochs(
         recording.iter_epochs(), calibrator, _temperature(recording), advance, jobs
     )
+    begin = None if apart.ok.any() else _start(recording, observations.__getitem__, calibrator)
     grid = ObservationGrid.from_observations(targets, observations)
-    table = table_of_series(head, targets, apart, grid, adjusted, jobs=jobs)
+    table = table_of_series(head, targets, apart, grid, adjusted, begin, jobs=jobs)
     return table, lambda row: observations[row]
 
 
-def _start(recording: Recording, calibrator: Calibrator) -> Array:
-    """Parameters (16,) to start from: medians over some epochs from first to last."""
-    found, reasons = [], []
-    for row in spread_rows(len(recording), _STARTS).tolist():
-        seen = recording.observations(row)
-        if seen is None or not len(seen):
-            continue
-        result = calibrator.adjust(seen)
-        if result.ok:
-            found.append(result.values)
-        else:
-            reasons.append(result.reason)
+def _start(
+    source: Recording | StoredRecording,
+    observations: Callable[[int], Observations | None],
+    calibrator: Calibrator,
+) -> Array:
+    """Parameters (16,) to start from: medians over some epochs from first to last.
+
+    Where each is too weak by itself, together they may carry the parameters. Raises DataError.
+    """
+    seen = map(observations, spread_rows(len(source), _STARTS).tolist())
+    results = [calibrator.adjust(points) for points in seen if points is not None and len(points)]
+    found = [r.values for r in results if r.ok] or [
+        r.values for r in results if r.status == "weak_geometry" and r.interior is not None
+    ]
     if not found:
-        why = max(reasons, key=reasons.count) if reasons else "no target was measured"
-        raise DataError(f"{recording.head.name}: no epoch has a result; most often: {why}")
+        statuses = [r.status for r in results]
+        common = max(statuses, key=statuses.count, default="")
+        why = next((r.reason for r in results if r.status == common), "no target was measured")
+        raise DataError(f"{source.head.name}: no epoch has a result; most often: {why}")
     start: Array = np.median(found, axis=0)
     return start
 
@@ -220,12 +225,17 @@ def table_of_stored(
         "per_epoch",
         head=series.head,
     )
-    if not ok.any() or exterior == "stored":
+    weak = columns["status"] == "weak_geometry"
+    if exterior == "stored" or not (ok.any() or weak.any()):
         return apart
+    start = None
+    if not ok.any():
+        calibrator = Calibrator.of_recording(source, settings)
+        start = _start(source, source.observations, calibrator)
     return table_of_series(
-        series.head, series.testfield, apart, source, SeriesSettings.of(settings, exterior),
-        jobs=jobs,
-    )  # fmt: skip
+        series.head, series.testfield, apart, source, SeriesSettings.of(settings, exterior), start,
+        jobs,
+    )
 
 
 def _parameters(source: StoredRecording, prefix: str, ok: NDArray[np.bool_]) -> Array:

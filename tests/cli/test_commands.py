@@ -277,6 +277,20 @@ def test_what_only_some_commands_need_is_imported_by_those():
     assert done.stdout.split() == []
 
 
+def test_what_a_live_camera_needs_is_without_an_optimiser():
+    """A camera as it is predicted, at a gauge, and in its series: SciPy's optimiser is 20 MB."""
+    code = (
+        "import sys, thermocald as tc, thermocald.daemon.plan\n"
+        "import thermocald.analysis.thermal.gauge, thermocald.analysis.thermal.correction\n"
+        "import thermocald.analysis.online.running_series, thermocald.analysis.series.adjusted\n"
+        "tc.load_camera\n"
+        "heavy = ('scipy.optimize', 'scipy.stats', 'scipy.spatial', 'scipy.integrate')\n"
+        "print(*sorted(set(heavy) & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def test_the_daemon_s_imports_stay_small():
     """What the daemon needs, imported and waiting: 80 MB where numpy and cv2 alone are 41.
 

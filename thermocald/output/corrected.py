@@ -22,7 +22,7 @@ from thermocald.errors import DataError, ImageError, ThermocaldError, UsageError
 from thermocald.files import make_folder, new_file, write_parts
 from thermocald.photogrammetry.targets.image_file import EncodedImage, with_metadata
 from thermocald.result import document_of
-from thermocald.store.logger.photographs import iso
+from thermocald.store.logger.clock import iso
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

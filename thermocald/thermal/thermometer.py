@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.integrate import trapezoid
 
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.normals import spread_windows
@@ -60,6 +59,8 @@ class Thermometer:
         """By how much the curves between readings run ahead of straight lines between them, as a
         share of the time from one reading to the next: h/12τ where the temperature settles with τ.
         """
+        from scipy.integrate import trapezoid  # NumPy's has another name in 1.26 than in 2
+
         known = np.isfinite(self.trajectory)
         t, T, read = self.times[known], self.trajectory[known], self.times[self.real]
         ahead = T - np.interp(t, read, self.trajectory[self.real])

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from thermocald.analysis.camera.undistortion import directions, ideal_points, image_grid
 from thermocald.errors import ConfigurationError, UsageError
@@ -312,6 +310,8 @@ class CameraDifference(Result):
     @cached_property
     def turned_shifts(self) -> Array:
         """The same after the rotation that makes them smallest, (n, 2) px."""
+        from scipy.optimize import least_squares  # 20 MB that a live daemon does not need
+        from scipy.spatial.transform import Rotation
 
         def left(angles: Array) -> Array:
             turned = Rotation.from_rotvec(angles).apply(self._directions)

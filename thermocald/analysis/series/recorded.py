@@ -235,7 +235,7 @@ def table_of_stored(
     return table_of_series(
         series.head, series.testfield, apart, source, SeriesSettings.of(settings, exterior), start,
         jobs,
-    )
+    )  # fmt: skip
 
 
 def _parameters(source: StoredRecording, prefix: str, ok: NDArray[np.bool_]) -> Array:

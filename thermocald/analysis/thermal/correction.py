@@ -46,8 +46,7 @@ from thermocald.photogrammetry.targets.image_file import (
     with_metadata,
 )
 from thermocald.result import jsonable, with_sds
-from thermocald.store.logger.clock import DeviceClock, parse_moment
-from thermocald.store.logger.photographs import iso
+from thermocald.store.logger.clock import DeviceClock, iso, parse_moment
 
 if TYPE_CHECKING:
     import io

@@ -200,6 +200,12 @@ _ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2
 _PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds since 1970 are fewer for 3000 years
 
 
+def iso(seconds: float) -> str:
+    """A time as ISO 8601 in UTC, to a millisecond."""
+    moment = datetime.fromtimestamp(float(seconds), UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
 def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
     """A date with a time, with or without a zone; or a date, or a time, alone.
 

@@ -28,7 +28,7 @@ from thermocald.errors import DataError, DriverMissing, ImageError, UsageError
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files import read_camera
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.store.logger.clock import parse_moment
+from thermocald.store.logger.clock import iso, parse_moment
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import EpochColumns, Recording
@@ -275,12 +275,6 @@ def _positive(value: Any) -> float | None:
 
 
 _LARGEST_GAP_IN_INTERVALS = 10.0
-
-
-def iso(seconds: float) -> str:
-    """A time as ISO 8601 in UTC, to a millisecond."""
-    moment = datetime.fromtimestamp(float(seconds), UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def read_series(

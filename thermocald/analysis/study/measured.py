@@ -115,9 +115,9 @@ class MeasuredSeries:
         return np.array([np.mean(self.column(name)[0]) for name in IOP_NAMES])
 
     def column(self, name: str) -> tuple[Array, Array]:
-        """Return copies of the values and standard deviations (E,) of one IOP."""
+        """Return the values and standard deviations (E,) of one IOP, not to be written to."""
         k = IOP_NAMES.index(name)
-        return self.values[:, k].copy(), self.sds[:, k].copy()
+        return np.ascontiguousarray(self.values[:, k]), np.ascontiguousarray(self.sds[:, k])
 
     @property
     def reference(self) -> Thermometer | None:

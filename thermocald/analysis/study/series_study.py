@@ -338,16 +338,16 @@ def _significance(
             f"{' but too many gaps' if len(series) >= settings.window else ''}: not tested."
         )
         return {}
-    columns = {name: series.column(name) for name in series.free}
     drifts = {
-        name: drift_test(*column, series.redundancy, settings.window, series.time_s)
-        for name, column in columns.items()
+        name: drift_test(*series.column(name), series.redundancy, settings.window, series.time_s)
+        for name in series.free
     }
     tested = {name: drift for name, drift in drifts.items() if drift is not None}
     p_holm = dict(zip(tested, holm([d.p_value for d in tested.values()]), strict=True))
     p_excess = dict(zip(tested, holm([d.p_excess for d in tested.values()]), strict=True))
     result = {}
-    for name, (values, sds) in columns.items():
+    for name in series.free:
+        values, sds = series.column(name)
         test = moving_f_test(
             values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
         )
@@ -388,13 +388,14 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
         )
     if reason:
         return ChannelStudy(thermometer, {}, {}, {}, reason)
-    columns = {column: series.column(column) for column in series.free}
-    columns["sigma0"] = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
-    found = {
-        column: dependence(values[have], sds[have], t, sd, series.time_s[have])
-        for column, (values, sds) in columns.items()
-        if np.ptp(values[have]) > 0
-    }
+    found = {}
+    for column in (*series.free, "sigma0"):
+        if column == "sigma0":
+            values, sds = series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy)
+        else:
+            values, sds = series.column(column)
+        if np.ptp(values[have]) > 0:
+            found[column] = dependence(values[have], sds[have], t, sd, series.time_s[have])
     return ChannelStudy(
         thermometer,
         found,

@@ -309,11 +309,12 @@ def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, fl
     system, sensor = estimate.system, series.sensor
     half = 0.5 * np.array([sensor.width - 1, sensor.height - 1])
     radius = np.linalg.norm(system.design.at.predicted - half, axis=1)
-    weights = system.weights[..., 0]
-    stated = np.divide(
-        series.stated[..., 0], weights, out=np.zeros_like(weights), where=weights > 0
-    )
-    tests = point_tests(system, estimate.residuals) * stated
+    tests = point_tests(system, estimate.residuals)
+    if series.stated is not system.weights:
+        weights = system.weights[..., 0]
+        tests *= np.divide(
+            series.stated[..., 0], weights, out=np.zeros_like(weights), where=weights > 0
+        )
     offered = series.grid.observed & system.good[:, None]  # the rejected too: noise is cut else
     return noise_by_radius(tests, offered, radius)
 

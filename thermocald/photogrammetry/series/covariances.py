@@ -12,7 +12,12 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, EOP_COLUMNS, PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import inverse_2x2, inverse_of_determined, root_of
-from thermocald.photogrammetry.series.normals import among_all, cofactors, linearise
+from thermocald.photogrammetry.series.normals import (
+    among_all,
+    cofactors,
+    linearise,
+    sums_of_targets,
+)
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array, Index, Mask
@@ -177,8 +182,8 @@ def of_held_affinity(
     free = np.union1d(design.own, design.common)
     held = np.setdiff1d([C1, C2], free)
     both = np.concatenate([free, held])
-    used = system.used(system.good)
-    weights = used.sum(axis=0)
+    use = system.use & system.good[:, None]
+    weights = np.stack([(system.weights[..., k] * use).sum(axis=0) for k in range(3)], axis=1)
     seen = (weights[:, :2] > 0).all(axis=1)
     noise, of_field = inverse_2x2(_full(weights[seen])), np.zeros((2, 2))
     if design.offset_prior is not None:
@@ -186,9 +191,7 @@ def of_held_affinity(
     N = _normals(A[seen], inverse_2x2(noise + of_field))
     moves = np.zeros((len(held), 16))
     moves[:, free] = -N[np.ix_(held, free)] @ inverse_of_determined(N[np.ix_(free, free)])
-    (wx, wy, wxy) = used[:, seen].T
-    (vx, vy) = np.nan_to_num(residuals[system.good][:, seen]).T
-    sums = np.stack([(wx * vx + wxy * vy).sum(axis=1), (wxy * vx + wy * vy).sum(axis=1)], axis=1)
+    sums = sums_of_targets(system.weights, residuals, use)[seen]
     state = start = found.values[system.good].mean(axis=0)
     image = linearise(sensor, field, start[:10], start[10:]).predicted + np.nan_to_num(
         found.offsets

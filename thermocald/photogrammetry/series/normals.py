@@ -270,6 +270,14 @@ def sums_of_squares(
     return total
 
 
+def sums_of_targets(weights: Array, residuals: Array, use: NDArray[np.bool_]) -> Array:
+    """P v (T, 2) of every target, over the epochs in which it takes part, use (E, T)."""
+    total = np.zeros((residuals.shape[1], 2))
+    for part in chunks(*residuals.shape[:2]):
+        total += _weighted(weights[part], residuals[part], use[part]).sum(axis=1).T
+    return total
+
+
 def _weighted(weights: Array, residuals: Array, use: NDArray[np.bool_] | None) -> Array:
     """P v (2, E, T) of every point, 0 where it takes no part."""
     out = np.empty((2, *residuals.shape[:2]))

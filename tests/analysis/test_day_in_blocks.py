@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,3 +100,25 @@ def test_the_fit(day):
         fitted = fit_thermal_model([reduce_series(short, strict=False)], [])
         rates.append([fitted.model.rates[name] for name in ("c", "x0", "y0")])
     np.testing.assert_allclose(rates[1], rates[0], rtol=SAME)
+
+
+@pytest.mark.slow
+def test_a_coordinate_that_is_wrong(day, monkeypatch, tmp_path):
+    """30 mm of one target moved c by 98 µm: it is left out, and named, as in a short series."""
+    for module in (adjusted, recorded):
+        monkeypatch.setattr(module, "together_at_most", lambda _: TOGETHER)
+    path, means = tmp_path / "day", []
+    shutil.copytree(day.recording.path, path)
+    field = (path / "testfield.csv").read_text().splitlines()
+    sure = [line.rsplit(",", 3)[0] + ",0.3,0.3,0.3" for line in field[1:]]
+    name, x, rest = sure[7].split(",", 2)
+    wrong = [*sure[:7], f"{name},{float(x) + 30.0},{rest}", *sure[8:]]
+    for lines in (sure, wrong):
+        (path / "testfield.csv").write_text("\n".join([field[0], *lines]) + "\n")
+        series = tc.open(path)
+        table = series.calibrate()
+        assert table.ok.all()
+        means.append(table.values[:, :3].mean(axis=0))
+        said = any(f": {name} " in doubt for doubt in series.doubts(table))
+        assert said == (lines is wrong)
+    assert (np.abs(means[1] - means[0]) < 3 * table.level_sd[:3]).all()

@@ -109,12 +109,12 @@ def table_of_series(
     if start is None:
         rows = np.flatnonzero(apart.ok)
         start = np.median(apart.values[rows[:: max(len(rows) // _SOME, 1)]], axis=0)
-    wrong = np.zeros(0, dtype=np.int64)
     few = spread_windows(len(source), _LOOKED_AT)
     own = np.where(apart.ok[:, None], apart.values, np.nan)[np.r_[few]]
-    if np.isfinite(own).any():  # epochs of a long series are not calibrated one by one
-        far = misplaced_targets(head.camera.sensor, testfield, gathered(source, few), own)
-        wrong = np.flatnonzero(far)
+    if not np.isfinite(own).any():  # epochs of a long series are not calibrated one by one
+        own = np.tile(start, (len(own), 1))
+    far = misplaced_targets(head.camera.sensor, testfield, gathered(source, few), own)
+    wrong = np.flatnonzero(far)
 
     def left_out() -> Epochs:
         """The table without targets that are wrong, which count as rejected."""
@@ -127,15 +127,19 @@ def table_of_series(
         return left_out()
     apart = replace(apart, head=head)
     settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
-    if len(source) > together_at_most(len(testfield)):
-        return _in_blocks(testfield, apart, start, source, settings, jobs, advance)
-    grid = gathered(source, [slice(0, len(source))])
-    found = _as_one(testfield, apart, start, grid, settings)
+    in_blocks = len(source) > together_at_most(len(testfield))
+    if in_blocks:
+        found = _in_blocks(testfield, apart, start, source, settings, jobs, advance)
+    else:
+        grid = gathered(source, [slice(0, len(source))])
+        found = _as_one(testfield, apart, start, grid, settings)
     assert found.adjustment is not None
     c_px = start[0] / head.camera.sensor.pixel_pitch
     wrong = np.flatnonzero(find_misplaced(found.adjustment.offsets, c_px))
     if len(wrong):  # they had drawn the start to themselves
         return left_out()
+    if in_blocks:
+        return found
     moved, still = still_field(
         head.camera.sensor, testfield, grid, found.adjustment, start, apart.number,
         apart.frame_time,

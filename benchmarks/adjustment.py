@@ -3,8 +3,9 @@
 Run: python benchmarks/adjustment.py
 Bounds: warm epoch with full covariance ≤ 0.4 × cv2.calibrateCameraExtended on the same points;
 a batch of 1,000 epochs ≤ 0.14 × per epoch (0.06 before a series said how noisy its outer targets
-are and what a held affinity does to its level; from run to run 0.10 to 0.13). The adjustment with its covariance stands beside all
-that `adjust` does: data snooping, redundancy numbers, a look at the geometry. OpenCV does neither.
+are and what a held affinity does to its level; from run to run 0.10 to 0.13). The adjustment with
+its covariance stands beside all that `adjust` does: data snooping, redundancy numbers, a look at
+the geometry. OpenCV does neither.
 """
 
 from __future__ import annotations

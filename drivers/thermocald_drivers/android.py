@@ -176,9 +176,7 @@ class AndroidCamera(Camera):
         tags |= focus_state(self.phone.shell("dumpsys media.camera"))
         self._require_lock(tags)
         start = self._exposure_start(tags, triggered)
-        image, _ = support.decode(
-            memoryview(jpeg), "JPEG", self.options.width, self.options.height
-        )
+        image, _ = support.decode(memoryview(jpeg), "JPEG", self.options.width, self.options.height)
         if self.options.delete:
             self.phone.shell(f"rm -f '{path}'")
         middle = start + float(tags.get("exposure_s", 0.0)) / 2.0

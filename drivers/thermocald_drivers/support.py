@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.hal import Clock
+
     Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
 

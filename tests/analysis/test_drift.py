@@ -28,14 +28,15 @@ SIGMA = 0.05
 
 
 def series(
-    seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int = 60, targets: int = 60
-) -> Epochs:
+    seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int = 60, targets: int = 60,
+    field_mm: float = 0.02,
+) -> Epochs:  # fmt: skip
     """Circles before a camera that warms up within 400 s; one of them may wander by some px."""
     plain = corner_field("plain", per_side=5, pitch_mm=124.0)
     rng = np.random.default_rng(seed)
     rows = rng.permutation(len(plain))[:targets]
-    field = TestField.build([plain.names[i] for i in rows], plain.points[rows], 0.02)
-    true = field.points + rng.normal(0, 0.02, field.points.shape)
+    field = TestField.build([plain.names[i] for i in rows], plain.points[rows], field_mm)
+    true = field.points + rng.normal(0, field_mm, field.points.shape)
     model = demonstration_model(plain)
     iop, eop = model.interior.as_array(), model.exterior.as_array()
     observations = []
@@ -68,6 +69,18 @@ def test_no_target_is_accused_of_what_the_camera_did(seed):
     assert all(not c.rests_on for c in found)
     x0 = found[1]
     assert x0.last_minus_first == pytest.approx(-1.39e-3, abs=4 * x0.sd_last_minus_first)
+
+
+@pytest.mark.parametrize(("field_mm", "hangs"), [(0.02, False), (2.0, True)])
+def test_changes_are_as_wrong_as_c_and_that_is_said(field_mm, hangs):
+    """An image shows a change as a share of c, which the field shows."""
+    table = with_drifts(series(4, field_mm=field_mm))
+    found = table.as_dict().get("changes_hang_on_c")
+    assert (found is not None) is hangs
+    assert any("changes are as wrong as c" in line for line in table.lines()) is hangs
+    x0 = table.drifts[1]
+    off, share = abs(x0.last_minus_first + 1.39e-3), found["c_known_to"] if found else 0.0
+    assert off < 4 * np.hypot(x0.sd_last_minus_first, share * 1.39e-3)
 
 
 @pytest.mark.parametrize(("targets", "few"), [(12, 12), (60, None)])

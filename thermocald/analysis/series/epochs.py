@@ -54,6 +54,7 @@ CAUSES_OF_SIGMA0 = (
     "it can be the noise of the image points, a test field worse than stated, or a lens that the "
     "distortion does not describe"
 )
+_CARRIED = 0.5  # standard deviations of a change that an error of c may carry into it
 _TESTS_A_FIELD = 18  # redundant coordinates of a level: 16 targets
 _SHOWN_SDS = 5.0  # of an affinity that the targets show
 _LEVEL_OF_FEW = 1.6  # error over sd of 12 to 14 targets whose field is 3 to 10 times worse
@@ -212,6 +213,8 @@ class Epochs(Result):
         }
         if few := _few_targets(self.adjustment):
             document["level_tested_by_targets"] = few
+        if hang := self._hang_on_c():
+            document["changes_hang_on_c"] = hang
         if self.adjustment is not None and self.exterior == "series":
             document["stood_still"] = _stood_still(self.stillness)
         converted: dict[str, Any] = jsonable(document)
@@ -284,6 +287,12 @@ class Epochs(Result):
             for name in self.left_out
         ]
         out += table_of(self.drifts)
+        if hang := document.get("changes_hang_on_c"):
+            out.append(
+                f"the field shows c to {hang['c_known_to']:.2%} only, and changes are as wrong as "
+                f"c: they may be off by up to {hang['sds']:.1f} of their standard deviations; use "
+                "a field with depth whose coordinates are known better"
+            )
         if limits := [c for c in self.drifts if isfinite(c.sd_by_perspective)]:
             sds = ", ".join(f"{c.name} ± {1e3 * c.sd_by_perspective:.3f}" for c in limits)
             out.append(
@@ -301,6 +310,19 @@ class Epochs(Result):
                 f"{still['largest_chi2']:.0f}, {bound}): use --exterior per_epoch"
             )
         return out
+
+    def _hang_on_c(self) -> dict[str, float] | None:
+        """Return how well c is known, and how many sds of a change that may make; None: few.
+
+        An image shows a change as a share of c.
+        """
+        if not self.drifts or not self.level_sd[0] > 0:
+            return None
+        share = float(self.level_sd[0] / np.nanmedian(self.values[self.ok, 0]))
+        changes = [(c.per_kelvin, c.sd_per_kelvin) for c in self.drifts]
+        changes += [(c.last_minus_first, c.sd_last_minus_first) for c in self.drifts]
+        sds = max((abs(v) / sd * share for v, sd in changes if sd > 0), default=0.0)
+        return {"c_known_to": share, "sds": sds} if sds > _CARRIED else None
 
     def _cause_of_noise(self) -> str:
         """Return what a sigma0 beyond 1 can be, "" where it is not."""

@@ -1,8 +1,8 @@
 """Two outputs compared number by number, and long ones kept short.
 
 Numbers of a document: within a relative bound, or a share of the standard deviation that stands
-beside them (`sd_c` beside `c`, `sd` beside `value`); members of a long list within a relative bound
-of its RMS. Numbers in a text: one unit of the last digit.
+beside them (`sd_c` beside `c`, `sd` beside `value`) or that their significance tells; members of a
+long list within a relative bound of its RMS. Numbers in a text: one unit of the last digit.
 """
 
 from __future__ import annotations
@@ -109,6 +109,8 @@ def _beside(document: dict[str, Any], key: str) -> float:
     """The standard deviation that belongs to an entry, the largest of a column; 0 without."""
     if key.endswith("_sigmas"):
         return 1.0  # it counts standard deviations
+    if key == "rms_px" and (sigmas := document.get("significance_sigmas")):
+        return abs(float(document[key]) / sigmas)
     own = document.get("sd" if key == "value" else f"sd_{key}")
     if own is None and key in ("mean", "change", "last_minus_first", "scatter"):
         own = document.get("stated_sd")

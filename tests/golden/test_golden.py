@@ -62,6 +62,9 @@ def test_a_number_that_moved_is_seen():
     assert list(differences(before, {**before, "text": "c = 3.0402 mm in 12 epochs"}, bound))
     assert list(differences(before, {**before, "text": "c = 3.0400 mm in 13 epochs"}, bound))
     assert list(differences(before, {**before, "n": 13}, bound))
+    small = {"rms_px": 1.6e-4, "significance_sigmas": 0.02}  # its sd is 0.008 px
+    assert list(differences(small, {**small, "rms_px": 1.60005e-4}, bound)) == []
+    assert list(differences(small, {**small, "rms_px": 1.601e-4}, bound))
     some = shortened([-1e-6, *range(20)])
     moved = {**some, "some": [1e-9, *some["some"][1:]]}
     assert list(differences(some, moved, Bounds(1e-6, 0, 0))) == []

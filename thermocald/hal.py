@@ -35,7 +35,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from thermocald.addresses import hide_secrets
 from thermocald.config import Section, in_words, keys
-from thermocald.errors import ConfigurationError, DriverMissing, WrongDevice
+from thermocald.errors import ConfigurationError, DeviceGone, DriverMissing, WrongDevice
 from thermocald.names import channel_fault as channel_fault
 from thermocald.names import require_channels
 
@@ -183,10 +183,15 @@ class Device:
 
     The constructor raises a ConfigurationError and does not touch hardware.
     `open` raises a DeviceError; `close` never raises and may be called twice.
+    where: the device in messages; handle: what `open` got hold of, None while it is closed; seen:
+    whether it was open before, for what is missing then has gone.
     """
 
     Options: ClassVar[type[DriverOptions]] = DriverOptions
     options: Any
+    where: str = ""
+    handle: Any = None
+    seen = False
 
     device_classes: ClassVar[tuple[str, ...]] = ()
     """The nodes in /dev that it opens, as systemd's DeviceAllow= names them: `char-i2c`."""
@@ -205,6 +210,15 @@ class Device:
 
     def close(self) -> None:
         """Release the device."""
+        handle, self.handle = self.handle, None
+        if handle is not None:
+            handle.close()
+
+    def opened(self) -> Any:
+        """Return the handle; DeviceGone while the device is closed."""
+        if self.handle is None:
+            raise DeviceGone(f"{self.where}: not open")
+        return self.handle
 
     def identity(self) -> Mapping[str, str]:
         """Name, serial number, versions: what distinguishes this device from others."""

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from thermocald.addresses import hide
-from thermocald.errors import ConfigurationError, DeviceGone
+from thermocald.errors import ConfigurationError
 from thermocald.hal import DriverOptions, Output
 from thermocald.names import WITH_VALUES
 from thermocald_drivers import support
@@ -309,8 +309,6 @@ class AlertOptions(DriverOptions):
 class AlertOutput(Output):
     """An output that delivers alerts; a driver says how in `deliver`, and where in `where`."""
 
-    where: str
-
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         conditions = [condition_of(stanza) for stanza in self.options.when]
@@ -319,18 +317,16 @@ class AlertOutput(Output):
             raise ConfigurationError(f"when: {min(twice)} is given twice")
         self._watch = Watch(conditions)
         self._waiting: deque[Alert] = deque(maxlen=MOST_WAITING)
-        self._opened = False
 
     def open(self) -> None:
         self.reach()
-        self._opened = True
+        self.handle = self.handle or True
 
     def close(self) -> None:
-        self._opened = False
+        self.handle = None
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        if not self._opened:
-            raise DeviceGone(f"{self.where}: not open")
+        self.opened()
         for alert in self._watch.changes(result, str(result.get("device", self.options.device))):
             log.warning("%s", alert.text, extra={"event": "alert"})
             self._waiting.append(alert)

@@ -52,7 +52,7 @@ from thermocald.errors import (
 )
 from thermocald.hal import Camera, Found, Frame
 from thermocald_drivers import support
-from thermocald_drivers.android_phone import ADB_CLASSES, AdbPhone, PhoneOptions, list_devices
+from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, list_devices
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -105,16 +105,14 @@ class CameraOptions(PhoneOptions):
     timeout_s: Annotated[float, Field(ge=0.1, le=600.0)] = 15.0
 
 
-class AndroidCamera(Camera):
+class AndroidCamera(AdbPhone, Camera):
     """The camera app of a phone, triggered through adb."""
 
-    device_classes = ADB_CLASSES
     Options = CameraOptions
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         o = self.options
-        self.phone = AdbPhone(o)
         if o.trigger != "tap":
             self.command = f"input keyevent {KEYS[o.trigger]}"
         elif o.tap is None:
@@ -135,17 +133,11 @@ class AndroidCamera(Camera):
         ]
 
     def open(self) -> None:
-        self.phone.connect()
+        super().open()
         self._wake()
         self._require_space()
-        self._offset, self._zone, _ = self.phone.clock_offset()
-        self.phone.shell(OPEN_APP)
-
-    def close(self) -> None:
-        self.phone.disconnect()
-
-    def identity(self) -> Mapping[str, str]:
-        return {"serial": self.phone.serial}
+        self._offset, self._zone, _ = self.clock_offset()
+        self.shell(OPEN_APP)
 
     def warnings(self) -> list[str]:
         found = []
@@ -159,26 +151,26 @@ class AndroidCamera(Camera):
         return self.options.width, self.options.height
 
     def capture(self) -> Frame:
-        if "Awake" not in self.phone.shell(STATE):
+        if "Awake" not in self.shell(STATE):
             self._wake()
-            self.phone.shell(OPEN_APP)
-        before = self.phone.listing(self.folder)
+            self.shell(OPEN_APP)
+        before = self.listing(self.folder)
         triggered = time.time()
-        self.phone.shell(self.command)
+        self.shell(self.command)
         triggered = (triggered + time.time()) / 2.0
         path, jpeg = self._new_photograph(set(before))
         tags = exif(jpeg)
         if (tags["width"], tags["height"]) != (self.options.width, self.options.height):
             raise WrongDevice(
-                f"{self.phone.where}: the photograph has {tags['width']}×{tags['height']} px, not "
+                f"{self.where}: the photograph has {tags['width']}×{tags['height']} px, not "
                 f"{self.options.width}×{self.options.height}; set the camera app to its full size"
             )
-        tags |= focus_state(self.phone.shell("dumpsys media.camera"))
+        tags |= focus_state(self.shell("dumpsys media.camera"))
         self._require_lock(tags)
         start = self._exposure_start(tags, triggered)
         image, _ = support.decode(memoryview(jpeg), "JPEG", self.options.width, self.options.height)
         if self.options.delete:
-            self.phone.shell(f"rm -f '{path}'")
+            self.shell(f"rm -f '{path}'")
         middle = start + float(tags.get("exposure_s", 0.0)) / 2.0
         monotonic, utc = support.on_clock(self.clock, middle - time.time() + time.monotonic())
         return Frame(
@@ -196,25 +188,25 @@ class AndroidCamera(Camera):
 
     def _wake(self) -> None:
         """Switch the screen on and dismiss a lock without PIN; DeviceDenied if it has one."""
-        self.phone.shell(f"input keyevent {WAKE_KEY}; wm dismiss-keyguard")
-        state = self.phone.shell(STATE)
+        self.shell(f"input keyevent {WAKE_KEY}; wm dismiss-keyguard")
+        state = self.shell(STATE)
         if "Lockscreen=true" in state or "isKeyguardShowing=true" in state:
             raise DeviceDenied(
-                f"{self.phone.where}: the screen is locked; unlock it and set the screen lock to "
+                f"{self.where}: the screen is locked; unlock it and set the screen lock to "
                 "'None' (and 'Stay awake' in the developer options)"
             )
         if "mWakefulness=" in state and "Awake" not in state:
-            raise DeviceGone(f"{self.phone.where}: the screen does not come on")
+            raise DeviceGone(f"{self.where}: the screen does not come on")
 
     def _require_space(self) -> None:
         """PermanentDeviceError if the storage is full; unknown free space is accepted."""
-        lines = self.phone.shell(f"df -k '{self.folder}' 2>/dev/null || df -k /sdcard").split("\n")
+        lines = self.shell(f"df -k '{self.folder}' 2>/dev/null || df -k /sdcard").split("\n")
         fields = lines[-1 if lines[-1].strip() else -2].split() if len(lines) > 1 else []
         if len(fields) >= 4 and fields[3].isdigit():
             free_mb = int(fields[3]) / 1024.0
             if free_mb < self.options.minimum_free_mb:
                 raise PermanentDeviceError(
-                    f"{self.phone.where}: its storage is full ({free_mb:.0f} MB left, "
+                    f"{self.where}: its storage is full ({free_mb:.0f} MB left, "
                     f"{self.options.minimum_free_mb:g} wanted); delete photographs, or delete: true"
                 )
 
@@ -225,30 +217,30 @@ class AndroidCamera(Camera):
         while time.monotonic() < deadline:
             new = {
                 name: size
-                for name, size in self.phone.listing(self.folder).items()
+                for name, size in self.listing(self.folder).items()
                 if name not in before
                 and name.lower().endswith((".jpg", ".jpeg"))
                 and not name.startswith((".pending", ".trashed"))
             }
             if len(new) > 1:
                 raise BadReading(
-                    f"{self.phone.where}: {len(new)} new photographs ({', '.join(sorted(new))}); "
+                    f"{self.where}: {len(new)} new photographs ({', '.join(sorted(new))}); "
                     "switch off burst, HDR and RAW+JPEG copies, and touch nothing"
                 )
             for name, size in new.items():
                 if size > 0 and size == last_size:
-                    jpeg = self.phone.pull(f"{self.folder}/{name}")
+                    jpeg = self.pull(f"{self.folder}/{name}")
                     if len(jpeg) == size and support.jpeg_end(jpeg):
                         return f"{self.folder}/{name}", jpeg
                     short = f"{name} has {len(jpeg)} of {size} bytes and no end"
                 last_size = size
             time.sleep(POLL_S)
         if short or name:
-            raise BadReading(f"{self.phone.where}: partial photograph, {short or name}")
+            raise BadReading(f"{self.where}: partial photograph, {short or name}")
         self._require_space()
         self._wake()
         raise DeviceTimeout(
-            f"{self.phone.where}: no new photograph in {self.folder} {self.options.timeout_s:g} s "
+            f"{self.where}: no new photograph in {self.folder} {self.options.timeout_s:g} s "
             "after the trigger; is the camera app open, is the trigger right (camera, volume, tap)?"
         )
 
@@ -266,7 +258,7 @@ class AndroidCamera(Camera):
         why = {None: moved, True: moved or changed, False: ""}[refuse]
         if why:
             raise BadReading(
-                f"{self.phone.where}: focus or exposure moved, {why}; set the camera app to manual "
+                f"{self.where}: focus or exposure moved, {why}; set the camera app to manual "
                 "(refuse_unlocked: false accepts it)"
             )
 

@@ -42,7 +42,7 @@ import stat
 import struct
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from thermocald.errors import (
     BadReading,
@@ -53,7 +53,7 @@ from thermocald.errors import (
     DeviceTimeout,
     WrongDevice,
 )
-from thermocald.hal import DriverOptions, Found, Thermometer
+from thermocald.hal import Device, DriverOptions, Found, Thermometer
 from thermocald_drivers import chips, kernel, support
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def list_devices() -> list[tuple[str, str]]:
     """Return (serial, state) of what a running adb server lists; [] without one."""
     adbutils = support.library("adbutils", "android")
     try:
-        AdbPhone(PhoneOptions(serial="none", timeout_s=1.0)).require_server()
+        require_server("127.0.0.1", 5037, 1.0, seen=False)
         return _devices(adbutils.AdbClient(socket_timeout=1.0))
     except (OSError, adbutils.AdbError):
         return []
@@ -105,24 +105,36 @@ def _devices(client: Any) -> list[tuple[str, str]]:
     return [(serial.strip(), state.strip()) for serial, _, state in pairs]
 
 
-class AdbPhone:
-    """One phone: `connect` before anything else; `seen` once that has succeeded."""
+def require_server(host: str, port: int, timeout_s: float, *, seen: bool) -> None:
+    """Raise a DeviceError unless an adb server answers; none is started."""
+    try:
+        socket.create_connection((host, port), timeout=timeout_s).close()
+    except OSError as error:
+        message = f"no adb server at {host}:{port} ({error}); run `adb start-server`"
+        raise support.absent(message, seen=seen) from error
 
-    def __init__(self, options: PhoneOptions) -> None:
-        self.serial = options.serial
-        self.where = f"phone {self.serial}"
-        self._host, self._port = options.host, options.port
-        self._timeout_s, self._start_server = options.timeout_s, options.start_server
-        self._device: Any = None
+
+class AdbPhone(Device):
+    """What the drivers of a phone share."""
+
+    device_classes = ADB_CLASSES
+    Options: ClassVar[type[DriverOptions]] = PhoneOptions
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.where = f"phone {self.options.serial}"
         self._lines: list[Any] = []
-        self.seen = False
 
-    def connect(self) -> None:
+    def identity(self) -> Mapping[str, str]:
+        return {"serial": self.options.serial}
+
+    def open(self) -> None:
         """Find the phone among the server's devices; DeviceError says why it cannot be used."""
         adbutils = support.library("adbutils", "android")
-        if not self._start_server:
-            self.require_server()
-        client = adbutils.AdbClient(self._host, self._port, socket_timeout=self._timeout_s)
+        o = self.options
+        if not o.start_server:
+            require_server(o.host, o.port, o.timeout_s, seen=self.seen)
+        client = adbutils.AdbClient(o.host, o.port, socket_timeout=o.timeout_s)
         connect = client.make_connection
 
         def remembering(timeout: float | None = None) -> Any:
@@ -131,7 +143,7 @@ class AdbPhone:
 
         client.make_connection = remembering
         listed = self._call(lambda: _devices(client))
-        states = [state for serial, state in listed if serial == self.serial]
+        states = [state for serial, state in listed if serial == o.serial]
         if len(states) > 1:
             raise WrongDevice(
                 f"{self.where}: {len(states)} devices have this serial number "
@@ -152,38 +164,27 @@ class AdbPhone:
             raise support.denied(message, seen=self.seen)
         if state != "device":
             raise DeviceGone(f"{self.where}: its state is {state!r}; let it boot into Android")
-        self._device = client.device(serial=self.serial)
-        self.seen = True
+        self.handle, self.seen = client.device(serial=o.serial), True
 
-    def require_server(self) -> None:
-        """Raise a DeviceError unless an adb server answers; none is started."""
-        try:
-            socket.create_connection((self._host, self._port), timeout=self._timeout_s).close()
-        except OSError as error:
-            raise support.absent(
-                f"no adb server at {self._host}:{self._port} ({error}); run `adb start-server`",
-                seen=self.seen,
-            ) from error
-
-    def disconnect(self) -> None:
+    def close(self) -> None:
         """Forget the phone; the server keeps running."""
-        self._device = None
+        self.handle = None
 
     def shell(self, command: str) -> str:
         """Return the command's output (both streams); its exit status is ignored."""
-        device = self._connected()
-        answer = self._call(lambda: device.shell2(command, timeout=self._timeout_s, v2=True))
+        device, timeout_s = self.opened(), self.options.timeout_s
+        answer = self._call(lambda: device.shell2(command, timeout=timeout_s, v2=True))
         return str(answer.output)
 
     def listing(self, folder: str) -> dict[str, int]:
         """Return {name: bytes} of the plain files of a folder."""
-        device = self._connected()
+        device = self.opened()
         entries = self._call(lambda: list(device.sync.iter_directory(folder)))
         return {e.path: e.size for e in entries if stat.S_ISREG(e.mode)}
 
     def pull(self, path: str) -> bytes:
         """Return a file's bytes; BadReading if the phone ends it early."""
-        device = self._connected()
+        device = self.opened()
         return bytes(self._call(lambda: device.sync.read_bytes(path)))
 
     def clock_offset(self, tries: int = 12) -> tuple[float, str, float]:
@@ -206,7 +207,7 @@ class AdbPhone:
     def _ask_clock(self) -> tuple[float, str, float]:
         # the connection is opened first: adbutils sleeps 10 ms while opening and closing one, which
         # would lengthen one side of the round trip only
-        line = self._connected().open_transport(timeout=self._timeout_s)
+        line = self.opened().open_transport(timeout=self.options.timeout_s)
         start = time.time()
         line.send_command("shell:date '+%s.%N %z'")
         line.check_okay()
@@ -218,18 +219,14 @@ class AdbPhone:
             raise BadReading(f"{self.where}: `date` says {' '.join(text)!r}") from error
         return phone - (start + end) / 2.0, "".join(text[1:2]), (end - start) / 2.0
 
-    def _connected(self) -> Any:
-        if self._device is None:
-            raise DeviceGone(f"{self.where}: not open")
-        return self._device
-
     def _call(self, action: Callable[[], Any]) -> Any:
         """Translate adbutils' errors, by what the server answers."""
         adbutils = support.library("adbutils", "android")
         try:
             return action()
         except (adbutils.AdbTimeout, TimeoutError) as error:
-            raise DeviceTimeout(f"{self.where}: no answer in {self._timeout_s:g} s") from error
+            within = f"{self.options.timeout_s:g} s"
+            raise DeviceTimeout(f"{self.where}: no answer in {within}") from error
         except adbutils.AdbError as error:
             raise self._translated(str(error)) from error
         except (EOFError, struct.error, ConnectionError) as error:
@@ -249,7 +246,8 @@ class AdbPhone:
         if "offline" in message:
             return DeviceGone(f"{self.where}: {OFFLINE}")
         if "connect to adb server" in message or "No adb exe" in message:
-            return DeviceNotFound(f"no adb server at {self._host}:{self._port}: {message}")
+            server = f"{self.options.host}:{self.options.port}"
+            return DeviceNotFound(f"no adb server at {server}: {message}")
         if "not found" in message or "closed" in message or "Unknown data" in message:
             return DeviceGone(f"{self.where}: {message}")
         if "chunk missing" in message or "Invalid sync" in message:
@@ -296,15 +294,13 @@ class ThermometerOptions(PhoneOptions):
     timeout_s: support.Seconds = 5.0
 
 
-class AndroidThermometer(Thermometer):
+class AndroidThermometer(AdbPhone, Thermometer):
     """Battery, thermal service and thermal zones of a phone, in one shell call each."""
 
-    device_classes = ADB_CLASSES
     Options = ThermometerOptions
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.phone = AdbPhone(self.options)
         self.sensors: dict[str, str] = self.options.sensors
         for channel, source in self.sensors.items():
             kind, _, name = source.partition(":")
@@ -326,24 +322,18 @@ class AndroidThermometer(Thermometer):
         """List the phones of the adb server."""
         return [Found({"serial": serial}, f"{serial} {state}") for serial, state in list_devices()]
 
-    def open(self) -> None:
-        self.phone.connect()
-
     def close(self) -> None:
-        self.phone.disconnect()
+        super().close()
         self._believed.clear()
         self._scales = self._stated()
 
     def named_channels(self) -> list[str]:
         return list(self.sensors)
 
-    def identity(self) -> Mapping[str, str]:
-        return {"serial": self.phone.serial}
-
     def read(self) -> Reading:
         start = self.clock.monotonic()
         kinds = {source.partition(":")[0] for source in self.sensors.values()}
-        texts = {kind: self.phone.shell(DUMPS[kind]) for kind in sorted(kinds)}
+        texts = {kind: self.shell(DUMPS[kind]) for kind in sorted(kinds)}
         found = self._battery(texts) | self._service(texts) | self._zones(texts)
         measures = {
             channel: (source, partial(self._judge, channel, source, found.get(source)))
@@ -352,7 +342,7 @@ class AndroidThermometer(Thermometer):
         return self._believed.reading(measures, start)
 
     def _judge(self, channel: str, source: str, value: float | str | None) -> float:
-        where = f"{self.phone.where}: {source}"
+        where = f"{self.where}: {source}"
         if value is None:
             raise BadReading(f"{where}: the phone does not report it")
         if isinstance(value, str):

@@ -29,10 +29,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from thermocald.errors import BadReading, DeviceDenied, DeviceGone, DeviceNotFound
+from thermocald.errors import DeviceDenied, DeviceNotFound
 from thermocald.hal import DriverOptions, Output
 from thermocald_drivers import support
-from thermocald_drivers.heating import HeatingOptions, HeatingProgramme
+from thermocald_drivers.heating import HeatingOptions, HeatingOutput
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -85,75 +85,67 @@ class LedOutput(Output):
 
     device_classes = GPIO_CLASSES
     Options = LedOptions
-    _led: Any = None
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.where = f"LED at GPIO {self.options.pin}"
 
     def open(self) -> None:
-        self._led = _pin("LED", self.options)
+        self.handle = _pin("LED", self.options)
         self._good: bool | None = None
 
     def close(self) -> None:
-        led, self._led = self._led, None
+        led, self.handle = self.handle, None
         if led is not None:
             led.off()
             led.close()
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        if self._led is None:
-            raise DeviceGone(f"LED at GPIO {self.options.pin}: not open")
+        led = self.opened()
         good = result.get("status") == "ok"
         if good == self._good:
             return  # restarting at each epoch would hide the blinking
         self._good = good
         if good:
-            self._led.on()
+            led.on()
         else:
-            self._led.blink(
-                on_time=self.options.blink_s, off_time=self.options.blink_s, background=True
-            )
+            led.blink(on_time=self.options.blink_s, off_time=self.options.blink_s, background=True)
 
 
-class RelayOutput(Output):
+class RelayOutput(HeatingOutput):
     """A relay that heats by a programme; the module's docstring lists when it is off."""
 
     device_classes = GPIO_CLASSES
-    heats = True
     Options = RelayOptions
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.programme = HeatingProgramme(self.options, self.options.channel)
+        self.channel = self.options.channel
         self.where = f"relay at GPIO {self.options.pin}"
-        self._relay: Any = None
         self._lock = threading.Lock()
         self._watchdog: threading.Timer | None = None
 
     def open(self) -> None:
-        self._relay = _pin("DigitalOutputDevice", self.options)
-        self.programme.reset()
-        self._started = self.clock.monotonic()
+        self.handle = _pin("DigitalOutputDevice", self.options)
+        self.begin()
 
     def close(self) -> None:
         self._stop_watchdog()
         with self._lock:
-            relay, self._relay = self._relay, None
+            relay, self.handle = self.handle, None
             if relay is not None:
                 relay.off()
                 relay.close()
 
-    def emit(self, result: Mapping[str, Any]) -> None:
+    def measure(self, result: Mapping[str, Any]) -> float | None:
         self._stop_watchdog()
-        was_tripped = self.programme.tripped
+        self.opened()
+        value = result.get(self.channel)
+        return float(value) if isinstance(value, int | float) else None
+
+    def switch(self, heat: bool) -> None:
         with self._lock:
-            if self._relay is None:
-                raise DeviceGone(f"{self.where}: not open")
-            value = result.get(self.options.channel)
-            temperature = float(value) if isinstance(value, int | float) else None
-            heat = self.programme.decide(self.clock.monotonic() - self._started, temperature)
-            self._relay.value = heat
-        if self.programme.tripped:
-            if not was_tripped:
-                raise BadReading(f"{self.where}: off for good, {self.programme.tripped}")
-            return
+            self.opened().value = heat
         if heat:
             self._watchdog = threading.Timer(self.options.watchdog_s, self._starve)
             self._watchdog.daemon = True
@@ -168,7 +160,7 @@ class RelayOutput(Output):
     def _starve(self) -> None:
         """Switch off until the next result: there was none for `watchdog_s`."""
         with self._lock:
-            if self._relay is not None:
-                self._relay.off()
-                self.programme.heating = False
+            if self.handle is not None:
+                self.handle.off()
+                self.heating = False
         log.warning("%s: no result for %g s, off", self.where, self.options.watchdog_s)

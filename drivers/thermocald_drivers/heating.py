@@ -1,6 +1,6 @@
 """The heating programme of `relay` and `android_load`, with a hard limit; `android_load` itself.
 
-A pure decision: (elapsed time, temperature) → heat or not. The limit switches off until the device
+The limit switches off until the device
 is opened again; so does the end of the programme. The options of both drivers:
 
     limit_c: 60                   # at and above it: off until the device is opened again
@@ -40,7 +40,7 @@ from pydantic import Field, model_validator
 
 from thermocald.errors import BadReading, ConfigurationError, DeviceError
 from thermocald.hal import DriverOptions, HeatingStep, Output
-from thermocald_drivers.android_phone import ADB_CLASSES, AdbPhone, PhoneOptions, battery
+from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, battery
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -66,23 +66,36 @@ class HeatingOptions(DriverOptions):
         return self
 
 
-class HeatingProgramme:
-    """Decides at each epoch; times are s since the start of the programme.
+class HeatingOutput(Output):
+    """Heats by its programme: a driver says in `measure` how warm it is, and obeys in `switch`."""
 
-    channel: what is limited, for messages.
-    """
+    heats = True
+    channel: str
+    """What is limited, for messages."""
 
-    def __init__(self, options: HeatingOptions, channel: str) -> None:
-        self.options, self.channel = options, channel
-        self.reset()
-
-    def reset(self) -> None:
-        """Start again: heating off, not tripped."""
+    def begin(self) -> None:
+        """Start the programme again: heating off, limit not reached."""
         self.heating = False
         self.tripped = ""
         self._known_at = 0.0
+        self._started = self.clock.monotonic()
 
-    def decide(self, elapsed_s: float, temperature_c: float | None) -> bool:
+    def emit(self, result: Mapping[str, Any]) -> None:
+        """Heat or not; BadReading once, when the limit was reached."""
+        temperature_c, was_tripped = self.measure(result), self.tripped
+        self.switch(self._decide(self.clock.monotonic() - self._started, temperature_c))
+        if self.tripped and not was_tripped:
+            raise BadReading(f"{self.where}: off for good, {self.tripped}")
+
+    def measure(self, result: Mapping[str, Any]) -> float | None:
+        """Return the temperature °C that an epoch gives; None if it is not known."""
+        raise NotImplementedError
+
+    def switch(self, heat: bool) -> None:
+        """Heat, or do not."""
+        raise NotImplementedError
+
+    def _decide(self, elapsed_s: float, temperature_c: float | None) -> bool:
         """Return whether to heat now; sets `tripped` (a sentence) once the limit was reached."""
         limit = self.options.limit_c
         if temperature_c is not None and not math.isfinite(temperature_c):
@@ -118,53 +131,40 @@ class LoadOptions(HeatingOptions, PhoneOptions):
     timeout_s: Annotated[float, Field(ge=0.1, le=60.0)] = 5.0
 
 
-class AndroidLoadOutput(Output):
+class AndroidLoadOutput(AdbPhone, HeatingOutput):
     """Busy loops on the phone while the programme asks for heat."""
 
-    device_classes = ADB_CLASSES
-    heats = True
     Options = LoadOptions
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self.phone = AdbPhone(self.options)
-        self.programme = HeatingProgramme(self.options, "battery")
+    channel = "battery"
+    _renewed = float("-inf")
 
     def open(self) -> None:
-        self.phone.connect()
-        self.programme.reset()
-        self._started = self.clock.monotonic()
-        self._renewed = float("-inf")
-        self._stop()  # what a crashed program left behind
+        super().open()
+        self.begin()
+        self.switch(False)  # what a crashed program left behind
 
     def close(self) -> None:
         with contextlib.suppress(DeviceError):  # out of reach: the lease ends the load
-            self._stop()
-        self.phone.disconnect()
+            self.switch(False)
+        super().close()
 
-    def emit(self, result: Mapping[str, Any]) -> None:  # noqa: ARG002 - it reads the phone
-        found = battery(self.phone.shell("dumpsys battery"))
-        celsius = None if found is None else found[0] * found[1]
-        was_tripped = self.programme.tripped
+    def measure(self, result: Mapping[str, Any]) -> float | None:  # noqa: ARG002 - it asks the phone
+        found = battery(self.shell("dumpsys battery"))
+        return None if found is None else found[0] * found[1]
+
+    def switch(self, heat: bool) -> None:
+        """End the load, or renew it where half of its lease is over."""
         now = self.clock.monotonic()
-        if not self.programme.decide(now - self._started, celsius):
-            self._stop()
-            if self.programme.tripped and not was_tripped:
-                raise BadReading(f"{self.phone.where}: off for good, {self.programme.tripped}")
+        if heat and now - self._renewed < self.options.lease_s / 2.0:
             return
-        if now - self._renewed >= self.options.lease_s / 2.0:
-            self._stop()
-            self._start()
-            self._renewed = now
-
-    def _start(self) -> None:
-        loop = f"{MARK}=1; while :; do :; done"
-        for _ in range(self.options.processes):
-            self.phone.shell(
-                f"timeout {self.options.lease_s:g} sh -c '{loop}' >/dev/null 2>&1 </dev/null &"
-            )
-
-    def _stop(self) -> None:
-        # [t]: the pattern must not match the shell that carries it
-        self.phone.shell(f"pkill -f '[{MARK[0]}]{MARK[1:]}'")
         self._renewed = float("-inf")
+        # [t]: the pattern must not match the shell that carries it
+        self.shell(f"pkill -f '[{MARK[0]}]{MARK[1:]}'")
+        if not heat:
+            return
+        load = f"{MARK}=1; while :; do :; done"
+        for _ in range(self.options.processes):
+            self.shell(
+                f"timeout {self.options.lease_s:g} sh -c '{load}' >/dev/null 2>&1 </dev/null &"
+            )
+        self._renewed = now

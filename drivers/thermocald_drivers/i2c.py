@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout, WrongDevice
+from thermocald.errors import BadReading, ConfigurationError, DeviceTimeout, WrongDevice
 from thermocald.hal import DriverOptions, Found, Thermometer
 from thermocald_drivers import chips, support
 
@@ -72,8 +72,6 @@ class I2cThermometer(Thermometer):
                 f"address: 0x{chosen:02x} is not an address of a {self.chip} ({known})"
             )
         self.where = f"{self.chip} at 0x{self.address:02x} on /dev/i2c-{self.options.bus}"
-        self._smbus: Any = None
-        self._seen = False
         self._channels = support.Channels(self.clock, *self.range_c)
 
     @classmethod
@@ -92,17 +90,12 @@ class I2cThermometer(Thermometer):
         smbus2 = support.library("smbus2")
         hint = "is I2C switched on (dtparam=i2c_arm=on), the chip wired, the user in group i2c?"
         try:
-            self._smbus = smbus2.SMBus(self.options.bus)
+            self.handle = smbus2.SMBus(self.options.bus)
             self._identify()
         except OSError as error:
             self.close()
-            raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
-        self._seen = True
-
-    def close(self) -> None:
-        smbus, self._smbus = self._smbus, None
-        if smbus is not None:
-            smbus.close()
+            raise support.fault(error, self.where, seen=self.seen, hint=hint) from error
+        self.seen = True
 
     def named_channels(self) -> list[str]:
         return [self.options.channel]
@@ -113,8 +106,7 @@ class I2cThermometer(Thermometer):
         }  # fmt: skip
 
     def read(self) -> Reading:
-        if self._smbus is None:
-            raise DeviceGone(f"{self.where}: not open")
+        self.opened()
         return self._channels.reading({self.options.channel: (self.where, self._believed)})
 
     def _believed(self) -> float:
@@ -130,11 +122,11 @@ class I2cThermometer(Thermometer):
         raise NotImplementedError
 
     def _byte(self, register: int) -> int:
-        return int(self._smbus.read_byte_data(self.address, register))
+        return int(self.handle.read_byte_data(self.address, register))
 
     def _word(self, register: int) -> int:
         """A 16-bit register: high byte first on the wire, where SMBus has the low one first."""
-        value = int(self._smbus.read_word_data(self.address, register))
+        value = int(self.handle.read_word_data(self.address, register))
         return (value & 0xFF) << 8 | value >> 8
 
     def _reader(self, mask: int) -> Callable[[int], int]:
@@ -143,7 +135,7 @@ class I2cThermometer(Thermometer):
 
     def _write_word(self, register: int, value: int) -> None:
         swapped = (value & 0xFF) << 8 | value >> 8
-        self._smbus.write_word_data(self.address, register, swapped)
+        self.handle.write_word_data(self.address, register, swapped)
 
     def _driven(self, word: int) -> int:
         """Return a measurement's word; 0xFFFF is a bus that nothing drives, and is refused."""
@@ -211,7 +203,7 @@ class _ConvertingThermometer(I2cThermometer):
         if self.SHUTDOWN > 0xFF:
             self._write_word(self.CONFIGURATION, configuration & ~self.SHUTDOWN)
         else:
-            self._smbus.write_byte_data(
+            self.handle.write_byte_data(
                 self.address, self.CONFIGURATION, configuration & ~self.SHUTDOWN
             )
         if read(self.CONFIGURATION) & self.SHUTDOWN:
@@ -321,13 +313,13 @@ class Sht3xThermometer(I2cThermometer):
         return -45.0 + 175.0 * temperature / 65535.0, ""
 
     def _command(self, command: int, wait_s: float) -> None:
-        self._smbus.write_i2c_block_data(self.address, command >> 8, [command & 0xFF])
+        self.handle.write_i2c_block_data(self.address, command >> 8, [command & 0xFF])
         self._wait(wait_s)
 
     def _words(self, count: int) -> list[int]:
         """Plain read of `count` words, each followed by its CRC."""
         message = support.library("smbus2").i2c_msg.read(self.address, 3 * count)
-        self._smbus.i2c_rdwr(message)
+        self.handle.i2c_rdwr(message)
         data = bytes(message)
         words = []
         for k in range(0, 3 * count, 3):
@@ -355,11 +347,11 @@ class Bme280Thermometer(I2cThermometer):
         self._calibration = struct.unpack("<Hhh", table[:6])
 
     def _block(self, register: int, size: int) -> bytes:
-        return bytes(self._smbus.read_i2c_block_data(self.address, register, size))
+        return bytes(self.handle.read_i2c_block_data(self.address, register, size))
 
     def _measure(self) -> tuple[float, str]:
-        self._smbus.write_byte_data(self.address, self.CONTROL_HUMIDITY, 0b001)
-        self._smbus.write_byte_data(self.address, self.CONTROL, self.FORCED_X2_X1)
+        self.handle.write_byte_data(self.address, self.CONTROL_HUMIDITY, 0b001)
+        self.handle.write_byte_data(self.address, self.CONTROL, self.FORCED_X2_X1)
         self._wait(0.012)
         self._await(self.STATUS, self.MEASURING, 0, 0.005)
         data = self._block(self.DATA, 8)

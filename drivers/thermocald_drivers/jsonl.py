@@ -57,8 +57,7 @@ class JsonLinesOutput(Output):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.path = Path(self.options.path)
-        self._file = -1
-        self._seen = False
+        self.where = self.options.path
         self._mount = mount_point(self.path)
 
     def open(self) -> None:
@@ -68,27 +67,21 @@ class JsonLinesOutput(Output):
         self._mount = mount_point(self.path)
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
         try:
-            self._file = os.open(self.path, flags, 0o644)
+            self.handle = os.fdopen(os.open(self.path, flags, 0o644), "wb", buffering=0)
         except OSError as error:
             if error.errno == errno.ENXIO:
                 raise DeviceGone(f"{self.path}: nobody reads the pipe") from error
-            raise support.fault(error, str(self.path), seen=self._seen) from error
-        mode = os.fstat(self._file).st_mode
+            raise support.fault(error, str(self.path), seen=self.seen) from error
+        mode = os.fstat(self.handle.fileno()).st_mode
         self._pipe = stat.S_ISFIFO(mode)
         if stat.S_ISREG(mode):
             if not mode & 0o600:  # of a umask of 777
-                os.fchmod(self._file, 0o600)
+                os.fchmod(self.handle.fileno(), 0o600)
             self._end_half_line()
-        self._seen = True
-
-    def close(self) -> None:
-        file, self._file = self._file, -1
-        if file >= 0:
-            os.close(file)
+        self.seen = True
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        if self._file < 0:
-            raise DeviceGone(f"{self.path}: not open")
+        self.opened()
         line = encode(result) + b"\n"
         try:
             self._reopen_if_moved()
@@ -96,17 +89,15 @@ class JsonLinesOutput(Output):
         except BrokenPipeError as error:
             raise DeviceGone(f"{self.path}: nobody reads the pipe any more") from error
         except OSError as error:
-            if isinstance(error, TransientDeviceError):
-                raise
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise TransientDeviceError(
-                    f"{self.path}: the disk is full; line not written"
-                ) from error
+                full = f"{self.path}: the disk is full; line not written"
+                raise TransientDeviceError(full) from error
             raise support.fault(error, str(self.path), seen=True) from error
 
     def _end_half_line(self) -> None:
         """Remove the half of a line that a killed process or a power cut left at the end."""
-        size = os.fstat(self._file).st_size
+        file_number = self.handle.fileno()
+        size = os.fstat(file_number).st_size
         with contextlib.suppress(OSError), self.path.open("rb") as file:
             file.seek(max(0, size - _LONGEST_LINE))
             half = file.read().rpartition(b"\n")[2]
@@ -116,34 +107,35 @@ class JsonLinesOutput(Output):
             except ValueError:
                 ours = half.strip(b"\0")[:1] in (b"", b"{")  # what was not written may read as 0
             if ours and len(half) < _LONGEST_LINE:
-                os.ftruncate(self._file, size - len(half))
+                os.ftruncate(file_number, size - len(half))
             elif half:
-                os.write(self._file, b"\n")
+                os.write(file_number, b"\n")
 
     def _reopen_if_moved(self) -> None:
         try:
             here = self.path.stat()
         except FileNotFoundError:
             here = None
-        mine = os.fstat(self._file)
+        mine = os.fstat(self.handle.fileno())
         if here is None or (here.st_ino, here.st_dev) != (mine.st_ino, mine.st_dev):
             self.open()
 
     def _write(self, line: bytes) -> None:
         """Write the whole line; on failure remove what was written of it."""
-        start = os.fstat(self._file).st_size
+        file_number = self.handle.fileno()
+        start = os.fstat(file_number).st_size
         deadline = time.monotonic() + self.options.timeout_s
         written = 0
         try:
             while written < len(line):
                 try:
-                    written += os.write(self._file, line[written:])
+                    written += os.write(file_number, line[written:])
                 except BlockingIOError:
                     left = deadline - time.monotonic()
-                    if left <= 0 or not select.select([], [self._file], [], left)[1]:
+                    if left <= 0 or not select.select([], [file_number], [], left)[1]:
                         raise DeviceTimeout(f"{self.path}: the pipe's reader is too slow") from None
         except OSError:
             if written and not self._pipe:
                 with contextlib.suppress(OSError):
-                    os.ftruncate(self._file, start)
+                    os.ftruncate(file_number, start)
             raise

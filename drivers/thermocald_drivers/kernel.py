@@ -108,11 +108,9 @@ class _KernelThermometer(Thermometer):
             raise ConfigurationError(
                 f"minimum_c {o.minimum_c:g} is not below maximum_c {o.maximum_c:g}"
             )
-        self.chip = getattr(o, self.key)
+        self.chip = self.where = getattr(o, self.key)
         self.sysfs = Path(o.sysfs)
-        self._seen = False
         self._believed = support.Channels(self.clock, o.minimum_c, o.maximum_c)
-        self._device: Path | None = None
         self._channels: dict[str, str] = {}
         self._name = ""
 
@@ -139,13 +137,13 @@ class _KernelThermometer(Thermometer):
         ]
 
     def open(self) -> None:
-        self._device = None
+        self.handle = None
         found = list(self.devices(self.sysfs))
         matches = [folder for folder, name, address in found if self.chip in (name, address)]
         where = f"{self.sysfs / self.folder}: {self.chip!r}"
         if not matches:
             names = ", ".join(sorted({name for _, name, _ in found})) or "nothing"
-            raise support.absent(f"{where} is not there; there is {names}", seen=self._seen)
+            raise support.absent(f"{where} is not there; there is {names}", seen=self.seen)
         if len(matches) > 1:
             addresses = ", ".join(a for folder, _, a in found if folder in matches)
             raise WrongDevice(f"{where} is there {len(matches)} times; write chip: {addresses}")
@@ -153,18 +151,18 @@ class _KernelThermometer(Thermometer):
         if not inputs:
             raise WrongDevice(f"{matches[0]}: this device has no temperature input")
         self._channels = self._select(inputs, matches[0])
-        self._device, self._seen = matches[0], True
+        self.handle, self.seen = matches[0], True
         self._name = support.read_line(matches[0] / self.name_file)
 
     def close(self) -> None:
-        self._device = None
+        self.handle = None
         self._believed.clear()
 
     def named_channels(self) -> list[str]:
         return list(self.options.channels)
 
     def identity(self) -> Mapping[str, str]:
-        return {"chip": self.chip, "path": str(self._device or "")}
+        return {"chip": self.chip, "path": str(self.handle or "")}
 
     def _select(self, inputs: dict[str, str], folder: Path) -> dict[str, str]:
         """Return {our channel: kernel's input}, from the option `channels`."""
@@ -187,9 +185,8 @@ class _KernelThermometer(Thermometer):
         return chosen
 
     def read(self) -> Reading:
-        if self._device is None:
-            raise DeviceGone(f"{self.chip}: not open")
-        folder, measures = self._device, {}
+        folder: Path = self.opened()
+        measures = {}
         for channel, key in self._channels.items():
             where = f"{folder.name} ({self.chip}) {key}"
             measures[channel] = where, partial(self._measure, folder, key, where)

@@ -40,8 +40,9 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -149,19 +150,13 @@ class OutputOptions(MockOptions):
 
 
 class MockDevice(Device):
-    """What the mocks share: opening and closing, faults, and the time since the first opening.
-
-    name: for messages.
-    """
-
-    name: ClassVar[str]
+    """What the mocks share: opening and closing, faults, and the time since the first opening."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._faults: list[Fault] = list(self.options.faults)
         self._calls = 0
         self._started: float | None = None
-        self._open = False
 
     def inject(self, kind: Kind, count: int = 1) -> None:
         """Let the next `count` calls fail."""
@@ -176,15 +171,15 @@ class MockDevice(Device):
             self._started = self.clock.monotonic()
         if self._fault(self._calls + 1) == "unplugged":
             self._calls += 1  # such an attempt counts as a call
-            raise DeviceGone(f"{self.name}: unplugged")
-        self._open = True
+            raise DeviceGone(f"{self.where}: unplugged")
+        self.handle = True
 
     def close(self) -> None:
-        self._open = False
+        self.handle = None
 
     def identity(self) -> Mapping[str, str]:
         seed = getattr(self.options, "seed", 0)
-        return {"name": self.name, "serial": f"mock-{seed}"}
+        return {"name": self.where, "serial": f"mock-{seed}"}
 
     def _fault(self, call: int) -> Kind | None:
         elapsed = self._elapsed(self.clock.monotonic())
@@ -196,19 +191,18 @@ class MockDevice(Device):
         Raises DeviceTimeout after the time has passed, DeviceGone, or BadReading for an answer (a
         `unit`) that a driver must refuse.
         """
-        if not self._open:
-            raise DeviceGone(f"{self.name}: it is not open")
+        self.opened()
         self._calls += 1
         kind, timeout_s = self._fault(self._calls), self.options.timeout_s
         if kind == "unplugged":
-            raise DeviceGone(f"{self.name}: unplugged")
+            raise DeviceGone(f"{self.where}: unplugged")
         wait_s = timeout_s if kind == "timeout" else seconds
         self.clock.sleep_until(self.clock.monotonic() + wait_s)
         if kind == "timeout":
-            raise DeviceTimeout(f"{self.name}: no answer within {timeout_s:g} s")
+            raise DeviceTimeout(f"{self.where}: no answer within {timeout_s:g} s")
         if kind in ("truncated", "wrong_size"):
             what = "is cut off" if kind == "truncated" else "has the wrong size"
-            raise BadReading(f"{self.name}: the {unit} {what}")
+            raise BadReading(f"{self.where}: the {unit} {what}")
         return kind == "stuck"
 
     def _elapsed(self, monotonic: float) -> float:
@@ -224,14 +218,13 @@ class MockDevice(Device):
 class MockCamera(MockDevice, Camera):
     """Renders what a warming camera would see; equal times give equal frames."""
 
-    name = "mock camera"
+    where = "mock camera"
     Options = CameraOptions
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._latency_s = max(self.options.latency_s, self.options.exposure_s)
         self._sequence = 0
-        self._scene: Scene | None = None
         self._last: NDArray[np.uint8] | None = None
 
     def open(self) -> None:
@@ -241,37 +234,37 @@ class MockCamera(MockDevice, Camera):
     def identity(self) -> Mapping[str, str]:
         return {**super().identity(), "testfield": self.options.testfield}
 
-    @property
-    def scene(self) -> Scene:
-        """The test field in front of the camera; loaded at first use."""
-        if self._scene is None:
-            from thermocald.physics.model_file import read_model
-            from thermocald.physics.scene import Scene
-            from thermocald.physics.testfields import demonstration_model, load_field
+    @cached_property
+    def field(self) -> TestField:
+        """The test field that is rendered; loaded at first use, as the two below."""
+        from thermocald.physics.testfields import load_field
 
-            field, path = load_field(self.options.testfield), self.options.model
-            self._model = demonstration_model(field) if path is None else read_model(Path(path))
-            if self._model.exterior is None:
-                raise ConfigurationError(
-                    f"{path}: has no exterior orientation; the mock camera needs one in front of "
-                    "its test field"
-                )
-            self._scene = Scene(self._model.sensor, field)
-        return self._scene
+        return load_field(self.options.testfield)
+
+    @cached_property
+    def model(self) -> ThermalModel:
+        """The true thermal model."""
+        from thermocald.physics.model_file import read_model
+        from thermocald.physics.testfields import demonstration_model
+
+        path = self.options.model
+        model = demonstration_model(self.field) if path is None else read_model(Path(path))
+        if model.exterior is None:
+            raise ConfigurationError(
+                f"{path}: has no exterior orientation; the mock camera needs one in front of "
+                "its test field"
+            )
+        return model
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The test field in front of the camera."""
+        from thermocald.physics.scene import Scene
+
+        return Scene(self.model.sensor, self.field)
 
     def known_scene(self) -> tuple[Any, Any]:
         return self.model.sensor, self.field
-
-    @property
-    def field(self) -> TestField:
-        """The test field that is rendered."""
-        return self.scene.field
-
-    @property
-    def model(self) -> ThermalModel:
-        """The true thermal model."""
-        _ = self.scene
-        return self._model
 
     def capture(self) -> Frame:
         stuck = self._call("frame", self._latency_s)
@@ -304,7 +297,7 @@ class MockCamera(MockDevice, Camera):
 class MockThermometer(MockDevice, Thermometer):
     """Reads a programme; equal times give equal readings."""
 
-    name = "mock thermometer"
+    where = "mock thermometer"
     Options = ThermometerOptions
 
     def __init__(self, **options: Any) -> None:
@@ -352,7 +345,7 @@ class MockThermometer(MockDevice, Thermometer):
 class MockOutput(MockDevice, Output):
     """Keeps the last results in `results`, oldest first."""
 
-    name = "mock output"
+    where = "mock output"
     Options = OutputOptions
 
     def __init__(self, **options: Any) -> None:

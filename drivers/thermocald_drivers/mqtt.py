@@ -158,14 +158,13 @@ class _Broker(Output):
         if o.key and not o.cert:
             raise ConfigurationError("key: needs its certificate, cert")
         self.where = f"MQTT broker {o.host}:{self.port}"
-        self._client: Any = None
         self._answered = threading.Event()
         self._refusal = ""
 
     @property
     def connected(self) -> bool:
         """Whether the connection is up."""
-        return self._client is not None and bool(self._client.is_connected())
+        return self.handle is not None and bool(self.handle.is_connected())
 
     def connect(self, will: str | None) -> None:
         """Connect; will: the topic that says `offline` once the connection breaks."""
@@ -189,36 +188,31 @@ class _Broker(Output):
         except (OSError, ValueError) as error:
             why = support.reason(error)
             raise DeviceGone(f"{self.where}: cannot connect ({why})") from error
-        self._client = client
+        self.handle = client
         client.loop_start()
         if not self._answered.wait(self.options.timeout_s):
-            self._disconnect()
+            _Broker.close(self)
             raise DeviceTimeout(f"{self.where}: no answer in {self.options.timeout_s:g} s")
         if self._refusal:
-            self._disconnect()
+            _Broker.close(self)
             raise DeviceDenied(f"{self.where}: {self._refusal}; check username and password_file")
 
     def close(self) -> None:
-        super().close()
-        self._disconnect()
-
-    def _disconnect(self) -> None:
-        client, self._client = self._client, None
+        client, self.handle = self.handle, None
         if client is not None:
             client.disconnect()
             client.loop_stop()
 
-    def require_connected(self) -> None:
-        """Raise DeviceGone unless the connection is up."""
-        if self._client is None:
-            raise DeviceGone(f"{self.where}: not open")
+    def opened(self) -> Any:
+        """Return the connection; DeviceGone while it is closed or down."""
+        client = super().opened()
         if not self.connected:
             raise DeviceGone(f"{self.where}: the connection is down")
+        return client
 
     def publish(self, topic: str, payload: bytes, *, retain: bool) -> None:
         """Publish with QoS 1 and wait for the broker's acknowledgement; raises a DeviceError."""
-        self.require_connected()
-        info = self._client.publish(topic, payload, qos=1, retain=retain)
+        info = self.opened().publish(topic, payload, qos=1, retain=retain)
         try:
             info.wait_for_publish(self.options.timeout_s)
         except (RuntimeError, ValueError) as error:
@@ -265,7 +259,7 @@ class MqttOutput(_Broker):
         super().close()
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        self.require_connected()
+        self.opened()
         device = str(result.get("device", self.options.device))
         o = self.options
         if device not in self._announced:
@@ -290,11 +284,6 @@ class MqttAlert(_Broker, AlertOutput):
 
     def reach(self) -> None:
         self.connect(None)
-
-    def emit(self, result: Mapping[str, Any]) -> None:
-        if self._opened:
-            self.require_connected()
-        super().emit(result)
 
     def deliver(self, alert: Alert) -> None:
         node, condition = node_of(alert.device), node_of(alert.condition)

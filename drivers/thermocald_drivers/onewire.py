@@ -117,13 +117,12 @@ class Ds18b20Thermometer(Thermometer):
     """One or several 1-wire thermometers, read at the same time."""
 
     Options = OneWireOptions
+    where = "1-wire"
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.sensors: dict[str, str] = self.options.sensors
         self.root = Path(self.options.sysfs) / "bus/w1/devices"
-        self._seen = False
-        self._open = False
         self._pending: dict[str, Future[float]] = {}
         self._believed = support.Channels(self.clock, -55.0, 125.0)
 
@@ -151,20 +150,19 @@ class Ds18b20Thermometer(Thermometer):
             raise support.absent(
                 f"1-wire {', '.join(missing)}: not on the bus, there is {there}; "
                 "is dtoverlay=w1-gpio set and the sensor wired?",
-                seen=self._seen,
+                seen=self.seen,
             )
-        self._seen = self._open = True
+        self.handle = self.seen = True
 
     def close(self) -> None:
-        self._open = False
+        self.handle = None
         self._believed.clear()
 
     def identity(self) -> Mapping[str, str]:
         return {"sensors": ", ".join(self.sensors.values())}
 
     def read(self) -> Reading:
-        if not self._open:
-            raise DeviceGone("1-wire: not open")
+        self.opened()
         deadline = self.clock.monotonic() + self.options.timeout_s * len(self.sensors)
         for channel in self.sensors:
             late = self._pending.get(channel)

@@ -44,7 +44,6 @@ from thermocald.errors import (
     BadReading,
     ConfigurationError,
     DeviceDenied,
-    DeviceGone,
     DeviceTimeout,
     WrongDevice,
 )
@@ -119,8 +118,6 @@ class Picamera2Camera(Camera):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.where = f"libcamera camera {self.options.camera}"
-        self._camera: Any = None
-        self._seen = False
         self._held: dict[str, Any] = {}
         o = self.options
         stated = {
@@ -144,7 +141,7 @@ class Picamera2Camera(Camera):
 
     def open(self) -> None:
         self._in_time(self._open, "opening")
-        self._seen = True
+        self.seen = True
 
     def _open(self) -> None:
         library = support.library("picamera2")
@@ -154,7 +151,7 @@ class Picamera2Camera(Camera):
             raise support.absent(
                 f"{self.where}: libcamera lists {len(cameras)} ({names}); "
                 "is the ribbon cable seated, camera_auto_detect=1 set?",
-                seen=self._seen,
+                seen=self.seen,
             )
         found = str(cameras[self.options.camera].get("Model", ""))
         if self.options.model is not None and self.options.model != found:
@@ -170,7 +167,7 @@ class Picamera2Camera(Camera):
         except BaseException:
             camera.close()
             raise
-        self._camera = camera
+        self.handle = camera
 
     def _configure(self, camera: Any) -> None:
         focuses = "LensPosition" in camera.camera_controls
@@ -223,7 +220,7 @@ class Picamera2Camera(Camera):
             camera.set_controls(held)
 
     def close(self) -> None:
-        camera, self._camera = self._camera, None
+        camera, self.handle = self.handle, None
         if camera is not None:
             try:
                 self._in_time(camera.close, "closing", CLOSE_S)
@@ -240,9 +237,7 @@ class Picamera2Camera(Camera):
         return self.options.width, self.options.height
 
     def capture(self) -> Frame:
-        camera = self._camera
-        if camera is None:
-            raise DeviceGone(f"{self.where}: not open")
+        camera = self.opened()
         called_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         try:
             plane, metadata = self._in_time(lambda: self._fresh(camera, called_ns), "a capture")
@@ -271,7 +266,7 @@ class Picamera2Camera(Camera):
     def _fresh(self, camera: Any, called_ns: int) -> tuple[Any, Mapping[str, Any]]:
         """Return (grey plane, metadata) of the first frame that began after the call."""
         deadline = time.monotonic() + self.options.timeout_s
-        while time.monotonic() < deadline and self._camera is camera:
+        while time.monotonic() < deadline and self.handle is camera:
             request = camera.capture_request()
             try:
                 metadata = request.get_metadata()

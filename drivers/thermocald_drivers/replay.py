@@ -23,7 +23,6 @@ from thermocald.errors import (
     BadReading,
     DataError,
     DeviceFinished,
-    DeviceGone,
     DeviceNotFound,
     ImageError,
     PermanentDeviceError,
@@ -62,10 +61,10 @@ class _Replay(Device):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._path = Path(self.options.recording)
+        self.where = str(self._path)
         self._recording: Recording | None = None
-        self._epochs: Iterator[Epoch] | None = None
+        self._epochs: Iterator[Epoch] = iter(())
         self._shift_s = 0.0
-        self._open = False
 
     def open(self) -> None:
         if not self._path.is_dir():
@@ -76,10 +75,10 @@ class _Replay(Device):
             with _for_good():
                 self._recording = open_recording(self._path)
             self._epochs = self._recording.iter_epochs()
-        self._open = True
+        self.handle = self._recording
 
     def close(self) -> None:
-        self._open = False
+        self.handle = None
 
     def identity(self) -> Mapping[str, str]:
         if self._recording is None:
@@ -88,14 +87,13 @@ class _Replay(Device):
         return {"name": head.camera.name, "recording": head.name, "series": head.series}
 
     def _next(self) -> Epoch:
-        if not self._open or self._epochs is None or self._recording is None:
-            raise DeviceGone(f"{self._path}: it is not open")
+        recording: Recording = self.opened()
         with _for_good():
             epoch = next(self._epochs, None)
         if epoch is None and self.options.loop:
-            times = self._recording.columns.frame_time
-            self._shift_s += float(times[-1] - times[0]) + self._recording.head.interval
-            self._epochs = self._recording.iter_epochs()
+            times = recording.columns.frame_time
+            self._shift_s += float(times[-1] - times[0]) + recording.head.interval
+            self._epochs = recording.iter_epochs()
             epoch = next(self._epochs)
         if epoch is None:
             raise DeviceFinished(f"{self._path}: the recording has ended")
@@ -114,10 +112,10 @@ class ReplayCamera(_Replay, Camera):
         epoch = self._next()
         monotonic, utc = self._times(epoch.frame_time)
         observations = image = encoded = None
-        if epoch.observations is not None and self._recording is not None:
+        if epoch.observations is not None:
             from thermocald.photogrammetry.field.testfield import observations_to_lists
 
-            observations = observations_to_lists(epoch.observations, self._recording.testfield)
+            observations = observations_to_lists(epoch.observations, self.handle.testfield)
         elif epoch.frame is None:
             raise BadReading(f"{self._path}: epoch {epoch.number} has no frame")
         if epoch.frame is not None:

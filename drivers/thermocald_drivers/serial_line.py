@@ -182,8 +182,6 @@ class SerialThermometer(Thermometer):
             raise ConfigurationError("pattern: name the value, such as (?P<temperature>[-+0-9.]+)")
         if o.checksum != "none" and "checksum" not in self.pattern.groupindex:
             raise ConfigurationError("pattern: a checksum needs a group (?P<checksum>…)")
-        self._serial: Any = None
-        self._seen = False
         self._believed = support.Channels(self.clock, o.minimum_c, o.maximum_c)
         self._decimals: dict[str, tuple[int, bool, int]] = {}
         self._line = b""
@@ -208,7 +206,7 @@ class SerialThermometer(Thermometer):
         serial = support.library("serial")
         data_bits, parity, stop_bits = tuple(self.options.framing)
         try:
-            self._serial = serial.Serial(
+            self.handle = serial.Serial(
                 self.options.port,
                 self.options.baud,
                 bytesize=int(data_bits),
@@ -224,17 +222,12 @@ class SerialThermometer(Thermometer):
             if "exclusively lock" in str(error):
                 error = OSError(16, "another program holds the port")
             hint = "is it plugged in, and the user in the group dialout?"
-            raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
-        self._seen = self._owed = True
+            raise support.fault(error, self.where, seen=self.seen, hint=hint) from error
+        self.seen = self._owed = True
         self._decimals.clear()
         if not self.command:
             self._line, self._synchronous = b"", False
         self._believed.clear()
-
-    def close(self) -> None:
-        port, self._serial = self._serial, None
-        if port is not None:
-            port.close()
 
     def identity(self) -> Mapping[str, str]:
         return {"instrument": self.options.instrument or "serial line", "port": self.options.port}
@@ -243,8 +236,7 @@ class SerialThermometer(Thermometer):
         return list(self.channels)
 
     def read(self) -> Reading:
-        if self._serial is None:
-            raise DeviceGone(f"{self.where}: not open")
+        self.opened()
         try:
             if self.command:
                 self._ask()
@@ -272,20 +264,20 @@ class SerialThermometer(Thermometer):
     def _ask(self) -> None:
         """Send the command once the line is quiet, and note whether a line is unfinished."""
         late, deadline = self._line, time.monotonic() + self.options.timeout_s
-        while (self._owed or late or self._serial.in_waiting) and time.monotonic() < deadline:
+        while (self._owed or late or self.handle.in_waiting) and time.monotonic() < deadline:
             # an answer to an earlier command may be on its way, or its rest
-            if not (more := self._serial.read(max(1, self._serial.in_waiting))):
+            if not (more := self.handle.read(max(1, self.handle.in_waiting))):
                 break
             late += more
         rest = _one_end(late).rpartition(b"\n")[2].strip(b" \0")
         # the rest of a late line would look like a whole one; a prompt is no line
         self._synchronous = not rest or rest[-1:] in PROMPTS
         self._line, self._owed = b"", True
-        self._serial.write(self.command)
+        self.handle.write(self.command)
 
     def _skip_queue(self) -> None:
         """Discard what came before now, but keep the start of the current line."""
-        waiting = self._serial.read(self._serial.in_waiting)
+        waiting = self.handle.read(self.handle.in_waiting)
         if len(waiting) >= QUEUE:
             self._line, self._synchronous = b"", False  # bytes may be missing in the middle
             return
@@ -304,7 +296,7 @@ class SerialThermometer(Thermometer):
                 line, self._line = self._line.split(b"\n", 1)
                 whole, self._synchronous = self._synchronous, True
                 if not whole and self.command:
-                    self._serial.write(self.command)  # the answer may have hung on the late line
+                    self.handle.write(self.command)  # the answer may have hung on the late line
                 line = line.strip(b"\0")
                 if not line or not whole or line.strip() == self.command.strip():
                     continue
@@ -321,7 +313,7 @@ class SerialThermometer(Thermometer):
                 self._line, self._synchronous = b"", False
             if time.monotonic() >= deadline:
                 raise self._nothing(skipped, problem)
-            self._line += _one_end(self._serial.read(max(1, self._serial.in_waiting)))
+            self._line += _one_end(self.handle.read(max(1, self.handle.in_waiting)))
 
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
         """Return the error for a time-out: what was wrong with the lines that came."""

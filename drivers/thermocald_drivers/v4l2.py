@@ -43,8 +43,6 @@ from pydantic import Field
 from thermocald.errors import (
     BadReading,
     ConfigurationError,
-    DeviceError,
-    DeviceGone,
     DeviceTimeout,
     DriverMissing,
     TransientDeviceError,
@@ -141,8 +139,6 @@ class V4l2Camera(Camera):
         self.where = f"camera {o.device or o.serial}"
         self._wanted = {lock.option: getattr(o, lock.option) for lock in LOCKS}
         self._controls = CameraControls(self.where, self._wanted, o.controls)
-        self._stream: Stream | None = None
-        self._seen = False
 
     @classmethod
     def attached(cls, sysfs: str = "/sys", dev: str = "/dev") -> list[Found]:
@@ -173,55 +169,46 @@ class V4l2Camera(Camera):
         o, path = self.options, self._path()
         try:
             try:
-                self._stream = (OpenCvStream if o.backend == "opencv" else LinuxpyStream)(path)
+                stream: Stream = (OpenCvStream if o.backend == "opencv" else LinuxpyStream)(path)
             except DriverMissing:
                 if o.backend != "auto":
                     raise
-                self._stream = OpenCvStream(path)
-            self._stream.set_format(o.pixel_format.ljust(4), o.width, o.height)
-            card = self._stream.card
-            if o.card is not None and o.card not in card:
-                raise WrongDevice(f"{path}: this is {card!r}, not {o.card!r}")
-            self._controls.apply(self._stream, strict=o.strict)
-            self._stream.start()
-        except DeviceError as error:
-            self.close()
-            if self._seen and isinstance(error, WrongDevice):
-                # it was the right one before: another may have its number until the next plug
-                raise TransientDeviceError(str(error)) from error
-            raise
+                stream = OpenCvStream(path)
+            self.handle = stream
+            stream.set_format(o.pixel_format.ljust(4), o.width, o.height)
+            if o.card is not None and o.card not in stream.card:
+                raise WrongDevice(f"{path}: this is {stream.card!r}, not {o.card!r}")
+            self._controls.apply(stream, strict=o.strict)
+            stream.start()
         except OSError as error:
             self.close()
+            if self.seen and isinstance(error, WrongDevice):
+                # it was the right one before: another may have its number until the next plug
+                raise TransientDeviceError(str(error)) from error
             hint = "is it plugged in, and the user in the group video?"
-            raise support.fault(error, self.where, seen=self._seen, hint=hint) from error
-        self._seen = True
-
-    def close(self) -> None:
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            stream.close()
+            raise support.fault(error, self.where, seen=self.seen, hint=hint) from error
+        self.seen = True
 
     def warnings(self) -> list[str]:
         return support.automatic_warnings(self._wanted)
 
     def identity(self) -> Mapping[str, str]:
-        card = self._stream.card if self._stream else ""
+        card = self.handle.card if self.handle else ""
         return {"device": str(self.options.device or self.options.serial), "card": card}
 
     def frame_size(self) -> tuple[int, int]:
         return self.options.width, self.options.height
 
     def capture(self) -> Frame:
-        if self._stream is None:
-            raise DeviceGone(f"{self.where}: not open")
+        stream: Stream = self.opened()
         called = time.monotonic()
         deadline = called + self.options.timeout_s
         try:
-            settings = self._controls.settings(self._controls.values(self._stream))
+            settings = self._controls.settings(self._controls.values(stream))
             # where the camera is in manual exposure and reports it
             exposure = None if settings.get("exposure_auto") else settings.get("exposure_s")
-            grab, stamp = self._fresh(self._stream, called, deadline, exposure or 0.0)
-            values = self._controls.values(self._stream)
+            grab, stamp = self._fresh(stream, called, deadline, exposure or 0.0)
+            values = self._controls.values(stream)
         except OSError as error:
             raise support.fault(error, self.where, seen=True) from error
         disobeyed = self._controls.deviations(values)
@@ -243,9 +230,8 @@ class V4l2Camera(Camera):
         self, stream: Stream, called: float, deadline: float, exposure_s: float
     ) -> tuple[Grab, float]:
         """Return a frame that was exposed after the call, and its time stamp in s."""
-        dropped = 0
+        dropped, arrived = 0, 0.0
         broken: BadReading | None = None
-        arrived = 0.0
 
         def accept(stamp: float | None, start_of_exposure: bool) -> bool:
             nonlocal arrived
@@ -292,7 +278,7 @@ class V4l2Camera(Camera):
         if not links:
             raise support.absent(
                 f"camera {self.options.serial}: none in {self.options.dev}/v4l/by-id",
-                seen=self._seen,
+                seen=self.seen,
             )
         return str(links[0])
 
@@ -399,10 +385,9 @@ class CameraControls:
         except OSError as error:
             if control in locked and control not in MODES:
                 return  # it cannot be set, so it stays; every frame is checked
-            remedy = self._remedy(control) or f"it takes {self._limits(control)}"
+            name, remedy = self._available[control].name, self._remedy(control, "it takes ")
             raise WrongDevice(
-                f"{self._where}: does not take {self._name(control)} = {value} "
-                f"({error.strerror}); {remedy}"
+                f"{self._where}: does not take {name} = {value} ({error.strerror}); {remedy}"
             ) from error
 
     def values(self, stream: Stream) -> dict[int, int]:
@@ -414,8 +399,8 @@ class CameraControls:
     def deviations(self, values: Mapping[int, int]) -> list[str]:
         """Return a sentence for each control that does not read back as it was set."""
         return [
-            f"{self._name(control)} was set to {asked} and is {values[control]} "
-            f"({self._remedy(control) or self._limits(control)})"
+            f"{self._available[control].name} was set to {asked} and is {values[control]} "
+            f"({self._remedy(control)})"
             for control, asked in self._asked.items()
             if values[control] != asked
         ]
@@ -430,19 +415,15 @@ class CameraControls:
                 found[lock.flag] = float(values[lock.automatic] != lock.manual)
             if lock.control in values:
                 found[lock.option] = round(values[lock.control] * lock.unit, 9)
-        others = {c: v for c, v in values.items() if c not in named}
-        return found | {self._name(control): float(value) for control, value in others.items()}
+        others = {self._available[c].name: float(v) for c, v in values.items() if c not in named}
+        return found | others
 
-    def _name(self, control: int) -> str:
-        return self._available[control].name
-
-    def _limits(self, control: int) -> str:
+    def _remedy(self, control: int, range_of: str = "") -> str:
+        """What to write where a control does not do as it is told: the option, or its range."""
+        if lock := MODES.get(control):
+            return f"to let it change, write {lock.option}: auto"
         c = self._available[control]
-        return f"{c.minimum} … {c.maximum} in steps of {c.step}"
-
-    def _remedy(self, control: int) -> str:
-        lock = MODES.get(control)
-        return f"to let it change, write {lock.option}: auto" if lock else ""
+        return f"{range_of}{c.minimum} … {c.maximum} in steps of {c.step}"
 
 
 def current_settings(path: str) -> dict[str, float]:

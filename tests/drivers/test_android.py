@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from thermocald_drivers.android_phone import AdbPhone, PhoneOptions
+from thermocald_drivers.android_phone import AdbPhone
 
 from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph
 from thermocald import errors
@@ -117,7 +117,7 @@ def test_the_time_is_exifs_with_the_phones_clock_compared(server, phone, offset)
     ],
 )
 def test_the_phones_clock_lies_where_all_round_trips_overlap(trips, offset, half):
-    one = AdbPhone(PhoneOptions(serial=SERIAL, port=1, timeout_s=1.0))
+    one = AdbPhone(clock=VirtualClock(), serial=SERIAL, port=1, timeout_s=1.0)
     left = list(trips)
 
     def ask():

@@ -65,16 +65,8 @@ def test_a_bus_error_while_reading(bus, name, number, error):
 
 @pytest.mark.parametrize("name", CHIPS)
 def test_nobody_at_the_address(bus, name):
-    device = thermometer(name)
     with pytest.raises(errors.DeviceNotFound, match="dtparam=i2c_arm=on"):
-        device.open()
-    address, chip, _ = CHIPS[name]
-    bus.chips[address] = chip()
-    device.open()
-    device.close()
-    del bus.chips[address]
-    with pytest.raises(errors.DeviceGone):  # it was there once: worth another try
-        device.open()
+        thermometer(name).open()
 
 
 @pytest.mark.parametrize("name", CHIPS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import threading
 import time
 
@@ -12,7 +11,7 @@ import pytest
 from thermocald_drivers.onewire import crc8, decode
 
 from tests.drivers.fakes.sysfs import Sysfs, w1_crc, w1_slave
-from thermocald.errors import BadReading, DeviceGone, DeviceNotFound, DeviceTimeout
+from thermocald.errors import BadReading, DeviceNotFound, DeviceTimeout
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
 ROM = "28-000000bfe244"
@@ -196,21 +195,6 @@ def test_a_crc_error_is_read_once_more(sysfs, monkeypatch):
     )
     with thermometer(sysfs, attempts=2) as device:
         assert device.read().values == {"temperature": 20.0}
-
-
-def test_a_vanished_slave(sysfs):
-    # raspberrypi/linux issue 252: "No such file or directory", back minutes later
-    path = sysfs.w1(ROM, w1_slave(20.0))
-    device = thermometer(sysfs)
-    device.open()
-    shutil.rmtree(path.parent)
-    with pytest.raises(DeviceGone, match="vanished"):
-        device.read()
-    with pytest.raises(DeviceGone):
-        device.open()
-    sysfs.w1(ROM, w1_slave(20.5))
-    device.open()
-    assert device.read().values == {"temperature": 20.5}
 
 
 def test_a_rom_that_was_never_there(sysfs):

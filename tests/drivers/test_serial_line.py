@@ -205,27 +205,6 @@ def test_one_channel_without_a_sensor_does_not_take_the_others_along(instrument)
         assert device.read().values == {"a": 20.5}
 
 
-def test_unplugged_and_plugged_again(instrument, tmp_path):
-    """A by-id link comes back with another tty behind it."""
-    link = tmp_path / "usb-thermometer"
-    far = instrument({b"T?\r\n": b"T=20.50\r\n"})
-    link.symlink_to(far.port)
-    device = asked(far, port=str(link))
-    device.open()
-    device.read()
-    far.unplug()
-    with pytest.raises(errors.DeviceGone, match="unplugged"):
-        device.read()
-    device.close()
-    link.unlink()
-    with pytest.raises(errors.DeviceGone):
-        device.open()
-    link.symlink_to(instrument({b"T?\r\n": b"T=21.50\r\n"}).port)
-    device.open()
-    assert device.read().values == {"temperature": 21.5}
-    device.close()
-
-
 def test_no_such_port():
     device = open_device(
         "thermometer", "serial", {"port": "/dev/ttyNONE", "instrument": "papouch-tm"}, SystemClock()

@@ -283,24 +283,6 @@ def test_a_stalled_camera(kernel):
         device.capture()
 
 
-def test_unplugged_and_plugged_again(kernel):
-    device = camera(kernel)
-    device.open()
-    device.capture()
-    kernel.errors = {"DQBUF": errno.ENODEV, "STREAMOFF": errno.ENODEV, "G_CTRL": errno.ENODEV}
-    with pytest.raises(errors.DeviceGone):
-        device.capture()
-    device.close()
-    kernel.path.rename(kernel.path.with_name("away"))
-    with pytest.raises(errors.DeviceGone):
-        device.open()
-    kernel.path.with_name("away").rename(kernel.path)
-    kernel.errors = {}
-    device.open()
-    device.capture()
-    device.close()
-
-
 def test_it_was_never_there(kernel):
     kernel.path.unlink()
     with pytest.raises(errors.DeviceNotFound, match="group video"):

@@ -113,6 +113,7 @@ class Link:
     ) -> None:
         self.kind = kind
         self.name = name
+        self.called = f"{kind} {name}"
         self.device = device
         self.state: LinkState = "closed"
         self.why = ""
@@ -146,7 +147,7 @@ class Link:
         except Exception as error:
             # a driver's own mistake must not end the daemon
             if self.state != "out":
-                log.exception("%s %s: its driver failed", self.kind, self.name)
+                log.exception("%s: its driver failed", self.called)
             self._out(f"{type(error).__name__}: {error}", max(self._period_s, _LONGEST_PAUSE_S))
         else:
             self._back()
@@ -164,15 +165,13 @@ class Link:
         try:
             return dict(self.device.identity())
         except Exception:
-            log.exception("%s %s: does not say what it is", self.kind, self.name)
+            log.exception("%s: does not say what it is", self.called)
             return {}
 
     def _back(self) -> None:
         if self.state == "out":
             away_s = self._clock.monotonic() - self.out_since
-            text = f"{self.kind} {self.name} is back after {away_s:.0f} s"
-            log.info(text, extra={"device": self.name, "event": "device_back"})
-            self._on_event(self._clock.utc(), "device_back", text)
+            self._tell(logging.INFO, "device_back", f"{self.called} is back after {away_s:.0f} s")
         self.state = "open"
         self.since = math.nan
         self.why = ""
@@ -187,9 +186,7 @@ class Link:
             self.state = "out"
             self.out_since = self._clock.monotonic()
             self.since = self._clock.utc()
-            text = f"{self.kind} {self.name} is out: {why}"
-            log.warning(text, extra={"device": self.name, "event": "device_out"})
-            self._on_event(self.since, "device_out", text)
+            self._tell(logging.WARNING, "device_out", f"{self.called} is out: {why}")
         # the first retry comes with the next tick, since most faults are of one frame alone
         now = self._clock.monotonic()
         self._retry_at = now + 0.9 * self._pause_s
@@ -207,16 +204,18 @@ class Link:
         finished = isinstance(error, DeviceFinished)
         self.state = "finished" if finished else "failed"
         level = logging.INFO if finished else logging.ERROR
-        kind = f"device_{self.state}"
-        log.log(level, "%s %s: %s", self.kind, self.name, self.why, extra={"event": kind})
-        self._on_event(self.since, kind, f"{self.kind} {self.name}: {self.why}")
+        self._tell(level, f"device_{self.state}", f"{self.called}: {self.why}")
+
+    def _tell(self, level: int, kind: str, text: str) -> None:
+        log.log(level, "%s", text, extra={"device": self.name, "event": kind})
+        self._on_event(self._clock.utc(), kind, text)
 
     def status(self, busy_s: float, hang_after_s: float) -> dict[str, Any]:
         """Return the device's part of the daemon's status."""
         try:
             warnings = list(self.device.warnings())
         except Exception:
-            log.exception("%s %s: its warnings cannot be read", self.kind, self.name)
+            log.exception("%s: its warnings cannot be read", self.called)
             warnings = []
         return {
             "device": "hung" if busy_s > hang_after_s else self.state,
@@ -257,9 +256,7 @@ class DeviceLoop:
         self._stop = threading.Event()
         self._busy_since: float | None = None
         # a hung driver cannot be ended; it must not keep the process from ending either
-        self._thread = threading.Thread(
-            target=self._run, name=f"{link.kind} {link.name}", daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, name=link.called, daemon=True)
 
     def start(self) -> None:
         """Begin at the next tick."""

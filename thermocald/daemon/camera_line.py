@@ -55,12 +55,14 @@ class SeriesDrift:
         self._pitch = pixel_pitch
         self._start: list[dict[str, float]] = []
         for row in earlier:
-            self._learn(row)
+            self.columns(row)
 
     def columns(self, row: dict[str, Any]) -> dict[str, float]:
         """Return the columns for one epoch; NaN without a result, and until the start is known."""
-        self._learn(row)
-        known = len(self._start) == START_EPOCHS and row.get("status") == "ok"
+        good = row.get("status") == "ok"
+        if good and len(self._start) < START_EPOCHS:
+            self._start.append({k: float(row[k]) for n in _NAMES for k in (n, f"sd_{n}")})
+        known = good and len(self._start) == START_EPOCHS
         result = {"pixel_pitch": self._pitch}
         for name in _NAMES:
             drift = sd = math.nan
@@ -70,10 +72,6 @@ class SeriesDrift:
                 sd = math.sqrt(row[f"sd_{name}"] ** 2 + start) / self._pitch
             result |= {f"drift_{name}_px": drift, f"sd_drift_{name}_px": sd}
         return result
-
-    def _learn(self, row: dict[str, Any]) -> None:
-        if len(self._start) < START_EPOCHS and row.get("status") == "ok":
-            self._start.append({k: float(row[k]) for n in _NAMES for k in (n, f"sd_{n}")})
 
 
 @dataclass(frozen=True)
@@ -172,9 +170,7 @@ class SeriesRun:
 
     def _tell(self, kind: str, text: str, utc: float, epoch: int) -> None:
         log.warning("camera %s: %s", self.plan.name, text, extra={"event": kind})
-        series = self.keeper.series
-        known = None if series is None else series.id
-        self._line.ground.guard.event(Event(utc, kind, text, known, epoch))
+        self.keeper.tell(utc, kind, text, epoch)
 
     def _observe(self, calibrated: CalibratedEpoch, in_order: bool) -> CalibratedEpoch:
         """Adjust the epoch with what its series tells, then test it against those before."""
@@ -367,9 +363,10 @@ class CameraLine:
 
     def _event(self, utc: float, kind: str, text: str) -> None:
         """Keep an event of the device, which belongs to the series being taken."""
-        series = None if self.run is None else self.run.keeper.series
-        known = None if series is None else series.id
-        self.ground.guard.event(Event(utc, kind, text, known))
+        if self.run is None:
+            self.ground.guard.event(Event(utc, kind, text))
+        else:
+            self.run.keeper.tell(utc, kind, text)
 
     def status(self) -> dict[str, Any]:
         """Return the camera's part of what `thermocald status` shows."""

@@ -86,6 +86,12 @@ class EpochKeeper:
         series = self.series
         return 1 if series is None else self._guard.last_epoch(series) + 1
 
+    def tell(self, utc: float, kind: str, text: str, epoch: int | None = None) -> None:
+        """Store an event of the series."""
+        series = self.series
+        known = None if series is None else series.id or None
+        self._guard.event(Event(utc, kind, text, known, epoch))
+
     def _read(self, first: int, last: int | None = None, **how: bool) -> list[StoredEpoch]:
         """Return some epochs of the series; none where they cannot be read, which is logged."""
         series = self.series
@@ -229,9 +235,8 @@ class EpochKeeper:
             self._series = StoredSeries(
                 0, head, field, self._start, self._identity(), settings, utc
             )
-            series, text = self.series, f"camera {self.plan.name}: series {self.plan.series} begins"
-            known = None if series is None or not series.id else series.id
-            self._guard.event(Event(utc, "series_begun", text, known, acquired.number))
+            text = f"camera {self.plan.name}: series {self.plan.series} begins"
+            self.tell(utc, "series_begun", text, acquired.number)
         return self._series
 
 

@@ -173,8 +173,8 @@ class Service:
         done = False
         control = ControlSocket(self.live.folder, self._ask)
         try:
-            self._sessions = Sessions(self._guard, self.clock)
             self._station = Station(self.config, self._ground)
+            self._sessions = Sessions(self._guard, self.clock, self._station)
             if not self._until_finished:
                 self._sessions.resume(self._station)
             with self._signals():
@@ -223,7 +223,7 @@ class Service:
                 self._reload = False
                 self._reload_configuration()
             self._answer_requests()
-            self._sessions.turn(self._station)
+            self._sessions.turn()
             if (step := self.clock.check()) is not None:
                 data = {"seconds": step.seconds, "adopted": step.adopted}
                 self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
@@ -257,7 +257,7 @@ class Service:
             "clock": {"trusted": self.clock.trusted(), "error_s": self.clock.error_s},
             "store": {**self._guard.status(), "path": self.config.store.path.absolute()},
             "stalled": self._station.stalled(),
-            "sessions": self._sessions.status(self._station),
+            "sessions": self._sessions.status(),
             "dashboard": {"enabled": self.config.dashboard.enabled, "why": self._dashboard.why},
             **self._station.status(),
         }
@@ -286,12 +286,12 @@ class Service:
 
     def _answer(self, request: Request) -> dict[str, Any]:
         if request.session is not None:
-            return {"session": self._sessions.start(self._station, request.session)}
+            return {"session": self._sessions.start(request.session)}
         if request.camera is not None:
-            return {"session": self._sessions.stop(self._station, request.camera)}
+            return {"session": self._sessions.stop(request.camera)}
         if request.do == "retention":
             return {"deleted": self._station.retain()}
-        return {"sessions": self._sessions.status(self._station)}
+        return {"sessions": self._sessions.status()}
 
     def _line(self) -> str:
         """Return the status line of `systemctl status`."""

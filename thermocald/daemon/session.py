@@ -80,7 +80,8 @@ class _Progress:
 class Sessions:
     """All sessions of a daemon, at most one per camera; used by one thread, the service's."""
 
-    def __init__(self, guard: StoreGuard, clock: Clock) -> None:
+    def __init__(self, guard: StoreGuard, clock: Clock, station: Station) -> None:
+        self.station = station
         self._guard = guard
         self._clock = clock
         self._active: dict[str, _Progress] = {}
@@ -105,23 +106,23 @@ class Sessions:
 
     def resume(self, station: Station) -> None:
         """Let a station that was just built go on with what its cameras were taking."""
-        for name, active in list(self._active.items()):
+        self.station = station
+        for active in list(self._active.values()):
             try:
                 if active.state == "checking":
-                    self._check(station, active)
+                    self._check(active)
                 else:
-                    self._take(station, active.session)
+                    self._take(active.session)
             except ThermocaldError as error:
-                del self._active[name]
-                self._end(station, active, "stopped", f"it cannot go on: {error}")
+                self._end(active, "stopped", f"it cannot go on: {error}")
 
-    def start(self, station: Station, session: Session) -> dict[str, Any]:
+    def start(self, session: Session) -> dict[str, Any]:
         """Begin a session, or go on with one that was stopped; raises what forbids it."""
-        line = _line(station, session.camera)
+        line = self._line(session.camera)
         if session.camera in self._active:
             running = self._active[session.camera].session
             if running == session:
-                return self.status(station)[session.camera]
+                return self.status()[session.camera]
             raise DataError(
                 f"camera {session.camera!r} is taking series {running.series!r} already; stop it "
                 f"first: thermocald session stop --camera {session.camera}"
@@ -147,43 +148,40 @@ class Sessions:
             for other in self._active.values():
                 if other.session.programme:
                     raise DataError(f"series {other.session.series!r} is using the heating")
-            station.heaters(session.steps(0.0))  # wrong steps show now
+            self.station.heaters(session.steps(0.0))  # wrong steps show now
         active = _Progress(session, "checking")
         if session.check:
-            self._check(station, active)
+            self._check(active)
         else:
-            self._begin(station, active)
+            self._begin(active)
         self._active[session.camera] = active
-        return self.status(station)[session.camera]
+        return self.status()[session.camera]
 
-    def stop(self, station: Station, camera: str) -> dict[str, Any]:
+    def stop(self, camera: str) -> dict[str, Any]:
         """End a camera's session before its time; raises DataError if it has none."""
-        active = self._active.pop(camera, None)
-        if active is None:
+        if camera not in self._active:
             raise DataError(f"camera {camera!r} has no session")
-        self._end(station, active, "stopped", "it was stopped by hand")
-        return self.status(station)[camera]
+        self._end(self._active[camera], "stopped", "it was stopped by hand")
+        return self.status()[camera]
 
-    def turn(self, station: Station) -> None:
+    def turn(self) -> None:
         """Look whether a check is made, or a series complete."""
         for name, active in list(self._active.items()):
-            line = station.line(name)
+            line = self.station.line(name)
             if line is None:
                 continue  # its end was told by `resume`
             if active.state == "checking":
-                self._judge(station, line, active)
+                self._judge(line, active)
             elif line.run is not None and line.run.full and not line.waiting():
-                del self._active[name]
-                self._end(station, active, "done", f"all {active.session.epochs} epochs are taken")
+                self._end(active, "done", f"all {active.session.epochs} epochs are taken")
             elif line.link.state == "finished":
-                del self._active[name]
-                self._end(station, active, "stopped", line.link.why)
+                self._end(active, "stopped", line.link.why)
 
-    def status(self, station: Station) -> dict[str, dict[str, Any]]:
+    def status(self) -> dict[str, dict[str, Any]]:
         """Return by camera the session under way, or the last one that ended."""
         told = {name: one.told() for name, one in self._ended.items()}
         for name, active in self._active.items():
-            line, document = station.line(name), active.told()
+            line, document = self.station.line(name), active.told()
             if line is not None and line.link.state in ("out", "failed"):
                 document.update(state="paused", why=line.link.why)
             if line is not None and line.run is not None and active.state == "running":
@@ -191,49 +189,43 @@ class Sessions:
             told[name] = document
         return told
 
-    def _judge(self, station: Station, line: CameraLine, active: _Progress) -> None:
-        found, name = line.checked, line.plan.name
-        why = ""
-        if found is not None:
-            active.found, why = found
-        elif line.link.ended:
-            why = line.link.why
-        else:
+    def _judge(self, line: CameraLine, active: _Progress) -> None:
+        why = line.link.why
+        if line.checked is not None:
+            active.found, why = line.checked
+        elif not line.link.ended:
             return
-        if not why:
-            try:
-                self._begin(station, active)
-            except ThermocaldError as error:
-                why = str(error)
+        try:
+            if not why:
+                self._begin(active)
+        except ThermocaldError as error:
+            why = str(error)
         if why:
-            del self._active[name]
-            self._end(station, active, "refused", f"the check failed: {why}")
+            self._end(active, "refused", f"the check failed: {why}")
 
-    def _check(self, station: Station, active: _Progress) -> None:
+    def _check(self, active: _Progress) -> None:
         active.state = "checking"
-        _line(station, active.session.camera).check()
+        self._line(active.session.camera).check()
         if active.session.programme:
-            station.heat(_NO_HEAT)
+            self.station.heat(_NO_HEAT)
 
-    def _begin(self, station: Station, active: _Progress) -> None:
+    def _begin(self, active: _Progress) -> None:
         session = active.session
-        self._take(station, session)
+        self._take(session)
         active.state = "running"
         self._tell("session_begun", active, f"{session.epochs} epochs begin")
 
-    def _take(self, station: Station, session: Session) -> None:
-        line = _line(station, session.camera)
+    def _take(self, session: Session) -> None:
+        line = self._line(session.camera)
         line.take(session.series, session.start, session.epochs)
         if session.programme and line.run is not None:
             # by epochs, not by the clock: a pause of the camera is a pause of the programme
             elapsed_s = (line.run.first - 1) * line.plan.config.period_s
-            station.heat(session.steps(elapsed_s))
+            self.station.heat(session.steps(elapsed_s))
 
-    def _end(
-        self, station: Station, active: _Progress,
-        state: Literal["done", "stopped", "refused"], why: str,
-    ) -> None:  # fmt: skip
-        session, line = active.session, station.line(active.session.camera)
+    def _end(self, active: _Progress, state: State, why: str) -> None:
+        session, line = active.session, self.station.line(active.session.camera)
+        self._active.pop(session.camera, None)
         if active.state == "running" and line is not None and line.run is not None:
             active.taken = line.run.taken
         active.state, active.why = state, why
@@ -242,7 +234,7 @@ class Sessions:
             if line is not None:
                 line.take(line.plan.config.series)
             if session.programme:
-                station.heat(_NO_HEAT)
+                self.station.heat(_NO_HEAT)
         except ThermocaldError as error:
             log.error("camera %s: %s", session.camera, error)
         kind = "session_refused" if state == "refused" else "session_ended"
@@ -258,10 +250,9 @@ class Sessions:
         }  # fmt: skip
         self._guard.event(Event(self._clock.utc(), kind, about, data=data))
 
-
-def _line(station: Station, camera: str) -> CameraLine:
-    line = station.line(camera)
-    if line is None:
-        there = ", ".join(c.plan.name for c in station.cameras) or "none"
-        raise ConfigurationError(f"there is no camera {camera!r}; there are: {there}")
-    return line
+    def _line(self, camera: str) -> CameraLine:
+        line = self.station.line(camera)
+        if line is None:
+            there = ", ".join(c.plan.name for c in self.station.cameras) or "none"
+            raise ConfigurationError(f"there is no camera {camera!r}; there are: {there}")
+        return line

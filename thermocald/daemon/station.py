@@ -98,7 +98,7 @@ class Station:
 
     def stalled(self) -> list[str]:
         """Return threads that have not come back for too long, or are gone, in words."""
-        busy = [(f"{loop.link.kind} {loop.link.name}", loop.busy_s()) for loop in self._loops]
+        busy = [(loop.link.called, loop.busy_s()) for loop in self._loops]
         busy += [(f"pipeline of {camera.plan.name}", camera.busy_s()) for camera in self.cameras]
         return [f"{name} hangs" for name, busy_s in busy if busy_s > self.ground.hang_after_s]
 

@@ -1,5 +1,0 @@
-"""A chip on a fake SMBus adapter; unplugging takes it off its address."""
-
-from tests.drivers.laboratory.bench import on_i2c
-
-thermometer = on_i2c("bme280")

@@ -91,12 +91,30 @@ def record(value, kind=2, name="battery"):
     return f"\tTemperature{{mValue={value}, mType={kind}, mName={name}, mStatus=0}}\n"
 
 
-HEAD = "Current temperatures from HAL:\n"
+HAL = """HAL Ready: true
+Cached temperatures:
+	Temperature{mValue=61.0, mType=3, mName=skin, mStatus=0}
+HAL connection:
+	ThermalHAL AIDL 3 connected: yes
+Current temperatures from HAL:
+%sCurrent cooling devices from HAL:
+	CoolingDevice{mValue=0, mType=2, mName=thermal-cpufreq-0}
+Temperature static thresholds from HAL:
+	TemperatureThreshold{mType=3, mName=skin, mHotThrottlingThresholds=[NaN, 39.0, 43.0]}
+"""
 RECORDS = [
+    (record(33.25, 3, "skin"), {"skin": 33.25}),
+    (record(31.5, 3, "back cover"), {"back cover": 31.5}),
+    (record(75.0, 13, "lmh-dcvs-00"), {}),  # a limit
+    (record(33250.0, 3, "skin"), {}),  # millidegrees
+    (record(-40.0, 15, "camera"), {}),  # not fitted
+    *((record(value), {}) for value in ("NaN", "0.0", "-3.4028235E38")),  # invalid, or not fitted
+    (record(3.9, 6, "vbat"), {}),  # a voltage
     *((record(46.7, kind), {}) for kind in (-1, 7, 8, 20)),  # their unit is not degrees
     *((record(value), {}) for value in ("2_5.0", "Infinity", "٢٥", "")),
     # a name with a line end does not hide the rest
-    (record(42.0, -1, "soc\n") + record(31.0, 3, "skin\n") + record(25.0), {"battery": 25.0}),
+    (record(42.0, -1, "soc\n") + record(31.0, 3, "skin\n") + record(25.0),
+     {"skin": 31.0, "battery": 25.0}),
     ((record(25.0) + "Cached temperatures:\n" + record(55.0, 0, "cpu")).replace("\n", "\r\n"),
      {"battery": 25.0}),
     (record(25.0) + record(31.0, 3), {}),  # one name for two sensors
@@ -105,7 +123,8 @@ RECORDS = [
 
 @pytest.mark.parametrize(("text", "expected"), RECORDS)
 def test_records_of_the_thermal_service(server, text, expected):
-    assert read(server, "thermal", ["battery", "cpu"], thermal=HEAD + text) == expected
+    names = {"battery", "cpu", *re.findall(r"mName=(\w[^,}\n]*)", text)} - {"soc"}
+    assert read(server, "thermal", names, thermal=HAL % text) == expected
 
 
 WARM, COLD = "pm_tz 30500\n", "pm_tz 5200\n"
@@ -139,3 +158,24 @@ def test_the_unit_of_a_zone(server, text, celsius):
     name = text.split()[0]
     found = read(server, "zone", [name], zones=text + "\n").get(name)
     assert found == (celsius and pytest.approx(celsius))
+
+
+PHONE_ZONES = """cpu-0-0-usr 38200
+gpuss-0-usr 36100
+battery 31000
+lmh-dcvs-00 75000
+pm6150-vbat-lvl0 4012
+pm6150l-bcl-lvl1 0
+bcl-cycle 12
+soc 87
+quiet-therm-adc 32100
+dock_therm -40960
+ibat-high 2000
+"""
+
+
+def test_zones_of_a_phone(server):
+    wanted = {line.split()[0]: f"zone:{line.split()[0]}" for line in PHONE_ZONES.splitlines()}
+    assert phone_reads(server, wanted, zones=PHONE_ZONES) == {
+        "cpu-0-0-usr": 38.2, "gpuss-0-usr": 36.1, "battery": 31.0, "quiet-therm-adc": 32.1,
+    }  # fmt: skip

@@ -132,3 +132,30 @@ def test_permission_denied(sysfs, monkeypatch):
         monkeypatch.setattr(type(folder), "read_text", read_text)
         with pytest.raises(TransientDeviceError, match="Permission denied"):
             device.read()
+
+
+def test_a_zone_that_showed_its_unit_may_pass_through_zero(sysfs):
+    read = []
+    sysfs.zone(0, "outside", "2100")
+    with thermometer("thermal_zone", sysfs, zone="outside") as device:
+        for number in ("2100", "700", "0", "-300"):
+            sysfs.zone(0, "outside", number)
+            read.append(device.read().values["temperature"])
+    assert read == [2.1, 0.7, 0.0, -0.3]
+
+
+def test_two_inputs_of_one_label_are_two_channels(sysfs):
+    labels = {"temp1_label": "Diode", "temp2_label": "Diode", "temp3_label": "Board"}
+    inputs = {"temp1_input": "20000", "temp2_input": "21000", "temp3_input": "22000"}
+    sysfs.hwmon(0, "chip", **labels, **inputs)
+    with thermometer("hwmon", sysfs, chip="chip") as device:
+        assert device.read().values == {"temp1": 20.0, "temp2": 21.0, "Board": 22.0}
+
+
+@pytest.mark.parametrize("label", [b"Temp \xb0C", b"\xff\xfe", b"Gr\xc3", b"\xed\xb3\xa9", b"\x80"])
+def test_a_label_that_is_no_text_is_read(sysfs, label):
+    files = {"temp1_input": "20000", "temp1_label": "x", "temp2_input": "21000"}
+    sysfs.hwmon(0, "chip", **files)
+    next(sysfs.root.rglob("temp1_label")).write_bytes(label)
+    with thermometer("hwmon", sysfs, chip="chip") as device:
+        assert list(device.read().values.values()) == [20.0, 21.0]

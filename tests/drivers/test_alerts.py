@@ -53,18 +53,6 @@ def test_temperature_disk_and_epochs_without_result(tmp_path):
     assert told({"free_disk_gb": 1e-6, "path": str(tmp_path)}, results) == []
 
 
-@pytest.mark.parametrize(
-    "when",
-    [{}, "c", {"drift": "A1", "px": 1}, {"drift": "c"}, {"drift": "c", "px": 1, "sds": 2},
-     {"drift": "c", "px": -1}, {"temperature": "t"}, {"no_result": 0}, {"no_result": 1, "px": 2},
-     {"temperature": "t", "above_c": 5, "below_c": 4}],
-)  # fmt: skip
-def test_a_wrong_condition_is_named(when):
-    options = {"command": ["true"], "when": [when]}
-    with pytest.raises(ConfigurationError, match="when"):
-        open_device("output", "alert_exec", options, VirtualClock())
-
-
 WHEN = [{"drift": "c", "px": 0.5}]
 OUT, IN = result(1, drift_c_px=0.8), result(2, drift_c_px=0.1)
 
@@ -159,13 +147,6 @@ def test_a_letter_by_starttls(tmp_path):
             open_device("output", "alert_mail", options, VirtualClock()).open()
     finally:
         server.close()
-
-
-def test_a_password_is_not_sent_in_the_open():
-    options = {"host": "x", "sender": "a@b", "recipients": ["a@b"], "when": WHEN,
-               "username": "u", "password_file": "p", "security": "none"}  # fmt: skip
-    with pytest.raises(ConfigurationError, match="without TLS"):
-        open_device("output", "alert_mail", options, VirtualClock())
 
 
 def test_mqtt_retains_what_is_out():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import sys
 import threading
 import time
 
@@ -350,12 +349,6 @@ def test_no_server():
         open_device("thermometer", "android", settings, SystemClock()).open()
 
 
-def test_without_adbutils(server, monkeypatch):
-    monkeypatch.setitem(sys.modules, "adbutils", None)
-    with pytest.raises(errors.DriverMissing, match="android"):
-        camera(server).open()
-
-
 def test_temperatures(server, phone, shared):
     phone.thermal = next((shared / "data/adb").glob("06_*")).read_text()
     phone.zones = "cpu-0-0 37000\nbattery 370\n"
@@ -402,24 +395,6 @@ def test_a_zone_of_unknown_unit_asks_for_the_option(server, phone):
         assert device.read().values == {"soc": 4.5}
 
 
-@pytest.mark.parametrize(
-    ("stanza", "message"),
-    [
-        *(
-            ({"sensors": {"soc": "zone:x", "skin": "thermal:y"}, "units": units}, "units")
-            for units in ({"soc": "kelvin"}, {"air": "degC"}, {"skin": "degC"})
-        ),
-        *(
-            ({"sensors": {"temperature": source}}, "neither battery")
-            for source in ("batery", "thermal", "zone:", "battery:x")
-        ),
-    ],
-)
-def test_wrong_sensors_and_units(server, stanza, message):
-    with pytest.raises(errors.ConfigurationError, match=message):
-        thermometer(server, **stanza)
-
-
 def test_two_phones_with_one_serial_number(server):
     server.listing = f"{SERIAL}\toffline\n{SERIAL}\tdevice\n"
     with pytest.raises(errors.WrongDevice, match="2 devices have this serial number"):
@@ -442,11 +417,6 @@ def test_two_phones_by_their_serials(server, phone):
             {"temperature": 28.7},
             {"temperature": 30.1},
         )
-
-
-def test_tap_needs_its_place(server):
-    with pytest.raises(errors.ConfigurationError, match="tap"):
-        camera(server, trigger="tap")
 
 
 def load(server, clock, **more):
@@ -497,13 +467,3 @@ def test_the_limit_stops_the_load_for_good(server, phone):
         heat(phone, 20.0)
         output.emit({})
         assert not phone.load
-
-
-def test_a_limit_that_a_battery_does_not_survive(server):
-    with pytest.raises(errors.ConfigurationError, match="limit_c: is 60; input should be less"):
-        open_device(
-            "output",
-            "android_load",
-            options(server, limit_c=60, programme=[{"seconds": 9, "hold_c": 30}]),
-            VirtualClock(),
-        )

@@ -10,7 +10,7 @@ from thermocald_drivers.mock import Kind
 
 from tests.drivers.small_camera import write_small_camera
 from thermocald import hal
-from thermocald.errors import BadReading, ConfigurationError, DeviceGone, DeviceTimeout
+from thermocald.errors import BadReading, DeviceGone, DeviceTimeout
 from thermocald.hal import VirtualClock, open_device
 
 
@@ -125,24 +125,6 @@ def test_injected_while_it_runs(clock):
         assert outcomes(device, 1) == ["DeviceGone"]
         device.clear()
         assert outcomes(device, 1) == ["ok"]
-
-
-@pytest.mark.parametrize(
-    ("plan", "message"),
-    [
-        ([{"kind": "explode"}], r"faults\[0\].kind: is 'explode'; input should be 'timeout'"),
-        ([{"kind": "timeout", "att": 3}], r"faults\[0\].att: unknown; is 'at' meant"),
-        ([{"kind": "timeout", "at": 0}], r"faults\[0\].at: is 0; .* greater"),
-        ([{"kind": "timeout", "at": 1.5}], "valid integer"),
-        ([{"kind": "timeout", "at_s": -1}], r"faults\[0\].at_s: is -1"),
-        ([{"kind": "timeout", "at": 3, "for_s": 2}], r"faults\[0\]: .*belong together"),
-        ([{"kind": "timeout", "at": 3, "at_s": 1, "for_s": 2}], "either `at`"),
-        (["timeout"], r"faults\[0\]: is 'timeout'"),
-    ],
-)
-def test_a_wrong_plan_is_refused(clock, plan, message):
-    with pytest.raises(ConfigurationError, match=message):
-        open_device("output", "mock", {"faults": plan}, clock)
 
 
 def test_an_output_that_fails_keeps_nothing(clock):

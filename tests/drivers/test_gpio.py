@@ -9,7 +9,7 @@ import gpiozero
 import pytest
 from gpiozero.pins.mock import MockFactory
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceDenied, DeviceNotFound
+from thermocald.errors import BadReading, DeviceDenied, DeviceNotFound
 from thermocald.hal import VirtualClock, open_device
 
 PROGRAMME = [
@@ -134,18 +134,3 @@ def test_permission_denied(pins, monkeypatch, clock):
     for device in (relay(clock), open_device("output", "led", {"pin": 17}, clock)):
         with pytest.raises(DeviceDenied, match=r"GPIO .*group gpio"):
             device.open()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"limit_c": 200}, "limit_c: is 200; input should be less"),
-        ({"limit_c": 45}, "hold_c: 45 °C is not below the limit"),
-        ({"programme": []}, "at least 1 item"),
-        ({"programme": [{"seconds": 10}]}, r"programme\[0\]"),
-        ({"pin": 99}, "pin"),
-    ],
-)
-def test_a_wrong_configuration(clock, options, message):
-    with pytest.raises(ConfigurationError, match=message):
-        relay(clock, **options)

@@ -108,12 +108,6 @@ def test_0xffff_is_a_line_that_nobody_drives(bus, name):
             device.read()
 
 
-@pytest.mark.parametrize("name", CHIPS)
-def test_an_address_that_the_chip_cannot_have(name):
-    with pytest.raises(errors.ConfigurationError, match="0x"):
-        thermometer(name, address=0x50)
-
-
 # what a chip holds: °C, or what is said of it; MCP9808 DS25095A: flags in bits 15–13, sign in 12;
 # TMP117 SNOSD82D table 7-1; LM75B rev. 6.1 table 10; TMP102 SBOS397H tables 6-2 and 6-3
 HELD = [

@@ -7,7 +7,6 @@ import pytest
 from tests.drivers.fakes.sysfs import Sysfs
 from thermocald.errors import (
     BadReading,
-    ConfigurationError,
     DeviceGone,
     DeviceNotFound,
     TransientDeviceError,
@@ -71,11 +70,6 @@ def test_a_channel_that_is_not_there(sysfs):
     sysfs.hwmon(0, "it87", temp2_input="51000")
     with pytest.raises(WrongDevice, match=r"temp1.*there is temp2"):
         thermometer("hwmon", sysfs, chip="it87", channels={"lens": "temp1"}).open()
-
-
-def test_a_zone_of_another_quantity_needs_its_unit(sysfs):
-    with pytest.raises(ConfigurationError, match="write unit: thousandths"):
-        thermometer("thermal_zone", sysfs, zone="pm8150b-vbat-lvl0")
 
 
 def test_an_open_diode_is_not_a_temperature(sysfs):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from thermocald.errors import ConfigurationError
 from thermocald.hal import VirtualClock, open_device
 
 QUIET = {"noise_k": 0.0, "resolution_k": 0.0}
@@ -73,21 +72,3 @@ def test_noise_has_the_stated_size_and_is_seeded():
     # the noise hangs on the instant, not on how often it was read before
     assert np.array_equal(first["a"][::2], read(options, times[::2])["a"])
     assert not np.array_equal(first["a"], read({**options, "seed": 5}, times)["a"])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
-        ({"programme": [0, 20]}, "valid list"),
-        ({"programme": "warm"}, "valid list"),
-        ({"programme": [[0, 20, 3]]}, "list of"),
-        ({"channels": {"t": {"lag": 3}}}, "channels.t.lag: unknown; is 'lag_s' meant"),
-        ({"channels": {"t": {"noise_k": -1}}}, "channels.t.noise_k: is -1"),
-        ({"seed": 1.5}, "seed: is 1.5; .*valid integer"),
-        ({"conversion_s": -1}, "conversion_s"),
-    ],
-)
-def test_wrong_options_are_refused(options, message):
-    with pytest.raises(ConfigurationError, match=message):
-        open_device("thermometer", "mock", options, VirtualClock())

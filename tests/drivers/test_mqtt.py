@@ -13,7 +13,7 @@ from thermocald_drivers.mqtt import discovery_messages, node_of
 
 from tests.drivers.fakes.certificate import own_certificate
 from tests.drivers.fakes.mqtt_broker import Broker
-from thermocald.errors import ConfigurationError, DeviceDenied, DeviceGone, DeviceTimeout
+from thermocald.errors import DeviceDenied, DeviceGone, DeviceTimeout
 from thermocald.hal import SystemClock, open_device
 
 RESULT = {"device": "rpi/1", "state": "steady", "status": "ok", "temperature": 31.25, "c": 3.041}
@@ -114,14 +114,6 @@ def test_a_line_that_breaks_leaves_the_will(broker):
         device.emit(RESULT)
     device.close()
     assert broker.messages[-1] == ("thermocald/thermocald/available", b"offline", True)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"), [({"password_file": "y"}, "username"), ({"key": "y"}, "cert")]
-)
-def test_options_that_need_one_another(options, message):
-    with pytest.raises(ConfigurationError, match=message):
-        open_device("output", "mqtt", {"host": "x", **options}, SystemClock())
 
 
 # paho leaves the socket of a refused handshake to the garbage collector, which says so

@@ -130,14 +130,6 @@ def test_auto_only_by_name_and_with_a_warning(focusing):
     assert (frame.settings["focus_auto"], frame.settings["focus_dioptres"]) == (1.0, 5.0)
 
 
-@pytest.mark.parametrize(
-    "options", [{"colour_gains": [1.0]}, {"colour_gains": "warm"}, {"gain": "high"}]
-)
-def test_a_wrong_configuration(pi, options):
-    with pytest.raises(errors.ConfigurationError):
-        camera(**options)
-
-
 def test_the_stanza_has_size_and_lens_position(focusing):
     (found,) = Picamera2Camera.attached()
     assert found.options == {
@@ -224,9 +216,3 @@ def test_a_camera_that_cannot_be_opened_is_given_back(pi, knobs, options, error,
     with pytest.raises(error, match=message):
         camera(**options).open()
     assert all(one.closed for one in pi.instances)
-
-
-def test_without_picamera2(monkeypatch):
-    monkeypatch.setitem(sys.modules, "picamera2", None)
-    with pytest.raises(errors.DriverMissing):
-        camera().open()

@@ -8,7 +8,6 @@ import pytest
 from thermocald.epoch import Epoch
 from thermocald.errors import (
     BadReading,
-    ConfigurationError,
     DeviceFinished,
     DeviceNotFound,
     PermanentDeviceError,
@@ -128,8 +127,6 @@ def test_no_recording(tmp_path):
     options = {"recording": str(tmp_path / "none")}
     with pytest.raises(DeviceNotFound, match="no such recording"):
         open_device("camera", "replay", options, VirtualClock()).open()
-    with pytest.raises(ConfigurationError):
-        open_device("camera", "replay", {}, VirtualClock())
 
 
 def test_a_real_recording(shared):

@@ -233,27 +233,6 @@ def test_permission_denied(instrument, monkeypatch):
         asked(far).open()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, "either instrument"),
-        ({"pattern": "("}, "pattern"),
-        ({"pattern": r"\d+"}, "name the value"),
-        ({"pattern": PATTERN, "checksum": "xor"}, "needs a group"),
-        ({"pattern": PATTERN, "unit": "R"}, "unit: is 'R'; input should be 'C', 'F'"),
-        ({"pattern": PATTERN, "framing": "9N1"}, "framing: is '9N1'"),
-        ({"pattern": PATTERN, "baud": 3}, "baud: is 3; input should be greater"),
-        ({"instrument": "acme"}, "instrument: is 'acme'; input should be 'papouch-tm'"),
-        ({"pattern": PATTERN, "unit": "mA"}, "mA needs scale"),
-        ({"pattern": PATTERN, "chip": "sht99"}, "chip: 'sht99' is not one of"),
-        ({"pattern": PATTERN, "command": "T°"}, "command"),
-    ],
-)
-def test_a_wrong_configuration(options, message):
-    with pytest.raises(errors.ConfigurationError, match=message):
-        open_device("thermometer", "serial", {"port": "/dev/null", **options}, SystemClock())
-
-
 CUT = {
     "a decimal is lost": (["21.56", "21.57", "21.5"], [21.56, 21.57, None]),
     "all decimals are lost": (["21.5", "21.4", "21"], [21.5, 21.4, None]),

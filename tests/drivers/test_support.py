@@ -7,8 +7,7 @@ import time
 import pytest
 from thermocald_drivers import support
 
-from thermocald.errors import ConfigurationError
-from thermocald.hal import SystemClock, VirtualClock, open_device
+from thermocald.hal import SystemClock
 
 
 class InterruptedClock(SystemClock):
@@ -35,9 +34,3 @@ def test_an_instant_on_the_clock_is_not_off_by_a_pause(pauses):
 def test_texts_that_are_not_numbers(text):
     with pytest.raises(ValueError, match="not a plain decimal number"):
         support.parse_number(text)
-
-
-@pytest.mark.parametrize("points", [[[0, 1e300]], [[0, -300]], [[0, "nan"]], [[0, float("inf")]]])
-def test_programmes_of_temperatures_that_do_not_exist(points):
-    with pytest.raises(ConfigurationError, match="programme"):
-        open_device("thermometer", "mock", {"programme": points}, VirtualClock())

@@ -1,0 +1,118 @@
+"""Stanzas that are refused when they are read, with the option and what is wrong with it."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from thermocald.errors import ConfigurationError, DriverMissing
+from thermocald.hal import VirtualClock, open_device
+
+SIZE = {"width": 96, "height": 64}
+V4L2 = {"device": "/dev/video0", **SIZE}
+PHONE = {"serial": "X"}
+PATTERN = r"T=(?P<temperature>[-+]?\d+\.\d+)"
+RELAY = {"pin": 27, "limit_c": 60, "hysteresis_k": 1.0, "programme": [
+    {"seconds": 100, "hold_c": None}, {"seconds": 1000, "hold_c": 45.0}]}  # fmt: skip
+LOAD = {**PHONE, "limit_c": 60, "programme": [{"seconds": 9, "hold_c": 30}]}
+WHEN = {"when": [{"drift": "c", "px": 0.5}]}
+OPEN = {"host": "x", "sender": "a@b", "recipients": ["a@b"], **WHEN,
+        "username": "u", "password_file": "p", "security": "none"}  # fmt: skip
+# {driver: (options of all its rows, [(further options, what is said)])}
+WRONG = {
+    ("camera", "v4l2"): (V4L2, [
+        ({"device": None}, "either device"), ({"serial": "x"}, "either device"),
+        ({"pixel_format": "PNG"}, "'PNG' is not one of"), ({"exposure_s": "long"}, "exposure_s"),
+        ({"focus": "manual"}, "neither a number nor auto"),
+    ]),
+    ("camera", "picamera2"): ({}, [
+        ({"colour_gains": [1.0]}, "colour_gains"), ({"colour_gains": "warm"}, "colour_gains"),
+        ({"gain": "high"}, "gain"),
+    ]),
+    ("camera", "android"): ({**PHONE, **SIZE}, [({"trigger": "tap"}, "tap")]),
+    ("camera", "replay"): ({}, [({}, "recording: is missing")]),
+    ("thermometer", "android"): (PHONE, [
+        *(({"sensors": {"soc": "zone:x", "skin": "thermal:y"}, "units": units}, "units")
+          for units in ({"soc": "kelvin"}, {"air": "degC"}, {"skin": "degC"})),
+        *(({"sensors": {"temperature": source}}, "neither battery")
+          for source in ("batery", "thermal", "zone:", "battery:x")),
+    ]),
+    **{("thermometer", chip): ({}, [({"address": 0x50}, "0x50 is not an address of a")])
+       for chip in ("bme280", "lm75", "mcp9808", "sht3x", "tmp117")},
+    ("thermometer", "thermal_zone"): ({}, [
+        ({"zone": "pm8150b-vbat-lvl0"}, "write unit: thousandths")]),
+    ("thermometer", "serial"): ({"port": "/dev/null"}, [
+        ({}, "either instrument"), ({"pattern": "("}, "pattern"),
+        ({"pattern": r"\d+"}, "name the value"),
+        ({"pattern": PATTERN, "checksum": "xor"}, "needs a group"),
+        ({"pattern": PATTERN, "unit": "R"}, "unit: is 'R'; input should be 'C', 'F'"),
+        ({"pattern": PATTERN, "framing": "9N1"}, "framing: is '9N1'"),
+        ({"pattern": PATTERN, "baud": 3}, "baud: is 3; input should be greater"),
+        ({"instrument": "acme"}, "instrument: is 'acme'; input should be 'papouch-tm'"),
+        ({"pattern": PATTERN, "unit": "mA"}, "mA needs scale"),
+        ({"pattern": PATTERN, "chip": "sht99"}, "chip: 'sht99' is not one of"),
+        ({"pattern": PATTERN, "command": "T°"}, "command"),
+    ]),
+    ("thermometer", "mock"): ({}, [
+        ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
+        ({"programme": [0, 20]}, "valid list"), ({"programme": "warm"}, "valid list"),
+        ({"programme": [[0, 20, 3]]}, "list of"),
+        *(({"programme": [[0, celsius]]}, "programme")  # temperatures that do not exist
+          for celsius in (1e300, -300, "nan", float("inf"))),
+        ({"channels": {"t": {"lag": 3}}}, "channels.t.lag: unknown; is 'lag_s' meant"),
+        ({"channels": {"t": {"noise_k": -1}}}, "channels.t.noise_k: is -1"),
+        ({"seed": 1.5}, "seed: is 1.5; .*valid integer"), ({"conversion_s": -1}, "conversion_s"),
+    ]),
+    ("output", "mock"): ({}, [
+        *(({"faults": [{"kind": "timeout", **plan}]}, message) for plan, message in [
+            ({"kind": "explode"}, r"faults\[0\].kind: is 'explode'; input should be 'timeout'"),
+            ({"att": 3}, r"faults\[0\].att: unknown; is 'at' meant"),
+            ({"at": 0}, r"faults\[0\].at: is 0; .* greater"), ({"at": 1.5}, "valid integer"),
+            ({"at_s": -1}, r"faults\[0\].at_s: is -1"),
+            ({"at": 3, "for_s": 2}, r"faults\[0\]: .*belong together"),
+            ({"at": 3, "at_s": 1, "for_s": 2}, "either `at`"),
+        ]),
+        ({"faults": ["timeout"]}, r"faults\[0\]: is 'timeout'"),
+    ]),
+    ("output", "relay"): (RELAY, [
+        ({"limit_c": 200}, "limit_c: is 200; input should be less"),
+        ({"limit_c": 45}, "hold_c: 45 °C is not below the limit"),
+        ({"programme": []}, "at least 1 item"), ({"pin": 99}, "pin"),
+        ({"programme": [{"seconds": 10}]}, r"programme\[0\]"),
+    ]),
+    # a limit that a battery does not survive
+    ("output", "android_load"): (LOAD, [({}, "limit_c: is 60; input should be less")]),
+    ("output", "mqtt"): ({"host": "x"}, [
+        ({"password_file": "y"}, "username"), ({"key": "y"}, "cert")]),
+    ("output", "alert_mail"): (OPEN, [({}, "without TLS")]),
+    ("output", "alert_exec"): ({"command": ["true"]}, [
+        ({"when": [when]}, "when") for when in (
+            {}, "c", {"drift": "A1", "px": 1}, {"drift": "c"}, {"drift": "c", "px": 1, "sds": 2},
+            {"drift": "c", "px": -1}, {"temperature": "t"}, {"no_result": 0},
+            {"no_result": 1, "px": 2}, {"temperature": "t", "above_c": 5, "below_c": 4})
+    ]),
+}  # fmt: skip
+ROWS = [
+    (kind, name, {**common, **options}, message)
+    for (kind, name), (common, rows) in WRONG.items()
+    for options, message in rows
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "options", "message"), ROWS)
+def test_a_wrong_option_is_named(kind, name, options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        open_device(kind, name, options, VirtualClock())
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "module", "message"),
+    [("v4l2", {**V4L2, "backend": "linuxpy"}, "linuxpy.video.device", r"thermocald\[v4l2\]"),
+     ("android", {**PHONE, **SIZE}, "adbutils", r"thermocald\[android\]"),
+     ("picamera2", {}, "picamera2", "'picamera2' is not installed")],
+)  # fmt: skip
+def test_a_library_that_is_missing_is_named(name, options, module, message, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DriverMissing, match=message):
+        open_device("camera", name, options, VirtualClock()).open()

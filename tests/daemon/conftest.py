@@ -56,12 +56,19 @@ class Daemon:
         arguments = ["run", *(["--config", str(self.config)] if config else []), *options]
         self.process = self.forker.start(self.folder, *arguments, **environment)
 
+    def run(self, *options: str, **sections) -> None:
+        self.configure(**sections)
+        self.start(*options)
+
     def signal(self, number: int) -> None:
         self.process.send_signal(number)
 
-    def stop(self, timeout_s: float = 60.0) -> int:
+    def stop(self) -> int:
+        """End it; the exit status. Nothing went wrong in a way that nobody had thought of."""
         self.signal(signal.SIGTERM)
-        return self.wait(timeout_s)
+        status = self.wait(60.0)
+        assert "Traceback" not in self.log()
+        return status
 
     def kill(self) -> None:
         self.process.kill()
@@ -87,12 +94,19 @@ class Daemon:
             assert not alive or self.process.poll() is None, f"it ended; log:\n{self.log()}"
             time.sleep(0.05)
 
+    def more(self, count: int) -> None:
+        """Wait until there are so many results more than now."""
+        had = len(self.results())
+        self.until(lambda: len(self.results()) >= had + count)
+
     def stored(self) -> tuple[list[int], list[str]]:
-        """(numbers, statuses) of the one series; the store must be sound."""
+        """(numbers, statuses) of the one series; the store must be sound and no number absent."""
         with Store.open(self.store) as store:
             assert store.examine().damaged == ()
             columns = store.series_columns(store.find_series(), ["epoch", "status"])
-            return columns["epoch"].astype(int).tolist(), columns["status"].tolist()
+        numbers = columns["epoch"].astype(int).tolist()
+        assert numbers == list(range(1, len(numbers) + 1))
+        return numbers, columns["status"].tolist()
 
     def events(self) -> list[str]:
         with Store.open(self.store) as store:

@@ -50,8 +50,7 @@ def test_a_daemon_alerts_once_out_and_once_in(daemon, replayed, servers):
          "sender": "pi@example.org", "recipients": ["me@example.org"], **here},
         {"name": "home", "driver": "alert_mqtt", "port": broker.port, **here},
     ]  # fmt: skip
-    daemon.configure(**sections)
-    daemon.start()
+    daemon.run(**sections)
     daemon.until(lambda: [p[2]["state"] for p in web.posts].count("in") == 2, 120.0)
     daemon.until(lambda: len(mail.letters) == 4 and len(log.read_text().split("\n")) == 5)
     daemon.until(lambda: sum("/alert/" in m[0] for m in broker.messages) == 4)

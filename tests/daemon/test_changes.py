@@ -117,8 +117,7 @@ def test_every_epoch_has_its_own_result_before_and_after_a_knock(store):
 @pytest.mark.parametrize("epochs", [24, pytest.param(600, marks=pytest.mark.slow)])
 def test_the_mock_at_half_a_second_tells_nothing_and_every_column_is_ours(daemon, devices, epochs):
     """No knock that nobody put in; and no name of a column can be a channel's, which loses it."""
-    daemon.configure(**devices(period_s=0.5))
-    daemon.start("--epochs", str(epochs))
+    daemon.run("--epochs", str(epochs), **devices(period_s=0.5))
     assert daemon.wait(560.0) == 0
     assert daemon.events() == ["started", "series_begun", "stopped"]
     with Store.open(daemon.store) as store:

@@ -37,13 +37,12 @@ def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, devices, preloaded,
     daemon.configure(**devices(period_s=0.3), frames=frames)
     daemon.forker = preloaded
     daemon.start(CLOCK_OFFSET_FILE=str(offset))
-    daemon.until(lambda: len(daemon.results()) > 4)
+    daemon.more(5)
     for seconds, steps in ((120 * DAY, 1), (0, 2), (-HOUR, 3), (0, 4)):
         # written over, since the process holds the file open
         offset.write_text(str(int(seconds)).ljust(12))
         daemon.until(lambda n=steps: daemon.log().count("the clock was set") == n)
-        count = len(daemon.results())
-        daemon.until(lambda n=count: len(daemon.results()) > n + 4)
+        daemon.more(5)
     assert daemon.stop() == 0
     columns, steps, archived = content(daemon, tmp_path)
     told = [(round(step["seconds"] / HOUR), step["adopted"]) for step in steps]
@@ -71,11 +70,10 @@ def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(
     daemon.configure(**devices(period_s=0.3), frames=frames)
     daemon.forker = preloaded
     daemon.start(CLOCK_OFFSET_FILE=str(offset))
-    daemon.until(lambda: len(daemon.results()) > 4)
+    daemon.more(5)
     offset.write_text("0".ljust(12))
     daemon.until(lambda: "time stamps follow" in daemon.log())
-    count = len(daemon.results())
-    daemon.until(lambda: len(daemon.results()) > count + 4)
+    daemon.more(5)
     assert daemon.stop() == 0
     columns, steps, archived = content(daemon, tmp_path)
     assert [step["adopted"] for step in steps] == [True]

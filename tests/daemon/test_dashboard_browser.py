@@ -27,9 +27,8 @@ def shown(daemon, devices):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     # slow enough for a busy machine: what is deferred is calibrated later, and not drawn
-    daemon.configure(**devices(period_s=1.5), dashboard={"enabled": True, "port": port})
-    daemon.start()
-    daemon.until(lambda: len(daemon.results()) > 2)
+    daemon.run(**devices(period_s=1.5), dashboard={"enabled": True, "port": port})
+    daemon.more(3)
     daemon.until(lambda: _listens(port))
     yield f"http://127.0.0.1:{port}/"
     if daemon.process.poll() is None:

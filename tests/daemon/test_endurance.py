@@ -44,7 +44,6 @@ def test_kills_lose_no_committed_epoch(daemon, recording, replayed):
             numbers, _ = daemon.stored()  # with an integrity check
             told = {result["epoch"] for result in daemon.results()}
             lost += len(told - set(numbers))
-            assert numbers == list(range(1, len(numbers) + 1))
     assert restarts == KILLS
     assert lost == 0
     print(f"{KILLS} kills, {len(numbers)} epochs, 0 lost")

@@ -31,8 +31,7 @@ def readings_of(daemon, name=None) -> list:
 
 def test_a_thermometer_alone_is_stored_and_archived(daemon, devices):
     sections = devices()
-    daemon.configure(thermometers=[{**sections["thermometers"][0], "name": "air"}])
-    daemon.start()
+    daemon.run(thermometers=[{**sections["thermometers"][0], "name": "air"}])
     daemon.until(lambda: len(readings_of(daemon)) > 5)
     assert daemon.stop() == 0
     kept = readings_of(daemon)
@@ -52,8 +51,7 @@ def test_a_thermometer_of_no_camera_is_stored_and_a_paired_one_while_the_camera_
 ):
     sections = devices(camera=[{"kind": "unplugged", "at_s": 0.5, "for_s": 2.0}])
     sections["thermometers"].append({**sections["thermometers"][0], "name": "air", "seed": 7})
-    daemon.configure(**sections)
-    daemon.start()
+    daemon.run(**sections)
     daemon.until(lambda: "camera one is back" in daemon.log())
     daemon.until(lambda: daemon.results() and daemon.results()[-1]["epoch"] > 5)
     daemon.until(lambda: len(readings_of(daemon, "air")) > 10)
@@ -72,8 +70,7 @@ def test_a_thermometer_of_no_camera_is_stored_and_a_paired_one_while_the_camera_
 def test_readings_wait_for_a_store_that_cannot_be_written(daemon, devices):
     import resource
 
-    daemon.configure(thermometers=devices()["thermometers"])
-    daemon.start()
+    daemon.run(thermometers=devices()["thermometers"])
     daemon.until(lambda: len(readings_of(daemon)) > 2)
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
@@ -125,8 +122,7 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
         sections = devices(series=series)
         daemon.configure(**sections, frames=limits)
         daemon.start(**SYNCHRONISED)
-        count = len(daemon.results())
-        daemon.until(lambda n=count: len(daemon.results()) > n + 3)
+        daemon.more(4)
         if series == "M1":
             assert daemon.stop() == 0
     # an old frame, while the daemon runs: it is the daemon that deletes it, and logs it
@@ -174,8 +170,7 @@ def test_the_frames_that_are_wanted_are_kept(daemon, recording, replayed, keep, 
     (folder / "epochs.csv").write_text("\n".join(rows) + "\n")
     sections = replayed(folder, period_s=0.05, loop=False)
     limits = {"folder": str(daemon.folder / "kept"), "min_free_gb": 0.0, **keep}
-    daemon.configure(**sections, frames=limits)
-    daemon.start("--epochs", "12")
+    daemon.run("--epochs", "12", **sections, frames=limits)
     assert daemon.wait() == 0
     names = sorted(p.name for p in (daemon.folder / "kept").rglob("*.jpg"))
     assert names == [f"{k:07d}.jpg" for k in kept]

@@ -136,8 +136,7 @@ def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, measured):
         daemon.configure(**measured, dashboard={"enabled": True, "port": port})
         daemon.start(INVOCATION_ID="")
         daemon.until(lambda: "acquisition goes on without it" in daemon.log(), 90.0)
-        count = len(daemon.results())
-        daemon.until(lambda: len(daemon.results()) > count + 3)
+        daemon.more(4)
         assert daemon.log().count("in use by another program") == 1
         assert "the page is at" not in daemon.log()
         status = read_json(daemon.folder / "thermocald.db.live/status.json")
@@ -148,7 +147,7 @@ def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, measured):
 def test_under_systemd_the_page_is_not_the_daemons_child(daemon, measured):
     daemon.configure(**measured, dashboard={"enabled": True, "port": free_port()})
     daemon.start(INVOCATION_ID="0" * 32)
-    daemon.until(lambda: len(daemon.results()) > 3)
+    daemon.more(4)
     children = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children")
     assert children.read_text().split() == []
     assert daemon.stop() == 0

@@ -167,9 +167,8 @@ def in_a_terminal(daemon, seconds: float, *options: str, key: bytes = b"") -> tu
 @pytest.mark.slow
 @pytest.mark.parametrize("key", [b"q", b""], ids=["q", "Ctrl-C"])
 def test_top_is_always_up_to_date(daemon, devices, key):
-    daemon.configure(**devices())
-    daemon.start()
-    daemon.until(lambda: len(daemon.results()) > 2)
+    daemon.run(**devices())
+    daemon.more(3)
     seen, status = in_a_terminal(daemon, 5.0, "top", "--store", str(daemon.store),
                                  "--interval", "0.3", key=key)  # fmt: skip
     assert daemon.stop() == 0
@@ -186,9 +185,8 @@ def test_status_says_how_it_is_in_json_and_fails_where_nothing_runs(daemon, meas
     status = partial(call, "status", "--store", daemon.store)
     gone = status()
     assert (gone.returncode, gone.stderr.count("\n")) == (1, 1)
-    daemon.configure(**measured)
-    daemon.start()
-    daemon.until(lambda: len(daemon.results()) > 2)
+    daemon.run(**measured)
+    daemon.more(3)
     told = status("--json", "-")
     document = json.loads(told.stdout)
     assert document["pid"] == daemon.process.pid

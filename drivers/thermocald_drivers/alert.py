@@ -60,7 +60,7 @@ class Alert:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What a condition compares: NaN where the result does not have it, or for no bound.
+    """What a condition compares: a value, NaN where the result does not have it, and its bounds.
 
     back: how far inside a bound the value is in again; step: what is added to a bound in words.
     """
@@ -83,8 +83,7 @@ class Measured:
     @property
     def inside(self) -> bool:
         """Whether the value is clearly within the bounds again."""
-        above = math.isnan(self.low) or self.value >= self.low + self.back
-        return above and (math.isnan(self.high) or self.value <= self.high - self.back)
+        return self.low + self.back <= self.value <= self.high - self.back
 
     @property
     def text(self) -> str:
@@ -147,7 +146,7 @@ class Drift(Condition):
         if self.px is None:
             unit, value = " sds", abs(drift) / sd if sd > 0 else math.nan
         words = f"{self.drift} is {value:.3g}{unit} from {start}"
-        return Measured(value, math.nan, high, (1 - _BACK) * high, words, unit)
+        return Measured(value, -math.inf, high, (1 - _BACK) * high, words, unit)
 
 
 class Temperature(Condition):
@@ -161,7 +160,7 @@ class Temperature(Condition):
     @model_validator(mode="after")
     def _something_between(self) -> Self:
         low, high = self._limits
-        if math.isnan(low) and math.isnan(high):
+        if math.isinf(low) and math.isinf(high):
             raise ConfigurationError(f"temperature {self.temperature} needs above_c or below_c")
         if high - low <= 2 * self.hysteresis_k:
             raise ConfigurationError(
@@ -176,7 +175,7 @@ class Temperature(Condition):
     @property
     def _limits(self) -> tuple[float, float]:
         low, high = self.below_c, self.above_c
-        return math.nan if low is None else low, math.nan if high is None else high
+        return -math.inf if low is None else low, math.inf if high is None else high
 
     def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
         value = _number(result.get(self.temperature))
@@ -190,7 +189,7 @@ Count = Annotated[int, Field(ge=1, le=1_000_000)]
 def _counted(count: int, most: int, said: str) -> Measured:
     """Return epochs as they are compared: out from `most` on, in again at none."""
     words = f"{count} epochs {said}"
-    return Measured(float(count), math.nan, most - 1, most - 1, words, step=1)
+    return Measured(float(count), -math.inf, most - 1, most - 1, words, step=1)
 
 
 class NoResult(Condition):
@@ -228,7 +227,7 @@ class FreeDisk(Condition):
             disk = os.statvfs(self.path)
             value = disk.f_bavail * disk.f_frsize / 1e9
         words = f"{value:.2f} GB are free at {self.path}"
-        return Measured(value, low, math.nan, (_DISK_BACK - 1) * low, words, " GB")
+        return Measured(value, low, math.inf, (_DISK_BACK - 1) * low, words, " GB")
 
 
 _KINDS: dict[str, type[Condition]] = {
@@ -274,7 +273,7 @@ class Watch:
             if was_out == beyond or not (beyond or found.inside):
                 continue
             self._out ^= {key}
-            bounds = (b for b in (found.beyond, found.low, found.high) if not math.isnan(b))
+            bounds = (b for b in (found.beyond, found.low, found.high) if math.isfinite(b))
             utc, epoch = _number(result.get("frame_time")), moment[1]
             changes.append(
                 Alert(

@@ -334,7 +334,11 @@ class AndroidThermometer(AdbPhone, Thermometer):
         start = self.clock.monotonic()
         kinds = {source.partition(":")[0] for source in self.sensors.values()}
         texts = {kind: self.shell(DUMPS[kind]) for kind in sorted(kinds)}
-        found = self._battery(texts) | self._service(texts) | self._zones(texts)
+        service = thermalservice(texts.get("thermal", ""))
+        found: dict[str, float | str] = {
+            f"thermal:{name}": value for name, value in service.items()
+        }
+        found |= self._battery(texts) | self._zones(texts)
         measures = {
             channel: (source, partial(self._judge, channel, source, found.get(source)))
             for channel, source in self.sensors.items()
@@ -375,10 +379,6 @@ class AndroidThermometer(AdbPhone, Thermometer):
         self._scales["battery"] = found[1]
         return {"battery": self._in_unit("battery", *found)}
 
-    def _service(self, texts: Mapping[str, str]) -> dict[str, float | str]:
-        found = thermalservice(texts.get("thermal", ""))
-        return {f"thermal:{name}": value for name, value in found.items()}
-
     def _zones(self, texts: Mapping[str, str]) -> dict[str, float | str]:
         raw = kernel.raw_zones(texts.get("zone", ""))
         known = {s.removeprefix("zone:"): f for s, f in self._scales.items() if s != "battery"}
@@ -409,7 +409,8 @@ def battery(text: str, unit: str = "") -> tuple[float, float] | None:
     fields: dict[str, str] = {}
     for name, value in _FIELD.findall(text):
         fields.setdefault(name, value)  # the first is current; log lines may repeat the word
-    raw, volts = _whole(fields.get("temperature")), _whole(fields.get("voltage"))
+    whole = {name: int(v) for name, v in fields.items() if v not in ("true", "false")}
+    raw, volts = whole.get("temperature"), whole.get("voltage")
     if raw is None or fields.get("present") == "false" or (raw == 0 and not volts):
         return None
     if unit:
@@ -424,10 +425,6 @@ def battery(text: str, unit: str = "") -> tuple[float, float] | None:
     # up to 70 it is tenths, or whole degrees: some boards give them beside mV
     tenths = not degrees and lowest <= raw <= 10 * HOTTEST_BATTERY_C
     return (raw, 0.1) if tenths else None
-
-
-def _whole(text: str | None) -> int | None:
-    return int(text) if text is not None and text not in ("true", "false") else None
 
 
 def thermalservice(text: str) -> dict[str, float]:

@@ -318,13 +318,12 @@ class MockThermometer(MockDevice, Thermometer):
             }
         return support.middle_reading(self.clock, self._last, start)
 
-    def truth(self, monotonic: float) -> float:
-        """Return the programme's temperature (°C) at a time of the monotonic clock."""
-        return self._followed(0.0, monotonic)
+    def truth(self, monotonic: float, lag_s: float = 0.0) -> float:
+        """Return the programme's temperature (°C) at a time of the monotonic clock.
 
-    def _followed(self, lag_s: float, at: float) -> float:
-        """Return the programme behind a first-order lag; in equilibrium before its first point."""
-        elapsed, times, values = self._elapsed(at), self._times, self._values
+        Behind a first-order lag; in equilibrium before its first point.
+        """
+        elapsed, times, values = self._elapsed(monotonic), self._times, self._values
         if lag_s == 0.0:
             return float(np.interp(elapsed, times, values))
         from thermocald.physics.operators import lag
@@ -334,7 +333,7 @@ class MockThermometer(MockDevice, Thermometer):
         return float(lag(knots, held, lag_s, np.array([max(elapsed, times[0])]))[0])
 
     def _value(self, number: int, channel: Channel, at: float) -> float:
-        true = self._followed(channel.lag_s, at)
+        true = self.truth(at, channel.lag_s)
         value = self._values[0] + channel.gain * (true - self._values[0]) + channel.offset_k
         seed = [self.options.seed, number, round(at * 1e6) & 2**63 - 1]
         value += channel.noise_k * float(np.random.default_rng(seed).standard_normal())

@@ -182,30 +182,21 @@ class Picamera2Camera(Camera):
             raise WrongDevice(
                 f"{self.where}: this lens cannot be focused; leave focus_dioptres out"
             )
-        camera.configure(
-            camera.create_still_configuration(
-                main={"size": (self.options.width, self.options.height), "format": "YUV420"},
-                controls=self._controls(focuses),
-                buffer_count=2,
-            )
-        )
-        camera.start()
-        self._lock(camera)
-
-    def _controls(self, focuses: bool) -> dict[str, Any]:
-        """Return the controls of the configuration; what is left out is locked by `_lock`."""
-        automatic = AUTO in (self.options.exposure_s, self.options.gain)
         controls: dict[str, Any] = {
-            "AeEnable": automatic,
+            "AeEnable": AUTO in (self.options.exposure_s, self.options.gain),
             "AwbEnable": self.options.colour_gains == AUTO,
+            **self._stated,
         }
-        controls |= self._stated
         if exposure := controls.get("ExposureTime"):
             controls["FrameDurationLimits"] = (max(exposure, 100_000),) * 2
         if focuses:
             automatic = self.options.focus_dioptres == AUTO
             controls["AfMode"] = CONTINUOUS_FOCUS if automatic else MANUAL_FOCUS
-        return controls
+        main = {"size": (self.options.width, self.options.height), "format": "YUV420"}
+        still = camera.create_still_configuration(main=main, controls=controls, buffer_count=2)
+        camera.configure(still)
+        camera.start()
+        self._lock(camera)
 
     def _lock(self, camera: Any) -> None:
         """Hold lens position and colour gains where the stanza leaves them out."""

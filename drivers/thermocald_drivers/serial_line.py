@@ -248,18 +248,15 @@ class SerialThermometer(Thermometer):
         except (OSError, termios.error) as error:  # a termios.error is no OSError
             if isinstance(error, BadReading | DeviceTimeout):
                 raise
-            raise self._lost(error) from error
+            if isinstance(error, support.library("serial").SerialTimeoutException):
+                raise DeviceTimeout(f"{self.where}: cannot send, the line is held") from error
+            # pyserial reports an unplug without an errno, or with EIO
+            raise DeviceGone(f"{self.where}: unplugged ({error})") from error
         reading = self._reading(match, start)
         if self.command:
             return reading
         monotonic, utc = support.on_clock(self.clock, ended)
         return replace(reading, monotonic=monotonic, utc=utc)
-
-    def _lost(self, error: Exception) -> Exception:
-        """Pyserial reports an unplug without an errno, or with EIO."""
-        if isinstance(error, support.library("serial").SerialTimeoutException):
-            return DeviceTimeout(f"{self.where}: cannot send, the line is held")
-        return DeviceGone(f"{self.where}: unplugged ({error})")
 
     def _ask(self) -> None:
         """Send the command once the line is quiet, and note whether a line is unfinished."""

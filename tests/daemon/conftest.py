@@ -199,6 +199,19 @@ def make_recording(
     return path
 
 
+def make_photographs(path: Path, recording: Path, frames: list[bytes]) -> Path:
+    """A recording of JPEGs, of the camera and the test field of another."""
+    (path / "frames").mkdir(parents=True)
+    for name in ("recording.yaml", "testfield.csv"):
+        shutil.copy(recording / name, path / name)
+    rows = ["epoch,frame_time,temperature_time,temperature,frame"]
+    for k, data in enumerate(frames, 1):
+        (path / f"frames/{k:04d}.jpg").write_bytes(data)
+        rows.append(f"{k},{1.7e9 + 10 * k},{1.7e9 + 10 * k},25.0,frames/{k:04d}.jpg")
+    (path / "epochs.csv").write_text("\n".join(rows) + "\n")
+    return path
+
+
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory) -> Path:
     """200 epochs of 27 targets at 50 ms."""

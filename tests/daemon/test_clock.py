@@ -6,7 +6,10 @@ tell it. Not real: the kernel's clock itself: file times and its word on synchro
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
+import pytest
 
 from thermocald.store.database.archive import archive_series
 from thermocald.store.database.store import Store
@@ -28,19 +31,32 @@ def content(daemon, folder):
     return columns, steps, read_recording(folder / "archive").columns.frame_time
 
 
-def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, devices, preloaded, tmp_path):
-    """120 days ahead for 3 s, an hour back: found to delete all frames and to leave times wrong."""
-    offset = tmp_path / "offset"
-    offset.write_text("0")
+@pytest.fixture
+def clocked(daemon, devices, preloaded, tmp_path):
+    """s → a daemon that has begun with its clock off by so much; it is set by `clocked.set`."""
     frames = {"keep": "all", "folder": str(tmp_path / "frames"), "max_age_days": 90,
               "min_free_gb": 0.0}  # fmt: skip
     daemon.configure(**devices(period_s=0.3), frames=frames)
     daemon.forker = preloaded
-    daemon.start(CLOCK_OFFSET_FILE=str(offset))
-    daemon.more(5)
-    for seconds, steps in ((120 * DAY, 1), (0, 2), (-HOUR, 3), (0, 4)):
+
+    def set_clock(seconds):
         # written over, since the process holds the file open
-        offset.write_text(str(int(seconds)).ljust(12))
+        (tmp_path / "offset").write_text(str(int(seconds)).ljust(12))
+
+    def start(seconds):
+        set_clock(seconds)
+        daemon.start(CLOCK_OFFSET_FILE=str(tmp_path / "offset"))
+        daemon.more(5)
+
+    start.set = set_clock
+    return start
+
+
+def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, clocked, tmp_path):
+    """120 days ahead for 3 s, an hour back: found to delete all frames and to leave times wrong."""
+    clocked(0)
+    for seconds, steps in ((120 * DAY, 1), (0, 2), (-HOUR, 3), (0, 4)):
+        clocked.set(seconds)
         daemon.until(lambda n=steps: daemon.log().count("the clock was set") == n)
         daemon.more(5)
     assert daemon.stop() == 0
@@ -58,20 +74,9 @@ def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, devices, preloaded,
     assert "frames_deleted" not in daemon.events()
 
 
-def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(
-    daemon, devices, preloaded, tmp_path
-):
-    import time
-
-    offset = tmp_path / "offset"
-    offset.write_text(str(-int(time.time()) + 60).ljust(12))  # a minute after 1970 began
-    frames = {"keep": "all", "folder": str(tmp_path / "frames"), "max_age_days": 90,
-              "min_free_gb": 0.0}  # fmt: skip
-    daemon.configure(**devices(period_s=0.3), frames=frames)
-    daemon.forker = preloaded
-    daemon.start(CLOCK_OFFSET_FILE=str(offset))
-    daemon.more(5)
-    offset.write_text("0".ljust(12))
+def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(daemon, clocked, tmp_path):
+    clocked(60 - time.time())  # a minute after 1970 began
+    clocked.set(0)
     daemon.until(lambda: "time stamps follow" in daemon.log())
     daemon.more(5)
     assert daemon.stop() == 0

@@ -11,24 +11,27 @@ import time
 import numpy as np
 import pytest
 
+from tests.daemon.conftest import make_photographs
 from tests.marks import mostly_slow
 from thermocald.files import read_json
 from thermocald.store.database.store import Store
 
 
-def test_killed_and_restarted_nothing_committed_is_lost(daemon, recording, replayed):
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("kills", [4, pytest.param(80, marks=pytest.mark.slow)])
+def test_killed_and_restarted_nothing_committed_is_lost(daemon, recording, replayed, kills):
+    """40 more in test_chaos, and 300 of the store's writer in store/test_kills."""
     daemon.configure(**replayed(recording))
     rng = np.random.default_rng(5)
-    for _ in range(4):
-        before = len(daemon.results())
+    for _ in range(kills):
         daemon.start()
-        daemon.until(lambda n=before: len(daemon.results()) > n + 3)
+        daemon.more(int(rng.integers(1, 6)))
         time.sleep(rng.uniform(0.0, 0.4))
         daemon.kill()
         told = [result["epoch"] for result in daemon.results()]
         numbers, _ = daemon.stored()
         assert set(told) <= set(numbers)
-    assert len(numbers) > 12
+    assert len(numbers) > 3 * kills
 
 
 def test_unplugged_and_back_told_once_each_and_no_other_device_waits(daemon, devices):
@@ -201,18 +204,12 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
 
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
 def test_garbage_frames_are_epochs_with_a_reason(daemon, recording, tmp_path, count):
-    garbage = tmp_path / "garbage"
-    (garbage / "frames").mkdir(parents=True)
-    for name in ("recording.yaml", "testfield.csv"):
-        shutil.copy(recording / name, garbage / name)
     rng = np.random.default_rng(1)
     heads = [b"\xff\xd8\xff\xe0", b"\xff\xd8" + b"\xff\xd9", b"\xff\xd8\xff\xdb\x00\x43\xff\xd9"]
-    rows = ["epoch,frame_time,temperature_time,temperature,frame"]
-    for k in range(1, count + 1):
-        data = heads[k % 3] + rng.bytes(int(rng.integers(0, 3000))) + b"\xff\xd9" * (k % 2)
-        (garbage / "frames" / f"{k:04d}.jpg").write_bytes(data)
-        rows.append(f"{k},{1.7e9 + 10 * k},{1.7e9 + 10 * k},25.0,frames/{k:04d}.jpg")
-    (garbage / "epochs.csv").write_text("\n".join(rows) + "\n")
+    garbage = make_photographs(tmp_path / "garbage", recording, [
+        heads[k % 3] + rng.bytes(int(rng.integers(0, 3000))) + b"\xff\xd9" * (k % 2)
+        for k in range(1, count + 1)
+    ])  # fmt: skip
     daemon.start("--recording", str(garbage), "--fast", "--store", str(daemon.store), config=False)
     assert daemon.wait(300) == 0
     numbers, statuses = daemon.stored()

@@ -9,9 +9,12 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from tests.commands import call
+from tests.daemon.conftest import make_photographs
 from thermocald.errors import StoreError
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
@@ -153,21 +156,8 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
 ])  # fmt: skip
 def test_the_frames_that_are_wanted_are_kept(daemon, recording, replayed, keep, kept):
     """Pictures of nothing: every epoch is an event."""
-    import shutil
-
-    import cv2
-    import numpy as np
-
-    folder = daemon.folder / "grey"
-    (folder / "frames").mkdir(parents=True)
-    for name in ("recording.yaml", "testfield.csv"):
-        shutil.copy(recording / name, folder / name)
     grey = cv2.imencode(".jpg", np.full((64, 64), 128, np.uint8))[1].tobytes()
-    rows = ["epoch,frame_time,temperature_time,temperature,frame"]
-    for k in range(1, 13):
-        (folder / "frames" / f"{k}.jpg").write_bytes(grey)
-        rows.append(f"{k},{1.7e9 + 10 * k},{1.7e9 + 10 * k},25.0,frames/{k}.jpg")
-    (folder / "epochs.csv").write_text("\n".join(rows) + "\n")
+    folder = make_photographs(daemon.folder / "grey", recording, [grey] * 12)
     sections = replayed(folder, period_s=0.05, loop=False)
     limits = {"folder": str(daemon.folder / "kept"), "min_free_gb": 0.0, **keep}
     daemon.run("--epochs", "12", **sections, frames=limits)

@@ -96,23 +96,19 @@ class SteadyClock:
             self._seen, self._seen_at = offset, now
             if abs(step) >= _LEAP_S:
                 self._leapt_at = now
-        pending = offset - self._offset
-        if abs(pending) < _STEP_S:
-            if not stepped:
-                return None
-            return self._report(ClockStep(self.utc(), step, adopted=False))
+        ahead = offset - self._offset
+        pending = abs(ahead) >= _STEP_S
         # a clock that shows a time before this program existed has just learned the time, too
         learned |= self.utc() < NOT_BEFORE <= self._machine.utc()
-        if learned or now - self._seen_at >= _CONFIRM_S:
+        if pending and (learned or now - self._seen_at >= _CONFIRM_S):
             self._offset = offset
-            return self._report(ClockStep(self.utc(), pending, adopted=True))
-        if not stepped:
+            told = ClockStep(self.utc(), ahead, adopted=True)
+        elif stepped:
+            told = ClockStep(self.utc(), step, adopted=False, pending=pending)
+        else:
             return None
-        return self._report(ClockStep(self.utc(), step, adopted=False, pending=True))
-
-    def _report(self, step: ClockStep) -> ClockStep:
-        log.warning(step.text, extra={"event": "clock_step"})
-        return step
+        log.warning(told.text, extra={"event": "clock_step"})
+        return told
 
     @property
     def error_s(self) -> float:

@@ -353,7 +353,12 @@ class Watch:
     def look(self, taken: int) -> bool:
         """Return whether it is enough; taken: epochs so far. Never waits."""
         if self._pending is not None and self._pending.done():
-            self._conclude(self._pending)
+            try:
+                self.found = self._pending.result()
+                sentence = self.found.sentence
+            except ThermocaldError as error:
+                sentence = str(error)
+            self._say(f"after {self._seen} epochs: {sentence}")
             self._pending = None
         if self._pending is None and taken >= max(_FEWEST, self._seen + _EVERY) and not self.ended:
             self._seen = taken
@@ -366,14 +371,6 @@ class Watch:
         if not self.ended:
             reached = self.found.sentence if self.found else "too few epochs"
             self._say(f"not separated: {reached}")
-
-    def _conclude(self, done: Future[Separation]) -> None:
-        try:
-            self.found = done.result()
-        except ThermocaldError as error:
-            self._say(f"after {self._seen} epochs: {error}")
-            return
-        self._say(f"after {self._seen} epochs: {self.found.sentence}")
 
     def _compare(self) -> Separation:
         from thermocald.discovery.experiment import compare_effects

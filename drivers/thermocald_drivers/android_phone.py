@@ -263,13 +263,10 @@ NO_BATTERY = (
     "no battery temperature: not fitted, frozen (`dumpsys battery reset` ends that), or in an "
     "unknown unit ({state})"
 )
-TYPES = {
-    0: "CPU", 1: "GPU", 2: "BATTERY", 3: "SKIN", 4: "USB_PORT", 5: "POWER_AMPLIFIER",
-    6: "BCL_VOLTAGE", 7: "BCL_CURRENT", 8: "BCL_PERCENTAGE", 9: "NPU", 10: "TPU", 11: "DISPLAY",
-    12: "MODEM", 13: "SOC", 14: "WIFI", 15: "CAMERA", 16: "FLASHLIGHT", 17: "SPEAKER",
-    18: "AMBIENT", 19: "POGO",
-}  # fmt: skip
-NOT_TEMPERATURES = {6, 7, 8}
+# TemperatureType: CPU 0, GPU, BATTERY, SKIN, USB_PORT, POWER_AMPLIFIER; BCL_VOLTAGE 6, BCL_CURRENT
+# and BCL_PERCENTAGE are none; NPU 9, TPU, DISPLAY, MODEM, SOC, WIFI, CAMERA, FLASHLIGHT, SPEAKER,
+# AMBIENT, POGO
+TEMPERATURES = {*range(6), *range(9, 20)}
 LIVE_SECTION = "Current temperatures from HAL:"
 WHOLE_VOLTS = range(1, 100)
 CELL_MV = range(2500, 4600)
@@ -438,8 +435,7 @@ def thermalservice(text: str) -> dict[str, float]:
     values: dict[str, float] = {}
     ambiguous = set()
     for record in _RECORD.finditer(section):
-        kind = int(record["type"])
-        if kind not in TYPES or kind in NOT_TEMPERATURES:
+        if int(record["type"]) not in TEMPERATURES:
             continue
         try:
             value = support.parse_number(record["value"])

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import ssl
 import time
 
 import pytest
 from thermocald_drivers.alert import Watch, condition_of
 
 from tests.drivers.fakes.alert_servers import MailServer, WebServer
-from tests.drivers.fakes.certificate import own_certificate
+from tests.drivers.fakes.certificate import own_context
 from tests.drivers.fakes.mqtt_broker import Broker
 from thermocald.errors import ConfigurationError, DeviceDenied, DeviceError, DeviceTimeout
 from thermocald.hal import SystemClock, VirtualClock, open_device
@@ -87,70 +86,76 @@ def test_a_program_that_hangs_is_killed(tmp_path):
         device.emit(OUT)
 
 
-def test_a_webhook_and_an_outage(tmp_path):
-    server = WebServer()
-    (tmp_path / "token").write_text("swordfish\n")
-    options = {"url": f"http://127.0.0.1:{server.port}/hook?a=1", "when": WHEN,
-               "token_file": str(tmp_path / "token")}  # fmt: skip
-    try:
-        device = open_device("output", "alert_webhook", options, VirtualClock())
-        device.open()
-        server.answer = 503
-        with pytest.raises(DeviceError, match="503"):
-            device.emit(OUT)
-        device.close()  # as the daemon does, before it tries again
-        server.answer = 204
-        device.open()
-        device.emit(IN)
-        device.close()
-        _, kept, back = server.posts
-        assert kept[2]["state"] == "out"
-        assert back[2]["state"] == "in"
-        assert kept[0] == "/hook?a=1"
-        assert kept[1]["Authorization"] == "Bearer swordfish"
-        assert kept[2]["condition"] == "drift_c_px"
-        assert kept[2]["epoch"] == 1
-        server.answer = 302
-        device.open()
-        with pytest.raises(DeviceError, match="302"):
-            device.emit(result(3, drift_c_px=0.9))
-        server.answer = 403
-        with pytest.raises(DeviceDenied):
-            device.emit(result(3, drift_c_px=0.9))
-        assert not [p for p in server.posts if p[0] == "GET"]
-        device.close()
-    finally:
+@pytest.fixture
+def start():
+    """A server of a class on loopback, which is closed after the test."""
+    started = []
+
+    def make(server, **options):
+        started.append(server(**options))
+        return started[-1]
+
+    yield make
+    for server in started:
         server.close()
 
 
-def test_a_letter_by_starttls(tmp_path):
-    ca, key = own_certificate(tmp_path)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(ca, key)
-    server = MailServer(context=context)
+def test_a_webhook_and_an_outage(start, tmp_path):
+    server = start(WebServer)
+    (tmp_path / "token").write_text("swordfish\n")
+    options = {"url": f"http://127.0.0.1:{server.port}/hook?a=1", "when": WHEN,
+               "token_file": str(tmp_path / "token")}  # fmt: skip
+    device = open_device("output", "alert_webhook", options, VirtualClock())
+    device.open()
+    server.answer = 503
+    with pytest.raises(DeviceError, match="503"):
+        device.emit(OUT)
+    device.close()  # as the daemon does, before it tries again
+    server.answer = 204
+    device.open()
+    device.emit(IN)
+    device.close()
+    _, kept, back = server.posts
+    assert kept[2]["state"] == "out"
+    assert back[2]["state"] == "in"
+    assert kept[0] == "/hook?a=1"
+    assert kept[1]["Authorization"] == "Bearer swordfish"
+    assert kept[2]["condition"] == "drift_c_px"
+    assert kept[2]["epoch"] == 1
+    server.answer = 302
+    device.open()
+    with pytest.raises(DeviceError, match="302"):
+        device.emit(result(3, drift_c_px=0.9))
+    server.answer = 403
+    with pytest.raises(DeviceDenied):
+        device.emit(result(3, drift_c_px=0.9))
+    assert not [p for p in server.posts if p[0] == "GET"]
+    device.close()
+
+
+def test_a_letter_by_starttls(start, tmp_path):
+    ca, context = own_context(tmp_path)
+    server = start(MailServer, context=context)
     (tmp_path / "password").write_text("swordfish\n")
     options = {"host": "127.0.0.1", "port": server.port, "sender": "pi@example.org",
                "recipients": ["me@example.org"], "username": "pi", "ca": str(ca),
                "password_file": str(tmp_path / "password"), "when": WHEN}  # fmt: skip
-    try:
-        with open_device("output", "alert_mail", options, VirtualClock()) as device:
-            device.emit(OUT)
-        (letter,) = server.letters
-        assert "Subject: [thermocald] alert: cam: c is 0.8 px from the start" in letter
-        assert all(secure for _, secure in server.logins)
-        assert server.logins
-        server.refuse_login = True
-        with pytest.raises(DeviceDenied, match="password"):
-            device.open()
-        del options["ca"]
-        with pytest.raises(DeviceError, match=r"certificate|CERTIFICATE"):
-            open_device("output", "alert_mail", options, VirtualClock()).open()
-    finally:
-        server.close()
+    with open_device("output", "alert_mail", options, VirtualClock()) as device:
+        device.emit(OUT)
+    (letter,) = server.letters
+    assert "Subject: [thermocald] alert: cam: c is 0.8 px from the start" in letter
+    assert all(secure for _, secure in server.logins)
+    assert server.logins
+    server.refuse_login = True
+    with pytest.raises(DeviceDenied, match="password"):
+        device.open()
+    del options["ca"]
+    with pytest.raises(DeviceError, match=r"certificate|CERTIFICATE"):
+        open_device("output", "alert_mail", options, VirtualClock()).open()
 
 
-def test_mqtt_retains_what_is_out():
-    broker = Broker()
+def test_mqtt_retains_what_is_out(start):
+    broker = start(Broker)
     options = {"host": "127.0.0.1", "port": broker.port, "when": WHEN, "timeout_s": 2}
     with open_device("output", "alert_mqtt", options, SystemClock()) as device:
         device.emit(OUT)
@@ -176,9 +181,9 @@ def test_an_address_with_a_secret_is_refused_and_not_quoted(url):
 
 
 @pytest.mark.parametrize("answer", [500, 404, 302, None])
-def test_a_secret_is_never_quoted(answer, tmp_path, caplog):
+def test_a_secret_is_never_quoted(answer, start, tmp_path, caplog):
     """Not by the address, not by the token, whatever the server or the library says."""
-    server = WebServer()
+    server = start(WebServer)
     (tmp_path / "token").write_text("SECRET\n")
     options = {"url": f"http://127.0.0.1:{server.port}/SECRET?key=SECRET", "when": WHEN,
                "token_file": str(tmp_path / "token"), "timeout_s": 1.0}  # fmt: skip
@@ -187,13 +192,9 @@ def test_a_secret_is_never_quoted(answer, tmp_path, caplog):
     server.answer = answer or 204
     if answer is None:
         server.close()
-    try:
-        with pytest.raises(DeviceError) as error:
-            device.emit(OUT)
-    finally:
-        device.close()
-        if answer is not None:
-            server.close()
+    with pytest.raises(DeviceError) as error:
+        device.emit(OUT)
+    device.close()
     assert "SECRET" not in f"{error.value} {caplog.text} {dict(device.identity())} {device.where}"
     assert error.value.__cause__ is None  # a log with its causes would quote the library
 
@@ -223,41 +224,32 @@ def test_a_program_gets_a_few_variables_only(tmp_path, monkeypatch):
     assert all(name in allowed or name.startswith("THERMOCALD_") for name in names)
 
 
-def test_a_letter_that_fails_quotes_no_password(tmp_path):
-    server = MailServer()
+def test_a_letter_that_fails_quotes_no_password(start, tmp_path):
+    server = start(MailServer)
     (tmp_path / "password").write_text("SECRET")
     options = {"host": "127.0.0.1", "port": server.port, "sender": "pi@example.org",
                "recipients": ["me@example.org"], "username": "pi", "security": "tls",
                "password_file": str(tmp_path / "password"), "when": WHEN,
                "timeout_s": 1}  # fmt: skip
-    try:
-        with pytest.raises(DeviceError) as error:
-            open_device("output", "alert_mail", options, VirtualClock()).open()
-    finally:
-        server.close()
+    with pytest.raises(DeviceError) as error:
+        open_device("output", "alert_mail", options, VirtualClock()).open()
     assert "SECRET" not in str(error.value)
 
 
-def test_a_webhook_with_tls_and_a_redirection_into_this_network(tmp_path, monkeypatch):
-    ca, key = own_certificate(tmp_path)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(ca, key)
-    server, inner = WebServer(context=context), WebServer()
+def test_a_webhook_with_tls_and_a_redirection_into_this_network(start, tmp_path, monkeypatch):
+    ca, context = own_context(tmp_path)
+    server, inner = start(WebServer, context=context), start(WebServer)
     url = f"https://127.0.0.1:{server.port}/SECRET"
     options = {"url": url, "when": WHEN, "timeout_s": 5.0}
-    try:
-        with open_device("output", "alert_webhook", options, VirtualClock()) as device:
-            with pytest.raises(DeviceError, match="not trusted") as error:
-                device.emit(OUT)
-            assert "SECRET" not in str(error.value)
-        monkeypatch.setenv("SSL_CERT_FILE", str(ca))
-        with open_device("output", "alert_webhook", options, VirtualClock()) as device:
+    with open_device("output", "alert_webhook", options, VirtualClock()) as device:
+        with pytest.raises(DeviceError, match="not trusted") as error:
             device.emit(OUT)
-            assert [post[2]["state"] for post in server.posts] == ["out"]
-            server.answer, server.location = 302, f"http://127.0.0.1:{inner.port}/meta-data"
-            with pytest.raises(DeviceError, match="302"):
-                device.emit(IN)
-        assert inner.posts == []
-    finally:
-        server.close()
-        inner.close()
+        assert "SECRET" not in str(error.value)
+    monkeypatch.setenv("SSL_CERT_FILE", str(ca))
+    with open_device("output", "alert_webhook", options, VirtualClock()) as device:
+        device.emit(OUT)
+        assert [post[2]["state"] for post in server.posts] == ["out"]
+        server.answer, server.location = 302, f"http://127.0.0.1:{inner.port}/meta-data"
+        with pytest.raises(DeviceError, match="302"):
+            device.emit(IN)
+    assert inner.posts == []

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import re
 import socket
-import ssl
 import time
 
 import pytest
 from thermocald_drivers.mqtt import discovery_messages, node_of
 
-from tests.drivers.fakes.certificate import own_certificate
+from tests.drivers.fakes.certificate import own_context
 from tests.drivers.fakes.mqtt_broker import Broker
 from thermocald.errors import DeviceDenied, DeviceGone, DeviceTimeout
 from thermocald.hal import SystemClock, open_device
@@ -119,9 +118,7 @@ def test_a_line_that_breaks_leaves_the_will(broker):
 # paho leaves the socket of a refused handshake to the garbage collector, which says so
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_tls(tmp_path):
-    ca, key = own_certificate(tmp_path)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(ca, key)
+    ca, context = own_context(tmp_path)
     broker = Broker(context=context)
     try:
         with output(broker, ca=str(ca), timeout_s=5) as device:

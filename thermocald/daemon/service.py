@@ -31,11 +31,7 @@ from thermocald.daemon.live_state import LiveState
 from thermocald.daemon.session import Sessions
 from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard
-from thermocald.daemon.systemd import (
-    notify,
-    notify_ready,
-    watchdog_interval_s,
-)
+from thermocald.daemon.systemd import notify, watchdog_interval_s
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import option_names
 from thermocald.names import WITH_VALUES
@@ -183,7 +179,7 @@ class Service:
                     control.open()
                 log.info("thermocald %s runs", __version__, extra={"event": "started"})
                 self._tell("started", f"thermocald {__version__} started")
-                notify_ready(self._line())
+                notify(f"READY=1\nSTATUS={self._line()}")
                 try:
                     self._loop()
                 finally:
@@ -322,7 +318,7 @@ class Service:
 
     def _reload_configuration(self) -> None:
         now_us = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-        notify(f"RELOADING=1\nMONOTONIC_USEC={now_us}")  # `notify_ready` ends it
+        notify(f"RELOADING=1\nMONOTONIC_USEC={now_us}")  # READY=1 ends it
         try:
             text = self._change()
         except ThermocaldError as error:
@@ -331,7 +327,7 @@ class Service:
             self._tell("reload_failed", str(error))
         else:
             log.info(text, extra={"event": "reloaded"})
-        notify_ready(self._line())
+        notify(f"READY=1\nSTATUS={self._line()}")
 
     def _change(self) -> str:
         """Read the configuration again and go over to it; return what was done."""

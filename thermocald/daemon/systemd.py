@@ -92,11 +92,6 @@ def notify(message: str) -> bool:
     return False
 
 
-def notify_ready(status: str) -> None:
-    """Started, or reloaded."""
-    notify(f"READY=1\nSTATUS={status}")
-
-
 def watchdog_interval_s() -> float | None:
     """How often the watchdog is to be fed, half of what systemd allows; None if there is none."""
     pid = os.environ.get("WATCHDOG_PID", "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import ssl
 import subprocess
 
 import pytest
@@ -21,3 +22,11 @@ def own_certificate(folder):
         check=True, capture_output=True,
     )  # fmt: skip
     return certificate, key
+
+
+def own_context(folder):
+    """(certificate, what a server with it is given)."""
+    certificate, key = own_certificate(folder)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    return certificate, context

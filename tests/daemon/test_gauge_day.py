@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.daemon.conftest import ENVIRONMENT, fast_run
+from tests.daemon.conftest import fast_run
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations
@@ -94,33 +91,27 @@ def site(tmp_path):
     return tmp_path
 
 
-def run_until_killed(site: Path, recording: Path, rows: int) -> list[dict]:
+def run_until_killed(daemon, recording: Path, rows: int) -> list[dict]:
     """Let a daemon work at full speed and kill it when it has told so many rows; all rows."""
     replay = {"driver": "replay", "recording": str(recording), "period_s": PERIOD_S}
     document = {
-        "store": {"path": str(site / "thermocald.db")}, "frames": {"keep": "none"},
-        "cameras": [{"name": "gauge", "thermal_model": str(site / "model.yaml"),
-                     "control_points": str(site / "gcp.csv"), "thermometers": ["box"], **replay}],
+        "store": {"path": str(daemon.store)}, "frames": {"keep": "none"},
+        "cameras": [{"name": "gauge", "thermal_model": "model.yaml", "control_points": "gcp.csv",
+                     "thermometers": ["box"], **replay}],
         "thermometers": [{"name": "box", **replay}],
-        "outputs": [{"name": "log", "driver": "jsonl", "path": str(site / "results.jsonl")}],
+        "outputs": [{"name": "log", "driver": "jsonl", "path": "results.jsonl"}],
     }  # fmt: skip
     script = fast_run(json.dumps(document), 0)
-    process = subprocess.Popen([sys.executable, "-c", script], cwd=site, env=ENVIRONMENT)
-    results = site / "results.jsonl"
-    deadline = time.monotonic() + 300
-    while process.poll() is None and time.monotonic() < deadline:
-        text = results.read_text() if results.exists() else ""
-        if text.count("\n") >= rows:
-            break
-        time.sleep(0.02)
-    process.kill()
-    process.wait()
-    lines = results.read_text().split("\n")[:-1]
-    return [json.loads(line) for line in lines]
+    daemon.process = daemon.forker.start(daemon.folder, script=script)
+    daemon.until(
+        lambda: daemon.process.poll() is not None or len(daemon.results()) >= rows, 300, alive=False
+    )
+    daemon.kill()
+    return daemon.results()
 
 
 @pytest.mark.timeout(900)
-def test_a_day_with_kills_and_a_lost_thermometer(site):
+def test_a_day_with_kills_and_a_lost_thermometer(daemon, site):
     """Nothing told is lost; each c, x0, y0 is within its sds, which grow and fall as they must."""
     rng = np.random.default_rng(5)
     first, told, starts, left = 0.0, [], [], 86_400.0
@@ -129,17 +120,11 @@ def test_a_day_with_kills_and_a_lost_thermometer(site):
         folder = record(site / f"part-{len(starts)}", first, rng)
         # the last one has time to forget, and ends by itself
         more = int(rng.integers(150, 300)) if first < 57_600 else 10_000
-        told = run_until_killed(site, folder, len(told) + more)
+        told = run_until_killed(daemon, folder, len(told) + more)
         left = BEGIN + 86_400 - PERIOD_S - told[-1]["frame_time"]
         first = told[-1]["frame_time"] - BEGIN + DOWN_S
-    from thermocald.store.database.store import Store
-
-    with Store.open(site / "thermocald.db") as store:
-        assert store.examine().damaged == ()
-        found = store.series_columns(store.find_series(), ["epoch"])
-        assert "camera_moved" not in {event.kind for event in store.events()}
-    stored = found["epoch"].astype(int).tolist()
-    assert stored == list(range(1, len(stored) + 1))
+    stored, _ = daemon.stored()
+    assert "camera_moved" not in daemon.events()
     assert {row["epoch"] for row in told} <= set(stored)
     assert len(starts) >= 5
     when = np.array([row["frame_time"] for row in told])

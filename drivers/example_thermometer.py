@@ -8,7 +8,7 @@ Source: data sheet DS21462D, 3.2: register 0 is °C in two's complement, registe
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 
@@ -26,29 +26,23 @@ class Tc74Thermometer(Thermometer):
 
     device_classes = ("char-i2c",)
     Options = Tc74Options
-    _smbus: Any = None
+    where = "TC74"
 
     def open(self) -> None:
         import smbus2  # the library is imported when the device is opened
 
         try:
-            self._smbus = smbus2.SMBus(self.options.bus)
-            self._smbus.read_byte_data(self.options.address, 1)
+            self.handle = smbus2.SMBus(self.options.bus)  # which `close` of a Device closes
+            self.handle.read_byte_data(self.options.address, 1)
         except OSError as error:
             self.close()
             raise DeviceNotFound(f"TC74 at {self.options.address:#x}: {error.strerror}") from error
 
-    def close(self) -> None:
-        smbus, self._smbus = self._smbus, None
-        if smbus is not None:
-            smbus.close()
-
     def read(self) -> Reading:
-        if self._smbus is None:
-            raise DeviceGone("TC74: not open")
+        smbus = self.opened()
         try:
-            ready = self._smbus.read_byte_data(self.options.address, 1) & 0x40
-            raw = self._smbus.read_byte_data(self.options.address, 0)
+            ready = smbus.read_byte_data(self.options.address, 1) & 0x40
+            raw = smbus.read_byte_data(self.options.address, 0)
         except OSError as error:
             raise DeviceGone(f"TC74 at {self.options.address:#x}: {error.strerror}") from error
         if not ready:

@@ -73,25 +73,6 @@ class Measured:
     unit: str = ""
     step: int = 0
 
-    @property
-    def beyond(self) -> float:
-        """The bound that the value has passed, NaN if none."""
-        if self.value < self.low:
-            return self.low
-        return self.high if self.value > self.high else math.nan
-
-    @property
-    def inside(self) -> bool:
-        """Whether the value is clearly within the bounds again."""
-        return self.low + self.back <= self.value <= self.high - self.back
-
-    @property
-    def text(self) -> str:
-        """The value and its bound in words."""
-        if math.isnan(self.beyond):
-            return f"{self.words}: within its limits again"
-        return f"{self.words} (limit {self.beyond + self.step:g}{self.unit})"
-
 
 class Condition(DriverOptions):
     """A threshold of `when`; `name` is what it is called in alerts."""
@@ -269,20 +250,23 @@ class Watch:
         for condition in self.conditions:
             key = (device if condition.per_device else "", condition.name)
             found = condition.measure(result, failed, lost)
-            was_out, beyond = key in self._out, not math.isnan(found.beyond)
-            if was_out == beyond or not (beyond or found.inside):
+            value, low, high = found.value, found.low, found.high
+            out, was_out = value < low or value > high, key in self._out
+            if out == was_out or not (out or low + found.back <= value <= high - found.back):
                 continue
             self._out ^= {key}
-            bounds = (b for b in (found.beyond, found.low, found.high) if math.isfinite(b))
+            limit = high if value > high or math.isinf(low) else low
+            bound = f" (limit {limit + found.step:g}{found.unit})"
+            text = found.words + (bound if out else ": within its limits again")
             utc, epoch = _number(result.get("frame_time")), moment[1]
             changes.append(
                 Alert(
                     device,
                     condition.name,
-                    "out" if beyond else "in",
-                    f"{device}: {found.text}",
-                    found.value,
-                    next(bounds),
+                    "out" if out else "in",
+                    f"{device}: {text}",
+                    value,
+                    limit,
                     str(result.get("series", "")),
                     int(epoch) if isinstance(epoch, int) else None,
                     None if math.isnan(utc) else utc,

@@ -368,9 +368,7 @@ class AndroidThermometer(AdbPhone, Thermometer):
     def _battery(self, texts: Mapping[str, str]) -> dict[str, float | str]:
         if "battery" not in texts:
             return {}
-        known = self._scales.get("battery")
-        unit = next((word for word, scale in kernel.UNITS.items() if scale == known), "")
-        found = battery(texts["battery"], unit)
+        found = battery(texts["battery"], self._scales.get("battery"))
         if found is None:
             return {"battery": NO_BATTERY}
         self._scales["battery"] = found[1]
@@ -395,10 +393,10 @@ class AndroidThermometer(AdbPhone, Thermometer):
         return found
 
 
-def battery(text: str, unit: str = "") -> tuple[float, float] | None:
+def battery(text: str, scale: float | None = None) -> tuple[float, float] | None:
     """Return (number, factor to °C) of `dumpsys battery`; None where there is none to be believed.
 
-    unit: a word of UNITS, where it is known.
+    scale: the factor, where it is known.
     """
     text = text.replace("\r", "")
     if "UPDATES STOPPED" in text:
@@ -410,8 +408,7 @@ def battery(text: str, unit: str = "") -> tuple[float, float] | None:
     raw, volts = whole.get("temperature"), whole.get("voltage")
     if raw is None or fields.get("present") == "false" or (raw == 0 and not volts):
         return None
-    if unit:
-        scale = kernel.UNITS[unit]
+    if scale is not None:
         return (raw, scale) if abs(raw) * scale <= HOTTEST_BATTERY_C else None
     if raw == 0 and volts not in CELL_MV:  # a board that runs from the mains
         return None

@@ -32,7 +32,7 @@ import hashlib
 import json
 import re
 import ssl
-import threading
+from concurrent.futures import Future
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -158,8 +158,6 @@ class _Broker(Output):
         if o.key and not o.cert:
             raise ConfigurationError("key: needs its certificate, cert")
         self.where = f"MQTT broker {o.host}:{self.port}"
-        self._answered = threading.Event()
-        self._refusal = ""
 
     @property
     def connected(self) -> bool:
@@ -169,11 +167,15 @@ class _Broker(Output):
     def connect(self, will: str | None) -> None:
         """Connect; will: the topic that says `offline` once the connection breaks."""
         mqtt = support.library("paho.mqtt.client", "mqtt")
-        self._answered.clear()
-        self._refusal = ""
+        answered: Future[Any] = Future()
+
+        def on_connect(_client: Any, _data: Any, _flags: Any, code: Any, _more: Any) -> None:
+            if not answered.done():  # it connects by itself again and again
+                answered.set_result(code)
+
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
         client.connect_timeout = self.options.timeout_s
-        client.on_connect = self._on_connect
+        client.on_connect = on_connect
         if will is not None:
             client.will_set(will, "offline", qos=1, retain=True)
         if self.options.username:
@@ -190,12 +192,16 @@ class _Broker(Output):
             raise DeviceGone(f"{self.where}: cannot connect ({why})") from error
         self.handle = client
         client.loop_start()
-        if not self._answered.wait(self.options.timeout_s):
+        try:
+            code = answered.result(self.options.timeout_s)
+        except TimeoutError:
             _Broker.close(self)
-            raise DeviceTimeout(f"{self.where}: no answer in {self.options.timeout_s:g} s")
-        if self._refusal:
+            why = f"no answer in {self.options.timeout_s:g} s"
+            raise DeviceTimeout(f"{self.where}: {why}") from None
+        if code.is_failure:
             _Broker.close(self)
-            raise DeviceDenied(f"{self.where}: {self._refusal}; check username and password_file")
+            why = f"refused the connection ({code}); check username and password_file"
+            raise DeviceDenied(f"{self.where}: {why}")
 
     def close(self) -> None:
         client, self.handle = self.handle, None
@@ -233,11 +239,6 @@ class _Broker(Output):
         except OSError as error:
             raise support.fault(error, "ca, cert or key", seen=False) from error
         return context
-
-    def _on_connect(self, _client: Any, _data: Any, _flags: Any, code: Any, _more: Any) -> None:
-        if code.is_failure:
-            self._refusal = f"refused the connection ({code})"
-        self._answered.set()
 
 
 class MqttOutput(_Broker):

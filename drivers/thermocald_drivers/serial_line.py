@@ -77,35 +77,26 @@ ENDS_OF_WORDS = {32767, 32768, 65535}
 FULL_SCALE = {-1.0, 1023.0, 4095.0, 16383.0, 32767.0, 65535.0}
 
 
-def _instrument(pattern: str, **options: Any) -> dict[str, Any]:
-    """Return the options of an instrument; its own error texts say that nothing was measured."""
-    return {
-        "pattern": pattern, "minimum_c": -100.0, "maximum_c": 300.0, "refuse_c": [], **options
-    }  # fmt: skip
-
-
-INSTRUMENTS = {
+# its own error texts say that nothing was measured
+OF_AN_INSTRUMENT = {"minimum_c": -100.0, "maximum_c": 300.0, "refuse_c": []}
+INSTRUMENTS: Mapping[str, dict[str, Any]] = {
     # Papouch TM, TMU: sends by itself every 10 s, ends with CR alone.
-    "papouch-tm": _instrument(r"(?P<temperature>[-+]\d{3}\.\d)C", timeout_s=22.0),
+    "papouch-tm": {"pattern": r"(?P<temperature>[-+]\d{3}\.\d)C", "timeout_s": 22.0},
     # Vaisala HMP230/240/260 series, user's guides, appendix "Serial commands".
-    "vaisala-hmp": _instrument(
-        rf"(?:RH= *{NUMBER} *%RH +)?T= *(?P<temperature>{NUMBER}) *'C(?: .*)?",
-        command="SEND\r",
-        baud=4800,
-        framing="7E1",
-    ),
+    "vaisala-hmp": {
+        "pattern": rf"(?:RH= *{NUMBER} *%RH +)?T= *(?P<temperature>{NUMBER}) *'C(?: .*)?",
+        "command": "SEND\r", "baud": 4800, "framing": "7E1",
+    },
     # Lake Shore 218, user's manual 6.2: eight inputs in one line; kelvin keeps the sign simple.
-    "lakeshore-218": _instrument(
-        ",".join(rf"(?P<input{k}>[-+]\d+\.\d+)" for k in range(1, 9)),
-        command="KRDG?\r\n",
-        framing="7O1",
-        unit="K",
-    ),
+    "lakeshore-218": {
+        "pattern": ",".join(rf"(?P<input{k}>[-+]\d+\.\d+)" for k in range(1, 9)),
+        "command": "KRDG?\r\n", "framing": "7O1", "unit": "K",
+    },
     # Fluke 1522, user's guide 8.2.1; the unit is set at the instrument and must be C.
-    "fluke-1522": _instrument(
-        r"t: *(?P<temperature>[-+]?\d+\.\d+) C", command="read?\r", baud=2400
-    ),
-}
+    "fluke-1522": {
+        "pattern": r"t: *(?P<temperature>[-+]?\d+\.\d+) C", "command": "read?\r", "baud": 2400,
+    },
+}  # fmt: skip
 
 
 CHECKSUMS: Mapping[str, Callable[[bytes], int]] = {
@@ -151,7 +142,9 @@ class SerialOptions(DriverOptions):
             raise ConfigurationError(
                 f"write either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
             )
-        own = INSTRUMENTS.get(name, {}) if isinstance(name, str) else {}
+        own = {}
+        if isinstance(name, str) and name in INSTRUMENTS:
+            own = {**OF_AN_INSTRUMENT, **INSTRUMENTS[name]}
         return {**own, **{key: value for key, value in data.items() if value is not None}}
 
 

@@ -78,11 +78,6 @@ class Lock:
     control: int
     unit: float = 1.0
 
-    @property
-    def flag(self) -> str:
-        """The name of the automatic mode among a frame's settings."""
-        return f"{self.option.rsplit('_', 1)[0] if '_' in self.option else self.option}_auto"
-
 
 LOCKS = (
     # V4L2_EXPOSURE_MANUAL is 1; aperture priority, automatic, shutter priority are 3, 0, 2
@@ -412,7 +407,8 @@ class CameraControls:
         for lock in LOCKS:
             named |= {lock.automatic, lock.control}
             if lock.automatic in values:
-                found[lock.flag] = float(values[lock.automatic] != lock.manual)
+                flag = lock.option.removesuffix("_s").removesuffix("_k") + "_auto"
+                found[flag] = float(values[lock.automatic] != lock.manual)
             if lock.control in values:
                 found[lock.option] = round(values[lock.control] * lock.unit, 9)
         others = {self._available[c].name: float(v) for c, v in values.items() if c not in named}

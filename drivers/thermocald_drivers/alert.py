@@ -29,7 +29,7 @@ from thermocald.names import WITH_VALUES
 from thermocald_drivers import support
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
 log = logging.getLogger(__name__)
 
@@ -225,29 +225,64 @@ def condition_of(stanza: Mapping[str, Any]) -> Condition:
     return kind.read(stanza, "when")
 
 
-class Watch:
-    """The state of all conditions for every device whose results come."""
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    return float(value)
 
-    def __init__(self, conditions: Sequence[Condition]) -> None:
-        self.conditions = conditions
-        self._out: set[tuple[str, str]] = set()
-        self._failed: dict[str, int] = {}
-        self._seen: dict[str, tuple[Any, Any]] = {}
-        self._lost = self._waiting = 0
+
+class AlertOptions(DriverOptions):
+    """What all alert drivers have."""
+
+    when: Annotated[list[dict[str, Any]], Field(min_length=1)]
+    device: support.Text = "thermocald"
+    timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 5.0
+
+
+class AlertOutput(Output):
+    """An output that delivers alerts; a driver says how in `deliver`, and where in `where`."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._conditions = [condition_of(stanza) for stanza in self.options.when]
+        names = [condition.name for condition in self._conditions]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise ConfigurationError(f"when: {min(twice)} is given twice")
+        self._waiting: deque[Alert] = deque(maxlen=MOST_WAITING)
+        self._out: set[tuple[str, str]] = set()  # devices and conditions
+        self._in_a_row: dict[str, int] = {}  # epochs of a device without a result
+        self._told: dict[str, tuple[Any, Any]] = {}
+        self._lost = self._unstored = 0
+
+    def open(self) -> None:
+        self.reach()
+        self.handle = self.handle or True
+
+    def close(self) -> None:
+        self.handle = None
+
+    def emit(self, result: Mapping[str, Any]) -> None:
+        self.opened()
+        for alert in self.changes(result, str(result.get("device", self.options.device))):
+            log.warning("%s", alert.text, extra={"event": "alert"})
+            self._waiting.append(alert)
+        while self._waiting:
+            self.deliver(self._waiting[0])
+            self._waiting.popleft()
 
     def changes(self, result: Mapping[str, Any], device: str) -> list[Alert]:
         """Return what this result changes; the same result again changes nothing."""
         moment = (result.get("series"), result.get("epoch"))
-        if moment[1] is not None and self._seen.get(device) == moment:
+        if moment[1] is not None and self._told.get(device) == moment:
             return []
-        self._seen[device] = moment
-        failed = 0 if result.get("status") in WITH_VALUES else self._failed.get(device, 0) + 1
-        self._failed[device] = failed
+        self._told[device] = moment
+        failed = 0 if result.get("status") in WITH_VALUES else self._in_a_row.get(device, 0) + 1
+        self._in_a_row[device] = failed
         before, self._lost = self._lost, int(result.get("lost", self._lost))
-        self._waiting = self._waiting + 1 if result.get("stored") is False else 0
-        lost = max(0, self._lost - before, self._waiting)
+        self._unstored = self._unstored + 1 if result.get("stored") is False else 0
+        lost = max(0, self._lost - before, self._unstored)
         changes = []
-        for condition in self.conditions:
+        for condition in self._conditions:
             key = (device if condition.per_device else "", condition.name)
             found = condition.measure(result, failed, lost)
             value, low, high = found.value, found.low, found.high
@@ -273,49 +308,6 @@ class Watch:
                 )
             )
         return changes
-
-
-def _number(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return math.nan
-    return float(value)
-
-
-class AlertOptions(DriverOptions):
-    """What all alert drivers have."""
-
-    when: Annotated[list[dict[str, Any]], Field(min_length=1)]
-    device: support.Text = "thermocald"
-    timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 5.0
-
-
-class AlertOutput(Output):
-    """An output that delivers alerts; a driver says how in `deliver`, and where in `where`."""
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        conditions = [condition_of(stanza) for stanza in self.options.when]
-        names = [condition.name for condition in conditions]
-        if twice := {name for name in names if names.count(name) > 1}:
-            raise ConfigurationError(f"when: {min(twice)} is given twice")
-        self._watch = Watch(conditions)
-        self._waiting: deque[Alert] = deque(maxlen=MOST_WAITING)
-
-    def open(self) -> None:
-        self.reach()
-        self.handle = self.handle or True
-
-    def close(self) -> None:
-        self.handle = None
-
-    def emit(self, result: Mapping[str, Any]) -> None:
-        self.opened()
-        for alert in self._watch.changes(result, str(result.get("device", self.options.device))):
-            log.warning("%s", alert.text, extra={"event": "alert"})
-            self._waiting.append(alert)
-        while self._waiting:
-            self.deliver(self._waiting[0])
-            self._waiting.popleft()
 
     def reach(self) -> None:
         """Look whether alerts can be delivered; a DeviceError if not."""

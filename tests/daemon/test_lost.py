@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from thermocald_drivers.alert import Watch, condition_of
 
 from tests.commands import call
 from tests.daemon.conftest import make_recording
@@ -20,7 +19,7 @@ from thermocald.acquisition.thermometers import Thermometers
 from thermocald.cli.run import status, status_warnings
 from thermocald.daemon.live_state import LiveState
 from thermocald.errors import DataError, StoreError
-from thermocald.hal import Frame, SystemClock
+from thermocald.hal import Frame, SystemClock, open_device
 from thermocald.output.dashboard.view import View
 from thermocald.store.database.store import Store
 
@@ -145,12 +144,13 @@ def test_an_epoch_that_is_not_handed_over_is_lost(how):
 
 
 def test_an_alert_says_so_and_takes_it_back():
-    watch = Watch([condition_of({"lost": 1})])
+    options = {"command": ["true"], "when": [{"lost": 1}]}
+    output = open_device("output", "alert_exec", options, SystemClock())
     rows = [
         {"epoch": n, "series": "M1", "status": "ok", "frame_time": float(n), "lost": lost}
         for n, lost in enumerate([0, 0, 1, 1, 4, 4])
     ]
-    alerts = [(r["epoch"], a.state, a.text) for r in rows for a in watch.changes(r, "cam")]
+    alerts = [(r["epoch"], a.state, a.text) for r in rows for a in output.changes(r, "cam")]
     assert [(n, state) for n, state, _ in alerts] == [(2, "out"), (3, "in"), (4, "out"), (5, "in")]
     assert alerts[2][2] == "cam: 3 epochs were taken and not kept (limit 1)"
 

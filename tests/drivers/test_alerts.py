@@ -7,7 +7,6 @@ import math
 import time
 
 import pytest
-from thermocald_drivers.alert import Watch, condition_of
 
 from tests.drivers.fakes.alert_servers import MailServer, WebServer
 from tests.drivers.fakes.certificate import own_context
@@ -23,8 +22,9 @@ def result(epoch, **values):
 
 def told(when, results):
     """(epoch, state) of all changes."""
-    watch = Watch([condition_of(when)])
-    return [(r["epoch"], a.state) for r in results for a in watch.changes(r, "cam")]
+    options = {"command": ["true"], "when": [when]}
+    output = open_device("output", "alert_exec", options, VirtualClock())
+    return [(r["epoch"], a.state) for r in results for a in output.changes(r, "cam")]
 
 
 def test_a_drift_is_out_once_and_in_once():

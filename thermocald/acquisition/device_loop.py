@@ -95,8 +95,9 @@ _SEARCH_PAUSE_S = 10.0
 class Link:
     """One device and its state; used by one thread, looked at by others.
 
-    Attributes for the status: state; why: the last fault; out_since: monotonic s; since: UTC s,
-    when it went away or ended, NaN while it has not; faults: calls that failed.
+    called: kind and name. Attributes for the status: state; why: the last fault; out_since:
+    monotonic s; since: UTC s, when it went away or ended, NaN while it has not; faults: calls that
+    failed.
     on_event: receives UTC s, a kind and a sentence when the device goes away (`device_out`), comes
     back (`device_back`), fails for good (`device_failed`), or a recording ends (`device_finished`).
     """
@@ -111,7 +112,6 @@ class Link:
         period_s: float = 1.0,
         on_event: OnEvent = lambda *_: None,
     ) -> None:
-        self.kind = kind
         self.name = name
         self.called = f"{kind} {name}"
         self.device = device
@@ -120,7 +120,6 @@ class Link:
         self.out_since = 0.0
         self.since = math.nan
         self.faults = 0
-        self.error: PermanentDeviceError | None = None
         self._clock = clock
         self._period_s = period_s
         self._on_event = on_event
@@ -197,7 +196,6 @@ class Link:
             self._out(str(error), max(self._period_s, _SEARCH_PAUSE_S))
             return
         self.device.close()
-        self.error = error
         self.since = self._clock.utc()
         self.why = without_secrets(str(error))
         # a recording that has been played to its end is not a failure
@@ -247,7 +245,6 @@ class DeviceLoop:
     ) -> None:
         self.link = link
         self.schedule = Schedule(clock, period_s, begin)
-        self.done = 0
         self.lost = 0
         self._action = action
         self._free_running = free_running
@@ -290,9 +287,7 @@ class DeviceLoop:
                 if self._idle():
                     if self.link.state == "open":  # one that is away stays so
                         self.link.close()
-                elif self.link.do(self._action):
-                    self.done += 1
-                else:
+                elif not self.link.do(self._action):
                     self.lost += 1
                 self._busy_since = None
         finally:

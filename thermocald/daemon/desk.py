@@ -80,7 +80,7 @@ def take_on_the_desk(
 
 def _turn(station: Station, progress: Progress, watch: Watch | None) -> bool:
     camera = station.cameras[0]
-    if camera.link.error is not None and camera.link.state == "failed":
+    if camera.link.state == "failed":
         raise DeviceError(f"camera {camera.plan.name}: {camera.link.why}")
     last = {} if camera.run is None else camera.run.last
     progress.show(last, camera.link.why if camera.link.state == "out" else "")

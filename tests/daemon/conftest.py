@@ -78,7 +78,8 @@ class Daemon:
         return self.process.wait(timeout_s)
 
     def log(self) -> str:
-        return (self.folder / "log.txt").read_text()
+        path = self.folder / "log.txt"
+        return path.read_text() if path.exists() else ""
 
     def results(self, name: str = "results.jsonl") -> list[dict]:
         path = self.folder / name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import threading
@@ -228,31 +229,29 @@ def feed(path, content, delay):
     return thread
 
 
-def test_slow_sensors_are_read_in_parallel(sysfs):
-    roms = [f"28-0000000000{k:02x}" for k in range(4)]
-    threads = [feed(sysfs.w1(rom, ""), w1_slave(20.0 + k), 0.3) for k, rom in enumerate(roms)]
-    sensors = {f"t{k}": rom for k, rom in enumerate(roms)}
-    with thermometer(sysfs, SystemClock(), sensors=sensors) as device:
-        begin = time.monotonic()
-        values = device.read().values
-        took = time.monotonic() - begin
-    [thread.join() for thread in threads]
-    assert values == {"t0": 20.0, "t1": 21.0, "t2": 22.0, "t3": 23.0}
-    assert took < 0.8  # one after the other would be 1.2 s
-
-
-def test_a_kernel_that_converts_one_after_the_other(sysfs):
-    """As w1_therm of Linux 6.1 does: the last of four answers after four times the first's time."""
+@pytest.mark.parametrize(
+    ("delays_s", "timeout_s", "most_s"),
+    [
+        ([0.3] * 4, 3.0, 0.8),  # one after the other would be 1.2 s
+        # w1_therm of Linux 6.1 converts one after the other: the last after four times the first
+        ([0.15, 0.3, 0.45, 0.6], 0.3, math.inf),
+    ],
+)
+def test_slow_sensors_are_read_in_parallel(sysfs, delays_s, timeout_s, most_s):
     roms = [f"28-0000000000{k:02x}" for k in range(4)]
     threads = [
-        feed(sysfs.w1(rom, ""), w1_slave(20.0 + k), 0.15 * (k + 1)) for k, rom in enumerate(roms)
+        feed(sysfs.w1(rom, ""), w1_slave(20.0 + k), delay)
+        for k, (rom, delay) in enumerate(zip(roms, delays_s, strict=True))
     ]
     sensors = {f"t{k}": rom for k, rom in enumerate(roms)}
-    with thermometer(sysfs, SystemClock(), sensors=sensors, timeout_s=0.3) as device:
+    with thermometer(sysfs, SystemClock(), sensors=sensors, timeout_s=timeout_s) as device:
+        begin = time.monotonic()
         reading = device.read()
+        took = time.monotonic() - begin
     [thread.join() for thread in threads]
-    assert len(reading.values) == 4
+    assert reading.values == {"t0": 20.0, "t1": 21.0, "t2": 22.0, "t3": 23.0}
     assert not reading.missing
+    assert took < most_s
 
 
 def test_a_hanging_bus_times_out_and_its_late_answer_is_dropped(sysfs):

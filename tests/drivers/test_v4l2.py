@@ -298,30 +298,24 @@ def test_busy_and_denied(kernel, call, number, error):
         camera(kernel).open()
 
 
-def test_denied_after_a_plug_is_tried_again(kernel):
-    device = camera(kernel)
-    device.open()
-    device.close()
-    kernel.errors = {"QUERYCAP": errno.EACCES}  # the node is root's until udev has seen it
-    with pytest.raises(errors.TransientDeviceError, match="Permission denied"):
+@pytest.mark.parametrize(
+    ("knob", "value", "message"),
+    [
+        # the node is root's until udev has seen it
+        ("errors", {"QUERYCAP": errno.EACCES}, "Permission denied"),
+        # v4l2loopback without its feeder captures no more; /dev/video0 may be another camera
+        ("capture_device", False, "not a capture device"),
+    ],
+)
+def test_what_is_wrong_after_a_plug_is_tried_again(kernel, knob, value, message):
+    device, usual = camera(kernel), getattr(kernel, knob)
+    with device:
+        setattr(kernel, knob, value)
+    with pytest.raises(errors.TransientDeviceError, match=message):
         device.open()
-    kernel.errors = {}
-    device.open()
-    device.close()
-
-
-def test_another_device_at_its_number_is_not_the_end(kernel):
-    """v4l2loopback without its feeder captures no more; /dev/video0 may be another camera."""
-    device = camera(kernel)
-    device.open()
-    device.close()
-    kernel.capture_device = False
-    with pytest.raises(errors.TransientDeviceError, match="not a capture device"):
-        device.open()
-    kernel.capture_device = True
-    device.open()
-    device.capture()
-    device.close()
+    setattr(kernel, knob, usual)
+    with device:
+        device.capture()
 
 
 def test_a_single_broken_frame_is_skipped(kernel):

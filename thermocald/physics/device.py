@@ -61,7 +61,7 @@ from thermocald.physics.model_file import read_sensor
 from thermocald.physics.scene import Look
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from thermocald.arrays import Array
@@ -123,12 +123,7 @@ def read_programme(path: Path) -> Programme:
     duration = (epochs - 1) * interval
     boundaries = {"ambient": read_course(top, "ambient", "degC", duration, path.parent)}
     boundaries |= _read_courses(top, "boundaries", "degC", duration, path.parent)
-    offset, spread = 0.0, 1.0
-    if document.get("reading") is not None:
-        reading = top.inner("reading")
-        reading.only(("offset", "spread"))
-        offset = reading.number("offset", "s", 0.0)
-        spread = reading.number("spread", "s", 1.0, low=0.0)
+    reading = _group(top, "reading", ("offset", "spread"))
     return Programme(
         top.text("name", path.stem),
         epochs,
@@ -137,11 +132,18 @@ def read_programme(path: Path) -> Programme:
         _read_courses(top, "sources", "W", duration, path.parent),
         top.text("series", "M1"),
         top.number("jitter", "s", 0.0, low=0.0),
-        offset,
-        spread,
+        reading.number("offset", "s", 0.0),
+        reading.number("spread", "s", 1.0, low=0.0),
         top.number("begin", "s", 1_600_000_000.0),
         top.number("initial", "degC") if document.get("initial") is not None else None,
     )
+
+
+def _group(top: QuantityReader, key: str, known: Sequence[str]) -> QuantityReader:
+    """Enter the mapping at a key, which holds nothing else than these; empty where it is absent."""
+    group = top.inner(key) if top.mapping.get(key) is not None else QuantityReader(key, {})
+    group.only(known)
+    return group
 
 
 def _read_courses(
@@ -234,42 +236,30 @@ def read_camera_device(path: Path) -> CameraDevice:
             )
     if not thermometers:
         raise top.fail("thermometers", "is empty: one thermometer is needed")
+    where = _group(top, "exterior", EOP_NAMES)
+    measuring = _group(top, "measuring", ("sigma", "missed", "gross", "gross_size"))
+    look = _group(top, "look", ("paper", "ink", "blur", "noise", "vignetting"))
+    usual, seen = Measuring(), Look()
     return CameraDevice(
         top.text("name", "camera"),
         read_sensor(top),
         network,
         thermometers,
-        _read_exterior(top) if document.get("exterior") is not None else None,
+        ExteriorOrientation(*(where.number(n, PARAMETER_UNITS[n]) for n in EOP_NAMES))
+        if where.mapping
+        else None,
         top.number("distance", "mm", 1300.0, above=0.0),
-        _read_measuring(top) if document.get("measuring") is not None else Measuring(),
-        _read_look(top) if document.get("look") is not None else Look(),
-    )
-
-
-def _read_exterior(top: QuantityReader) -> ExteriorOrientation:
-    reader = top.inner("exterior")
-    reader.only(EOP_NAMES)
-    return ExteriorOrientation(*(reader.number(n, PARAMETER_UNITS[n]) for n in EOP_NAMES))
-
-
-def _read_measuring(top: QuantityReader) -> Measuring:
-    reader, usual = top.inner("measuring"), Measuring()
-    reader.only(("sigma", "missed", "gross", "gross_size"))
-    return Measuring(
-        reader.number("sigma", "px", usual.sigma, above=0.0),
-        reader.share("missed", usual.missed),
-        reader.share("gross", usual.gross),
-        reader.number("gross_size", "px", usual.gross_size, low=0.0),
-    )
-
-
-def _read_look(top: QuantityReader) -> Look:
-    reader, usual = top.inner("look"), Look()
-    reader.only(("paper", "ink", "blur", "noise", "vignetting"))
-    return Look(
-        reader.number("paper", "DN", usual.paper_dn, low=0.0, high=255.0),
-        reader.number("ink", "DN", usual.ink_dn, low=0.0, high=255.0),
-        reader.number("blur", "px", usual.blur_px, low=0.0, high=30.0),
-        reader.number("noise", "DN", usual.noise_dn, low=0.0, high=60.0),
-        reader.number("vignetting", "1", usual.vignetting, low=0.0, high=1.0),
+        Measuring(
+            measuring.number("sigma", "px", usual.sigma, above=0.0),
+            measuring.share("missed", usual.missed),
+            measuring.share("gross", usual.gross),
+            measuring.number("gross_size", "px", usual.gross_size, low=0.0),
+        ),
+        Look(
+            look.number("paper", "DN", seen.paper_dn, low=0.0, high=255.0),
+            look.number("ink", "DN", seen.ink_dn, low=0.0, high=255.0),
+            look.number("blur", "px", seen.blur_px, low=0.0, high=30.0),
+            look.number("noise", "DN", seen.noise_dn, low=0.0, high=60.0),
+            look.number("vignetting", "1", seen.vignetting, low=0.0, high=1.0),
+        ),
     )

@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.history import Follower, History
 
+    Values = Mapping[str, Any]  # of parameters: numbers, or a channel, or names of targets
+    Estimates = Mapping[str, Mapping[str, Any]]  # {parameter: {value, sd, unit}}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Displacement:
@@ -112,7 +115,7 @@ class Parameter:
 
     unit; low, high: range to search; default: start value; log: searched by its logarithm; text: a
     name (a channel, targets) rather than a number; role: what it means to a search, which chooses
-    the grid of trial values by it.
+    the grid of trial values by it; sized: nobody knows beforehand how large it is.
     """
 
     unit: str
@@ -122,25 +125,28 @@ class Parameter:
     log: bool = False
     text: bool = False
     role: Role = ""
+    sized: bool = False
 
     def difference_step(self, value: float) -> float:
         """Return a step for difference quotients: small for its effect, large for rounding."""
-        if self.log:
+        if self.log or self.sized:
             return 1e-3 * max(abs(value), 1e-6)
-        return {"threshold": 0.02, "delay": 0.05}.get(self.role, 1e-3)
+        if self.unit == "degC" or self.role == "threshold":
+            return 0.02
+        return 0.05 if self.role == "delay" else 1e-3
 
     def bounded(self, old: float, new: float, slack: float = 1.0) -> float:
         """Limit a step of an iteration to the range, and to a factor of 2 if `log`.
 
         slack: factor on the lower bound: data may ask for less than a simulation makes sense of.
         """
+        low = self.low
         if self.log:
-            near = np.clip(new, old / 2.0, old * 2.0)
-            return float(np.clip(near, slack * self.low, self.high))
-        return float(np.clip(new, self.low, self.high))
+            new, low = np.clip(new, old / 2.0, old * 2.0), slack * low
+        return float(np.clip(new, low, self.high))
 
 
-def say_estimate(estimate: Mapping[str, Any]) -> str:
+def say_estimate(estimate: Values) -> str:
     """Write an estimate as people do: 84.1 ± 1.9 s, two digits of the standard deviation."""
     value, sd, unit = estimate.get("value"), estimate.get("sd"), estimate.get("unit", "")
     unit = "" if unit == "1" else f" {unit}"
@@ -159,9 +165,7 @@ def say_estimate(estimate: Mapping[str, Any]) -> str:
 
 def coefficient_units(per: str, parameters: tuple[str, ...] = PARAMETER_NAMES) -> dict[str, str]:
     """Return units of coefficients that act on parameters: mm/K, rad/K, …; `per`: "K", "s", "1"."""
-    if per == "1":
-        return {name: PARAMETER_UNITS[name] for name in parameters}
-    return {name: f"{PARAMETER_UNITS[name]}/{per}" for name in parameters}
+    return {n: PARAMETER_UNITS[n] + (f"/{per}" if per != "1" else "") for n in parameters}
 
 
 Kind = Literal["drive", "signal", "image"]
@@ -201,7 +205,7 @@ class Effect(ABC):
 
     name: ClassVar[str]
     noun: ClassVar[str]
-    kind: ClassVar[Kind]
+    kind: ClassVar[Kind] = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {}
     linear: ClassVar[Mapping[str, str]] = {}
     usual: ClassVar[tuple[str, ...]] = ()
@@ -217,7 +221,7 @@ class Effect(ABC):
     steady_signal: ClassVar[Steady | None] = None
     of_now: ClassVar[bool] = False
 
-    def follower(self, values: Mapping[str, Any]) -> Follower | None:  # noqa: ARG002
+    def follower(self, values: Values) -> Follower | None:  # noqa: ARG002
         """The drive with its state, for readings one by one; None where it needs them all."""
         return None
 
@@ -253,9 +257,7 @@ class Effect(ABC):
         raise NotImplementedError(f"{self.name} is not a drive")
 
     def signal(self, history: History, **nonlinear: Any) -> Array:
-        """Return the time series (E, k) that the coefficients multiply; k is 1 but for
-        oscillations.
-        """
+        """Return the time series (E, k) that the coefficients multiply; k is 1, or 2 of a wave."""
         raise NotImplementedError(f"{self.name} has no signal")
 
     def channel(self, history: History, **nonlinear: Any) -> str:  # noqa: ARG002
@@ -274,29 +276,20 @@ class Effect(ABC):
         step = 1e-4
         columns = np.zeros((len(history.times), len(readings)))
         for i in np.flatnonzero(np.isfinite(readings)):
-            sides = []
             for sign in (1.0, -1.0):
                 moved = readings.copy()
                 moved[i] += sign * step
                 other = replace(history, readings={**history.readings, name: moved})
-                sides.append(self._course(other, **nonlinear))
-            columns[:, i] = (sides[0] - sides[1]) / (2 * step)
+                course = self.drive if self.is_drive else self.signal
+                columns[:, i] += sign * course(other, **nonlinear).reshape(len(columns), -1)[:, 0]
+            columns[:, i] /= 2 * step
         return csr_array(columns)
 
-    def further_sensitivities(
-        self,
-        history: History,  # noqa: ARG002
-        **nonlinear: Any,  # noqa: ARG002
-    ) -> dict[str, csr_array]:
+    def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:  # noqa: ARG002
         """Return the same for every further column that it reads, {channel: (E, R)}."""
         return {}
 
-    def unresolved(
-        self,
-        history: History,
-        rate_jump: Array | None = None,  # noqa: ARG002
-        **nonlinear: Any,  # noqa: ARG002
-    ) -> Array:
+    def unresolved(self, history: History, rate_jump: Array | None = None, **_: Any) -> Array:  # noqa: ARG002
         """Return the sd (E,) of drive or first signal that the times of the readings leave.
 
         What happens between two readings, or after the last, no reading tells; their noise is not
@@ -313,12 +306,7 @@ class Effect(ABC):
         """
         return np.zeros(len(history.times), dtype=bool)
 
-    def steady(
-        self,
-        values: Mapping[str, Any],  # noqa: ARG002
-        T0: float,  # noqa: ARG002
-        channels: Mapping[str, float] | None,  # noqa: ARG002
-    ) -> Steady:
+    def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:  # noqa: ARG002
         """Return the signal of a camera that has long been at one temperature, and never hotter.
 
         T0: the model's reference temperature °C; channels: °C of other thermometers. A drive has
@@ -331,18 +319,11 @@ class Effect(ABC):
             )
         return self.steady_signal or Steady()
 
-    def _course(self, history: History, **nonlinear: Any) -> Array:
-        if self.kind == "drive":
-            return self.drive(history, **nonlinear)
-        return self.signal(history, **nonlinear)[:, 0]
-
-    def weights(self, values: Mapping[str, Any], name: str) -> Array:
-        """Return the weight (k,) of each signal in one coefficient; oscillations split by their
-        phase.
-        """
+    def weights(self, values: Values, name: str) -> Array:
+        """Return the weight (k,) of each signal in one coefficient; a wave's is split by phase."""
         return np.array([float(values[name])])
 
-    def split(self, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, float]]:
+    def split(self, values: Values) -> tuple[dict[str, Any], dict[str, float]]:
         """Split parameter values into (non-linear ones, coefficients)."""
         searched = {k: values[k] for k in self.nonlinear if k in values}
         return searched, {k: float(values[k]) for k in self.linear if k in values}
@@ -350,14 +331,13 @@ class Effect(ABC):
     def influence(
         self,
         history: History,
-        values: Mapping[str, Any],
+        values: Values,
         field: TestField | None = None,  # noqa: ARG002
     ) -> Influence:
         """Return what it changes at the history's times; a drive changes nothing by itself."""
-        epochs = len(history.times)
+        found = Influence.none(len(history.times))
         if self.kind == "image":
-            return replace(Influence.none(epochs), **self.image_changes(history, values))
-        found = Influence.none(epochs)
+            return replace(found, **self.image_changes(history, values))
         searched, coefficients = self.split(values)
         if self.kind == "signal" and any(coefficients.values()):
             course = self.signal(history, **searched)
@@ -369,11 +349,7 @@ class Effect(ABC):
                     found.eop[:, EOP_NAMES.index(name)] += change
         return found
 
-    def image_changes(
-        self,
-        history: History,  # noqa: ARG002
-        values: Mapping[str, Any],  # noqa: ARG002
-    ) -> dict[str, Any]:
+    def image_changes(self, history: History, values: Values) -> dict[str, Any]:  # noqa: ARG002
         """Return what an `image` effect without need of a test field changes of an `Influence`."""
         return {}
 
@@ -381,9 +357,9 @@ class Effect(ABC):
         """Return the unit of every parameter by its name."""
         return {**{k: p.unit for k, p in self.nonlinear.items()}, **self.linear}
 
-    def check(self, values: Mapping[str, Any], where: str = "") -> None:
+    def check(self, values: Values) -> None:
         """Raise ConfigurationError where a parameter is missing, unknown or no number in range."""
-        place = f"{where}effect {self.name}"
+        place = f"effect {self.name}"
         known = self.units()
         for name in values:
             if name not in known:
@@ -391,32 +367,26 @@ class Effect(ABC):
                     f"{place} has no parameter {name!r}; it has: {', '.join(known)}"
                 )
         for name, parameter in self.nonlinear.items():
-            if name not in values:
-                if name in self.optional:
-                    continue
+            if name not in values and name not in self.optional:
                 raise ConfigurationError(
                     f"{place}: parameter {name!r} ({parameter.unit}) is missing"
                 )
-            value = values[name]
-            if parameter.text:
+        for name in (n for n in known if n in values):
+            value, given = values[name], self.nonlinear.get(name)
+            if given is not None and given.text:
                 continue
             if not isinstance(value, (int, float)) or not np.isfinite(value):
                 raise ConfigurationError(f"{place}: {name} = {value!r} is not a finite number")
-            if (parameter.log or self.kind == "drive") and parameter.low >= 0 and value < 0:
-                raise ConfigurationError(f"{place}: {name} = {value} {parameter.unit} is negative")
+            if given is None or given.low < 0 or not (given.log or self.is_drive):
+                continue
+            if value < 0:
+                raise ConfigurationError(f"{place}: {name} = {value} {given.unit} is negative")
         if self.linear and not any(name in values for name in self.linear):
             raise ConfigurationError(
                 f"{place}: it needs at least one of the coefficients {', '.join(self.linear)}"
             )
-        for name in self.linear:
-            if name in values and not (
-                isinstance(values[name], (int, float)) and np.isfinite(values[name])
-            ):
-                raise ConfigurationError(
-                    f"{place}: {name} = {values[name]!r} is not a finite number"
-                )
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         """Write one sentence for a report; estimates: {parameter: {value, sd, unit}}."""
         numbers = ", ".join(f"{name} = {say_estimate(e)}" for name, e in estimates.items())
         return f"{self.noun}{': ' if numbers else ''}{numbers}"
@@ -443,28 +413,29 @@ class Remembering(Effect):
 
     operator: ClassVar[str]
 
-    def _constants(self, values: Mapping[str, Any]) -> list[float]:
-        return [values.get(name, p.default) for name, p in self.nonlinear.items()]
+    def _arguments(self, history: History, values: Values) -> tuple[Any, ...]:
+        """Return what the operator takes: knots, their values, its constants, times."""
+        p = history.polygon()
+        constants = [values.get(name, c.default) for name, c in self.nonlinear.items()]
+        return p.times, p.values, *constants, history.times
 
     def drive(self, history: History, **nonlinear: Any) -> Array:
-        p, trajectory = history.polygon(), OPERATORS[self.operator].trajectory
-        assert trajectory is not None
-        return trajectory(p.times, p.values, *self._constants(nonlinear), history.times)
+        return OPERATORS[self.operator].value(*self._arguments(history, nonlinear))
 
     def signal(self, history: History, **nonlinear: Any) -> Array:
         return self.drive(history, **nonlinear)[:, None]
 
     def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
-        p, matrix = history.polygon(), OPERATORS[self.operator].matrix
-        assert matrix is not None
-        return matrix(p.times, p.values, *self._constants(nonlinear), history.times) @ p.matrix
+        matrix: csr_array = OPERATORS[self.operator].derivatives(
+            *self._arguments(history, nonlinear)
+        )
+        return matrix @ history.polygon().matrix
 
 
 class OfTime(Effect):
     """An effect that knows the time alone: the thermometer's error does not reach it."""
 
     of_now = True
-
     steady_signal = Steady()
 
     def sensitivity(self, history: History, **_: Any) -> csr_array:
@@ -477,8 +448,11 @@ class Proportional(Effect):
     """An effect whose signal is T - T₀, at once."""
 
     of_now = True
-
     steady_signal = Steady((0.0, 1.0, 0.0))
+    behaviour: ClassVar[Mapping[str, str]] = {
+        "hold": "does not move while the temperature stands",
+        "cycle": "runs along the same line up and down",
+    }
 
     def signal(self, history: History, **_: Any) -> Array:
         return (history.temperature() - history.T0)[:, None]

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
+    from thermocald.physics.effect import Estimates, Values
     from thermocald.physics.history import History
 
 TIME = "time"
@@ -163,7 +164,7 @@ class Node:
         inner = [v for n in self.inputs if (v := n.steady(temperatures)) is not None]
         if len(inner) < len(self.inputs) or len(self.channels()) > 1:
             return None
-        if self.kind.value is not None:
+        if not self.kind.remembers:
             return self.kind.value(*inner, *self.constants)
         return inner[0] if self.kind.keeps else None
 
@@ -299,19 +300,20 @@ class Evaluator:
         """Return the values (E,) of a bound formula at the frames, or (K,) at the knots."""
         key = (node, at_knots)
         if key not in self._kept:
-            self._kept[key] = self._computed(node, at_knots)
+            self._kept[key] = (
+                self._leaf(node, self.knots if at_knots else self.history.times)
+                if node.is_leaf
+                else node.kind.value(*self._arguments(node, at_knots))
+            )
         return self._kept[key]
 
-    def _computed(self, node: Node, at_knots: bool) -> Array:
+    def _arguments(self, node: Node, at_knots: bool) -> tuple[Any, ...]:
+        """Return what a node's operator takes: values of its inputs, or a polygon and times."""
+        if not node.kind.remembers:
+            return *(self.values(n, at_knots) for n in node.inputs), *node.constants
+        inner = self.values(node.inputs[0], at_knots=True)
         at = self.knots if at_knots else self.history.times
-        if node.is_leaf:
-            return self._leaf(node, at)
-        kind = node.kind
-        if kind.trajectory is not None:
-            inner = self.values(node.inputs[0], at_knots=True)
-            return kind.trajectory(self.knots, inner, *node.constants, at)
-        assert kind.value is not None
-        return kind.value(*(self.values(n, at_knots) for n in node.inputs), *node.constants)
+        return self.knots, inner, *node.constants, at
 
     def _leaf(self, node: Node, at: Array) -> Array:
         if node.operator == TIME:
@@ -335,18 +337,17 @@ class Evaluator:
                 return csr_array((len(at), len(self.history.reading_times)))
             p = self.history.polygon(channel)
             return interpolation_matrix(p.times, at) @ p.matrix
-        kind = node.kind
-        if kind.matrix is not None:
-            inner = self.values(node.inputs[0], at_knots=True)
-            carried = self.sensitivity(node.inputs[0], channel, at_knots=True)
-            if not carried.nnz:
-                return csr_array((len(at), carried.shape[1]))
-            return csr_array(kind.matrix(self.knots, inner, *node.constants, at) @ carried)
-        assert kind.slopes is not None
-        slopes = kind.slopes(*(self.values(n, at_knots) for n in node.inputs), *node.constants)
         total = csr_array((len(at), len(self.history.reading_times)))
-        for slope, inner_node in zip(slopes, node.inputs, strict=True):
-            total = total + diags_array(slope) @ self.sensitivity(inner_node, channel, at_knots)
+        carried = [
+            self.sensitivity(n, channel, at_knots or node.kind.remembers) for n in node.inputs
+        ]
+        if not any(matrix.nnz for matrix in carried):
+            return total
+        derivatives = node.kind.derivatives(*self._arguments(node, at_knots))
+        if node.kind.remembers:
+            return csr_array(derivatives @ carried[0])
+        for slope, matrix in zip(derivatives, carried, strict=True):
+            total = total + diags_array(slope) @ matrix
         return csr_array(total)
 
     def rate_jumps(self, node: Node, jump: Array) -> Array:
@@ -360,60 +361,38 @@ class Evaluator:
             return self.values(node) + jump
         if node.is_leaf or node.kind.remembers:
             return self.values(node)
-        assert node.kind.value is not None
         return node.kind.value(*(self._shifted(n, jump) for n in node.inputs), *node.constants)
-
-
-@dataclass(frozen=True, slots=True)
-class _FormulaConstant(Parameter):
-    """A constant of a formula; its size is whatever the formula's input has."""
-
-    positive: bool = False
-
-    def difference_step(self, value: float) -> float:
-        if self.positive:
-            return 1e-3 * max(abs(value), 1e-6)
-        return 0.02 if self.unit == "degC" else 1e-3 * max(abs(value), 1e-6)
 
 
 class _OfFormula(Effect):
     """Adds a × formula. The formula is data: a tree of known operators over recorded quantities."""
 
-    kind = "signal"
     usual = ("c", "x0", "y0")
     node: ClassVar[Node]
-
-    def _bound(self, history: History, values: Mapping[str, Any]) -> tuple[Evaluator, Node]:
-        return Evaluator(history), self.node.bound(values)
 
     def channel(self, history: History, **_: Any) -> str:
         channels = self.node.channels()
         return history.reference if history.reference in channels or not channels else channels[0]
 
     def signal(self, history: History, **nonlinear: Any) -> Array:
-        evaluator, node = self._bound(history, nonlinear)
-        return evaluator.values(node)[:, None]
+        return Evaluator(history).values(self.node.bound(nonlinear))[:, None]
 
     def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
-        evaluator, node = self._bound(history, nonlinear)
-        return evaluator.sensitivity(node, self.channel(history))
+        channel = self.channel(history)
+        return Evaluator(history).sensitivity(self.node.bound(nonlinear), channel)
 
     def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:
-        evaluator, node = self._bound(history, nonlinear)
+        evaluator, node = Evaluator(history), self.node.bound(nonlinear)
         first = self.channel(history)
-        others = [name for name in self.node.channels() if name != first]
-        found = {name: evaluator.sensitivity(node, name) for name in others}
+        found = {n: evaluator.sensitivity(node, n) for n in self.node.channels() if n != first}
         return {name: matrix for name, matrix in found.items() if matrix.nnz}
 
-    def unresolved(
-        self, history: History, rate_jump: Array | None = None, **nonlinear: Any
-    ) -> Array:
+    def unresolved(self, history: History, rate_jump: Array | None = None, **given: Any) -> Array:
         if rate_jump is None:
             return np.zeros(len(history.times))
-        evaluator, node = self._bound(history, nonlinear)
-        return evaluator.rate_jumps(node, rate_jump)
+        return Evaluator(history).rate_jumps(self.node.bound(given), rate_jump)
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         said = {
             name: _say_constant(e, self.nonlinear[name]).replace("degC", "°C")
             for name, e in estimates.items()
@@ -424,7 +403,7 @@ class _OfFormula(Effect):
         return f"{', '.join(moved) or 'the camera'} {verb} {self.node.words(said)}"
 
 
-def _say_constant(estimate: Mapping[str, Any], parameter: Parameter) -> str:
+def _say_constant(estimate: Values, parameter: Parameter) -> str:
     """Write an estimate; one that is not determined as about so much."""
     value, sd = estimate["value"], estimate["sd"]
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
@@ -445,7 +424,7 @@ def formula_effect(text: str) -> Effect:
         noun = f"an influence that follows {tree.words({})}"
         node = tree
         nonlinear: ClassVar[Mapping[str, Parameter]] = {
-            constant_name: _make_parameter(owner.unit_of(constant), constant)
+            constant_name: _make_parameter(owner.unit_of(constant), constant.positive)
             for constant_name, constant, owner in tree.free()
         }
         linear: ClassVar[Mapping[str, str]] = coefficient_units(
@@ -548,9 +527,6 @@ def is_formula(name: str) -> bool:
     return "(" in name
 
 
-def _make_parameter(unit: str, constant: Constant) -> Parameter:
-    low, high = (1e-9, 1e9) if constant.positive else (-1e9, 1e9)
+def _make_parameter(unit: str, positive: bool) -> Parameter:
     start = {"degC": 30.0, "s": 60.0}.get(unit, 1.0)
-    return _FormulaConstant(
-        unit, low, high, start, log=constant.positive, positive=constant.positive
-    )
+    return Parameter(unit, 1e-9 if positive else -1e9, 1e9, start, positive, sized=unit != "degC")

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from thermocald.errors import ConfigurationError
-from thermocald.physics.operators import lag
+from thermocald.physics.operators import decayed_sums, lag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -383,8 +383,6 @@ class HeatNetwork:
 
 def _solve_mode(grid: Array, rate: float, begin: Array, end: Array, start: float) -> Array:
     """Solve Z' = -rate z + f with f straight from begin[k] to end[k+1] over each step; (g,)."""
-    from scipy.linalg.lapack import dtbtrs
-
     h = np.diff(grid)
     x = rate * h
     small = x < 1e-4
@@ -392,14 +390,8 @@ def _solve_mode(grid: Array, rate: float, begin: Array, end: Array, start: float
     # φ1 = (1 - e^-x)/x and φ2 = (x - 1 + e^-x)/x², by their series where they would cancel
     phi1 = np.where(small, 1.0 - x / 2 + x * x / 6, -np.expm1(-safe) / safe)
     phi2 = np.where(small, 0.5 - x / 6 + x * x / 24, (safe + np.expm1(-safe)) / safe**2)
-    z = np.empty((len(grid), 1))
-    z[0] = start
-    z[1:, 0] = h * (phi1 * begin[:-1] + phi2 * (end[1:] - begin[:-1]))
-    band = np.ones((2, len(grid)), order="F")
-    band[1, :-1] = -np.exp(-x)
-    solution, _ = dtbtrs(band, z, uplo="L", diag="U")
-    result: Array = solution[:, 0]
-    return result
+    driven = np.append(start, h * (phi1 * begin[:-1] + phi2 * (end[1:] - begin[:-1])))
+    return decayed_sums(np.exp(-x), driven[:, None])[:, 0]
 
 
 def read_network(reader: QuantityReader) -> HeatNetwork:

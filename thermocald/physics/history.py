@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -138,10 +139,9 @@ def _lay_polygon(times: Array, readings: Array, frames: Array) -> Polygon:
             if n > 1:
                 step = t[first] - t[second]
                 share = float(np.clip((edge - t[first]) / step, 0.0, 1.0))
-            index = sum(len(k) for k in knots)
             column.append(rows[[first, second]] if n > 1 else rows[[0, 0]])
             weight.append(np.array([1.0 + share, -share]))
-            knot.append(np.array([index, index]))
+            knot.append(np.full(2, sum(map(len, knots))))
             knots.append(np.array([edge]))
     all_times = np.concatenate(knots)
     order = np.argsort(all_times, kind="stable")
@@ -156,59 +156,54 @@ def _lay_polygon(times: Array, readings: Array, frames: Array) -> Polygon:
     )
 
 
-class Follower(Protocol):
-    """An operator that keeps its state."""
-
-    def push(self, time: float, value: float) -> float:
-        """Take the next knot, s and °C; return the operator's value there."""
+Follower = Callable[[float, float], float]
+"""An operator that keeps its state: takes the next knot, s and °C, and returns its value there."""
 
 
-class LagFollower:
+def follow_lag(tau: float) -> Follower:
     """`operators.lag` with a time constant s."""
+    last = before = state = math.nan
 
-    def __init__(self, tau: float) -> None:
-        self.tau, self.time, self.input, self.state = tau, math.nan, math.nan, math.nan
-
-    def push(self, time: float, value: float) -> float:
-        """Take the next knot; return the lagged value."""
-        if math.isnan(self.time):
-            self.state = value
+    def push(time: float, value: float) -> float:
+        nonlocal last, before, state
+        if math.isnan(last):
+            state = value
         else:
-            x = (time - self.time) / self.tau
+            x = (time - last) / tau
             a, g = math.exp(-x), -math.expm1(-x) / x
-            self.state = a * self.state + (g - a) * self.input + (1.0 - g) * value
-        self.time, self.input = time, value
-        return self.state
+            state = a * state + (g - a) * before + (1.0 - g) * value
+        last, before = time, value
+        return state
+
+    return push
 
 
-class PlayFollower:
+def follow_play(half_width: float) -> Follower:
     """`operators.play` with a half-width K."""
+    state = math.nan
 
-    def __init__(self, half_width: float) -> None:
-        self.half_width, self.state = half_width, math.nan
+    def push(_: float, value: float) -> float:
+        nonlocal state
+        if math.isnan(state):
+            state = value
+        state = min(max(state, value - half_width), value + half_width)
+        return state
 
-    def push(self, time: float, value: float) -> float:  # noqa: ARG002
-        """Take the next knot; return where the play rests."""
-        if math.isnan(self.state):
-            self.state = value
-        self.state = min(max(self.state, value - self.half_width), value + self.half_width)
-        return self.state
+    return push
 
 
-class DelayFollower:
+def follow_delay(d: float) -> Follower:
     """The value d s ago; with a negative delay the present one, as nobody knows more."""
+    knots: deque[tuple[float, float]] = deque()
 
-    def __init__(self, d: float) -> None:
-        self.d = d
-        self.knots: deque[tuple[float, float]] = deque()
-
-    def push(self, time: float, value: float) -> float:
-        """Take the next knot; return the value d s before it."""
-        self.knots.append((time, value))
-        asked = time - self.d
-        while len(self.knots) > 2 and self.knots[1][0] <= asked:
-            self.knots.popleft()
-        if self.d <= 0 or len(self.knots) == 1:
+    def push(time: float, value: float) -> float:
+        knots.append((time, value))
+        asked = time - d
+        while len(knots) > 2 and knots[1][0] <= asked:
+            knots.popleft()
+        if d <= 0 or len(knots) == 1:
             return value
-        (t0, v0), (t1, v1) = self.knots[0], self.knots[1]
+        (t0, v0), (t1, v1) = knots[0], knots[1]
         return v0 + (v1 - v0) * min(max((asked - t0) / (t1 - t0), 0.0), 1.0)
+
+    return push

@@ -104,21 +104,20 @@ def effect_of(reader: QuantityReader) -> ModelEffect:
         if sd is not None:
             own[key] = sd
     try:
-        effect.check(values)
+        return ModelEffect(name, values, own)
     except ConfigurationError as error:
         raise reader.fail("parameters", str(error)) from error
-    return ModelEffect(name, values, own)
 
 
 def effect_document(effect: ModelEffect) -> dict[str, Any]:
     """Return the mapping that a file holds for an effect."""
     units = catalogue.get(effect.name).units()
-    parameters: dict[str, Any] = {}
-    for key, value in effect.values.items():
-        if isinstance(value, str | tuple | list):
-            parameters[key] = list(value) if not isinstance(value, str) else value
-        else:
-            parameters[key] = write_quantity(value, units[key], effect.sds.get(key))
+    parameters = {
+        key: list(value) if isinstance(value, tuple | list)
+        else value if isinstance(value, str)
+        else write_quantity(value, units[key], effect.sds.get(key))
+        for key, value in effect.values.items()
+    }  # fmt: skip
     return {"effect": effect.name, "parameters": parameters}
 
 

@@ -29,7 +29,7 @@ memory take a polygon of values and give it back at any times:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -84,24 +84,29 @@ def _lag_weights(knots: Array, tau: float) -> tuple[Array, Array, Array]:
     return a, g - a, 1.0 - g
 
 
+def decayed_sums(kept: Array, driven: Array) -> Array:
+    """Return s (K, m) with s₀ = driven₀, s₊ = kept s + driven₊; kept (K-1,), driven (K, m)."""
+    from scipy.linalg.lapack import dtbtrs
+
+    band = np.ones((2, len(driven)), order="F")
+    band[1, :-1] = -kept
+    sums: Array = dtbtrs(band, driven, uplo="L", diag="U")[0]
+    return sums
+
+
 def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
     """Send a polygon through a first-order lag `tau` L' = T - L, L = T at the first knot.
 
     knots (K,) s, values (K,) or (K, m), at (E,) s; returns (E,) or (E, m).
     """
-    from scipy.linalg.lapack import dtbtrs
-
     v = np.asarray(values, dtype=float)
     columns = v.reshape(len(v), -1)
     state = columns
     if len(knots) > 1:
         a, old, new = _lag_weights(knots, tau)
-        driven = np.empty_like(columns)
-        driven[0] = columns[0]
+        driven = columns.copy()
         driven[1:] = old[:, None] * columns[:-1] + new[:, None] * columns[1:]
-        band = np.ones((2, len(knots)), order="F")
-        band[1, :-1] = -a
-        state, _ = dtbtrs(band, driven, uplo="L", diag="U")
+        state = decayed_sums(a, driven)
     left, right, share = _edges(knots, at)
     elapsed = share * (knots[right] - knots[left]) / tau
     edge = (knots[right] - knots[left]) / tau
@@ -116,7 +121,7 @@ def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
     return shaped
 
 
-def lag_matrix(knots: Array, tau: float, at: Array) -> csr_array:
+def lag_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:  # noqa: ARG001
     """Return the matrix (E, K) of `lag`; weights older than 14 tau are left out (below 1e-6)."""
     from scipy.sparse import csr_array
 
@@ -164,8 +169,7 @@ def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:
     states = _play_states(values, half_width)
     left, right, share = _edges(knots, at)
     now = values[left] * (1.0 - share) + values[right] * share
-    result: Array = np.minimum(np.maximum(states[left], now - half_width), now + half_width)
-    return result
+    return np.clip(states[left], now - half_width, now + half_width)
 
 
 def _play_states(values: Array, half_width: float) -> Array:
@@ -175,16 +179,14 @@ def _play_states(values: Array, half_width: float) -> Array:
     step = 1
     while step < len(values):
         lo, hi = low[step:].copy(), high[step:].copy()
-        low[step:] = np.minimum(np.maximum(low[:-step], lo), hi)
-        high[step:] = np.minimum(np.maximum(high[:-step], lo), hi)
+        low[step:], high[step:] = np.clip(low[:-step], lo, hi), np.clip(high[:-step], lo, hi)
         step *= 2
     return low
 
 
 def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> csr_array:
     """Return ∂ play / ∂ values (E, K): each output depends on the reading that moved it last."""
-    moving, source, _ = _play_moves(knots, values, half_width, at)
-    return _switched(knots, at, moving, source)
+    return _switched(knots, at, *_play_moves(knots, values, half_width, at)[:2])
 
 
 def _play_moves(
@@ -222,8 +224,7 @@ def running_maximum(knots: Array, values: Array, at: Array) -> Array:
     """Return the highest value from the first knot to each time, (E,)."""
     left, right, share = _edges(knots, at)
     now = values[left] * (1.0 - share) + values[right] * share
-    result: Array = np.maximum(np.maximum.accumulate(values)[left], now)
-    return result
+    return np.asarray(np.maximum(np.maximum.accumulate(values)[left], now))
 
 
 def running_maximum_matrix(knots: Array, values: Array, at: Array) -> csr_array:
@@ -256,7 +257,7 @@ def _switched(
     )
 
 
-def slope_matrix(knots: Array, at: Array) -> csr_array:
+def slope_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
     """Return the matrix (E, K) of the rate dT/dt at times (E,).
 
     At the knots the slope of the parabola through three neighbours (second order, also for uneven
@@ -315,33 +316,26 @@ class Operator:
 
     inputs: how many; constants: in order; powers: exponent of the input's unit in the result's (0:
     a pure number), seconds: exponent of s that is multiplied; keeps: the result is a value of
-    the input's own kind (°C stays °C). value, slopes: of pointwise ones, (inputs…, constants…) →
-    values, partial derivatives by each input. trajectory, matrix: of those with memory, (knots,
-    values, constants, times) → values at the times, ∂ by the values at the knots.
+    the input's own kind (°C stays °C); remembers: it depends on the past. value, derivatives: of
+    pointwise ones (inputs…, constants…) → values, partial derivatives by each input; of those with
+    memory (knots, values, constants, times) → values at the times, ∂ by the values at the knots.
     """
 
     inputs: int
     constants: tuple[Constant, ...]
     words: str
+    value: Callable[..., Array]
+    derivatives: Callable[..., Any]
+    remembers: bool = False
     powers: int = 1
     seconds: int = 0
     keeps: bool = False
-    value: Callable[..., Array] | None = None
-    slopes: Callable[..., tuple[Array, ...]] | None = None
-    trajectory: Callable[..., Array] | None = None
-    matrix: Callable[..., csr_array] | None = None
-
-    @property
-    def remembers(self) -> bool:
-        """Whether it depends on the past."""
-        return self.trajectory is not None
 
 
 def _integral(knots: Array, values: Array, at: Array) -> Array:
     steps = 0.5 * np.diff(knots) * (values[1:] + values[:-1])
     total = np.append(0.0, np.cumsum(steps))
-    last = len(knots) - 1
-    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, max(last - 1, 0))
+    left, _, _ = _edges(knots, at)
     elapsed = np.clip(at - knots[left], 0.0, None)
     now = np.interp(at, knots, values)
     whole: Array = total[left] + 0.5 * elapsed * (values[left] + now)
@@ -359,21 +353,12 @@ def _integral_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # no
     inside = np.tri(n, n - 1, -1) * h / 2.0
     whole[:, :-1] += inside
     whole[:, 1:] += inside
-    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, n - 2)
-    share = np.clip((at - knots[left]) / h[left], 0.0, 1.0)
+    left, right, share = _edges(knots, at)
     weights = whole[left]
     rows = np.arange(len(at))
     weights[rows, left] += h[left] * share * (1.0 - share / 2.0)
-    weights[rows, left + 1] += h[left] * share**2 / 2.0
-    return csr_array(weights - _from_start(whole, knots))
-
-
-def _from_start(whole: Array, knots: Array) -> Array:
-    """Return the row of `whole` at time 0, where an integral begins."""
-    at = np.clip(np.searchsorted(knots, 0.0, side="right") - 1, 0, len(knots) - 2)
-    share = float(np.clip(-knots[at] / (knots[at + 1] - knots[at]), 0.0, 1.0))
-    out: Array = whole[at] * (1.0 - share) + whole[at + 1] * share
-    return out
+    weights[rows, right] += h[left] * share**2 / 2.0
+    return csr_array(weights - interpolation_matrix(knots, np.zeros(1)) @ whole)
 
 
 def _change(knots: Array, values: Array, at: Array) -> Array:
@@ -391,12 +376,12 @@ def _peak(knots: Array, values: Array, tau: float, at: Array) -> Array:
     """Source: the diode and leaky capacitor of a peak detector (Horowitz, Hill (2015): The Art of
     Electronics, 3rd ed., section 4.5.1).
     """
-    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 1)
     decay = np.exp(-np.diff(knots) / tau)
     states = [float(values[0])]
     for v, d in zip(values[1:].tolist(), decay.tolist(), strict=True):
         states.append(max(v, v + (states[-1] - v) * d))
     now = np.interp(at, knots, values)
+    left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 1)
     gone = np.exp(-np.clip(at - knots[left], 0.0, None) / tau)
     return np.asarray(np.maximum(now, now + (np.array(states)[left] - now) * gone))
 
@@ -431,80 +416,59 @@ _W = Constant("w", "scale", True)
 _TAU = Constant("tau", "time_constant", True, same_unit=False)
 
 
-def _ones(x: Array, *_: float) -> tuple[Array]:
-    return (np.ones_like(x),)
-
-
 OPERATORS: dict[str, Operator] = {
-    "offset": Operator(
-        1, (_A,), "({0} − {1})", value=lambda x, a: np.asarray(x - a), slopes=_ones
-    ),
-    "above": Operator(
-        1, (_K,), "({0} − {1})₊", value=lambda x, k: np.maximum(x - k, 0.0),
-        slopes=lambda x, k: ((x > k).astype(float),),
-    ),
+    "offset": Operator(1, (_A,), "({0} − {1})", lambda x, a: np.asarray(x - a),
+                       lambda x, a: (np.ones_like(x),)),  # noqa: ARG005
+    "above": Operator(1, (_K,), "({0} − {1})₊", lambda x, k: np.maximum(x - k, 0.0),
+                      lambda x, k: ((x > k).astype(float),)),
     "power": Operator(
-        1, (Constant("p", "exponent", True, same_unit=False),), "[{0}]^({1})", 0,
-        value=lambda x, p: np.asarray(np.maximum(x, 0.0) ** p),
+        1, (Constant("p", "exponent", True, same_unit=False),), "[{0}]^({1})",
+        lambda x, p: np.asarray(np.maximum(x, 0.0) ** p),
         # a root is vertical at its foot: held where the reading's error ends
-        slopes=lambda x, p: (p * np.maximum(x, 1e-2) ** (p - 1.0) * (x > 0),),
+        lambda x, p: (p * np.maximum(x, 1e-2) ** (p - 1.0) * (x > 0),), powers=0,
     ),
-    "square": Operator(
-        1, (), "[{0}]²", 2, value=lambda x: np.asarray(x**2), slopes=lambda x: (2.0 * x,)
-    ),
-    "cube": Operator(
-        1, (), "[{0}]³", 3, value=lambda x: np.asarray(x**3), slopes=lambda x: (3.0 * x**2,)
-    ),
-    "signed_square": Operator(
-        1, (), "sign({0}) · ({0})²", 2, value=lambda x: x * np.abs(x),
-        slopes=lambda x: (2.0 * np.abs(x),),
-    ),
-    "magnitude": Operator(1, (), "|{0}|", value=np.abs, slopes=lambda x: (np.sign(x),)),
+    "square": Operator(1, (), "[{0}]²", lambda x: np.asarray(x**2), lambda x: (2.0 * x,),
+                       powers=2),
+    "cube": Operator(1, (), "[{0}]³", lambda x: np.asarray(x**3), lambda x: (3.0 * x**2,),
+                     powers=3),
+    "signed_square": Operator(1, (), "sign({0}) · ({0})²", lambda x: x * np.abs(x),
+                              lambda x: (2.0 * np.abs(x),), powers=2),
+    "magnitude": Operator(1, (), "|{0}|", np.abs, lambda x: (np.sign(x),)),
     "saturation": Operator(
-        1, (_K, _W), "tanh(({0} − {1}) / {2})", 0,
-        value=lambda x, k, w: np.tanh((x - k) / w),
-        slopes=lambda x, k, w: (
-            1.0 / (w * np.cosh(np.clip((x - k) / w, -300.0, 300.0)) ** 2),
-        ),
+        1, (_K, _W), "tanh(({0} − {1}) / {2})", lambda x, k, w: np.tanh((x - k) / w),
+        lambda x, k, w: (1.0 / (w * np.cosh(np.clip((x - k) / w, -300.0, 300.0)) ** 2),),
+        powers=0,
     ),
     "exponential": Operator(
-        1, (_W,), "exp({0} / {1})", 0,
-        value=lambda x, w: np.exp(np.clip(x / w, -300.0, 300.0)),
-        slopes=lambda x, w: (np.exp(np.clip(x / w, -300.0, 300.0)) / w,),
+        1, (_W,), "exp({0} / {1})", lambda x, w: np.exp(np.clip(x / w, -300.0, 300.0)),
+        lambda x, w: (np.exp(np.clip(x / w, -300.0, 300.0)) / w,), powers=0,
     ),
     "wave": Operator(
         1, (Constant("P", "scale", True), Constant("phi", "phase", False, same_unit=False)),
-        "sin(2π · {0} / {1} + {2})", 0,
-        value=lambda x, P, phi: np.sin(2 * np.pi * x / P + phi),
-        slopes=lambda x, P, phi: (2 * np.pi / P * np.cos(2 * np.pi * x / P + phi),),
+        "sin(2π · {0} / {1} + {2})", lambda x, P, phi: np.sin(2 * np.pi * x / P + phi),
+        lambda x, P, phi: (2 * np.pi / P * np.cos(2 * np.pi * x / P + phi),), powers=0,
     ),
-    "product": Operator(
-        2, (), "{0} · {1}", value=lambda x, y: np.asarray(x * y), slopes=lambda x, y: (y, x)
-    ),
+    "product": Operator(2, (), "{0} · {1}", lambda x, y: np.asarray(x * y),
+                        lambda x, y: (y, x)),
     "rate": Operator(
-        1, (), "d{0}/dt", seconds=-1, matrix=lambda knots, _, at: slope_matrix(knots, at),
-        trajectory=lambda knots, x, at: np.asarray(slope_matrix(knots, at) @ x),
+        1, (), "d{0}/dt", lambda knots, x, at: np.asarray(slope_matrix(knots, x, at) @ x),
+        slope_matrix, remembers=True, seconds=-1,
     ),
-    "integral": Operator(1, (), "∫ {0} dt", seconds=1, trajectory=_integral,
-                         matrix=_integral_matrix),
-    "change": Operator(1, (), "({0} − {0} at the start)", trajectory=_change,
-                       matrix=_change_matrix),
-    "lag": Operator(1, (_TAU,), "({0}, lagged by {1})", keeps=True, trajectory=lag,
-                    matrix=lambda knots, _, tau, at: lag_matrix(knots, tau, at)),
-    "play": Operator(
-        1, (Constant("r", "width", True),), "({0}, through a play of half-width {1})", keeps=True,
-        trajectory=play, matrix=play_matrix,
-    ),
-    "maximum": Operator(1, (), "(highest {0} so far)", keeps=True, trajectory=running_maximum,
-                        matrix=running_maximum_matrix),
+    "integral": Operator(1, (), "∫ {0} dt", _integral, _integral_matrix, remembers=True,
+                         seconds=1),
+    "change": Operator(1, (), "({0} − {0} at the start)", _change, _change_matrix,
+                       remembers=True),
+    "lag": Operator(1, (_TAU,), "({0}, lagged by {1})", lag, lag_matrix, remembers=True,
+                    keeps=True),
+    "play": Operator(1, (Constant("r", "width", True),), "({0}, through a play of half-width {1})",
+                     play, play_matrix, remembers=True, keeps=True),
+    "maximum": Operator(1, (), "(highest {0} so far)", running_maximum, running_maximum_matrix,
+                        remembers=True, keeps=True),
     "minimum": Operator(
-        1, (), "(lowest {0} so far)", keeps=True,
-        trajectory=lambda knots, x, at: -running_maximum(knots, -x, at),
-        matrix=lambda knots, x, at: running_maximum_matrix(knots, -x, at),
+        1, (), "(lowest {0} so far)", lambda knots, x, at: -running_maximum(knots, -x, at),
+        lambda knots, x, at: running_maximum_matrix(knots, -x, at), remembers=True, keeps=True,
     ),
-    "peak": Operator(
-        1, (_TAU,), "(highest {0} so far, fading within {1})", keeps=True, trajectory=_peak,
-        matrix=_peak_matrix,
-    ),
+    "peak": Operator(1, (_TAU,), "(highest {0} so far, fading within {1})", _peak, _peak_matrix,
+                     remembers=True, keeps=True),
 }  # fmt: skip
 """Every operator by its name."""

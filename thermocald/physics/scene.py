@@ -210,13 +210,13 @@ class Scene:
         self.field = field
         self.look = look or Look()
         self._normals = surface_normals(field)
-        self._facing = np.zeros(len(field), dtype=bool)
+        self._facing: NDArray[np.bool_] | None = None
         self._outlines: Outlines | None = None
 
-    def _shapes(self, centre: Array) -> Outlines:
+    def _shapes(self, centre: Array) -> Outlines | None:
         """Return the outlines seen from a point (3,) mm: its side decides how ring codes run."""
         facing = np.sum(self._normals * (centre - self.field.points), axis=1) > 0
-        if self._outlines is None or not np.array_equal(facing, self._facing):
+        if self._facing is None or not np.array_equal(facing, self._facing):
             self._facing = facing
             normals = np.where(facing[:, None], self._normals, -self._normals)
             self._outlines = outlines(self.field, normals)
@@ -258,7 +258,7 @@ class Scene:
         self, canvas: NDArray[np.int16], iop: Array, eop: Array, points: Array, blur_factor: float
     ) -> None:
         shapes = self._shapes(eop[3:6])
-        if not len(shapes.centre):
+        if shapes is None:
             return
         image = project(self.sensor, iop, eop, shapes.vertices(points))
         count = len(shapes.centre)

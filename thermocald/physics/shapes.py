@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,12 +24,15 @@ from thermocald.photogrammetry.targets import outline, ring_code
 from thermocald.photogrammetry.targets.markers import is_marker, marker_cells, parse_marker
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
 
     Integers = NDArray[np.int64]
+    _Polygon = tuple[float, list[int], Array, Array]  # sign, rows, weights (k, 4), offset (k, 3)
 
 # π/2 in two parts: multiples of the first are exact for the angles that occur
 _HALF_PI_HIGH = 1.5707963267341256
@@ -114,7 +117,7 @@ class Outlines:
 
     A vertex is Σ weights × points[rows] + offset. rows (v, 4), weights (v, 4), offset (v, 3) mm;
     following (v,): the next vertex of the same polygon; sign (v,): +1 ink, -1 paper again;
-    shape (v,): which target (or marker) it belongs to; counts: number of shapes;
+    shape (v,): which target (or marker) it belongs to;
     centre (s,), normal (s, 3): row of a target and plane of each shape.
     """
 
@@ -232,72 +235,62 @@ def _lay_box(x0: int, y0: int, x1: int, y1: int) -> Array:
     return np.concatenate(sides)
 
 
-def outlines(field: TestField, normals: Array) -> Outlines:
+def outlines(field: TestField, normals: Array) -> Outlines | None:
     """Return the outlines of all targets that can be drawn; normals (n, 3) point at the viewer.
 
-    Circles without a diameter, and markers of which the field lacks a corner, are left out.
+    Circles without a diameter, and markers of which the field lacks a corner, are left out; None
+    where nothing is left.
     """
-    rows, weights, offset, sign, counts, shape = [], [], [], [], [], []
     centre: list[int] = []
     normal: list[Array] = []
-    markers: dict[tuple[str, int], dict[int, int]] = {}
-    for i in range(len(field)):
-        if field.kinds[i] == "marker_corner":
-            if is_marker(field.codes[i]):
-                dictionary, marker, corner = parse_marker(field.codes[i])
-                if corner is not None:
-                    markers.setdefault((dictionary, marker), {})[corner] = i
-            continue
-        if not field.diameters[i] > 0:
-            continue
-        right, down = _find_basis(normals[i])
-        for polygon in _disc_polygons(float(field.diameters[i]), field.codes[i]):
-            k = len(polygon)
-            rows.append(np.full((k, 4), i))
-            weights.append(np.tile([1.0, 0.0, 0.0, 0.0], (k, 1)))
-            offset.append(polygon[:, :1] * right + polygon[:, 1:] * down)
-            sign.append(np.ones(k))
-            counts.append(k)
-            shape.append(np.full(k, len(centre)))
-        centre.append(i)
-        normal.append(normals[i])
-    for (dictionary, marker), corners in markers.items():
-        if len(corners) < 4:
-            continue
-        order = [corners[k] for k in range(4)]
-        for s, polygon in _marker_polygons(dictionary, marker):
-            u, v = polygon[:, 0], polygon[:, 1]
-            k = len(polygon)
-            rows.append(np.tile(order, (k, 1)))
-            weights.append(np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1))
-            offset.append(np.zeros((k, 3)))
-            sign.append(np.full(k, s))
-            counts.append(k)
-            shape.append(np.full(k, len(centre)))
-        centre.append(order[0])
-        side, other = (
-            field.points[order[1]] - field.points[order[0]],
-            (field.points[order[3]] - field.points[order[0]]),
-        )
-        # corners run clockwise for the viewer: right × down points away from him
-        normal.append(-np.cross(side, other))
-    if not centre:
-        nothing = np.zeros(0, dtype=np.int64)
-        return Outlines(
-            np.zeros((0, 4), np.int64), np.zeros((0, 4)), np.zeros((0, 3)),
-            nothing, np.zeros(0), nothing, nothing, np.zeros((0, 3)),
-        )  # fmt: skip
-    sizes = np.array(counts)
+    drawn: list[tuple[Any, ...]] = []
+    for row, up, polygons in _shapes(field, normals):
+        drawn += [(len(centre), *polygon) for polygon in polygons]
+        centre.append(row)
+        normal.append(up)
+    if not drawn:
+        return None
+    shape, sign, rows, weights, offset = zip(*drawn, strict=True)
+    sizes = np.array([len(w) for w in weights])
     first = np.cumsum(sizes) - sizes
     following = np.arange(sizes.sum()) + 1
     following[first + sizes - 1] = first
     return Outlines(
-        np.concatenate(rows).astype(np.int64),
+        np.repeat(np.array(rows), sizes, axis=0),
         np.concatenate(weights),
         np.concatenate(offset),
-        following.astype(np.int64),
-        np.concatenate(sign),
-        np.concatenate(shape).astype(np.int64),
-        np.array(centre, dtype=np.int64),
+        following,
+        np.repeat(np.array(sign), sizes),
+        np.repeat(np.array(shape), sizes),
+        np.array(centre),
         np.array(normal),
     )
+
+
+def _shapes(field: TestField, normals: Array) -> Iterator[tuple[int, Array, list[_Polygon]]]:
+    """Yield the row and the plane of each disc, then of each marker, and its polygons."""
+    markers: dict[tuple[str, int], dict[int, int]] = {}
+    for i, (kind, code) in enumerate(zip(field.kinds, field.codes, strict=True)):
+        if kind == "marker_corner":
+            if is_marker(code):
+                dictionary, marker, corner = parse_marker(code)
+                if corner is not None:
+                    markers.setdefault((dictionary, marker), {})[corner] = i
+        elif field.diameters[i] > 0:
+            right, down = _find_basis(normals[i])
+            yield i, normals[i], [
+                (1.0, [i] * 4, np.tile([1.0, 0.0, 0.0, 0.0], (len(p), 1)),
+                 p[:, :1] * right + p[:, 1:] * down)
+                for p in _disc_polygons(float(field.diameters[i]), code)
+            ]  # fmt: skip
+    for (dictionary, marker), corners in markers.items():
+        if len(corners) == 4:
+            order = [corners[k] for k in range(4)]
+            polygons = []
+            for sign, polygon in _marker_polygons(dictionary, marker):
+                u, v = polygon.T
+                weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1)
+                polygons.append((sign, order, weights, np.zeros((len(u), 3))))
+            a, b, _, d = field.points[order]
+            # corners run clockwise for the viewer: right × down points away from him
+            yield order[0], -np.cross(b - a, d - a), polygons

@@ -455,7 +455,7 @@ class _Drive:
     def push(self, time: float, value: float) -> Array:
         """Take a reading °C, and return what drives now, (1,) °C."""
         for stage in self._stages:
-            value = stage.push(time, value)
+            value = stage(time, value)
         return np.array([value])
 
 

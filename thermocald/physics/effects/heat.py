@@ -17,7 +17,7 @@ from thermocald.physics.effect import (
     coefficient_units,
     say_estimate,
 )
-from thermocald.physics.history import DelayFollower, Follower, History, LagFollower
+from thermocald.physics.history import Follower, History, follow_delay, follow_lag
 from thermocald.physics.operators import interpolation_matrix
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
+    from thermocald.physics.effect import Estimates, Values
 
 
 class ThermalLag(Remembering):
@@ -49,10 +50,10 @@ class ThermalLag(Remembering):
         "idle": "does nothing",
     }
 
-    def follower(self, values: Mapping[str, Any]) -> Follower | None:
-        return LagFollower(float(values["tau"]))
+    def follower(self, values: Values) -> Follower | None:
+        return follow_lag(float(values["tau"]))
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         return f"the camera follows the thermometer with a lag of {say_estimate(estimates['tau'])}"
 
 
@@ -75,8 +76,8 @@ class TimeOffset(Effect):
         "idle": "does nothing",
     }
 
-    def follower(self, values: Mapping[str, Any]) -> Follower | None:
-        return DelayFollower(float(values["d"]))
+    def follower(self, values: Values) -> Follower | None:
+        return follow_delay(float(values["d"]))
 
     def drive(self, history: History, d: float = 0.0, **_: Any) -> Array:
         return history.polygon().at(history.times - d)
@@ -105,7 +106,7 @@ class TimeOffset(Effect):
         p = history.polygon()
         return interpolation_matrix(p.times, history.times - d) @ p.matrix
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         late = say_estimate(estimates["d"])
         return f"the camera follows the thermometer after a pure delay of {late}"
 
@@ -123,7 +124,6 @@ class ThermalGradient(Remembering):
     name = "thermal_gradient"
     operator = "rate"
     noun = "a thermal gradient"
-    kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("(K/s)")
     usual = ("c", "x0", "y0")
     moves_mount = True
@@ -137,12 +137,7 @@ class ThermalGradient(Remembering):
         "idle": "does nothing",
     }
 
-    def unresolved(
-        self,
-        history: History,
-        rate_jump: Array | None = None,
-        **_: Any,
-    ) -> Array:
+    def unresolved(self, history: History, rate_jump: Array | None = None, **_: Any) -> Array:
         """Return by how much the rate jumps where a lamp is switched between two readings."""
         if rate_jump is not None:
             return rate_jump
@@ -165,7 +160,6 @@ class SelfHeating(OfTime):
 
     name = "self_heating"
     noun = "self-heating"
-    kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
         "tau": Parameter("s", 10.0, 10000.0, 300.0, log=True, role="time_constant")
     }
@@ -182,7 +176,7 @@ class SelfHeating(OfTime):
     def signal(self, history: History, tau: float = 300.0, **_: Any) -> Array:
         return -np.expm1(-history.times / tau)[:, None]
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         return (
             "the device warms itself, unseen by the thermometer, with a time constant of "
             f"{say_estimate(estimates['tau'])}"
@@ -194,18 +188,15 @@ class SecondHeatSource(Effect):
 
     name = "second_heat_source"
     noun = "a second heat source"
-    kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
         "channel": Parameter("name", 0.0, 0.0, 0.0, text=True)
     }
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
     usual = ("c", "x0", "y0")
     of_now = True
-    behaviour: ClassVar[Mapping[str, str]] = {
-        "load": "follows the other thermometer",
-        "idle": "follows the other thermometer",
-        "hold": "follows the other thermometer",
-    }
+    behaviour: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("load", "idle", "hold"), "follows the other thermometer"
+    )
 
     def channel(self, history: History, channel: str = "", **_: Any) -> str:
         return channel or next(c for c in history.readings if c != history.reference)
@@ -216,9 +207,7 @@ class SecondHeatSource(Effect):
     def sensitivity(self, history: History, channel: str = "", **_: Any) -> csr_array:
         return history.temperature_matrix(self.channel(history, channel))
 
-    def steady(
-        self, values: Mapping[str, Any], T0: float, channels: Mapping[str, float] | None
-    ) -> Steady:
+    def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:
         channel = str(values["channel"])
         if channels is None or channel not in channels:
             raise DataError(
@@ -227,5 +216,5 @@ class SecondHeatSource(Effect):
             )
         return Steady((float(channels[channel]) - T0, 0.0, 0.0))
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         return f"{estimates['channel']['value']} heats the camera too"

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
+    from thermocald.physics.effect import Estimates, Values
     from thermocald.physics.history import History
 
 
@@ -26,7 +27,6 @@ class NonlinearExpansion(Effect):
 
     name = "nonlinear_expansion"
     noun = "a quadratic expansion"
-    kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K2")
     usual = ("c", "x0", "y0")
     steady_signal = Steady((0.0, 0.0, 1.0))
@@ -52,15 +52,12 @@ class RadialDistortionDrift(Proportional):
 
     name = "radial_distortion_drift"
     noun = "a drift of the radial distortion"
-    kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("A1", "A2", "A3"))
     usual = ("A1",)
     parameter_sets = (("A1",), ("A1", "A2"), ("A1", "A2", "A3"))
     behaviour: ClassVar[Mapping[str, str]] = {
-        "turn": "stays radial about the principal point",
-        "hold": "does not move while the temperature stands",
-        "cycle": "runs along the same line up and down",
-    }
+        **Proportional.behaviour, "turn": "stays radial about the principal point"
+    }  # fmt: skip
 
 
 class DecenteringDrift(Proportional):
@@ -68,14 +65,11 @@ class DecenteringDrift(Proportional):
 
     name = "decentering_drift"
     noun = "a drift of the decentering distortion"
-    kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("B1", "B2"))
     usual = ("B1", "B2")
     behaviour: ClassVar[Mapping[str, str]] = {
-        "turn": "turns with the camera",
-        "hold": "does not move while the temperature stands",
-        "cycle": "runs along the same line up and down",
-    }
+        **Proportional.behaviour, "turn": "turns with the camera"
+    }  # fmt: skip
 
 
 class AffinityDrift(Proportional):
@@ -83,14 +77,11 @@ class AffinityDrift(Proportional):
 
     name = "affinity_drift"
     noun = "a drift of the affinity"
-    kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("C1", "C2"))
     usual = ("C1", "C2")
     behaviour: ClassVar[Mapping[str, str]] = {
-        "turn": "turns with the camera, along the sensor axes",
-        "hold": "does not move while the temperature stands",
-        "cycle": "runs along the same line up and down",
-    }
+        **Proportional.behaviour, "turn": "turns with the camera, along the sensor axes"
+    }  # fmt: skip
 
 
 class Defocus(Proportional):
@@ -112,9 +103,9 @@ class Defocus(Proportional):
         "cycle": "makes noise come and go with the temperature",
     }
 
-    def image_changes(self, history: History, values: Mapping[str, Any]) -> dict[str, Any]:
+    def image_changes(self, history: History, values: Values) -> dict[str, Any]:
         factor = np.maximum(1.0 + values["factor"] * self.signal(history)[:, 0], 0.1)
         return {"noise_factor": factor, "blur_factor": factor}
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         return f"heat defocuses: the measuring noise grows by {say_estimate(estimates['factor'])}"

@@ -25,7 +25,7 @@ from thermocald.physics.effect import (
     coefficient_units,
     say_estimate,
 )
-from thermocald.physics.history import Follower, History, PlayFollower
+from thermocald.physics.history import Follower, History, follow_play
 from thermocald.physics.operators import play_turns
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.history import History
+    from thermocald.physics.effect import Estimates, Values
 
 
 class Hysteresis(Remembering):
@@ -60,14 +60,14 @@ class Hysteresis(Remembering):
         "idle": "does nothing",
     }
 
-    def follower(self, values: Mapping[str, Any]) -> Follower | None:
-        return PlayFollower(float(values["half_width"]))
+    def follower(self, values: Values) -> Follower | None:
+        return follow_play(float(values["half_width"]))
 
     def turns(self, history: History, half_width: float = 1.0, **_: Any) -> NDArray[np.bool_]:
         p = history.polygon()
         return play_turns(p.times, p.values, half_width, history.times)
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         return (
             "the way up is not the way down: the camera follows with a play of "
             f"± {say_estimate(estimates['half_width'])}"
@@ -83,7 +83,6 @@ class Softening(Effect):
 
     name = "softening"
     noun = "softening"
-    kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
         "T_k": Parameter("degC", -40.0, 150.0, 40.0, role="threshold")
     }
@@ -105,15 +104,10 @@ class Softening(Effect):
         above = (history.temperature() > T_k).astype(float)
         return history.temperature_matrix().multiply(above[:, None]).tocsr()
 
-    def steady(
-        self,
-        values: Mapping[str, Any],
-        T0: float,  # noqa: ARG002
-        channels: Mapping[str, float] | None,  # noqa: ARG002
-    ) -> Steady:
+    def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:  # noqa: ARG002
         return Steady(knee=float(values["T_k"]), knee_name="T_k")
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         return f"something gives way above {say_estimate(estimates['T_k'])}"
 
 
@@ -127,7 +121,6 @@ class PermanentSet(Remembering):
     name = "permanent_set"
     operator = "maximum"
     noun = "a permanent set"
-    kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
     usual = ("c", "x0", "y0")
     irreversible = True
@@ -154,7 +147,6 @@ class Creep(OfTime):
 
     name = "creep"
     noun = "creep"
-    kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("s")
     usual = ("c", "x0", "y0")
     moves_mount = True
@@ -177,7 +169,6 @@ class Slip(OfTime):
 
     name = "slip"
     noun = "a slip"
-    kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
         "time": Parameter("s", 0.0, 1e9, 600.0, role="event")
     }
@@ -194,7 +185,7 @@ class Slip(OfTime):
     def signal(self, history: History, time: float = 600.0, **_: Any) -> Array:
         return (history.times >= time).astype(float)[:, None]
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         return f"a part slipped at {say_estimate(estimates['time'])} after the start"
 
 
@@ -203,14 +194,11 @@ class HousingTilt(Proportional):
 
     name = "housing_tilt"
     noun = "a tilt of the housing"
-    kind = "signal"
     linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("omega", "phi", "kappa"))
     usual = ("omega", "phi", "kappa")
     behaviour: ClassVar[Mapping[str, str]] = {
-        "turn": "keeps its direction in space",
-        "hold": "does not move while the temperature stands",
-        "cycle": "runs along the same line up and down",
-    }
+        **Proportional.behaviour, "turn": "keeps its direction in space"
+    }  # fmt: skip
 
 
 class MountMotion(Remembering):
@@ -225,7 +213,6 @@ class MountMotion(Remembering):
     name = "mount_motion"
     operator = "lag"
     noun = "a motion of the mount"
-    kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
         "tau": Parameter("s", 2.0, 3000.0, 300.0, log=True, role="time_constant")
     }
@@ -250,7 +237,7 @@ class MountMotion(Remembering):
             return super().sensitivity(history, tau=tau)
         return history.temperature_matrix()
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         moved = ", ".join(f"{k} = {say_estimate(e)}" for k, e in estimates.items() if k != "tau")
         tau = estimates.get("tau")
         late = "at once" if not tau or not tau["value"] else f"with a lag of {say_estimate(tau)}"
@@ -266,7 +253,6 @@ class CyclicInterference(OfTime):
 
     name = "cyclic_interference"
     noun = "a cyclic interference"
-    kind = "signal"
     nonlinear: ClassVar[Mapping[str, Parameter]] = {
         "P": Parameter("s", 20.0, 5000.0, 120.0, log=True, role="period"),
         "phase": Parameter("rad", -np.pi, np.pi, 0.0, role="phase"),
@@ -285,11 +271,11 @@ class CyclicInterference(OfTime):
         angle = (2.0 * np.pi / P) * history.times
         return np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
-    def weights(self, values: Mapping[str, Any], name: str) -> Array:
+    def weights(self, values: Values, name: str) -> Array:
         a, phase = float(values[name]), float(values["phase"])
         return a * np.array([np.cos(phase), np.sin(phase)])
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         return f"something cycles with a period of {say_estimate(estimates['P'])}"
 
 
@@ -305,13 +291,9 @@ class TestFieldExpansion(Proportional):
     linear: ClassVar[Mapping[str, str]] = {"X": "1/K", "Y": "1/K", "Z": "1/K"}
     usual = ("X", "Y", "Z")
     columns: ClassVar[Mapping[str, str]] = {"X": "scale_X", "Y": "scale_Y", "Z": "scale_Z"}
-    behaviour: ClassVar[Mapping[str, str]] = {
-        "shade": "stops",
-        "hold": "does not move while the temperature stands",
-        "cycle": "runs along the same line up and down",
-    }
+    behaviour: ClassVar[Mapping[str, str]] = {**Proportional.behaviour, "shade": "stops"}
 
-    def image_changes(self, history: History, values: Mapping[str, Any]) -> dict[str, Any]:
+    def image_changes(self, history: History, values: Values) -> dict[str, Any]:
         rates = np.array([float(values.get(axis, 0.0)) for axis in self.linear])
         return {"scale": 1.0 + self.signal(history) * rates}
 
@@ -340,7 +322,7 @@ class TargetDisplacement(OfTime):
         return (history.times >= time).astype(float)[:, None]
 
     def influence(
-        self, history: History, values: Mapping[str, Any], field: TestField | None = None
+        self, history: History, values: Values, field: TestField | None = None
     ) -> Influence:
         nothing = Influence.none(len(history.times))
         if field is None:
@@ -360,7 +342,7 @@ class TargetDisplacement(OfTime):
         )
         return replace(nothing, displacements=(moved,))
 
-    def sentence(self, estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    def sentence(self, estimates: Estimates) -> str:
         targets = estimates["targets"]["value"]
         named = targets if isinstance(targets, str) else ", ".join(targets)
         return f"targets {named} have moved at {say_estimate(estimates['time'])} after the start"

@@ -108,6 +108,14 @@ class Panel:
     arrows: Arrows | None = None
 
 
+def image_panel(title: str, *curves: Curve, arrows: Arrows | None = None) -> Panel:
+    """A diagram of the image, px, y down as there; arrows bear a scale and a frame of their own."""
+    down = arrows is None
+    return Panel(
+        title, "x in px", "y in px, down", curves, equal=down, y_down=down, arrows=arrows
+    )  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class Figure:
     """Panels under one name, which is a file name too, or a drawing of matplotlib.

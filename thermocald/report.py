@@ -104,7 +104,12 @@ def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> st
         autoescape=select_autoescape(["html", "j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,
-        finalize=lambda value: isolated(value) if type(value) is str else value,
+        # else a camera's name in Hebrew or Arabic exchanges the width and height that follow it
+        finalize=lambda value: (
+            _WORDS_TO_LEFT.sub(lambda m: f"\u2068{m[0]}\u2069", value)
+            if type(value) is str
+            else value
+        ),
     )
     environment.filters["powers"] = typeset_powers
     at = datetime.now(tz=UTC)
@@ -118,26 +123,14 @@ def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> st
         style=(_TEMPLATES / "report.css").read_text(encoding="utf-8"),
         script=(_TEMPLATES / "report.js").read_text(encoding="utf-8"),
     )
-    return _PROSE.sub(lambda m: _kept_together(m[0]), page)
-
-
-def _kept_together(prose: str) -> str:
-    """Return prose in which no line ends within an option or before a unit."""
-    return _OPTION.sub(r'<span class="option">\g<0></span>', _BEFORE_UNIT.sub("\u00a0", prose))
+    together = r'<span class="option">\g<0></span>'
+    return _PROSE.sub(lambda m: _OPTION.sub(together, _BEFORE_UNIT.sub("\u00a0", m[0])), page)
 
 
 def as_sentence(text: str) -> str:
     """Return a line with a capital letter and a full stop."""
     text = text.strip().rstrip(".")
     return f"{text[:1].upper()}{text[1:]}."
-
-
-def isolated(text: str) -> str:
-    """Return a text in which Hebrew and Arabic words turn nothing around but themselves.
-
-    Else a camera's name exchanges the width and the height that follow it.
-    """
-    return _WORDS_TO_LEFT.sub(lambda m: f"\u2068{m[0]}\u2069", text)
 
 
 def day(start_utc: float) -> str:

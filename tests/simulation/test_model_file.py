@@ -171,8 +171,8 @@ PROGRAMME = {
 def test_programme_file(tmp_path):
     programme = read_programme(write(tmp_path / "p.yaml", PROGRAMME))
     lamp = programme.sources["lens"]
-    np.testing.assert_allclose(lamp.after([50.0, 250.0, 400.0, 999.0]), [0, 1.0, 0.5, 0.5])
-    np.testing.assert_allclose(lamp.before([400.0]), [2.0])
+    np.testing.assert_allclose(lamp.at([50.0, 250.0, 400.0, 999.0]), [0, 1.0, 0.5, 0.5])
+    np.testing.assert_allclose(lamp.at([400.0], "left"), [2.0])
     assert programme.duration == 990.0
 
 
@@ -219,4 +219,4 @@ def test_a_log_is_played_in(tmp_path):
     (tmp_path / "log.csv").write_text("t,air\n100,20\n600,30\n1100,25\n")
     played = {"log": "log.csv", "time": "t", "value": "air"}
     programme = read_programme(write(tmp_path / "p.yaml", {**PROGRAMME, "ambient": played}))
-    np.testing.assert_allclose(programme.boundaries["ambient"].after([0, 250, 1000]), [20, 25, 25])
+    np.testing.assert_allclose(programme.boundaries["ambient"].at([0, 250, 1000]), [20, 25, 25])

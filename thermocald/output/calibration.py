@@ -7,7 +7,6 @@ camera would get out of it, and what to add.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from thermocald.analysis.field import CELLS, FieldCheck
 from thermocald.arrays import spread_rows
-from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel
+from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, image_panel
 from thermocald.numbers import UNITS, coefficient, parameter_label, percent, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, render_report
@@ -39,17 +38,15 @@ _FEW_NAMES = 3  # that a legend has room for
 def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
     """Return the report as HTML text."""
     posed = [p for p in result.photographs if len(p.points)]
-    proof = residual_figure(result, sensor) if posed else None
-    figures = _figures(result, sensor) if posed else ()
     tables = (_interior(result, sensor), _correlations(result))
     sections = (
-        Section("Residuals and coverage", figures=figures),
+        Section("Residuals and coverage", figures=_figures(posed, sensor) if posed else ()),
         Section("Interior orientation", tables=tuple(t for t in tables if t.rows)),
         Section("Photographs", tables=(_photographs(result),)),
     )
     chapter = Chapter(
         f"Calibration of {name}",
-        replace(_answer(result, posed, sensor), proof=proof),
+        _answer(result, posed, sensor),
         tuple(s for s in sections if s.figures or s.tables),
         (f"{name}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm.",),
     )
@@ -64,14 +61,15 @@ def coverage(points: Array, sensor: Sensor) -> float:
 
 
 def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sensor) -> Answer:
+    proof = residual_figure(result, sensor) if posed else None
     steps = [
-        f"{Path(p.path).name}: {p.status.replace('_', ' ')}{f', {p.reason}' if p.reason else ''}."
+        f"{Path(p.path).name}: {_outcome(p, ', ')}."
         for p in result.photographs
         if not len(p.points)
     ]
     if not posed or result.interior is None:
-        return Answer(f"Not calibrated: {result.reason}.", next_steps=tuple(steps))
-    points, residuals = _used(result)
+        return Answer(f"Not calibrated: {result.reason}.", proof, next_steps=tuple(steps))
+    points, residuals = _used(posed)
     left_out = sum(int(np.count_nonzero(~p.used)) for p in posed)
     rms = float(np.sqrt(np.mean(residuals**2)))
     covered = coverage(points, sensor)
@@ -93,7 +91,7 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     if result.estimated:
         steps.append("Write the camera with --camera-out and use it in every later command.")
     return Answer(
-        sentence, None, more, tuple(steps),
+        sentence, proof, more, tuple(steps),
         (
             ("Temperatures other than that of the photographs: a series with a thermometer shows "
             "how the camera follows."),
@@ -107,20 +105,20 @@ def _found(result: Photographs, sensor: Sensor) -> str:
     """c, x0 and y0 with their standard deviations, mm and px."""
     assert result.interior is not None
     sds = np.sqrt(np.diag(result.covariance)[:3])
-    parts = []
-    for name, value, sd in zip(IOP_NAMES[:3], result.interior.as_array()[:3], sds, strict=True):
-        pitch = sensor.pixel_pitch
-        if sd > 0:
-            parts.append(
-                f"{parameter_label(name)} is {with_sd(value, float(sd), 'mm')} "
-                f"({with_sd(value / pitch, float(sd) / pitch, 'px')})"
-            )
+    found = zip(IOP_NAMES[:3], result.interior.as_array()[:3], sds, strict=True)
+    pitch = sensor.pixel_pitch
+    parts = [
+        f"{parameter_label(name)} is {with_sd(value, float(sd), 'mm')} "
+        f"({with_sd(value / pitch, float(sd) / pitch, 'px')})"
+        for name, value, sd in found
+        if sd > 0
+    ]
     return f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "".join(parts)
 
 
 def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
     """Measured minus adjusted image points of all photographs, as arrows; there may be none."""
-    points, residuals = _used(result)
+    points, residuals = _used(result.photographs)
     lengths = np.linalg.norm(residuals, axis=1)
     rows = spread_rows(len(points), _MOST_ARROWS)
     arrows = Arrows(
@@ -132,24 +130,20 @@ def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
         "Measured minus adjusted image points of all photographs. Without pattern they are noise; "
         "neighbours that point the same way are distortion that the model leaves, or targets that "
         "are not where the test field says.",
-        (Panel("Residuals", "x in px", "y in px, down", (), arrows=arrows),),
+        (image_panel("Residuals", arrows=arrows),),
     )  # fmt: skip
 
 
-def _used(result: Photographs) -> tuple[Array, Array]:
+def _used(photographs: Sequence[PhotographResult]) -> tuple[Array, Array]:
     """Image points (n, 2) that the adjustment used, and their residuals, px."""
-    posed = [p for p in result.photographs if len(p.points)]
-    nothing = np.empty((0, 2))
-    return (
-        np.concatenate([nothing, *(p.points[p.used] for p in posed)]),
-        np.concatenate([nothing, *(p.residuals[p.used] for p in posed)]),
-    )
+    found = [np.hstack([p.points, p.residuals])[p.used] for p in photographs if len(p.points)]
+    points, residuals = np.hsplit(np.concatenate([np.empty((0, 4)), *found]), 2)
+    return points, residuals
 
 
-def _figures(result: Photographs, sensor: Sensor) -> tuple[Figure, ...]:
+def _figures(posed: Sequence[PhotographResult], sensor: Sensor) -> tuple[Figure, ...]:
     """Where targets were seen, and what the residuals show."""
-    posed = [p for p in result.photographs if len(p.points)]
-    points, residuals = _used(result)
+    points, residuals = _used(posed)
     w, h = float(sensor.width), float(sensor.height)
     seen = [Curve("", np.array([0, w, w, 0, 0]), np.array([0, 0, h, h, 0]), "line", "#888888")]
     for i, photograph in enumerate(posed):
@@ -161,19 +155,13 @@ def _figures(result: Photographs, sensor: Sensor) -> tuple[Figure, ...]:
         Figure(
             "coverage", "Coverage",
             "Where targets were seen, a colour per photograph, and the image's frame.",
-            (
-                Panel("Coverage", "x in px", "y in px, down", tuple(seen), equal=True,
-                      y_down=True),
-            ),
+            (image_panel("Coverage", *seen),),
         ),
         _by_radius(points, residuals, sensor),
         Figure(
             "scatter", "Residuals in x and y",
             "The same residuals against each other: a round cloud without outliers.",
-            (
-                Panel("Residuals in x and y", "x in px", "y in px, down", (cloud,), equal=True,
-                      y_down=True),
-            ),
+            (image_panel("Residuals in x and y", cloud),),
         ),
     )  # fmt: skip
 
@@ -251,10 +239,11 @@ def _correlations(result: Photographs) -> Table:
     return Table("Correlations beyond ±0.5", ("pair", "r"), tuple(rows))
 
 
-def _photographs(result: Photographs) -> Table:
-    def outcome(p: PhotographResult) -> str:
-        return p.status.replace("_", " ") + (f": {p.reason}" if p.reason else "")
+def _outcome(p: PhotographResult, mark: str) -> str:
+    return p.status.replace("_", " ") + (f"{mark}{p.reason}" if p.reason else "")
 
+
+def _photographs(result: Photographs) -> Table:
     def place(p: PhotographResult) -> str:
         if p.exterior is None:
             return "–"
@@ -266,7 +255,7 @@ def _photographs(result: Photographs) -> Table:
         result.photographs,
         {
             "photograph": lambda p: Path(p.path).name,
-            "result": outcome,
+            "result": lambda p: _outcome(p, ": "),
             "targets": lambda p: str(p.n_targets),
             "left out": lambda p: str(len(p.rejected)),
             "RMS px": lambda p: f"{p.rms_px:.3f}" if np.isfinite(p.rms_px) else "–",
@@ -343,23 +332,20 @@ def _sd(value: float) -> str:
 def _seen(result: FieldCheck, field: TestField, model: CameraModel) -> Figure:
     """The visible targets in the image, with the parts that ought to be filled."""
     w, h = float(model.sensor.width), float(model.sensor.height)
-    lines = [Curve("", np.array([x, x]), np.array([0.0, h]), colour="#bbbbbb")
-             for x in np.linspace(0, w, CELLS[0] + 1)]  # fmt: skip
-    lines += [Curve("", np.array([0.0, w]), np.array([y, y]), colour="#bbbbbb")
-              for y in np.linspace(0, h, CELLS[1] + 1)]  # fmt: skip
+    upright = [((x, x), (0.0, h)) for x in np.linspace(0, w, CELLS[0] + 1)]
+    level = [((0.0, w), (y, y)) for y in np.linspace(0, h, CELLS[1] + 1)]
+    lines = [
+        Curve("", np.array(x), np.array(y), colour="#bbbbbb") for x, y in (*upright, *level)
+    ]  # fmt: skip
     points = project(
         model.sensor, model.interior.as_array(), result.station.as_array(),
         field.points[result.visible],
     )  # fmt: skip
     targets = Curve("", points[:, 0], points[:, 1], "points", PALETTE[0])
     empty = int(np.count_nonzero(result.cells == 0))
-    panel = Panel(
-        "Targets in the image", "x in px", "y in px, down", (*lines, targets), equal=True,
-        y_down=True,
-    )  # fmt: skip
     return Figure(
         "seen", "What the camera sees",
         f"The visible targets in the image, in {CELLS[0]} × {CELLS[1]} parts, {empty} of them "
         "empty. Distortion is only known where there are targets.",
-        (panel,),
+        (image_panel("Targets in the image", *lines, targets),),
     )  # fmt: skip

@@ -22,6 +22,7 @@ from thermocald.figures import (
     Figure,
     Panel,
     drawing_style,
+    image_panel,
     label_axes,
     legend_above,
     new_drawing,
@@ -34,6 +35,7 @@ from thermocald.store.recording.sense import doubt_lines
 if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.discovery.entries import EffectFound
+    from thermocald.discovery.gap import Stage
     from thermocald.discovery.validation import SurrogateTest
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
@@ -249,15 +251,13 @@ def _movement(d: Discovery) -> Figure:
     longest = max(float(np.linalg.norm(drawn[0][1], axis=1).max()), _noise_px(d, 0))
     frame = (e.source.sensor.width, e.source.sensor.height)
     targets = Curve("", places[:, 0], places[:, 1], "points", PALE)
+    titles = ("Before", "After") if len(drawn) > 1 else ("Left",)
     panels = tuple(
-        Panel(
-            f"{title}: {misfit:.3f} px", "x in px", "y in px, down", (targets,),
+        image_panel(
+            f"{title}: {misfit:.3f} px", targets,
             arrows=Arrows(places, vectors, frame, colour, longest),
         )
-        for (misfit, vectors), title, colour in zip(
-            drawn, ("Before", "After") if len(drawn) > 1 else ("Left",), (_BASE, _FOUND),
-            strict=False,
-        )
+        for title, (misfit, vectors), colour in zip(titles, drawn, (_BASE, _FOUND), strict=False)
     )  # fmt: skip
     return Figure(
         "movement",
@@ -306,12 +306,8 @@ def gap_figure(d: Discovery) -> Figure:
         (
             _noise_px(d, k),
             [
-                (
-                    f"{name}, {f'+ {stage.added}' if stage.added else 'base model'}",
-                    stage.gaps[k].rms_px,
-                    _FOUND if stage.added else _BASE,
-                )
-                for stage in d.stages
+                (_gap_name(name, s), s.gaps[k].rms_px, _FOUND if s.added else _BASE)
+                for s in d.stages
             ],
         )
         for k, name in enumerate(_names(d))
@@ -325,9 +321,13 @@ def gap_figure(d: Discovery) -> Figure:
     )
 
 
+def _gap_name(recording: str, stage: Stage) -> str:
+    return f"{recording}, {f'+ {stage.added}' if stage.added else 'base model'}"
+
+
 def _gap_table(d: Discovery) -> Table:
     gaps = [
-        (f"{name}, {f'+ {stage.added}' if stage.added else 'base model'}", gap)
+        (_gap_name(name, stage), gap)
         for stage in d.stages
         for name, gap in zip(_names(d), stage.gaps, strict=True)
     ]

@@ -83,29 +83,23 @@ def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle
 def column_parts(
     table: Epochs, style: ExportStyle, pixel_pitch: float, others: Columns | None = None
 ) -> Iterator[Columns]:
-    """Yield the columns of `columns_of`, some thousand rows at a time: a year has to fit."""
+    """Yield the columns of a series in some style, then the others, as they are.
+
+    Some thousand rows at a time: a year has to fit. pixel_pitch: mm.
+    """
     done = 0
     for part in table.parts():
+        columns: Columns = {}
+        for name, values in part.columns().items():
+            suffix, factor = _unit(name.removeprefix("sd_"), style, pixel_pitch)
+            columns[name + suffix] = values if not suffix else np.asarray(values) * factor
+        if style.time == "iso":
+            columns["frame_time"] = tuple(map(_iso, part.frame_time.tolist()))
         rows = slice(done, done + len(part.number))
-        here = {name: values[rows] for name, values in (others or {}).items()}
-        yield columns_of(part, style, pixel_pitch, here)
+        for name, column in (others or {}).items():
+            columns[name if name not in columns else f"extra {name}"] = column[rows]
+        yield columns
         done = rows.stop
-
-
-def columns_of(table: Epochs, style: ExportStyle, pixel_pitch: float, others: Columns) -> Columns:
-    """Return the columns of a series in some style, then the others, as they are.
-
-    pixel_pitch: mm.
-    """
-    columns: Columns = {}
-    for name, values in table.columns().items():
-        suffix, factor = _unit(name.removeprefix("sd_"), style, pixel_pitch)
-        columns[name + suffix] = values if not suffix else np.asarray(values) * factor
-    if style.time == "iso":
-        columns["frame_time"] = tuple(_iso(t) for t in table.frame_time.tolist())
-    for name, column in others.items():
-        columns[name if name not in columns else f"extra {name}"] = column
-    return columns
 
 
 def _unit(name: str, style: ExportStyle, pixel_pitch: float) -> tuple[str, float]:

@@ -27,7 +27,7 @@ Thermometers as instruments: what one says is not the temperature of what it is 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
@@ -81,15 +81,9 @@ class Course:
         """Where it begins and ends, s."""
         return float(self.times[0]), float(self.times[-1])
 
-    def after(self, t: ArrayLike) -> Array:
-        """Return the value right after each time (a jump there has happened)."""
-        return self._at(np.asarray(t, dtype=float), "right")
-
-    def before(self, t: ArrayLike) -> Array:
-        """Return the value right before each time (a jump there has not happened)."""
-        return self._at(np.asarray(t, dtype=float), "left")
-
-    def _at(self, t: Array, side: Any) -> Array:
+    def at(self, times: ArrayLike, side: Literal["left", "right"] = "right") -> Array:
+        """Return the value right after each time, or right before it (side: left), if it jumps."""
+        t = np.asarray(times, dtype=float)
         piece = np.clip(np.searchsorted(self.times, t, side=side) - 1, 0, len(self.begin) - 1)
         length = self.times[piece + 1] - self.times[piece]
         share = np.clip((t - self.times[piece]) / np.where(length > 0, length, 1.0), 0.0, 1.0)
@@ -119,32 +113,24 @@ def read_course(
 
 
 def _read_pieces(reader: QuantityReader, key: str, unit: str) -> Course:
-    times: list[float] = []
-    begin: list[float] = []
-    end: list[float] = []
+    pieces: list[tuple[float, ...]] = []
     for piece in reader.items(key):
         piece.only(("from", "to", "value", "begin", "end"))
         start, stop = piece.number("from", "s"), piece.number("to", "s")
         if stop <= start:
             raise piece.fail("to", f"is {stop:g} s, not after {start:g} s")
-        if times and start != times[-1]:
-            what = "a gap" if start > times[-1] else "an overlap"
+        before = pieces[-1][1] if pieces else start
+        if start != before:
+            what = "a gap" if start > before else "an overlap"
             raise piece.fail(
-                "from", f"is {start:g} s, but the piece before ends at {times[-1]:g} s: {what}"
+                "from", f"is {start:g} s, but the piece before ends at {before:g} s: {what}"
             )
-        if not times:
-            times.append(start)
-        times.append(stop)
-        if "value" in piece.mapping:
-            value = piece.number("value", unit)
-            begin.append(value)
-            end.append(value)
-        else:
-            begin.append(piece.number("begin", unit))
-            end.append(piece.number("end", unit))
-    if not times:
+        ends = ("value", "value") if "value" in piece.mapping else ("begin", "end")
+        pieces.append((start, stop, *(piece.number(name, unit) for name in ends)))
+    if not pieces:
         raise reader.fail(key, "is an empty list")
-    return Course(np.array(times), np.array(begin), np.array(end))
+    starts, stops, begin, end = np.array(pieces).T
+    return Course(np.append(starts[:1], stops), begin, end)
 
 
 def _read_log(reader: QuantityReader, unit: str, folder: Path) -> Course:
@@ -343,7 +329,7 @@ class HeatNetwork:
         last = float(t.max(initial=0.0))
         grid = np.unique(np.concatenate([[0.0], t, *inner]))
         grid = grid[(grid >= 0.0) & (grid <= last)]
-        begin, end = (self._drive(grid, B, powers, temperatures, side) for side in (True, False))
+        begin, end = (self._drive(grid, B, powers, temperatures, s) for s in ("right", "left"))
         root = np.sqrt(capacity)
         rate, modes = np.linalg.eigh(K / np.outer(root, root))
         into = (modes / root[:, None]).T
@@ -358,7 +344,7 @@ class HeatNetwork:
         place = np.searchsorted(grid, t)
         result = {name: solved[i, place] for i, name in enumerate(self.bodies)}
         for name in self.boundaries:
-            result[name] = temperatures[name].after(t)
+            result[name] = temperatures[name].at(t)
         return result
 
     def _drive(
@@ -367,17 +353,14 @@ class HeatNetwork:
         B: Array,
         powers: Mapping[str, Course],
         temperatures: Mapping[str, Course],
-        after: bool,
+        side: Any,
     ) -> Array:
-        """Return the heat flow (n, g) W into each body, right after or right before the
-        instants.
-        """
+        """Return the heat flow (n, g) W into each body, on one side of the instants."""
         q = np.zeros((len(self.bodies), len(grid)))
         for j, name in enumerate(self.boundaries):
-            course = temperatures[name]
-            q += B[:, j : j + 1] * (course.after(grid) if after else course.before(grid))
+            q += B[:, j : j + 1] * temperatures[name].at(grid, side)
         for name, course in powers.items():
-            q[self.bodies.index(name)] += course.after(grid) if after else course.before(grid)
+            q[self.bodies.index(name)] += course.at(grid, side)
         return q
 
 

@@ -94,7 +94,7 @@ class Simulation:
         grid = np.unique(np.concatenate([frames, regular]))
         initial = p.initial
         if initial is None:
-            initial = float(p.boundaries["ambient"].after(0.0))
+            initial = float(p.boundaries["ambient"].at(0.0))
         bodies = self.device.network.solve(grid, initial, p.sources, p.boundaries)
         channels = {name: bodies[t.body] for name, t in self.device.thermometers.items()}
         return History(frames, grid, channels, self.device.reference, self.model.T0)

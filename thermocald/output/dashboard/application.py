@@ -145,12 +145,10 @@ def build_application(
             Route("/static/plotly.js", _plotly),
             Route("/static/{name}", _static),
             Route("/api/stream", _stream),
-            Route("/api/cameras/{camera}/frame", _frame),
             Route("/api/series.csv", _csv),
-            Route("/camera.yaml", _camera_yaml),
             Route("/healthz", _health),
             Route("/metrics", _metrics),
-            *(Route(path, partial(_json, answer)) for path, answer in _ANSWERS.items()),
+            *(Route(path, partial(_answer, *how)) for path, how in _ANSWERS.items()),
         ],
         middleware=[
             Middleware(_Guard, token=token, names=HostNames(host, names)),
@@ -310,31 +308,26 @@ def _columns(view: View, request: Request) -> dict[str, Any]:
     return view.columns(camera, series, since, until, int(points or 1000))
 
 
-# what is answered as JSON
-_ANSWERS: dict[str, Callable[[View, Request], Any]] = {
-    "/api/status": lambda view, _: view.shown(),
-    "/api/series": lambda view, _: view.series(),
-    "/api/columns": _columns,
-    "/api/events": lambda view, request: view.events(_number(request, "since", 0.0, 1e11) or 0.0),
-    "/api/cameras/{camera}/epoch": lambda view, request: view.last_epoch(
-        request.path_params["camera"]
+# path → what is answered, and as what if not as JSON
+_ANSWERS: dict[str, tuple[Callable[[View, Request], Any], str]] = {
+    "/api/status": (lambda view, _: view.shown(), ""),
+    "/api/series": (lambda view, _: view.series(), ""),
+    "/api/columns": (_columns, ""),
+    "/api/events": (lambda view, r: view.events(_number(r, "since", 0.0, 1e11) or 0.0), ""),
+    "/api/cameras/{camera}/epoch": (lambda view, r: view.last_epoch(r.path_params["camera"]), ""),
+    "/api/cameras/{camera}/frame": (
+        lambda view, r: view.last_frame(r.path_params["camera"]), "image/jpeg"
     ),
-    "/camera.json": lambda view, request: view.current_camera(request.query_params.get("camera")),
-}
+    "/camera.json": (lambda view, r: view.current_camera(r.query_params.get("camera")), ""),
+    "/camera.yaml": (
+        lambda view, r: view.camera_info(r.query_params.get("camera")), "application/yaml"
+    ),
+}  # fmt: skip
 
 
-def _json(answer: Callable[[View, Request], Any], request: Request) -> Response:
-    return JSONResponse(answer(_view(request), request))
-
-
-def _frame(request: Request) -> Response:
-    data = _view(request).last_frame(request.path_params["camera"])
-    return Response(data, media_type="image/jpeg")
-
-
-def _camera_yaml(request: Request) -> Response:
-    text = _view(request).camera_info(request.query_params.get("camera"))
-    return Response(text, media_type="application/yaml")
+def _answer(said: Callable[[View, Request], Any], media_type: str, request: Request) -> Response:
+    found = said(_view(request), request)
+    return Response(found, media_type=media_type) if media_type else JSONResponse(found)
 
 
 def _csv(request: Request) -> Response:

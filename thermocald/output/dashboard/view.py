@@ -192,10 +192,8 @@ class View:
         """What happened since a UTC time, newest first, at most 200."""
         with Store.open(self._store) as store:
             found = store.events(since_utc=since)[-200:]
-        return [
-            {"utc": e.utc, "kind": e.kind, "text": e.text, "epoch": e.epoch}
-            for e in reversed(found)
-        ]
+        shown = ("utc", "kind", "text", "epoch")
+        return [{name: getattr(event, name) for name in shown} for event in reversed(found)]
 
     def csv(self, camera: str, series: str) -> Iterator[str]:
         """A series as CSV: epoch, times, temperatures as read, parameters with sds, status."""

@@ -43,13 +43,12 @@ def words_of(page):
     return unescape(re.sub(r"<[^>]*>", "", page)).replace("\xa0", " ")
 
 
-def test_ids_are_unique_and_no_style_loads_anything(html):
+def test_the_page_is_whole_and_holds_the_numbers_of_the_study(html, told):
     ids = re.findall(r'\sid="([^"]+)"', html)
     assert sorted(ids) == sorted(set(ids))
     assert not re.search(r"@import|url\((?!#)|(src|href)=\"(?!#|data:)", html)
-
-
-def test_the_words_and_tables_hold_the_numbers_of_the_study(html, told):
+    assert "<script>alert" not in html  # labels are text and no markup
+    assert "a &amp; &lt;b&gt;" in html
     words = words_of(html)
     assert "The principal point has moved in M1 by up to 15.9 px" in words
     assert "to the lower right" in words
@@ -58,6 +57,12 @@ def test_the_words_and_tables_hold_the_numbers_of_the_study(html, told):
     assert f"{mc.overall_mean / 10:.2f} cm" in words
     for name in ("success ratio", "n effective", "p naive", "sd over time"):
         assert name in words
+    # every label twice, as a row and as a column, in each of three matrices
+    figures = re.findall(r'<figure id="[^"]*correlation[^"]*".*?</figure>', html, flags=re.DOTALL)
+    assert len(figures) == 3
+    for figure in figures:
+        texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
+        assert texts.count("x₀") == texts.count("B2") == 2
 
 
 def test_a_study_of_nearly_nothing_says_why(empty_study):
@@ -74,11 +79,6 @@ def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told
     assert (cut[:, 2] == 50).all()
     assert len(re.findall(r'src="data:image/png;base64,', html)) == 2
     assert "Image around target 17" in html
-
-
-def test_labels_are_text_and_no_markup(html):
-    assert "<script>alert" not in html
-    assert "a &amp; &lt;b&gt;" in html
 
 
 @pytest.mark.slow
@@ -122,12 +122,3 @@ def test_json_has_no_nan_and_a_standard_deviation_beside_each_value(told, empty_
     assert {"slope", "sd_slope", "p", "p_naive", "p_holm"} <= set(dependence)
     assert set(camera["sd_over_time"]) == set(IOP_NAMES)
     assert sum(camera["object_space"]["fractions"]) == pytest.approx(1)
-
-
-def test_matrices_name_their_rows_and_columns(html):
-    """Every label twice, as a row and as a column, in each of three matrices."""
-    figures = re.findall(r'<figure id="[^"]*correlation[^"]*".*?</figure>', html, flags=re.DOTALL)
-    assert len(figures) == 3
-    for figure in figures:
-        texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
-        assert texts.count("x₀") == texts.count("B2") == 2

@@ -127,52 +127,33 @@ def test_hysteresis_of_a_triangle():
 
 
 T_SINE = lambda t: 12.0 * np.sin(t / 300.0)  # noqa: E731
+# parameters, coefficients, and what the coefficients multiply
 FORMULAS = {
-    "nonlinear_expansion": ({"c": 2e-6}, {"c": lambda t: 2e-6 * T_SINE(t) ** 2}),
-    "softening": (
-        {"T_k": 30.0, "y0": 1e-4},
-        {"y0": lambda t: 1e-4 * np.maximum(T_SINE(t) - 5.0, 0)},
-    ),
-    "thermal_gradient": ({"x0": 0.02}, {"x0": lambda t: 0.02 * 12 / 300 * np.cos(t / 300)}),
-    "permanent_set": (
-        {"x0": 1e-4},
-        {"x0": lambda t: 1e-4 * np.where(t < 150 * np.pi, T_SINE(t), 12.0)},
-    ),
-    "self_heating": (
-        {"tau": 240.0, "x0": 5e-3},
-        {"x0": lambda t: 5e-3 * (1 - np.exp(-t / 240))},
-    ),
-    "creep": ({"x0": 1e-6, "y0": -2e-6}, {"x0": lambda t: 1e-6 * t, "y0": lambda t: -2e-6 * t}),
-    "slip": ({"time": 777.0, "x0": 3e-3}, {"x0": lambda t: np.where(t >= 777, 3e-3, 0)}),
+    "nonlinear_expansion": ({}, {"c": 2e-6}, lambda t: T_SINE(t) ** 2),
+    "softening": ({"T_k": 30.0}, {"y0": 1e-4}, lambda t: np.maximum(T_SINE(t) - 5.0, 0)),
+    "thermal_gradient": ({}, {"x0": 0.02}, lambda t: 12 / 300 * np.cos(t / 300)),
+    "permanent_set": ({}, {"x0": 1e-4}, lambda t: np.where(t < 150 * np.pi, T_SINE(t), 12.0)),
+    "self_heating": ({"tau": 240.0}, {"x0": 5e-3}, lambda t: 1 - np.exp(-t / 240)),
+    "creep": ({}, {"x0": 1e-6, "y0": -2e-6}, lambda t: t),
+    "slip": ({"time": 777.0}, {"x0": 3e-3}, lambda t: np.where(t >= 777, 1.0, 0)),
     "cyclic_interference": (
-        {"P": 130.0, "phase": 0.7, "x0": 1e-3},
-        {"x0": lambda t: 1e-3 * np.sin(2 * np.pi * t / 130 + 0.7)},
-    ),
-    "second_heat_source": (
-        {"channel": "board", "c": 1e-4},
-        {"c": lambda t: 1e-4 * 5 * np.cos(t / 170)},
-    ),
-    "housing_tilt": ({"phi": 1e-5}, {"phi": lambda t: 1e-5 * T_SINE(t)}),
-    "mount_motion": (
-        {"phi": 1e-5, "Z0": 2e-3},
-        {"phi": lambda t: 1e-5 * T_SINE(t), "Z0": lambda t: 2e-3 * T_SINE(t)},
-    ),
-    "radial_distortion_drift": (
-        {"A1": 1e-5, "A2": 2e-6},
-        {"A1": lambda t: 1e-5 * T_SINE(t), "A2": lambda t: 2e-6 * T_SINE(t)},
-    ),
-    "decentering_drift": ({"B1": 1e-6}, {"B1": lambda t: 1e-6 * T_SINE(t)}),
-    "affinity_drift": ({"C2": 1e-6}, {"C2": lambda t: 1e-6 * T_SINE(t)}),
-}
+        {"P": 130.0, "phase": 0.7}, {"x0": 1e-3}, lambda t: np.sin(2 * np.pi * t / 130 + 0.7)),
+    "second_heat_source": ({"channel": "board"}, {"c": 1e-4}, lambda t: 5 * np.cos(t / 170)),
+    "housing_tilt": ({}, {"phi": 1e-5}, T_SINE),
+    "mount_motion": ({}, {"phi": 1e-5, "Z0": 2e-3}, T_SINE),
+    "radial_distortion_drift": ({}, {"A1": 1e-5, "A2": 2e-6}, T_SINE),
+    "decentering_drift": ({}, {"B1": 1e-6}, T_SINE),
+    "affinity_drift": ({}, {"C2": 1e-6}, T_SINE),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FORMULAS)
 def test_signal_follows_its_formula(name):
-    values, expected = FORMULAS[name]
+    values, coefficients, expected = FORMULAS[name]
     h = history()
-    added = shift(h, ModelEffect(name, values))
+    added = shift(h, ModelEffect(name, {**values, **coefficients}))
     for parameter in PARAMETER_NAMES:
-        course = expected.get(parameter, np.zeros_like)(h.times)
+        course = coefficients.get(parameter, 0.0) * expected(h.times)
         scale = max(1e-12, np.abs(course).max())
         np.testing.assert_allclose(added[:, column(parameter)] / scale, course / scale, atol=3e-6)
 

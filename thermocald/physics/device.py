@@ -43,8 +43,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from thermocald.files import QuantityReader, read_yaml
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES, ExteriorOrientation, Sensor
 from thermocald.physics.effect import PARAMETER_UNITS
@@ -64,7 +62,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from thermocald.arrays import Array
 
 PROGRAMME_FORMAT = "thermocald-programme/1"
 
@@ -93,20 +90,6 @@ class Programme:
     def duration(self) -> float:
         """From the first frame to the last, nominally, s."""
         return (self.epochs - 1) * self.interval
-
-    def frame_times(self, rng: np.random.Generator) -> Array:
-        """Draw when frames are taken, (E,) s from the start, the first at 0, ascending."""
-        nominal = np.arange(self.epochs) * self.interval
-        limit = 0.4 * self.interval
-        shift = np.clip(self.jitter * rng.standard_normal(self.epochs), -limit, limit)
-        shift[0] = 0.0
-        return nominal + shift
-
-    def reading_times(self, frames: Array, rng: np.random.Generator) -> Array:
-        """Draw when thermometers are read, (E,) s from the start, ascending."""
-        spread = self.reading_spread * rng.uniform(-1.0, 1.0, len(frames))
-        result: Array = np.maximum.accumulate(frames + self.reading_offset + spread)
-        return result
 
 
 def read_programme(path: Path) -> Programme:
@@ -189,6 +172,12 @@ class CameraDevice:
         return next(iter(self.thermometers))
 
 
+USUAL_THERMOMETERS: Mapping[str, SimulatedThermometer] = {
+    "temperature": SimulatedThermometer("lens"),
+    "board_temperature": SimulatedThermometer("board"),
+}
+
+
 def default_heat() -> tuple[HeatNetwork, dict[str, SimulatedThermometer]]:
     """Return a camera module on a board in a housing before a test field, and two thermometers.
 
@@ -206,11 +195,7 @@ def default_heat() -> tuple[HeatNetwork, dict[str, SimulatedThermometer]]:
             Link("test_field", "ambient", 5.0),
         ),
     )
-    thermometers = {
-        "temperature": SimulatedThermometer("lens"),
-        "board_temperature": SimulatedThermometer("board"),
-    }
-    return network, thermometers
+    return network, dict(USUAL_THERMOMETERS)
 
 
 def read_camera_device(path: Path) -> CameraDevice:

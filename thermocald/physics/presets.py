@@ -29,13 +29,14 @@ from thermocald.errors import ConfigurationError, UsageError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.device import (
+    USUAL_THERMOMETERS,
     CameraDevice,
     Programme,
     default_heat,
     read_camera_device,
     read_programme,
 )
-from thermocald.physics.heat import Course, HeatNetwork, Link, SimulatedThermometer
+from thermocald.physics.heat import Course, HeatNetwork, Link
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.physics.model_file import read_model
 from thermocald.physics.simulation import Simulation
@@ -144,12 +145,8 @@ def _device(preset: Preset) -> CameraDevice:
             Link("housing", "ambient", loss),
         ),
     )
-    thermometers = {
-        "temperature": SimulatedThermometer("lens"),
-        "board_temperature": SimulatedThermometer("board"),
-    }
     return CameraDevice(
-        preset.camera, preset.sensor, network, thermometers, distance=preset.distance_mm
+        preset.camera, preset.sensor, network, USUAL_THERMOMETERS, distance=preset.distance_mm
     )
 
 

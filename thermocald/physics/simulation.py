@@ -67,13 +67,19 @@ class Simulation:
 
     @cached_property
     def frame_times(self) -> Array:
-        """The frames' times (E,), s from the start."""
-        return self.programme.frame_times(self._rng(0))
+        """When frames are taken, (E,) s from the start, the first at 0, ascending."""
+        p, rng = self.programme, self._rng(0)
+        limit = 0.4 * p.interval
+        shift = np.clip(p.jitter * rng.standard_normal(p.epochs), -limit, limit)
+        shift[0] = 0.0
+        return np.arange(p.epochs) * p.interval + shift
 
     @cached_property
     def reading_times(self) -> Array:
-        """The readings' times (E,), s from the start."""
-        return self.programme.reading_times(self.frame_times, self._rng(1))
+        """When thermometers are read, (E,) s from the start, ascending."""
+        p = self.programme
+        spread = p.reading_spread * self._rng(1).uniform(-1.0, 1.0, p.epochs)
+        return np.asarray(np.maximum.accumulate(self.frame_times + p.reading_offset + spread))
 
     @cached_property
     def exterior(self) -> ExteriorOrientation:

@@ -199,24 +199,19 @@ def _interior(result: Photographs, sensor: Sensor) -> Table:
     values = () if result.interior is None else result.interior.as_array()
     sds = np.sqrt(np.diag(result.covariance)[:10])
 
-    def value(name: str, value: float, sd: float) -> str:
-        if not sd > 0:
-            return f"{plain(value, UNITS[name], 6)} (held)"
-        return with_sd(value, sd, UNITS[name])
-
-    def in_px(name: str, value: float, sd: float) -> str:
-        pitch = sensor.pixel_pitch
-        shown = sd > 0 and name in ("c", "x0", "y0")
-        return with_sd(value / pitch, sd / pitch, "px") if shown else ""
-
-    return Table.of(
+    pitch = sensor.pixel_pitch
+    rows = [
+        (
+            parameter_label(n),
+            with_sd(v, sd, UNITS[n]) if sd > 0 else f"{plain(v, UNITS[n], 6)} (held)",
+            with_sd(v / pitch, sd / pitch, "px") if sd > 0 and n in ("c", "x0", "y0") else "",
+        )
+        for n, v, sd in zip(IOP_NAMES, values, sds, strict=False)
+    ]
+    return Table(
         "Values",
-        list(zip(IOP_NAMES, values, sds, strict=False)),
-        {
-            "parameter": lambda r: parameter_label(r[0]),
-            "value ± sd": lambda r: value(*r),
-            "in px": lambda r: in_px(*r),
-        },
+        ("parameter", "value ± sd", "in px"),
+        tuple(rows),
         "The standard deviations hold the noise of the image points and the errors of the test "
         "field's coordinates; errors of the camera model they do not hold.",
     )

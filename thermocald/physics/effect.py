@@ -393,15 +393,17 @@ class Effect(ABC):
 
     def experiment_against(self, other: Effect) -> str:
         """Say what to do to tell this effect from another, and what one would see."""
-        for key, action in EXPERIMENTS.items():
-            mine, theirs = self.behaviour.get(key), other.behaviour.get(key)
+        answers = [
+            (action, self.behaviour.get(key), other.behaviour.get(key))
+            for key, action in EXPERIMENTS.items()
+        ]
+        for action, mine, theirs in answers:
             if mine and theirs and mine != theirs:
                 return f"{action}: {self.noun} {mine}, {other.noun} {theirs}"
-        for key, action in EXPERIMENTS.items():
-            mine, theirs = self.behaviour.get(key), other.behaviour.get(key)
+        for action, mine, theirs in answers:
             if mine or theirs:
-                mover, said = (self, mine) if mine else (other, theirs)
-                return f"{action}: {mover.noun} {said}"
+                said = f"{self.noun} {mine}" if mine else f"{other.noun} {theirs}"
+                return f"{action}: {said}"
         return f"record longer and under another programme than now ({self.noun}, {other.noun})"
 
 

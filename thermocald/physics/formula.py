@@ -407,10 +407,8 @@ def _say_constant(estimate: Values, parameter: Parameter) -> str:
     """Write an estimate; one that is not determined as about so much."""
     value, sd = estimate["value"], estimate["sd"]
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    if sd is None:
-        return f"about {value:.2g}{unit}"
-    if parameter.log and not sd <= abs(value):
-        return f"about {value:.3g}{unit}"
+    if sd is None or (parameter.log and not sd <= abs(value)):
+        return f"about {value:.{2 if sd is None else 3}g}{unit}"
     return say_estimate(estimate)
 
 

@@ -163,8 +163,11 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
     if not interior.get("c", 0.0) > 0:
         raise top.fail("interior.c", "is missing or not above 0 mm")
     exterior = group("exterior", EOP_NAMES)
+    for name in EOP_NAMES:
+        if exterior and name not in exterior:
+            raise top.fail(f"exterior.{name}", "is missing")
     rates = group("rates", RATED, "/K")
-    names, matrix = _read_covariance(top, document)
+    names, matrix = _read_covariance(top)
     return ThermalModel(
         camera=camera.text("name", "camera"),
         sensor=read_sensor(camera),
@@ -172,13 +175,13 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
         interior=InteriorOrientation.from_mapping({"c": 0.0, **interior}),
         rates=rates,
         effects=tuple(effect_of(reader) for reader in top.items("effects")),
-        exterior=_read_exterior(top, exterior),
+        exterior=ExteriorOrientation.from_mapping(exterior) if exterior else None,
         distortion=_read_distortion(top),
         image_sigma=top.number("image_sigma", "px", 0.04, above=0.0),
         sds=sds,
         covariance_names=names,
         covariance=matrix,
-        validity=_read_validity(top, document),
+        validity=_read_validity(top),
         fitted_on=tuple(document.get("fitted_on") or ()),
         evidence=dict(document.get("evidence") or {}),
         name=top.text("name", ""),
@@ -202,19 +205,10 @@ def read_sensor(camera: QuantityReader) -> Sensor:
     return Sensor(camera.whole("width", "px"), camera.whole("height", "px"), pitch)
 
 
-def _read_exterior(top: QuantityReader, values: dict[str, float]) -> ExteriorOrientation | None:
-    if not values:
-        return None
-    missing = [name for name in EOP_NAMES if name not in values]
-    if missing:
-        raise top.fail(f"exterior.{missing[0]}", "is missing")
-    return ExteriorOrientation.from_mapping(values)
-
-
 def _read_covariance(
-    top: QuantityReader, document: Mapping[str, Any]
+    top: QuantityReader,
 ) -> tuple[tuple[str, ...], tuple[tuple[float, ...], ...] | None]:
-    if document.get("covariance") is None:
+    if top.mapping.get("covariance") is None:
         return (), None
     reader = top.inner("covariance")
     names = tuple(str(n) for n in reader.mapping.get("parameters") or ())
@@ -229,11 +223,9 @@ def _read_covariance(
     return names, tuple(tuple(float(v) for v in row) for row in matrix)
 
 
-def _read_validity(
-    top: QuantityReader, document: Mapping[str, Any]
-) -> dict[str, tuple[float, float]]:
+def _read_validity(top: QuantityReader) -> dict[str, tuple[float, float]]:
     ranges: dict[str, tuple[float, float]] = {}
-    if document.get("validity") is None:
+    if top.mapping.get("validity") is None:
         return ranges
     reader = top.inner("validity")
     for channel, pair in reader.mapping.items():

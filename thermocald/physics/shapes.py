@@ -211,17 +211,9 @@ def _marker_polygons(dictionary: str, marker: int) -> tuple[tuple[float, Array],
     pattern = ~marker_cells(dictionary, marker)
     modules = len(pattern)
     result = [(1.0, _lay_box(0, 0, modules, modules) / modules)]
-    for y in range(modules):
-        x = 0
-        while x < modules:
-            if pattern[y, x]:
-                end = x
-                while end < modules and pattern[y, end]:
-                    end += 1
-                result.append((-1.0, _lay_box(x, y, end, y + 1) / modules))
-                x = end
-            else:
-                x += 1
+    for y, row in enumerate(pattern.astype(int)):
+        ends = np.flatnonzero(np.diff(row, prepend=0, append=0)).reshape(-1, 2)
+        result += [(-1.0, _lay_box(x0, y, x1, y + 1) / modules) for x0, x1 in ends.tolist()]
     return tuple(result)
 
 

@@ -7,9 +7,12 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
+import typer
 from typer.testing import CliRunner, Result
 
 from thermocald.cli import application, main
@@ -34,6 +37,7 @@ def call(*arguments: object, folder: Path | None = None) -> subprocess.Completed
         status = int(ended.code or 0)
     finally:
         os.chdir(before)
+    assert "Traceback" not in err.getvalue(), err.getvalue()
     return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
 
 
@@ -56,3 +60,12 @@ def succeed(*arguments: object, **environment: str) -> Result:
     result = invoke(*arguments, **environment)
     assert result.exit_code == 0, (result.output, result.exception)
     return result
+
+
+def every_command(command: Any = None, name: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the words of each command, and it itself."""
+    command = command or typer.main.get_command(application())
+    if not hasattr(command, "commands"):
+        yield " ".join(name), command
+    for key, value in getattr(command, "commands", {}).items():
+        yield from every_command(value, (*name, key))

@@ -329,7 +329,7 @@ QUICK = {(0o777, "a store, by the daemon"), (0o000, "a recording"), (0o000, "Par
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    return make_recording(tmp_path_factory.mktemp("recording") / "small", 60)
+    return make_recording(tmp_path_factory.mktemp("recording") / "small", 16)
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from thermocald.api import discover as discover
     from thermocald.api import fit as fit
     from thermocald.api import import_photographs as import_photographs
-    from thermocald.api import open as open  # noqa: A004
-    from thermocald.api import open_all as open_all
     from thermocald.api import plan as plan
     from thermocald.api import read_testfield as read_testfield
     from thermocald.api import reference_study as reference_study
@@ -38,6 +36,8 @@ if TYPE_CHECKING:
     from thermocald.results import Discovery as Discovery
     from thermocald.results import Study as Study
     from thermocald.series import Series as Series
+    from thermocald.series import open as open  # noqa: A004
+    from thermocald.series import open_all as open_all
     from thermocald.toolbox import check_testfield as check_testfield
     from thermocald.toolbox import compare_cameras as compare_cameras
     from thermocald.toolbox import convert_camera as convert_camera
@@ -56,13 +56,13 @@ _PLACES = {
     "analysis.series.epochs": "Epochs",
     "analysis.thermal.thermal_camera": "Along LiveCamera ThermalCamera load_camera",
     "api": (
-        "calibrate catalogue discover fit import_photographs open open_all plan read_testfield "
-        "reference_study simulate study"
+        "calibrate catalogue discover fit import_photographs plan read_testfield reference_study "
+        "simulate study"
     ),
     "photogrammetry.camera.camera_model": "ExteriorOrientation",
     "photogrammetry.field.testfield": "TestField",
     "results": "Calibration Discovery Study",
-    "series": "Series",
+    "series": "Series open open_all",
     "toolbox": (
         "check_testfield compare_cameras convert_camera correct fit_calibrations follow_scene "
         "measure predict survey_testfield"

@@ -15,14 +15,8 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camer
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.series import (
-    Series,
-    check_exterior,
-    free_names,
-    open_every_series,
-    open_series,
-    source_of,
-)
+from thermocald.series import Series, check_exterior, free_names, source_of
+from thermocald.series import open as open_series
 
 if TYPE_CHECKING:
     from thermocald.discovery.plan import Plan
@@ -34,30 +28,6 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int], None] | None
 Effects = Mapping[str, Mapping[str, Any]] | Iterable[str | Path] | Path
-
-
-def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
-    """Open a series: a recording's folder, a store, or `postgresql://…`.
-
-    series: which of a store, `CAMERA/SERIES` or `SERIES`; not needed where there is one. Frames
-    and observations are read when they are needed. Raises StoreError where nothing is there, or
-    several series fit; RecordingError names file, line and column.
-
-    >>> tc.open("M1")
-    <Series rpi-v2.1/M1: 150 epochs, 147 targets, 25.0 to 50.0 °C (reference: temperature)>
-    """
-    return open_series(source_of(source), series)
-
-
-def open_all(source: Path | str) -> list[Series]:
-    """Open every series of a store, a server or a recording's folder (then one).
-
-    Raises StoreError where nothing is there, DataError for a store without series.
-
-    >>> len(tc.open_all("thermocald.db"))
-    1
-    """
-    return open_every_series(source_of(source))
 
 
 def import_photographs(
@@ -102,7 +72,7 @@ def import_photographs(
     if out is None:
         return Series(recording)
     write_photographs(source_of(out), recording)
-    return open(out)
+    return open_series(out)
 
 
 def read_testfield(source: TestField | Path | str) -> TestField:
@@ -275,7 +245,14 @@ def fit(
         require_type(kind)
         if effects or model is not None or T0 is not None:
             raise UsageError(f"type {kind.camera}: effects and T0 are the type's; give no others")
-    listed, T0 = _structure(effects, model, T0)
+    start = _model_of(model)
+    listed = [] if start is None else list(start.effects)
+    for effect in _effects(effects):
+        if any(e.name == effect.name for e in listed):
+            raise UsageError(f"effect {effect.name} is given twice")
+        listed.append(effect)
+    if start is not None and T0 is None:
+        T0 = start.T0
     reduced = [reduce_series(one.observed(progress, jobs), strict=False) for one in series]
     check_names(listed, reduced)
     if isinstance(kind, ThermalModel):
@@ -309,7 +286,7 @@ def discover(
     from thermocald.discovery.entries import terms_of
     from thermocald.discovery.evidence import require_other_series
     from thermocald.discovery.result import discover_series
-    from thermocald.results import Discovery, as_result
+    from thermocald.results import Discovery
     from thermocald.thermal.reduce import reduce_together
 
     tell = say or (lambda _: None)
@@ -324,9 +301,8 @@ def discover(
     tell("reducing the epochs to normal equations")
     evidence = reduce_together(inputs, None if old is None else old.T0)
     found = discover_series(evidence, say, () if old is None else terms_of(old), jobs)
-    name = series.source.rsplit("/", 1)[-1]
-    found = replace(found, doubts=tuple(_doubts(every, evidence)))
-    return as_result(Discovery, found, name=name, before=old)
+    told = vars(found) | {"doubts": tuple(_doubts(every, evidence))}
+    return Discovery(**told, name=series.source.rsplit("/", 1)[-1], before=old)
 
 
 def plan(
@@ -438,7 +414,7 @@ def simulate(
     simulation.write(source_of(out), with_frames=frames, advance=progress or (lambda _: None))
     if model_out is not None:
         write_model(source_of(model_out), replace(simulated, exterior=simulation.exterior))
-    made = open(out)
+    made = open_series(out)
     made.simulation = simulation
     return made
 
@@ -475,18 +451,6 @@ def _model_of(model: ThermalCamera | ThermalModel | Path | str | None) -> Therma
     if isinstance(model, str | Path):
         return load_camera(model).model
     return model.model if isinstance(model, ThermalCamera) else model
-
-
-def _structure(
-    effects: Effects, model: ThermalCamera | ThermalModel | Path | str | None, T0: float | None
-) -> tuple[list[ModelEffect], float | None]:
-    start = _model_of(model)
-    listed = [] if start is None else list(start.effects)
-    for effect in _effects(effects):
-        if any(e.name == effect.name for e in listed):
-            raise UsageError(f"effect {effect.name} is given twice")
-        listed.append(effect)
-    return listed, start.T0 if start is not None and T0 is None else T0
 
 
 def _effects(given: Effects) -> list[ModelEffect]:

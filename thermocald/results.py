@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -33,14 +33,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
     from thermocald.physics.model import ThermalModel
     from thermocald.store.recording.head import CameraSpec
-
-
-_Kind = TypeVar("_Kind")
-
-
-def as_result(kind: type[_Kind], found: Any, **more: Any) -> _Kind:
-    """Return an object of a class with the fields of an object of its base class."""
-    return kind(**{f.name: getattr(found, f.name) for f in fields(found)}, **more)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

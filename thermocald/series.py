@@ -283,28 +283,41 @@ def _adjust(
     return table_of_stored(source, settings, exterior, jobs), source.observations
 
 
-def open_series(source: Path, name: str | None = None) -> Series:
-    """Open the one series of a source, or the one called `CAMERA/SERIES` or `SERIES`.
+def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
+    """Open a series: a recording's folder, a store, or `postgresql://…`.
 
-    Raises StoreError, listing what there is, where none or several fit.
+    series: which of a store, `CAMERA/SERIES` or `SERIES`; not needed where there is one. Frames
+    and observations are read when they are needed. Raises StoreError where nothing is there, or
+    several series fit; RecordingError names file, line and column.
+
+    >>> tc.open("M1")
+    <Series rpi-v2.1/M1: 150 epochs, 147 targets, 25.0 to 50.0 °C (reference: temperature)>
     """
-    if require_source(source).is_dir():
-        series = Series(open_recording(source))
-        if name not in (None, series.name, f"{series.camera}/{series.name}"):
-            raise DataError(f"{source}: is {series.camera}/{series.name}, not {name}")
-        return series
-    with open_source(source) as store:
-        return Series(store.only_series(name), source)
+    path = source_of(source)
+    if require_source(path).is_dir():
+        found = Series(open_recording(path))
+        if series not in (None, found.name, f"{found.camera}/{found.name}"):
+            raise DataError(f"{path}: is {found.camera}/{found.name}, not {series}")
+        return found
+    with open_source(path) as store:
+        return Series(store.only_series(series), path)
 
 
-def open_every_series(source: Path) -> list[Series]:
-    """Open every series of a source; DataError for a store without any."""
-    if require_source(source).is_dir():
-        return [Series(open_recording(source))]
-    with open_source(source) as store:
-        found = [Series(stored, source) for stored in store.all_series()]
+def open_all(source: Path | str) -> list[Series]:
+    """Open every series of a store, a server or a recording's folder (then one).
+
+    Raises StoreError where nothing is there, DataError for a store without series.
+
+    >>> len(tc.open_all("thermocald.db"))
+    1
+    """
+    path = source_of(source)
+    if require_source(path).is_dir():
+        return [open(path)]
+    with open_source(path) as store:
+        found = [Series(stored, path) for stored in store.all_series()]
     if not found:
-        raise DataError(f"{source_name(source)}: the store holds no series")
+        raise DataError(f"{source_name(path)}: the store holds no series")
     return found
 
 

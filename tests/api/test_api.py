@@ -33,7 +33,16 @@ def examples():
     return found
 
 
-@pytest.mark.parametrize("example", examples(), ids=lambda t: t.name)
+SLOW = {"thermocald.api.discover"}  # the command on the same series is tests/golden's
+
+
+@pytest.mark.parametrize(
+    "example",
+    [
+        pytest.param(t, marks=pytest.mark.slow if t.name in SLOW else (), id=t.name)
+        for t in examples()
+    ],
+)
 def test_an_example_of_a_docstring(inside, example):
     if "board" in example.docstring and not (inside / "board").is_dir():
         pytest.skip("the reference data are absent")

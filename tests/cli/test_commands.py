@@ -8,30 +8,22 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 
-import cv2
 import pytest
 
-from tests.commands import call
+import thermocald as tc
+from tests.commands import call as run
+from tests.pictures import write_markers
 from thermocald.cli.commands import COMMANDS
-from thermocald.physics.presets import preset_simulation
+from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.store.database.store import Store
-
-
-def run(*arguments):
-    done = call(*arguments)
-    assert "Traceback" not in done.stderr, done.stderr
-    return done
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """Forty epochs of a warming camera."""
     folder = tmp_path_factory.mktemp("recording") / "M1"
-    simulation = preset_simulation("rpi-v2.1-heating", 1, "M1", None)
-    short = replace(simulation, programme=replace(simulation.programme, epochs=40))
-    short.write(folder)
+    tc.simulate("rpi-v2.1-heating", seed=1, epochs=40, out=folder)
     return folder
 
 
@@ -151,27 +143,12 @@ def test_wrong_use_is_one_line(recording, tmp_path, arguments, status, words):
 
 def test_photographs_of_markers_give_the_camera(tmp_path):
     """Three rendered photographs of a corner field: c, x0, y0 within 4 sd of the truth."""
-    from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, Sensor
-    from thermocald.physics.scene import Scene
-    from thermocald.physics.testfields import demonstration_field, demonstration_model
-    from thermocald.store.recording.testfield_file import write_testfield
-
-    field = demonstration_field("markers")
-    model = replace(demonstration_model(field), sensor=Sensor(1640, 1232, 0.00224))
-    scene = Scene(model.sensor, field)
-    images = []
-    for k, turn in enumerate((0.0, 0.05, -0.05)):
-        e = model.exterior
-        moved = ExteriorOrientation(
-            e.omega, e.phi + turn, e.kappa + 20 * turn, e.X0 + 400 * turn, e.Y0, e.Z0
-        )
-        picture = scene.render(model.interior.as_array(), moved.as_array(), None, [k], 1.0)
-        images.append(tmp_path / f"{k}.png")
-        cv2.imwrite(str(images[-1]), picture)
-    write_testfield(tmp_path / "field.csv", field)
+    sensor = Sensor(1640, 1232, 0.00224)
+    model = write_markers(tmp_path, sensor)
+    images = [tmp_path / f"{k}.png" for k in range(3)]
     (tmp_path / "camera.yaml").write_text(
-        f"name: mock\nwidth: {model.sensor.width}\nheight: {model.sensor.height}\n"
-        f"pixel_pitch: {model.sensor.pixel_pitch}\n"
+        f"name: mock\nwidth: {sensor.width}\nheight: {sensor.height}\n"
+        f"pixel_pitch: {sensor.pixel_pitch}\n"
     )
     done = run("calibrate", *images, "--testfield", tmp_path / "field.csv",
                "--camera", tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
@@ -187,7 +164,7 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
     # The folder, and its pixel pitch by option; files for the next command and for people.
     out, page = tmp_path / "found.json", tmp_path / "page.html"
     done = run("calibrate", tmp_path, "--testfield", tmp_path / "field.csv", "--pixel-pitch",
-               model.sensor.pixel_pitch, "--camera-out", out, "--report", page)  # fmt: skip
+               sensor.pixel_pitch, "--camera-out", out, "--report", page)  # fmt: skip
     assert done.returncode == 0, done.stderr
     written = json.loads(out.read_text())
     c, sd = written["interior"]["c"], written["interior"]["sd_c"]
@@ -210,12 +187,12 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
 
 
 def test_the_demo_finds_what_was_put_in(tmp_path):
-    """Twelve epochs: drift found within 4 sd of the drift put in, and files that can be read."""
+    """Ten epochs: drift found within 4 sd of the drift put in, and files that can be read."""
     out = tmp_path / "demo"
-    done = run("demo", "--out", out, "--epochs", 12, "--no-discovery", "--json", "-")
+    done = run("demo", "--out", out, "--epochs", 10, "--no-discovery", "--json", "-")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
-    assert document["ok"] == 12
+    assert document["ok"] == 10
     assert document["targets"] >= 100
     for row in document["parameters"]:
         difference = row["drift_found_px"] - row["drift_in_px"]
@@ -243,52 +220,42 @@ def test_every_command_has_help_with_an_example():
 
 
 def test_without_a_configuration_run_says_where_it_looked(tmp_path):
-    done = call("run", folder=tmp_path)
+    done = run("run", folder=tmp_path)
     assert done.returncode == 2
     assert "./config.yaml" in done.stderr
     (tmp_path / "config.yaml").write_text("cameras: 3\n")
-    assert "config.yaml: cameras" in call("run", folder=tmp_path).stderr  # it is read
+    assert "config.yaml: cameras" in run("run", folder=tmp_path).stderr  # it is read
 
 
 def test_a_page_of_no_store_is_an_error(tmp_path):
-    done = call("dashboard", "--store", "no.db", folder=tmp_path)
+    done = run("dashboard", "--store", "no.db", folder=tmp_path)
     assert done.returncode == 1
     assert "does not exist" in done.stderr
 
 
-def resident_mb(imports):
-    """Resident memory of a process that imports something and waits."""
-    code = (
-        f"import {imports}\n"
-        "print([l for l in open('/proc/self/status') if l.startswith('VmRSS')][0].split()[1])"
-    )
+def printed_by(code):
+    """Words that a fresh interpreter prints."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return int(done.stdout) / 1024
+    return done.stdout.split()
 
 
 def test_what_only_some_commands_need_is_imported_by_those():
-    """OpenCV, SciPy and Matplotlib are half of the page's memory and of a command's start."""
-    code = (
+    """OpenCV, SciPy and Matplotlib are half of the page's memory and of a command's start; SciPy's
+    optimiser is 20 MB, and a camera as it is predicted, at a gauge, and in its series is without.
+    """
+    heavy = printed_by(
         "import sys, thermocald.cli, thermocald.output.dashboard.application\n"
         "thermocald.cli.application()\n"
-        "print(*sorted({'cv2', 'matplotlib', 'plotly', 'scipy'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
-
-
-def test_what_a_live_camera_needs_is_without_an_optimiser():
-    """A camera as it is predicted, at a gauge, and in its series: SciPy's optimiser is 20 MB."""
-    code = (
-        "import sys, thermocald as tc, thermocald.daemon.plan\n"
+        "print(*sorted({'cv2', 'matplotlib', 'plotly', 'scipy'} & set(sys.modules)))\n"
+        "import thermocald as tc, thermocald.daemon.plan\n"
         "import thermocald.analysis.thermal.gauge, thermocald.analysis.thermal.correction\n"
-        "import thermocald.analysis.online.running_series, thermocald.analysis.series.adjusted\n"
+        "import thermocald.analysis.online.running_series\n"
+        "import thermocald.analysis.series.adjusted\n"
         "tc.load_camera\n"
         "heavy = ('scipy.optimize', 'scipy.stats', 'scipy.spatial', 'scipy.integrate')\n"
         "print(*sorted(set(heavy) & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
+    assert heavy == []
 
 
 def test_the_daemon_s_imports_stay_small():
@@ -297,8 +264,13 @@ def test_the_daemon_s_imports_stay_small():
     The kernel maps more or less of the libraries' files, 41 to 65 MB for the same two: what is ours
     is the difference.
     """
-    ours = resident_mb(
-        "thermocald.acquisition.calibrator, thermocald.config, thermocald.hal, "
-        "thermocald.store.database.store, thermocald.acquisition.pipeline"
+    resident = (
+        "print([l for l in open('/proc/self/status') if l.startswith('VmRSS')][0].split()[1])"
     )
-    assert ours - resident_mb("numpy, cv2") < 80 - 41
+    libraries, ours = printed_by(
+        f"import numpy, cv2\n{resident}\n"
+        "import thermocald.acquisition.calibrator, thermocald.config, thermocald.hal\n"
+        "import thermocald.store.database.store, thermocald.acquisition.pipeline\n"
+        f"{resident}"
+    )
+    assert (int(ours) - int(libraries)) / 1024 < 80 - 41

@@ -79,7 +79,7 @@ CASES = [
 
 @pytest.mark.parametrize(("environment", "name"), CASES)
 def test_no_command_breaks_on_what_a_terminal_cannot_show(tmp_path, environment, name):
-    make_recording(tmp_path / "M1", 60)
+    make_recording(tmp_path / "M1", 24)
     os.rename(tmp_path / "M1", os.fsencode(tmp_path) + b"/" + name + b"M1")
     quoted = shlex.quote(os.fsdecode(name))
     lines = COMMANDS.strip().replace("«", quoted).replace("»", "")

@@ -10,9 +10,8 @@ import stat
 from contextlib import closing, suppress
 
 import pytest
-import typer
 
-from tests.commands import call
+from tests.commands import call, every_command
 from thermocald.cli import application, commands
 from thermocald.errors import OutputError
 from thermocald.files import check_output
@@ -73,16 +72,7 @@ def test_an_output_that_cannot_be_is_refused_before_the_work(option, tmp_path):
     assert lines[0].endswith("file is a file")
 
 
-def _leaves(command, name=()):
-    """Every command, by its words, with its options and arguments."""
-    for key, value in getattr(command, "commands", {}).items():
-        yield from _leaves(value, (*name, key))
-    if not hasattr(command, "commands"):
-        yield " ".join(name), command.params
-
-
-PROGRAM = typer.main.get_command(application())
-COMMANDS = dict(_leaves(PROGRAM))
+COMMANDS = {name: command.params for name, command in every_command()}
 
 
 def _kind(name: str, option: str) -> str | None:
@@ -151,7 +141,7 @@ def test_what_may_not_be_replaced_is_refused_before_the_work(
         if what == "a disk" and not place.exists():
             continue
         with pytest.raises(OutputError, match="cannot be written"):
-            PROGRAM.main([*words, given, str(place)], standalone_mode=False)
+            application()([*words, given, str(place)], standalone_mode=False)
         assert sorted(tmp_path.rglob("*")) == before
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import typer
 
+import thermocald as tc
 from thermocald.cli.commands import expert, subcommands
 from thermocald.cli.common import (
     DEFAULT_FREE,
@@ -65,8 +66,6 @@ def calibrate(
     Example: thermocald calibrate photos/ --testfield testfield.csv --pixel-pitch 0.00112
     --camera-out camera.json --report calibration.html
     """
-    import thermocald as tc
-
     if camera_out is not None and camera_out.suffix.lower() not in (".json", ".yaml", ".yml"):
         raise UsageError(
             f"{camera_out}: --camera-out writes .json or .yaml; for another program convert it "
@@ -105,8 +104,6 @@ def convert(
 
     Example: thermocald camera convert calibration.xml --to opencv --out camera.yaml
     """
-    import thermocald as tc
-
     found = tc.convert_camera(source, out, to, format=from_, pixel_pitch=pixel_pitch)
     show(found, json)
 
@@ -133,7 +130,6 @@ def at(
     Example: thermocald camera at camera.thermal.yaml --temperature 35 --to pyorc --renew site.json
     --reference clicked.jpg --frame now.jpg -o warm.json
     """
-    import thermocald as tc
     from thermocald.output import series_export
 
     if (to == "pyorc") != (renew is not None) or (renew is not None and out is None):
@@ -175,8 +171,6 @@ def diff(
 
     Example: thermocald camera diff cold.json warm.json
     """
-    import thermocald as tc
-
     found = tc.compare_cameras(cold, warm, pixel_pitch=pixel_pitch)
     if report is not None:
         found.report(report)
@@ -209,8 +203,6 @@ def predict(
 
     Example: thermocald predict --model camera.thermal.yaml --temperature 35
     """
-    import thermocald as tc
-
     thermal = warned(tc.load_camera(model))
     with warnings_said(), progress(None, "reading and measuring") as advance:
         found = tc.predict(
@@ -264,8 +256,6 @@ def correct(
 
     Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
     """
-    import thermocald as tc
-
     thermal = warned(tc.load_camera(model))
     done = tc.correct(
         points, thermal, log=log, log_options=log_options, to=to, temperature_sd=temperature_sd,
@@ -322,8 +312,6 @@ def measure(
     Example: thermocald measure points.csv --model camera.thermal.yaml --log weather.csv
     --control gcp.csv --seen 2026-05-04T09:00:00Z --plane water.yaml --length-unit m
     """
-    import thermocald as tc
-
     thermal = warned(tc.load_camera(model))
     with warnings_said():
         found = tc.measure(

@@ -120,8 +120,6 @@ def simulate(
 
     Example: thermocald simulate --preset rpi-v2.1-heating --out rpi-M1 --seed 1
     """
-    import thermocald as tc
-
     if list_:
         known = tc.catalogue()
         show(known, json)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import thermocald as tc
 from thermocald.cli.commands import expert, subcommands
 from thermocald.cli.common import (
     DEFAULT_FREE,
@@ -183,7 +184,6 @@ def find_series_tasks(sources: list[Path], out: Path, analysis: str) -> list[tup
 
 def analyse(analysis: str, sets: int, task: tuple[Path, Path]) -> Outcome:
     """Analyse one series and write its file, whole or not at all; sets: of a study."""
-    import thermocald as tc
     from thermocald.fleet.reprocess import Outcome
 
     source, target = task

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+import thermocald as tc
 from thermocald.cli.commands import expert, subcommands
 from thermocald.cli.common import ConfigOption, JsonOption, require_config, say, write_json
 from thermocald.errors import DataError, UsageError
@@ -57,7 +58,6 @@ def start(
 
     Example: thermocald session start --camera phone-1 --series M1 --start cold --epochs 150
     """
-    import thermocald as tc
     from thermocald.daemon import desk
 
     read = _configuration(config, mock)
@@ -157,8 +157,6 @@ def _finish(config: Config, session: Session, path: Path, report: bool) -> None:
     say(f"\nrecording: {path} ({int(np.sum(status == 'ok'))} of {len(status)} epochs calibrated)")
     if not report:
         return
-    import thermocald as tc
-
     target = path.with_suffix(".html")
     title = f"{session.camera}, series {session.series}"
     tc.study(*tc.open_all(path)).report(target, title)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+import thermocald as tc
 from thermocald.cli.commands import expert
 from thermocald.cli.common import (
     DEFAULT_FREE,
@@ -69,7 +70,6 @@ def replay(
 
     Example: thermocald replay photos --model camera.thermal.yaml --log weather.csv --timezone UTC
     """
-    import thermocald as tc
     from thermocald.store.recording.sense import doubt_lines
 
     if (model is None) != (log is None):
@@ -136,7 +136,6 @@ def export(
 
     Example: thermocald export M1 --units px,deg --time iso --separator ';' --decimal ',' -o M1.csv
     """
-    import thermocald as tc
     from thermocald.output import series_export
     from thermocald.store.recording.parquet_table import write_parquet
 
@@ -202,8 +201,6 @@ def study(
 
     Example: thermocald study M1 M2 --report study.html --json study.json
     """
-    import thermocald as tc
-
     if reference == bool(inputs):
         raise UsageError(
             "give recordings or stores to study, or --reference"
@@ -230,8 +227,6 @@ def study(
 
 
 def _study(inputs: list[str], settings: dict[str, Any], exterior: str, free: str) -> Study:
-    import thermocald as tc
-
     labels: list[str | None] = []
     series: list[tc.Series] = []
     for text in inputs:
@@ -275,8 +270,6 @@ def discover(
 
     Example: thermocald discover M1 --verify M2 --model-out camera.yaml --report discovery.html
     """
-    import thermocald as tc
-
     if plan:
         with progress(None, "planning") as advance:
             planned = tc.plan(
@@ -347,8 +340,6 @@ def fit(
 
     Example: thermocald fit 21.5=cold.json 48=warm.json -o camera.thermal.yaml
     """
-    import thermocald as tc
-
     calibrations = _temperatures(inputs)
     if calibrations:
         if effect or model or type_name:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import thermocald as tc
 from thermocald.cli.commands import expert, subcommands
 from thermocald.cli.common import JsonOption, PhotosArgument, PixelPitchOption, say, show, takes
 from thermocald.errors import UsageError
@@ -213,8 +214,6 @@ def survey(
     Example: thermocald testfield survey photos/ --field field/testfield.csv --scale R65 R89 340.12
     --out surveyed.csv
     """
-    import thermocald as tc
-
     result = tc.survey_testfield(
         photos, scale=scale, scale_sd=scale_sd, distances=distances, field=field, camera=camera,
         hold_camera=hold_camera, pixel_pitch=pixel_pitch, out=out, camera_out=camera_out, say=say,
@@ -254,7 +253,6 @@ def check(
 
     Example: thermocald testfield check field/testfield.csv --from 900 900 700
     """
-    import thermocald as tc
     from thermocald.output.testfield.layout import field_of, lay_out
 
     drawn = _design(paper, flat, landscape, diameter)

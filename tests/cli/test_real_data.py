@@ -10,18 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.commands import call
+from tests.commands import call as run
+from tests.golden.workshop import walls
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-
-
-def run(*arguments):
-    """The command as a user calls it: exit status, standard output, standard error."""
-    done = call(*arguments)
-    assert "Traceback" not in done.stderr
-    return done
 
 
 @pytest.mark.slow
@@ -48,35 +42,11 @@ def test_fixed_cameras(shared, camera, exterior):
     assert [p["name"] for p in document["parameters"]] == ["c", "x0", "y0"]
 
 
-def frc_inputs(shared, folder):
-    """The official field in our format; corner 0 of these tags is the bottom right one."""
-    corner = {
-        "viewer_bottom_right": 0, "viewer_bottom_left": 1,
-        "viewer_top_left": 2, "viewer_top_right": 3,
-    }  # fmt: skip
-    field = folder / "field.csv"
-    with (shared / "data" / "frc" / "targets.csv").open() as source, field.open("w") as out:
-        writer = csv.writer(out)
-        writer.writerow(["target", "X", "Y", "Z", "diameter", "sX", "sY", "sZ", "kind", "code"])
-        for row in csv.DictReader(source):
-            k, tag = corner[row["corner"]], row["tag_id"]
-            writer.writerow(
-                [f"{tag}.{k}", row["X_mm"], row["Y_mm"], row["Z_mm"], "", 5, 5, 5,
-                 "marker_corner", f"DICT_APRILTAG_36h11:{tag}:{k}"]
-            )  # fmt: skip
-    camera = folder / "camera.yaml"
-    camera.write_text(
-        "name: lifecam\nwidth: 1280\nheight: 720\npixel_pitch: 0.001\n"
-        "interior: {c: 1.1275, x0: -0.0139, y0: 0.0272}\n"
-    )
-    return field, camera
-
-
 def test_tags_on_walls(shared, tmp_path):
     """A pose where there are tags enough, a reason elsewhere; never a camera from 1 to 3 tags."""
-    field, camera = frc_inputs(shared, tmp_path)
-    images = sorted((shared / "data" / "frc").glob("*.jpg"))
-    done = run("calibrate", *images, "--testfield", field, "--camera", camera, "--json", "-")
+    walls(tmp_path)
+    done = run("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv",
+               "--camera", tmp_path / "lifecam.yaml", "--json", "-")  # fmt: skip
     assert done.returncode == 0
     document = json.loads(done.stdout)
     assert document["status"] == "weak_geometry"
@@ -94,9 +64,8 @@ def test_tags_on_walls(shared, tmp_path):
 
 
 def test_without_a_camera_tags_on_walls_give_nothing(shared, tmp_path):
-    field, _ = frc_inputs(shared, tmp_path)
-    images = sorted((shared / "data" / "frc").glob("*.jpg"))
-    done = run("calibrate", *images, "--testfield", field)
+    walls(tmp_path)
+    done = run("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv")
     assert done.returncode == 1
     assert "error: no photograph has a result" in done.stderr
 

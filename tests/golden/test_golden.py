@@ -18,8 +18,8 @@ def workshop(tmp_path_factory):
     return Workshop(tmp_path_factory.mktemp("golden"))
 
 
-CORPUS_TOO = ("blind-time-offset", "blind-pair")
-"""What the corpora of the slow suite hold sixty times over."""
+CORPUS_TOO = ("blind-time-offset", "blind-pair", "real-lag")
+"""What the corpora of the slow suite hold a hundred times over."""
 
 
 @pytest.mark.parametrize(

@@ -37,19 +37,20 @@ def column(table: list[dict[str, str]], name: str) -> np.ndarray:
     return np.array([float(r[name]) for r in table])
 
 
+def exported(source: Path, out: Path, *more: str) -> list[dict[str, str]]:
+    """The table that `export` writes of a recording or a store."""
+    assert call("export", source, *more, "-o", out).returncode == 0
+    return rows(out)
+
+
 def live_and_replayed(forker: Forker, recording: Path, folder: Path):
     """Both tables of a recording, and what the daemon said on the way."""
     own = folder / recording.name
     if own != recording:
         shutil.copytree(recording, own)
     store = folder / "live.db"
-    run = forker.start(folder, "run", "--recording", str(own), "--fast", "--store", str(store))
-    said = run.said(300)
-    assert run.returncode == 0, said
-    assert "Traceback" not in said
-    assert call("export", store, "--extra", "-o", folder / "live.csv").returncode == 0
-    assert call("export", own, "-o", folder / "replay.csv").returncode == 0
-    return rows(folder / "live.csv"), rows(folder / "replay.csv"), said
+    said = played(forker, own, store)
+    return exported(store, folder / "live.csv", "--extra"), exported(own, folder / "r.csv"), said
 
 
 def agree(live: list[dict[str, str]], replayed: list[dict[str, str]]) -> None:
@@ -187,28 +188,32 @@ def test_names_of_targets_that_are_exchanged(shared, forker, tmp_path):
             writer.writeheader()
             for row in seen:
                 writer.writerow(row | {"target": told.get(row["target"], row["target"])})
-        assert call("export", out, "-o", tmp_path / f"{name}.csv").returncode == 0
-        replays.append(rows(tmp_path / f"{name}.csv"))
+        replays.append(exported(out, tmp_path / f"{name}.csv"))
     assert len(good(replays[0])) == len(good(replays[1])) == 41
     for name in MAIN:
         (a, b), sds = (column(r, name) for r in replays), [column(r, f"sd_{name}") for r in replays]
         assert np.abs(a - b).max() < 0.05 * sds[1].min()
         np.testing.assert_allclose(*sds, rtol=2e-3)
-    live, replayed, _ = live_and_replayed(forker, tmp_path / "exchanged", tmp_path)
-    agree(live, replayed)
+    played(forker, tmp_path / "exchanged", tmp_path / "live.db")
+    agree(exported(tmp_path / "live.db", tmp_path / "live.csv", "--extra"), replays[0])
 
 
-def played(forker: Forker, recording: Path, store: Path, kill_at: int = 0) -> None:
-    """Play a recording into a store; kill the program as soon as it holds so many epochs."""
+def played(forker: Forker, recording: Path, store: Path, kill_at: int = 0) -> str:
+    """Play a recording into a store; kill the program as soon as it holds so many epochs.
+
+    Returns what it said where it was not killed.
+    """
     words = ("run", "--recording", str(recording), "--fast", "--store", str(store))
-    process = forker.start(recording.parent, *words)
+    process = forker.start(recording.parent, *words, log=f"{store.stem}-{recording.name}.txt")
     try:
         while kill_at and process.poll() is None and stored(store) < kill_at:
             time.sleep(0.02)
         if kill_at:
             assert process.poll() is None, "it ended before it was killed"
-            return
-        assert process.wait(600) == 0
+            return ""
+        assert process.wait(600) == 0, process.printed()
+        assert "Traceback" not in process.printed()
+        return process.printed()
     finally:
         process.kill()
         process.wait()
@@ -234,8 +239,8 @@ def restarted(forker: Forker, recording: Path, folder: Path, kill_at: int) -> np
         if kill:
             first = int(rows(recording / "epochs.csv")[stored(store)]["epoch"])
             played(forker, part_of(recording, folder / "rest", first), store)
-        assert call("export", store, "--extra", "-o", folder / f"{name}.csv").returncode == 0
-        tables.append({r["frame_time"]: r for r in rows(folder / f"{name}.csv")})
+        table = exported(store, folder / f"{name}.csv", "--extra")
+        tables.append({r["frame_time"]: r for r in table})
     whole, killed = tables
     assert list(whole) == list(killed)
     rest = list(whole)[kill_at:]
@@ -278,8 +283,7 @@ def beginning(forker, tmp_path_factory):
     (folder / "config.yaml").write_text(text.replace("period_s: 10", "period_s: 1"))
     done = forker.start(folder, "run", "--config", "config.yaml", "--epochs", "5")
     assert done.wait(120) == 0, done.printed()
-    assert call("export", folder / "thermocald.db", "-o", folder / "rows.csv").returncode == 0
-    return rows(folder / "rows.csv")
+    return exported(folder / "thermocald.db", folder / "rows.csv")
 
 
 def test_the_shipped_configuration_begins_well(beginning):

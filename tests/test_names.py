@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +12,7 @@ import pytest
 import yaml
 from hypothesis import given, settings, strategies
 
+import thermocald as tc
 from tests.commands import call
 from tests.drivers.fakes.sysfs import Sysfs
 from tests.store.test_crafted import change
@@ -27,7 +27,6 @@ from thermocald.names import channel_fault, require_channels
 from thermocald.output.dashboard.view import View
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.reader import read_recording, write_recording
@@ -81,8 +80,7 @@ def test_every_column_that_an_epoch_can_have_is_ours(tmp_path):
     plan = SimpleNamespace(name="cam", series="M1")
     row = result_row(plan, Epoch(1, 0.0, 0.0, {}), None, {})
     recording = tmp_path / "M1"
-    simulation = preset_simulation("rpi-v2.1-heating", 1, "M1", None)
-    replace(simulation, programme=replace(simulation.programme, epochs=12)).write(recording)
+    tc.simulate("rpi-v2.1-heating", seed=1, epochs=12, out=recording)
     call("replay", recording, "--store", tmp_path / "s.db")
     call("export", recording, "-o", tmp_path / "x.csv")
     with Store.open(tmp_path / "s.db") as store:
@@ -154,8 +152,7 @@ def test_a_label_of_the_kernel_that_is_no_name_gives_way_to_the_input(tmp_path, 
 
 
 def test_a_recording_with_a_column_of_ours_is_refused_when_it_is_opened(tmp_path):
-    simulation = preset_simulation("rpi-v2.1-heating", 1, "M1", None)
-    replace(simulation, programme=replace(simulation.programme, epochs=6)).write(tmp_path / "M1")
+    tc.simulate("rpi-v2.1-heating", seed=1, epochs=6, out=tmp_path / "M1")
     path = tmp_path / "M1/recording.yaml"
     path.write_text(path.read_text().replace("temperature:", "sigma0:", 1))
     with pytest.raises(RecordingError, match="'sigma0'"):

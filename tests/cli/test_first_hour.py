@@ -21,15 +21,16 @@ import yaml
 
 from tests.commands import succeed as run
 from tests.docs.blocks import blocks
+from tests.docs.worlds import put_photographs
 from tests.drivers.fakes.adb_server import AdbServer, FakePhone
 from tests.photogrammetry import board_images
 from tests.photogrammetry.network_cases import looking_at
-from tests.photogrammetry.printed_sheets import photograph, put_up
-from thermocald.output.testfield.layout import TRIM, paper_size
+from tests.photogrammetry.printed_sheets import photograph
+from tests.pictures import FOCAL, MODEL, TAKEN, save_photograph
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.store.recording.testfield_file import read_testfield
 
-Image = pytest.importorskip("PIL.Image")
+pytest.importorskip("PIL.Image")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 SENSOR = Sensor(1640, 1232, 0.00224)
@@ -53,14 +54,10 @@ def temperature_of(epoch):
 
 
 def write_photograph(file, grey, moment, model="imx219", **tags):
-    """A JPEG with EXIF into a path or a buffer; tags: further ones of the inner directory."""
-    exif = Image.Exif()
-    exif[0x0110] = model
-    inner = exif.get_ifd(0x8769)
-    inner[0x9003] = moment.strftime("%Y:%m:%d %H:%M:%S")
-    inner[0x920A] = 3.04
-    inner.update({int(number, 16): value for number, value in tags.items()})
-    Image.fromarray(grey).save(file, format="JPEG", exif=exif, quality=95)
+    """A JPEG with EXIF into a path or a buffer; tags: further ones."""
+    told = {MODEL: model, TAKEN: moment.strftime("%Y:%m:%d %H:%M:%S"), FOCAL: 3.04}
+    more = {int(number, 16): value for number, value in tags.items()}
+    save_photograph(file, told | more, grey, format="JPEG", quality=95)
 
 
 def write_log(path):
@@ -82,17 +79,7 @@ def corner(tmp_path_factory):
     a, b, nominal = re.search(
         r"measure (\w+) to (\w+) \(nominal ([\d.]+) mm", printed.stdout
     ).groups()
-    page = paper_size("A3", landscape=True)
-    sheets = put_up(place / "field" / "testfield.pdf", page, TRIM)
-    middle = read_testfield(place / "field" / "testfield.csv").points.mean(axis=0)
-    (place / "survey").mkdir()
-    rng = np.random.default_rng(0)
-    for i in range(8):
-        direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
-        where = middle + 680.0 * direction / np.linalg.norm(direction)
-        station = looking_at(where, middle, (i % 4) * np.pi / 2)
-        frame = photograph(sheets, camera_at(20.0), station, seed=i, finer=2)
-        cv2.imwrite(str(place / "survey" / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    sheets, middle = put_photographs(place, "survey")
     run(
         "testfield", "survey", place / "survey", "--field", place / "field" / "testfield.csv",
         "--scale", a, b, nominal, "--scale-sd", 0.2, "--pixel-pitch", SENSOR.pixel_pitch, "--out",

@@ -9,12 +9,23 @@ import numpy as np
 import pytest
 
 from tests.commands import invoke, succeed
+from tests.pictures import (
+    F35,
+    FOCAL,
+    MAKE,
+    MODEL,
+    OFFSET,
+    SERIAL,
+    SUBSECONDS,
+    TAKEN,
+    save_photograph,
+)
 from thermocald.errors import ThermocaldError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.recording.reader import read_recording
 from thermocald.store.recording.testfield_file import write_testfield
 
-Image = pytest.importorskip("PIL.Image")
+pytest.importorskip("PIL.Image")
 START = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()
 
 
@@ -23,17 +34,10 @@ def run(*arguments):
 
 
 def photograph(path, local, subsec="", offset="", size=(64, 48), focal=(304, 100), f35=29):
-    exif = Image.Exif()
-    exif[0x010F], exif[0x0110] = "RaspberryPi", "imx219"
-    inner = exif.get_ifd(0x8769)
-    if local:
-        inner[0x9003] = local
-    if subsec:
-        inner[0x9291] = subsec
-    if offset:
-        inner[0x9011] = offset
-    inner[0x920A], inner[0xA405] = focal[0] / focal[1], f35
-    Image.fromarray(np.full(size[::-1], 90, np.uint8)).save(path, exif=exif)
+    tags = {MAKE: "RaspberryPi", MODEL: "imx219", TAKEN: local, SUBSECONDS: subsec, OFFSET: offset,
+            FOCAL: focal[0] / focal[1], F35: f35}  # fmt: skip
+    grey = np.full(size[::-1], 90, np.uint8)
+    save_photograph(path, {tag: value for tag, value in tags.items() if value}, grey)
 
 
 @pytest.fixture
@@ -226,22 +230,15 @@ def log_of(place, values, head="Time;Temperature", step=15):
 
 @pytest.mark.parametrize(
     "other",
-    [{"make": "Canon"}, {"model": "imx477"}, {"focal": 6.0}, {"serial": "B2"}, {"nothing": True},
-     {"model": ""}],
+    [{MAKE: "Canon"}, {MODEL: "imx477"}, {FOCAL: 6.0}, {SERIAL: "B2"},
+     dict.fromkeys((MAKE, MODEL, SERIAL, FOCAL)), {MODEL: ""}],
 )  # fmt: skip
 def test_the_photograph_of_another_camera_is_refused(place, other):
     for i in range(6):
-        exif = Image.Exif()
-        odd = other if i == 3 else {}
-        exif[0x010F], exif[0x0110] = odd.get("make", "RaspberryPi"), odd.get("model", "imx219")
-        inner = exif.get_ifd(0x8769)
-        inner[0x9003], inner[0xA431] = f"2026:06:14 12:00:{10 * i:02d}", odd.get("serial", "A1")
-        inner[0x920A], inner[0xA405] = odd.get("focal", 3.04), 29
-        if odd.get("nothing"):
-            del exif[0x010F], exif[0x0110], inner[0xA431], inner[0x920A]
-        Image.fromarray(np.full((48, 64), 90 + i, np.uint8)).save(
-            place / "photos" / f"{i}.jpg", exif=exif
-        )
+        tags = {MAKE: "RaspberryPi", MODEL: "imx219", SERIAL: "A1", FOCAL: 3.04, F35: 29,
+                TAKEN: f"2026:06:14 12:00:{10 * i:02d}", **(other if i == 3 else {})}  # fmt: skip
+        known = {tag: value for tag, value in tags.items() if value is not None}
+        save_photograph(place / "photos" / f"{i}.jpg", known, np.full((48, 64), 90 + i, np.uint8))
     with pytest.raises(ThermocaldError, match=r"3\.jpg is of .*one recording is of one camera"):
         run(*arguments(place, "--timezone", "Europe/Berlin"))
     assert not (place / "M1").exists()

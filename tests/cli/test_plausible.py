@@ -11,6 +11,7 @@ import pytest
 import thermocald as tc
 from tests.cli.test_import import arguments, photograph, place, run
 from tests.commands import invoke
+from tests.pictures import FOCAL, TAKEN, save_photograph
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor, project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -76,7 +77,7 @@ def test_photographs_of_another_focal_length_are_flagged_at_calibrate(tmp_path, 
 
 def test_binned_photographs_are_flagged_at_import_where_exif_knows_the_focal_length_alone(tmp_path):
     """820 px of a sensor of 3280 with the sensor's own pitch: a quarter of c is found."""
-    Image = pytest.importorskip("PIL.Image")
+    pytest.importorskip("PIL.Image")
     field = demonstration_field("markers")
     model = demonstration_model(field)
     sensor = Sensor(820, 616, 0.00448)
@@ -86,10 +87,8 @@ def test_binned_photographs_are_flagged_at_import_where_exif_knows_the_focal_len
     (tmp_path / "photos").mkdir()
     rows = ["time,temperature"]
     for i in range(3):
-        exif = Image.Exif()
-        inner = exif.get_ifd(0x8769)
-        inner[0x9003], inner[0x920A] = f"2026:06:14 12:00:{10 * i:02d}", 3.04
-        Image.fromarray(pixels).save(tmp_path / "photos" / f"{i}.jpg", exif=exif, quality=95)
+        tags = {TAKEN: f"2026:06:14 12:00:{10 * i:02d}", FOCAL: 3.04}
+        save_photograph(tmp_path / "photos" / f"{i}.jpg", tags, pixels, quality=95)
         rows.append(f"2026-06-14T12:00:{10 * i:02d},{20 + i}")
     (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
     write_testfield(tmp_path / "field.csv", field)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import thermocald as tc
 from tests.commands import succeed as run
 from thermocald.cli import common
 from thermocald.daemon.desk import Progress
 from thermocald.errors import ThermocaldError, UsageError
 from thermocald.numbers import duration, with_sd
-from thermocald.physics.presets import preset_simulation
 from thermocald.physics.testfields import corner_field
 
 
@@ -22,8 +21,8 @@ def minute(tmp_path_factory):
     """Seven epochs: a minute. In a folder whose name is longer than a terminal is wide."""
     place = tmp_path_factory.mktemp("texts") / ("a-long-name-of-a-folder-" * 4)
     place.mkdir()
-    s = preset_simulation("rpi-v2.1-heating", seed=1, field=corner_field("circles", 4, 150.0))
-    replace(s, programme=replace(s.programme, epochs=7)).write(place / "M1")
+    field = corner_field("circles", 4, 150.0)
+    tc.simulate("rpi-v2.1-heating", seed=1, testfield=field, epochs=7, out=place / "M1")
     return place / "M1"
 
 

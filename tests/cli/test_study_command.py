@@ -3,20 +3,18 @@
 import json
 import re
 import shutil
-from dataclasses import replace
 from functools import partial
 
 import pytest
 
+import thermocald as tc
 from tests.commands import invoke
 from thermocald.errors import DataError, OutputError, ThermocaldError, UsageError
-from thermocald.physics.presets import preset_simulation
 
 
 def written(path, seed):
     """A recording of 60 epochs of the warm phone."""
-    simulation = preset_simulation("nexus5-warm", seed)
-    replace(simulation, programme=replace(simulation.programme, epochs=60)).write(path)
+    tc.simulate("nexus5-warm", seed=seed, epochs=60, out=path)
     return path
 
 
@@ -121,11 +119,7 @@ def test_a_file_that_is_no_store_is_one_error(run, tmp_path):
 
 @pytest.mark.slow
 def test_frames_that_are_not_measured_yet_are_measured_and_clipped(run, tmp_path):
-    from dataclasses import replace
-
-    simulation = preset_simulation("rpi-v2.1-heating", 3)
-    simulation = replace(simulation, programme=replace(simulation.programme, epochs=3))
-    simulation.write(tmp_path / "frames", with_frames=True)
+    tc.simulate("rpi-v2.1-heating", seed=3, epochs=3, frames=True, out=tmp_path / "frames")
     result = run(
         tmp_path / "frames", "--sets", "200", "--free", "c,x0,y0", "--report", tmp_path / "r.html"
     )

@@ -13,14 +13,14 @@ import pytest
 import yaml
 
 from tests.commands import answer as run
+from tests.pictures import MODEL, TAKEN, save_photograph, write_markers
 from thermocald.errors import ThermocaldError
 from thermocald.photogrammetry import camera_files
-from thermocald.photogrammetry.camera.camera_model import CameraModel, ExteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.camera_files import read_camera
 from thermocald.physics.device import CameraDevice, Programme, default_heat
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect
-from thermocald.physics.scene import Scene
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.recording.testfield_file import write_testfield
@@ -334,11 +334,9 @@ def test_images_are_never_overwritten(folder, two_images):
 def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
     """Of one that is unreadable the line is said; the other is corrected."""
     image_module = pytest.importorskip("PIL.Image")
-    exif = image_module.Exif()
-    exif[0x0110] = "imx219"
-    exif.get_ifd(0x8769)[0x9003] = "2026:06:14 12:00:00"
     grey = np.random.default_rng(1).integers(0, 255, (308, 410), np.uint8)
-    image_module.fromarray(grey).save(tmp_path / f"a.{kind}", exif=exif)
+    tags = {MODEL: "imx219", TAKEN: "2026:06:14 12:00:00"}
+    save_photograph(tmp_path / f"a.{kind}", tags, grey)
     (tmp_path / f"b.{kind}").write_bytes(b"no picture")
     times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
     rows = f"{times[40]:.2f},b.{kind}\n{times[45]:.2f},a.{kind}\n"
@@ -350,8 +348,8 @@ def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
     assert "is not an image" in json.loads(result.stdout)["refused"][0]["reason"]
     with image_module.open(tmp_path / "out" / f"a.{kind}") as written:
         told = written.getexif()
-        assert told[0x0110] == "imx219"
-        assert told.get_ifd(0x8769)[0x9003] == "2026:06:14 12:00:00"
+        assert told[MODEL] == "imx219"
+        assert told.get_ifd(0x8769)[TAKEN] == "2026:06:14 12:00:00"
         assert np.asarray(written).shape == (308, 410)
 
 
@@ -448,29 +446,14 @@ def test_the_program_s_own_description_stays_one(tmp_path):
     assert read_camera(path).interior is None
 
 
-@pytest.fixture(scope="module")
-def photographs(tmp_path_factory, camera):
-    path = tmp_path_factory.mktemp("photographs")
-    field = demonstration_field("markers")
-    e = demonstration_model(field).exterior
-    scene = Scene(camera.sensor, field)
-    for k, turn in enumerate((0.0, 0.05, -0.05)):
-        pose = ExteriorOrientation(
-            e.omega, e.phi + turn, e.kappa + 20 * turn, e.X0 + 400 * turn, e.Y0, e.Z0
-        )
-        picture = scene.render(camera.interior.as_array(), pose.as_array(), None, [k], 1.0)
-        cv2.imwrite(str(path / f"{k}.png"), picture)
-    write_testfield(path / "field.csv", field)
-    return path
-
-
 @pytest.mark.slow
-def test_calibrate_starts_from_the_camera_of_another_program(photographs, tmp_path, camera):
+def test_calibrate_starts_from_the_camera_of_another_program(tmp_path, camera):
+    write_markers(tmp_path, interior=camera.interior)
     path = tmp_path / f"camera{camera_files.FORMATS['opencv'].suffix}"
     near = CameraModel(camera.sensor, camera.interior.with_values(c=camera.interior.c * 1.01))
     camera_files.write(near, path, "opencv")
-    images = sorted(photographs.glob("*.png"))
-    result = run("calibrate", *images, "--testfield", photographs / "field.csv", "--camera", path,
+    images = sorted(tmp_path.glob("*.png"))
+    result = run("calibrate", *images, "--testfield", tmp_path / "field.csv", "--camera", path,
                  "--json", "-")  # fmt: skip
     assert result.exit_code == 0, result.exception
     interior = json.loads(result.stdout)["interior"]

@@ -11,27 +11,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
-from PIL import Image
 
+import thermocald as tc
 from tests.commands import succeed as run
 from tests.docs.blocks import ROOT, blocks
 from tests.photogrammetry import network_cases
-from tests.photogrammetry.printed_sheets import photograph, put_up
+from tests.photogrammetry.printed_sheets import Sheet, photograph, put_up
+from tests.pictures import TAKEN, save_photograph, write_markers
 from thermocald.output.testfield.layout import TRIM, paper_size
 from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
     InteriorOrientation,
     Sensor,
 )
-from thermocald.physics.heat import Course
-from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import write_model
-from thermocald.physics.presets import preset_simulation
-from thermocald.physics.scene import Scene
 from thermocald.physics.testfields import corner_field, demonstration_field, demonstration_model
 from thermocald.store.recording.testfield_file import read_testfield, write_testfield
-
-LAG = ModelEffect("thermal_lag", {"tau": 70.0})
 
 
 @cache
@@ -39,11 +34,11 @@ def recordings(shelf: Path) -> tuple[Path, Path]:
     """M1 and M2 of a Raspberry Pi camera with a lag, heated differently."""
     paths = []
     for series, seed, until, power in (("M1", 1, 600.0, 9.0), ("M2", 2, 800.0, 6.5)):
-        s = preset_simulation("rpi-v2.1-heating", seed=seed, series=series)
-        lamp = Course.steps([0, 80.0, until, 1e5], [0.0, power, 0.0])
-        programme = replace(s.programme, sources={"housing": lamp})
-        s = replace(s, model=replace(s.model, effects=(LAG,)), programme=programme)
-        s.write(shelf / series)
+        tc.simulate(
+            "rpi-v2.1-heating", effects={"thermal_lag": {"tau": 70.0}}, own_effects=False,
+            lamp=[(0.0, 0.0), (80.0, power), (until, 0.0)], seed=seed, series=series,
+            out=shelf / series,
+        )  # fmt: skip
         paths.append(shelf / series)
     return paths[0], paths[1]
 
@@ -110,21 +105,21 @@ def put_config(folder: Path, name: str, store: str = "thermocald.db") -> None:
     (folder / "config.yaml").write_text(yaml.safe_dump(document))
 
 
-def put_photographs(folder: Path) -> None:
-    """Eight photographs of the corner whose PDF was printed into `field/`."""
+def put_photographs(folder: Path, into: str = "photos") -> tuple[list[Sheet], np.ndarray]:
+    """Eight photographs of the corner that was printed into `field/`; its sheets and middle."""
     page = paper_size("A3", landscape=True)
     sheets = put_up(folder / "field" / "testfield.pdf", page, TRIM)
     middle = read_testfield(folder / "field" / "testfield.csv").points.mean(axis=0)
     camera = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02, -0.01, -2e-3))
-    (folder / "photos").mkdir(exist_ok=True)
+    (folder / into).mkdir(exist_ok=True)
     rng = np.random.default_rng(0)
     for i in range(8):  # stations that see all three sheets, every second one turned by 90°
         direction = np.ones(3) + rng.uniform(-0.45, 0.45, 3)
         where = middle + 680.0 * direction / np.linalg.norm(direction)
         station = network_cases.looking_at(where, middle, (i % 4) * np.pi / 2)
         frame = photograph(sheets, camera, station, seed=i, finer=2)
-        path = str(folder / "photos" / f"{i}.jpg")
-        cv2.imwrite(path, frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        cv2.imwrite(str(folder / into / f"{i}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    return sheets, middle
 
 
 def photographs_with_times(shelf: Path, folder: Path) -> None:
@@ -133,10 +128,8 @@ def photographs_with_times(shelf: Path, folder: Path) -> None:
     (folder / "photos").mkdir()
     rows = []
     for i in range(4):
-        exif = Image.Exif()
-        exif.get_ifd(0x8769)[0x9003] = f"2026:06:14 12:00:{10 * i:02d}"
-        picture = Image.fromarray(np.full((48, 64), 90, np.uint8))
-        picture.save(folder / "photos" / f"{i}.jpg", exif=exif)
+        tags = {TAKEN: f"2026:06:14 12:00:{10 * i:02d}"}
+        save_photograph(folder / "photos" / f"{i}.jpg", tags)
         rows.append(f"14.06.2026 12:00:{10 * i:02d};{20 + i},5")
     (folder / "logger.csv").write_text("Zeit;Temperatur °C\n" + "\n".join(rows) + "\n", "latin-1")
     write_testfield(folder / "surveyed.csv", corner_field("circles", 4, 150.0))
@@ -145,15 +138,9 @@ def photographs_with_times(shelf: Path, folder: Path) -> None:
 def how_to_calibrate(shelf: Path, folder: Path) -> None:
     """Three photographs of the markers' corner, rendered."""
     del shelf
-    field = demonstration_field("markers")
-    camera = demonstration_model(field)
-    scene = Scene(camera.sensor, field)
     (folder / "photos").mkdir()
-    for k, turn in enumerate((0.0, 0.05, -0.05)):
-        eop = camera.exterior.as_array() + np.array([0, turn, 20 * turn, 400 * turn, 0, 0])
-        frame = scene.render(camera.interior.as_array(), eop, None, [k], 1.0)
-        cv2.imwrite(str(folder / "photos" / f"{k}.png"), frame)
-    write_testfield(folder / "testfield.csv", field)
+    write_markers(folder / "photos")
+    (folder / "photos/field.csv").rename(folder / "testfield.csv")
 
 
 def how_to_daemon(shelf: Path, folder: Path) -> None:
@@ -177,7 +164,7 @@ def how_to_thermal_model(shelf: Path, folder: Path) -> None:
 def how_to_study(shelf: Path, folder: Path) -> None:
     put_recordings(shelf, folder, "rpi-heating-M1", "rpi-heating-M2")
     for k, preset in enumerate(("nexus5-cold", "nexus5-cold", "nexus5-warm", "nexus5-warm"), 1):
-        preset_simulation(preset, k, f"M{k}").write(folder / f"nexus-M{k}")
+        tc.simulate(preset, seed=k, series=f"M{k}", out=folder / f"nexus-M{k}")
 
 
 def simulation(shelf: Path, folder: Path) -> None:
@@ -191,8 +178,8 @@ def simulation(shelf: Path, folder: Path) -> None:
 def store(shelf: Path, folder: Path) -> None:
     """A store with a short measured series of a small field."""
     del shelf
-    s = preset_simulation("rpi-v2.1-heating", seed=1, field=corner_field("circles", 4, 150.0))
-    replace(s, programme=replace(s.programme, epochs=12)).write(folder / "short")
+    field = corner_field("circles", 4, 150.0)
+    tc.simulate("rpi-v2.1-heating", seed=1, testfield=field, epochs=12, out=folder / "short")
     run("replay", folder / "short", "--store", folder / "thermocald.db")
 
 

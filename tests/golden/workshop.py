@@ -16,6 +16,7 @@ import numpy as np
 from tests.commands import call
 from tests.golden.cases import CASES, Case
 from tests.golden.compare import differences, parsed, shortened
+from tests.pictures import FOCAL, TAKEN, save_photograph
 
 EXPECTED = Path(__file__).parent / "expected"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -128,15 +129,10 @@ def points(folder: Path) -> None:
 
 def photographs(folder: Path) -> None:
     """Six small photographs with EXIF times, and a German logger's file."""
-    from PIL import Image
-
     (folder / "photos").mkdir(exist_ok=True)
     for i in range(6):
-        exif = Image.Exif()
-        exif.get_ifd(0x8769)[0x9003] = f"2026:06:14 12:00:{10 * i:02d}"
-        exif.get_ifd(0x8769)[0x920A] = 3.04
-        image = Image.fromarray(np.full((48, 64), 90, np.uint8))
-        image.save(folder / "photos" / f"{i}.jpg", exif=exif)
+        tags = {TAKEN: f"2026:06:14 12:00:{10 * i:02d}", FOCAL: 3.04}
+        save_photograph(folder / "photos" / f"{i}.jpg", tags)
     rows = [f"14.06.2026;12:0{i // 4}:{15 * (i % 4):02d};{21 + 0.25 * i:.2f}" for i in range(8)]
     text = "Datum;Uhrzeit;Temperatur °C\n" + "\n".join(r.replace(".", ",", 0) for r in rows) + "\n"
     (folder / "log.csv").write_text(text.replace("21.", "21,").replace("22.", "22,"), "latin-1")

@@ -21,15 +21,19 @@ LONGEST = (
     "cli/test_first_hour", "photogrammetry/test_mount", "daemon/test_rhythm",
     "real_corners/test_real_corners", "test_properties", "store/test_kills", "analysis/test_scene",
     # of the quick one
-    "output/test_pages", "photogrammetry/test_templates", "daemon/test_faults",
-    "daemon/test_page_attacks", "daemon/test_sessions", "cli/test_commands",
-    "discovery/test_examination", "daemon/test_clock", "photogrammetry/test_boards",
-    "daemon/test_changes", "output/test_testfield_print", "fleet/test_reprocess",
-    "cli/test_testfield", "cli/test_discover", "cli/test_encodings", "cli/test_real_data",
-    "daemon/test_session", "photogrammetry/test_scale", "photogrammetry/test_adjustment",
-    "daemon/test_calibration_keys", "output/test_report_study", "docs/test_site",
-    "simulation/test_outside_effect", "analysis/test_online_filter", "daemon/test_telling",
-    "main_paths/test_commands", "fleet/test_dask",
+    "daemon/test_faults", "daemon/test_changes", "output/test_pages", "drivers/test_android",
+    "api/test_api", "daemon/test_quota", "main_paths/test_commands", "cli/test_commands",
+    "daemon/test_page_attacks", "discovery/test_examination", "daemon/test_sessions",
+    "daemon/test_store_file", "output/test_dashboard_browser", "daemon/test_clock",
+    "drivers/test_contract", "daemon/test_gauge", "discovery/test_field_motion", "test_audit",
+    "daemon/test_session", "test_secrets", "daemon/test_keeping", "cli/test_testfield",
+    "drivers/test_mosquitto", "fleet/test_reprocess", "photogrammetry/test_boards",
+    "cli/test_encodings", "drivers/test_serial_line", "output/camera_files/test_camera_files",
+    "daemon/test_virtual_clock", "analysis/test_gauge", "daemon/test_calibration_keys",
+    "analysis/test_online_filter", "analysis/test_delay", "drivers/test_chip_outputs",
+    "cli/test_discover", "analysis/test_missing_effect", "photogrammetry/test_scale",
+    "cli/test_thermal_commands", "output/test_testfield_print", "simulation/test_outside_effect",
+    "drivers/test_sensor_properties",
 )  # fmt: skip
 """Files that take longest, in that order: so that no process is left alone with one at the end."""
 

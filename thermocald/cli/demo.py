@@ -20,7 +20,6 @@ from thermocald.files import make_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from thermocald.arrays import Array
     from thermocald.daemon.station import Station

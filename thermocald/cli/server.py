@@ -81,9 +81,8 @@ def dashboard(
 
     Example: thermocald server dashboard -o fleet.json
     """
-    path = Path(output) if output != "-" else output
     text = (files("thermocald.output") / "templates" / "grafana.json").read_text(encoding="utf-8")
-    write_text(text, path)
+    write_text(text, output)
 
 
 group = subcommands(init=init, grant=grant, dashboard=dashboard)

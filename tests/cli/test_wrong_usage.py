@@ -10,6 +10,7 @@ import stat
 from contextlib import closing, suppress
 
 import pytest
+import typer
 
 from tests.commands import call, every_command
 from thermocald.cli import application, commands
@@ -72,7 +73,8 @@ def test_an_output_that_cannot_be_is_refused_before_the_work(option, tmp_path):
     assert lines[0].endswith("file is a file")
 
 
-COMMANDS = {name: command.params for name, command in every_command()}
+PROGRAM = typer.main.get_command(application())
+COMMANDS = {name: command.params for name, command in every_command(PROGRAM)}
 
 
 def _kind(name: str, option: str) -> str | None:
@@ -141,7 +143,7 @@ def test_what_may_not_be_replaced_is_refused_before_the_work(
         if what == "a disk" and not place.exists():
             continue
         with pytest.raises(OutputError, match="cannot be written"):
-            application()([*words, given, str(place)], standalone_mode=False)
+            PROGRAM.main([*words, given, str(place)], standalone_mode=False)
         assert sorted(tmp_path.rglob("*")) == before
 
 

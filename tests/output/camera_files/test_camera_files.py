@@ -389,12 +389,7 @@ def test_covariance_in_opencv_is_that_of_the_scatter(tmp_path, plain):
     samples = rng.multivariate_normal(plain.interior.as_array(), Q, 400)
     from thermocald.photogrammetry.camera.conversions import opencv
 
-    values = np.array(
-        [
-            opencv(5).from_brown(CameraModel(plain.sensor, plain.interior.from_array(s)))
-            for s in samples
-        ]
-    )
+    values = np.array([opencv(5).from_brown(plain.sensor, s) for s in samples])
     assert values.std(axis=0, ddof=1) / sd == pytest.approx(np.ones(9), abs=0.12)
     correlation = stated / np.outer(sd, sd)
     assert np.corrcoef(values.T) == pytest.approx(correlation, abs=0.15)

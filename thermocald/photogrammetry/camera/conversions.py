@@ -32,13 +32,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.errors import GeometryError
-from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
-    CameraModel,
-    InteriorOrientation,
-    Sensor,
-    project,
-)
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.photogrammetry.camera.camera_model import rays as camera_rays
 
 if TYPE_CHECKING:
@@ -57,14 +51,14 @@ class Family:
     """A camera model with parameters in a fixed order.
 
     name: for messages; project: directions (n, 2) → image points (n, 2) px; from_brown: its
-    parameters for our model, exact or near; to_brown: ours for its own.
+    parameters for our ten, exact or near; to_brown: ours for its own.
     """
 
     name: str
     parameters: tuple[str, ...]
     project: Callable[[Sensor, Array, Array], Array]
-    from_brown: Callable[[CameraModel], Array]
-    to_brown: Callable[[Sensor, Array], InteriorOrientation]
+    from_brown: Callable[[Sensor, Array], Array]
+    to_brown: Callable[[Sensor, Array], Array]
 
 
 def image_grid(sensor: Sensor, shape: tuple[int, int] = _GRID) -> Array:
@@ -91,14 +85,16 @@ def convert(
     """
     if source is target:
         return values, covariance, True, 0.0, 0.0
-    own = CameraModel(sensor, source.to_brown(sensor, values))
+    own = source.to_brown(sensor, values)
     grid, check = image_grid(sensor), image_grid(sensor, _CHECK_GRID)
-    directions, checked = (_directions(own, source, values, pixels) for pixels in (grid, check))
+    directions, checked = (
+        _directions(sensor, source, values, own, pixels) for pixels in (grid, check)
+    )
 
     def seen(v: Array, d: Array) -> Array:
         return target.project(sensor, v, d)
 
-    result = target.from_brown(own)
+    result = target.from_brown(sensor, own)
     residual = seen(result, checked) - check
     exact = bool(np.all(np.isfinite(residual)) and np.abs(residual).max() < EXACT_PX)
     if not exact:
@@ -114,14 +110,17 @@ def convert(
     return result, carried, exact, float(size.max()), float(np.sqrt(np.mean(size**2)))
 
 
-def _directions(own: CameraModel, family: Family, values: Array, pixels: Array) -> Array:
-    """Image points → directions of a family, by Newton's method from those of a pinhole camera."""
-    sensor, i = own.sensor, own.interior
+def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixels: Array) -> Array:
+    """Image points → directions of a family, by Newton's method from those of a pinhole camera.
+
+    own (10,): the parameters of our model that are near.
+    """
     if family is BROWN:
         r = camera_rays(sensor, values, pixels)
         return np.column_stack([r[:, 0] / -r[:, 2], r[:, 1] / r[:, 2]])
-    from_point = (pixels - sensor.centre) * sensor.pixel_pitch - np.array([i.x0, -i.y0])
-    d: Array = from_point / np.array([i.c * (1 + i.C1), i.c])
+    c, x0, y0, C1 = own[[0, 1, 2, 8]]
+    from_point = (pixels - sensor.centre) * sensor.pixel_pitch - np.array([x0, -y0])
+    d: Array = from_point / np.array([c * (1 + C1), c])
     step = 1e-6
     for _ in range(60):
         r = pixels - family.project(sensor, values, d)
@@ -218,28 +217,17 @@ def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, 
 
     values (10,), covariance (10, 10). Exact without an affinity and a shear, as `exact` says.
     """
-    c, _, _, A1, A2, A3, B1, B2, C1, C2 = values.tolist()
-    f = 1.0 / sensor.pixel_pitch
-    partials: tuple[dict[int, float], ...] = (
-        {0: (1 + C1) * f, 8: c * f},
-        {0: f},
-        {1: f},
-        {2: -f},
-        {0: 2 * A1 * c, 3: c**2},
-        {0: 4 * A2 * c**3, 4: c**4},
-        {0: -B2, 7: -c},
-        {0: B1, 6: c},
-        {0: 6 * A3 * c**5, 5: c**6},
-    )
-    family = opencv(5)
-    terms = family.from_brown(CameraModel(sensor, InteriorOrientation.from_array(values))).tolist()
+    family, step = opencv(5), 1e-30
+    terms = family.from_brown(sensor, values).tolist()
+    # the derivative by a step into the complex plane: to the last digit
+    aside = family.from_brown(sensor, values[:, None] + 1j * step * np.eye(10))
+    J = np.imag(aside) / step
     found: dict[str, float] = {"width": sensor.width, "height": sensor.height}
-    for name, value, partial in zip(family.parameters, terms, partials, strict=True):
-        j = np.zeros(10)
-        j[list(partial)] = list(partial.values())
-        variance = float(j @ covariance @ j)  # of a weak epoch, rounding may have left nothing
+    for name, value, variance in zip(
+        family.parameters, terms, np.diag(J @ covariance @ J.T).tolist(), strict=True
+    ):  # of a weak epoch, rounding may have left no variance
         found |= {name: value, f"sd_{name}": math.sqrt(variance) if variance >= 0 else math.nan}
-    return {**found, "exact": float(C1 == 0 and C2 == 0)}
+    return {**found, "exact": float(values[8] == 0 and values[9] == 0)}
 
 
 def _project_brown(sensor: Sensor, iop: Array, directions: Array) -> Array:
@@ -248,9 +236,8 @@ def _project_brown(sensor: Sensor, iop: Array, directions: Array) -> Array:
 
 
 BROWN = Family(
-    "Brown model", IOP_NAMES, _project_brown, lambda model: model.interior.as_array(),
-    lambda _, values: InteriorOrientation.from_array(values),
-)  # fmt: skip
+    "Brown model", IOP_NAMES, _project_brown, lambda _, values: values, lambda _, values: values
+)
 """Our own."""
 
 
@@ -264,7 +251,7 @@ def opencv(count: int) -> Family:
         f"OpenCV model with {count} coefficients",
         _OPENCV[: 4 + count],
         _project_opencv,
-        lambda model: _opencv_of_brown(model)[: 4 + count],
+        lambda sensor, iop: _opencv_of_brown(sensor, iop)[: 4 + count],
         _brown_of_opencv,
     )
 
@@ -279,30 +266,29 @@ def _project_opencv(_: Sensor, values: Array, directions: Array) -> Array:
     return np.asarray(found, dtype=float).reshape(-1, 2)
 
 
-def _opencv_of_brown(model: CameraModel) -> Array:
+def _opencv_of_brown(sensor: Sensor, iop: Array) -> Array:
     """CONVENTIONS §2."""
-    i, p = model.interior, model.sensor.pixel_pitch
-    cx, cy = model.sensor.centre
-    c = i.c
+    c, x0, y0, A1, A2, A3, B1, B2, C1, _ = iop
+    p, (cx, cy), none = sensor.pixel_pitch, sensor.centre, [0 * c] * 7
     return np.array(
         [
-            (1 + i.C1) * c / p, c / p, cx + i.x0 / p, cy - i.y0 / p,
-            i.A1 * c**2, i.A2 * c**4, -i.B2 * c, i.B1 * c, i.A3 * c**6, *[0.0] * 7,
+            (1 + C1) * c / p, c / p, cx + x0 / p, cy - y0 / p,
+            A1 * c**2, A2 * c**4, -B2 * c, B1 * c, A3 * c**6, *none,
         ]
     )  # fmt: skip
 
 
-def _brown_of_opencv(sensor: Sensor, values: Array) -> InteriorOrientation:
+def _brown_of_opencv(sensor: Sensor, values: Array) -> Array:
     """The inverse; a rational denominator enters to first order, thin prisms not at all."""
-    v = np.zeros(16)
-    v[: len(values)] = values
-    p, c = sensor.pixel_pitch, v[1] * sensor.pixel_pitch
-    centre = sensor.centre
-    return InteriorOrientation(
-        c=c, x0=(v[2] - centre[0]) * p, y0=-(v[3] - centre[1]) * p,
-        A1=(v[4] - v[9]) / c**2, A2=(v[5] - v[10] - v[9] * (v[4] - v[9])) / c**4,
-        A3=v[8] / c**6 if not v[9:12].any() else 0.0,
-        B1=v[7] / c, B2=-v[6] / c, C1=v[0] / v[1] - 1,
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, *_ = np.pad(values, (0, 16 - len(values)))
+    p, c, centre = sensor.pixel_pitch, fy * sensor.pixel_pitch, sensor.centre
+    A3 = 0.0 if k4 or k5 or k6 else k3 / c**6
+    return np.array(
+        [
+            c, (cx - centre[0]) * p, -(cy - centre[1]) * p,
+            (k1 - k4) / c**2, (k2 - k5 - k4 * (k1 - k4)) / c**4, A3,
+            p2 / c, -p1 / c, fx / fy - 1, 0.0,
+        ]
     )  # fmt: skip
 
 
@@ -318,26 +304,25 @@ def _project_metashape(sensor: Sensor, values: Array, directions: Array) -> Arra
     return np.column_stack([centre[0] + cx + xd * (f + b1) + yd * b2, centre[1] + cy + yd * f])
 
 
-def _metashape_of_brown(model: CameraModel) -> Array:
+def _metashape_of_brown(sensor: Sensor, iop: Array) -> Array:
     """Exact without affinity and shear, or without distortion."""
-    i, p = model.interior, model.sensor.pixel_pitch
-    c = i.c
+    c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = iop
+    p = sensor.pixel_pitch
     return np.array(
         [
-            c / p, i.x0 / p, -i.y0 / p, i.C1 * c / p, -i.C2 * c / p,
-            i.A1 * c**2, i.A2 * c**4, i.A3 * c**6, 0.0, i.B1 * c, -i.B2 * c,
+            c / p, x0 / p, -y0 / p, C1 * c / p, -C2 * c / p,
+            A1 * c**2, A2 * c**4, A3 * c**6, 0.0, B1 * c, -B2 * c,
         ]
     )  # fmt: skip
 
 
-def _brown_of_metashape(sensor: Sensor, values: Array) -> InteriorOrientation:
+def _brown_of_metashape(sensor: Sensor, values: Array) -> Array:
     """The inverse; k4 has no counterpart."""
     f, cx, cy, b1, b2, k1, k2, k3, _, p1, p2 = values
     p, c = sensor.pixel_pitch, f * sensor.pixel_pitch
-    return InteriorOrientation(
-        c=c, x0=cx * p, y0=-cy * p, A1=k1 / c**2, A2=k2 / c**4, A3=k3 / c**6,
-        B1=p1 / c, B2=-p2 / c, C1=b1 / f, C2=-b2 / f,
-    )  # fmt: skip
+    return np.array(
+        [c, cx * p, -cy * p, k1 / c**2, k2 / c**4, k3 / c**6, p1 / c, -p2 / c, b1 / f, -b2 / f]
+    )
 
 
 METASHAPE = Family(
@@ -367,16 +352,16 @@ def measured_point(r0: float) -> Family:
                 raise GeometryError(f"the {name} does not converge over the image")
         return np.column_stack([x0 + x, -(y0 + y)]) / sensor.pixel_pitch + sensor.centre
 
-    def of_brown(model: CameraModel) -> Array:
+    def of_brown(_: Sensor, iop: Array) -> Array:
         """Radial and decentering terms as they are, r0's part taken up by c; affinity exact."""
-        values = _rebalanced(model.interior.as_array(), 0.0, r0)
+        values = _balanced(iop, r0)
         values[8:] /= 1 + values[8]  # x̄ = (x' - x0 - C2 ȳ) / (1 + C1)
         return values
 
-    def to_brown(_: Sensor, values: Array) -> InteriorOrientation:
+    def to_brown(_: Sensor, values: Array) -> Array:
         at_ideal = values.copy()
         at_ideal[8:] /= 1 - values[8]
-        return InteriorOrientation.from_array(_rebalanced(at_ideal, r0, 0.0))
+        return _unbalanced(at_ideal, r0)
 
     return Family(name, IOP_NAMES, project_them, of_brown, to_brown)
 
@@ -394,15 +379,12 @@ def aicon(r0: float) -> Family:
         image = np.column_stack([x0 + (1 + C1) * x + C2 * y, -(y0 + y)])
         return image / sensor.pixel_pitch + sensor.centre
 
-    def rebalanced(values: Array, r_from: float, r_to: float) -> Array:
-        return np.concatenate([_rebalanced(values, r_from, r_to)[:8], values[8:]])
-
     return Family(
         f"AICON model, R0 {r0:g} mm",
         IOP_NAMES,
         project_them,
-        lambda model: rebalanced(model.interior.as_array(), 0.0, r0),
-        lambda _, values: InteriorOrientation.from_array(rebalanced(values, r0, 0.0)),
+        lambda _, iop: np.r_[_balanced(iop, r0)[:8], iop[8:]],
+        lambda _, values: np.r_[_unbalanced(values, r0)[:8], values[8:]],
     )
 
 
@@ -417,28 +399,26 @@ def _balanced_correction(values: Array, r0: float, x: Array, y: Array) -> tuple[
     )
 
 
-def _rebalanced(values: Array, r_from: float, r_to: float) -> Array:
-    """The terms with another r0 that give the same image at the ideal point, exactly.
+def _unbalanced(values: Array, r0: float) -> Array:
+    """The terms without balance that give the same image at the ideal point, exactly.
 
     With s = A1 r0² + A2 r0⁴ + A3 r0⁶ the balanced model is the unbalanced one of a camera of
     principal distance (1-s)c: x̄ becomes (1-s)x̄, and each term is rescaled for it.
     """
-    out = values.copy()
-    if r_from:
-        _, _, _, A1, A2, A3 = values[:6]
-        out = _stretched(values, 1 - (A1 * r_from**2 + A2 * r_from**4 + A3 * r_from**6))
-    if r_to:
-        # the stretch depends on the rescaled terms: solve for it (one real number near 1)
-        t = 1.0
-        for _ in range(100):
-            A1, A2, A3 = _stretched(out, t)[3:6]
-            # unbalancing stretches by 1 - s, so balancing does by its inverse
-            new = 1 / (1 - (A1 * r_to**2 + A2 * r_to**4 + A3 * r_to**6))
-            if abs(new - t) < 1e-16:
-                break
-            t = new
-        out = _stretched(out, t)
-    return out
+    A1, A2, A3 = values[3:6]
+    return _stretched(values, 1 - (A1 * r0**2 + A2 * r0**4 + A3 * r0**6))
+
+
+def _balanced(values: Array, r0: float) -> Array:
+    """The inverse: the stretch depends on the rescaled terms, one real number near 1."""
+    t = 1.0
+    for _ in range(100):
+        A1, A2, A3 = _stretched(values, t)[3:6]
+        # unbalancing stretches by 1 - s, so balancing does by its inverse
+        last, t = t, 1 / (1 - (A1 * r0**2 + A2 * r0**4 + A3 * r0**6))
+        if abs(t - last) < 1e-16:
+            break
+    return _stretched(values, t)
 
 
 def _stretched(values: Array, t: float) -> Array:

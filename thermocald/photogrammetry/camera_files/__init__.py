@@ -123,8 +123,7 @@ def read(
 
     pixel_pitch: mm, for files that do not say it. Raises ConfigurationError that names the file.
     """
-    text = _text(path)
-    chosen = _format(format) if format is not None else _recognised(text, path)
+    text, chosen = _opened(path, format)
     try:
         record = chosen.decode(text)
         sensor = record.sensor(text, pixel_pitch)
@@ -186,21 +185,21 @@ def convert(
     return Conversion(source, camera, out, to, statement)
 
 
-def _text(path: Path) -> str:
+def _opened(path: Path, format_: str | None = None) -> tuple[str, Format]:
+    """The text of a camera file, and its format; without a name it is told by the content."""
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise ConfigurationError(f"{path}: too large for a camera file")
-        return path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except OSError as cause:
         raise ConfigurationError(f"{path}: cannot be read: {cause.strerror}") from cause
     except UnicodeDecodeError:
         raise ConfigurationError(f"{path}: no text, and so no camera file") from None
-
-
-def _recognised(text: str, path: Path) -> Format:
+    if format_ is not None:
+        return text, _format(format_)
     for candidate in FORMATS.values():
         if candidate.recognises(text):
-            return candidate
+            return text, candidate
     raise ConfigurationError(f"{path}: no camera file of any of {', '.join(FORMATS)}")
 
 
@@ -212,16 +211,14 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
     does not say it.
     """
     try:
-        known = _recognised(_text(path), path).name
+        known = _opened(path)[1].name
     except ConfigurationError:  # of none of the formats: our own YAML
-        known = None
-    if known is not None:
-        found = read(path, known, pixel_pitch)
-        model = found.model
-        return CameraSpec(found.name, model.sensor, model.interior.c, model.interior)
-    reader = QuantityReader(path, read_yaml(path, ConfigurationError))
-    camera = reader.inner("camera") if "camera" in reader.mapping else reader
-    return CameraSpec.read(camera, path.stem)
+        reader = QuantityReader(path, read_yaml(path, ConfigurationError))
+        camera = reader.inner("camera") if "camera" in reader.mapping else reader
+        return CameraSpec.read(camera, path.stem)
+    found = read(path, known, pixel_pitch)
+    interior = found.model.interior
+    return CameraSpec(found.name, found.model.sensor, interior.c, interior)
 
 
 def write_camera(path: Path, camera: CameraSpec, covariance: Array, comment: str) -> None:
@@ -233,8 +230,7 @@ def write_camera(path: Path, camera: CameraSpec, covariance: Array, comment: str
     suffix, sensor, interior = path.suffix.lower(), camera.sensor, camera.interior
     assert interior is not None
     if suffix == ".json":
-        model = CameraModel(sensor, interior)
-        write(model, path, "json", covariance, comment, camera.name)
+        write(CameraModel(sensor, interior), path, "json", covariance, comment, camera.name)
         return
     if suffix not in (".yaml", ".yml"):
         raise UsageError(f"{path}: .json and .yaml are written; for another program convert it")

@@ -19,7 +19,7 @@ from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.photogrammetry.camera.conversions import BROWN, Family
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import CameraModel
@@ -78,7 +78,7 @@ class CameraRecord:
     values are; comment: free text for the file's head.
     """
 
-    size: tuple[int, int]
+    size: Sequence[float] | Array
     family: Family
     values: Array
     name: str = "camera"
@@ -103,7 +103,7 @@ class CameraRecord:
 
         Raises ConfigurationError where no camera has such values.
         """
-        width, height = self.size
+        width, height = (int(side) for side in self.size)
         if not (0 < width <= 100_000 and 0 < height <= 100_000):
             raise ConfigurationError(f"image size {width} × {height} px is impossible")
         if not np.all(np.abs(self.values) < _LARGEST):
@@ -113,9 +113,22 @@ class CameraRecord:
             raise ConfigurationError(
                 f"pixel pitch {given:g} mm was given, the file says {own:g} mm"
             )
-        sensor = Sensor(width, height, _pitch(text, own if given is None else given))
+        pitch = own if given is None else given
+        if pitch is None:
+            stated = _PITCH.search(text)  # by a comment of ours
+            if stated is None:
+                raise ConfigurationError(
+                    "the file does not say how large a pixel is: give it, in mm (--pixel-pitch "
+                    "0.00112 for a Raspberry Pi camera v2.1)"
+                )
+            pitch = float(stated.group(1))
+        if not (math.isfinite(pitch) and 1e-5 < pitch < 1):
+            raise ConfigurationError(
+                f"pixel pitch {pitch:g} mm: between 0.00001 and 1 mm are possible"
+            )
+        sensor = Sensor(width, height, pitch)
         # a focal length of zero or less would only fail later, and in other words
-        focal = self.values[0] / (sensor.pixel_pitch if self.family.parameters[0] == "c" else 1.0)
+        focal = self.values[0] / (pitch if self.family.parameters[0] == "c" else 1.0)
         if not 0.05 * max(self.size) < focal < 1000 * max(self.size):
             raise ConfigurationError(
                 f"a principal distance of {focal:g} px does not belong to an image of {width} × "
@@ -137,20 +150,6 @@ class Format:
     encode: Callable[[CameraRecord], str]
     decode: Callable[[str], CameraRecord]
     recognises: Callable[[str], bool]
-
-
-def _pitch(text: str, given: float | None) -> float:
-    """The pixel pitch: as given, else as a comment of ours states it."""
-    found = _PITCH.search(text)
-    pitch = given if given is not None else float(found.group(1)) if found else None
-    if pitch is None:
-        raise ConfigurationError(
-            "the file does not say how large a pixel is: give it, in mm (--pixel-pitch 0.00112 for "
-            "a Raspberry Pi camera v2.1)"
-        )
-    if not (math.isfinite(pitch) and 1e-5 < pitch < 1):
-        raise ConfigurationError(f"pixel pitch {pitch:g} mm: between 0.00001 and 1 mm are possible")
-    return pitch
 
 
 _VERSION = "thermocald-camera/1"
@@ -186,7 +185,7 @@ def _decode_own(text: str) -> CameraRecord:
     head, values = document.get("sensor"), document.get("interior")
     if not isinstance(head, dict) or not isinstance(values, dict):
         raise ConfigurationError("sensor or interior is missing")
-    width, height = (int(number(head.get(side), f"sensor.{side}")) for side in ("width", "height"))
+    size = [number(head.get(side), f"sensor.{side}") for side in ("width", "height")]
     pitch = number(head.get("pixel_pitch"), "sensor.pixel_pitch")
     if "c" not in values:
         raise ConfigurationError("interior.c is missing")
@@ -196,7 +195,7 @@ def _decode_own(text: str) -> CameraRecord:
         matrix = document["covariance"].get("matrix")
         covariance = numbers(matrix, "covariance.matrix", (100,)).reshape(10, 10)
     name = str(document.get("name", "camera"))
-    return CameraRecord((width, height), BROWN, interior, name, covariance, pitch)
+    return CameraRecord(size, BROWN, interior, name, covariance, pitch)
 
 
 OWN = Format(

@@ -57,6 +57,8 @@ from thermocald.photogrammetry.camera_files.camera_record import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from thermocald.arrays import Array
     from thermocald.photogrammetry.camera.camera_model import CameraModel
 
@@ -101,9 +103,9 @@ def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRec
     if "intrinsics_covariance" in document:
         n = len(values)
         covariance = matrix("intrinsics_covariance", (n * n,)).reshape(n, n)
-    width, height = (int(number(document.get(key), key)) for key in ("image_width", "image_height"))
+    size = [number(document.get(key), key) for key in ("image_width", "image_height")]
     name = str(document.get("camera_name", "camera"))
-    return CameraRecord((width, height), opencv(len(values) - 4), values, name, covariance)
+    return CameraRecord(size, opencv(len(values) - 4), values, name, covariance)
 
 
 OPENCV = Format(
@@ -184,7 +186,7 @@ def _decode_kalibr(text: str) -> CameraRecord:
     f = numbers(camera.get("intrinsics"), "intrinsics", (4,))
     d = numbers(camera.get("distortion_coeffs") or [], "distortion_coeffs", (0, 4))
     size = numbers(camera.get("resolution"), "resolution", (2,))
-    return CameraRecord((int(size[0]), int(size[1])), opencv(len(d)), np.concatenate([f, d]))
+    return CameraRecord(size, opencv(len(d)), np.concatenate([f, d]))
 
 
 KALIBR = Format(
@@ -204,16 +206,18 @@ def _four_or_five(model: CameraModel) -> Family:
 def _encode_mrcal(record: CameraRecord) -> str:
     values = ", ".join(map(repr, record.values.tolist()))
     width, height = record.size
-    return record.head() + (
-        "{\n"
-        f"    'lensmodel':  'LENSMODEL_OPENCV{len(record.values) - 4}',\n\n"
-        "    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
-        f"    'intrinsics': [ {values},],\n\n"
-        "    # extrinsics are rt_fromref\n"
-        "    'extrinsics': [ 0., 0., 0., 0., 0., 0.,],\n\n"
-        f"    'imagersize': [ {width}, {height},],\n"
-        "}\n"
-    )
+    return f"""{record.head()}{{
+    'lensmodel':  'LENSMODEL_OPENCV{len(record.values) - 4}',
+
+    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....
+    'intrinsics': [ {values},],
+
+    # extrinsics are rt_fromref
+    'extrinsics': [ 0., 0., 0., 0., 0., 0.,],
+
+    'imagersize': [ {width}, {height},],
+}}
+"""
 
 
 def _decode_mrcal(text: str) -> CameraRecord:
@@ -231,7 +235,7 @@ def _decode_mrcal(text: str) -> CameraRecord:
     count = _MRCAL_COUNTS[lens]
     values = numbers(document.get("intrinsics"), "intrinsics", (4 + count,))
     size = numbers(document.get("imagersize"), "imagersize", (2,))
-    return CameraRecord((int(size[0]), int(size[1])), opencv(count), values)
+    return CameraRecord(size, opencv(count), values)
 
 
 MRCAL = Format(
@@ -284,7 +288,7 @@ def _decode_colmap(text: str) -> CameraRecord:
     for where, value in zip(slots, given, strict=True):
         values[list(where)] = value
     values[2:4] -= _COLMAP_CENTRE
-    size = int(number(fields[2], "WIDTH")), int(number(fields[3], "HEIGHT"))
+    size = number(fields[2], "WIDTH"), number(fields[3], "HEIGHT")
     return CameraRecord(size, opencv(8), values)
 
 
@@ -307,7 +311,7 @@ def _aicon_family(model: CameraModel) -> Family:
     return aicon(_usual_r0((model.sensor.width, model.sensor.height), model.sensor.pixel_pitch))
 
 
-def _usual_r0(size: tuple[int, int], pitch: float) -> float:
+def _usual_r0(size: Sequence[float] | Array, pitch: float) -> float:
     half_diagonal = 0.5 * float(np.hypot(*size)) * pitch
     return float(f"{2 / 3 * half_diagonal:.4g}")
 
@@ -328,23 +332,23 @@ def _encode_aicon(record: CameraRecord) -> str:
 
 def _decode_aicon(text: str) -> CameraRecord:
     fields = _aicon_record(text)
-    if fields is None:
-        return _typed(text)
-    found = dict(zip(_AICON_FIELDS, fields, strict=True))
-    spread, name = {}, "camera"
-    for line in text.splitlines():
-        words = line.split()
-        if words[:2] == ["#", "name:"]:
-            name = " ".join(words[2:]) or name
-        if words[:2] == ["#", "sd"] and len(words) == 4:
-            spread[words[2]] = number(words[3], f"standard deviation of {words[2]}")
-    r0 = number(found["R0"], "R0")
-    if r0 == 0 and any(number(found[n], n) for n in _AICON_NAMES[3:8]):
+    found, spread, name = _typed(text) if fields is None else _commented(text, fields)
+    r0 = number(found.get("R0", 0.0), "R0")
+    values = np.array([number(found.get(key, 0.0), key) for key in _AICON_NAMES])
+    if fields is not None and r0 == 0 and values[3:8].any():
         raise ConfigurationError(
             "R0 is 0: programs differ in the unit of such terms; type the numbers over, one name "
             "and value per line"
         )
-    return _aicon_record_of(found, spread, aicon(r0), name)
+    values[0] = abs(values[0])
+    width, _, *pixels = [number(found[key], key) for key in _AICON_SIZES]
+    if not 0 <= r0 < 1000:
+        raise ConfigurationError(f"R0 is {r0:g} mm; it is a radius in the image")
+    if not 1 <= pixels[0] < 1e6:
+        raise ConfigurationError(f"{pixels[0]:g} columns of pixels are impossible")
+    covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _AICON_NAMES]) if spread else None
+    family = measured_point(r0) if fields is None else aicon(r0)
+    return CameraRecord(pixels, family, values, name, covariance, width / pixels[0])
 
 
 def _aicon_record(text: str) -> list[str] | None:
@@ -359,8 +363,20 @@ def _aicon_record(text: str) -> list[str] | None:
     return words if values[2] < 0 else None
 
 
-def _typed(text: str) -> CameraRecord:
-    """One `name value [sd]` per line."""
+def _commented(text: str, fields: list[str]) -> tuple[dict[str, str], dict[str, float], str]:
+    """The values of a record; standard deviations and name as comments of ours state them."""
+    spread, name = {}, "camera"
+    for line in text.splitlines():
+        words = line.split()
+        if words[:2] == ["#", "name:"]:
+            name = " ".join(words[2:]) or name
+        if words[:2] == ["#", "sd"] and len(words) == 4:
+            spread[words[2]] = number(words[3], f"standard deviation of {words[2]}")
+    return dict(zip(_AICON_FIELDS, fields, strict=True)), spread, name
+
+
+def _typed(text: str) -> tuple[dict[str, str], dict[str, float], str]:
+    """The same of one `name value [sd]` per line."""
     found: dict[str, str] = {}
     spread: dict[str, float] = {}
     name = "camera"
@@ -386,26 +402,7 @@ def _typed(text: str) -> CameraRecord:
     missing = [key for key in ("Ck", *_AICON_SIZES) if key not in found]
     if missing:
         raise ConfigurationError(f"{', '.join(missing)} missing")
-    r0 = number(found.get("R0", 0.0), "R0")
-    return _aicon_record_of(found, spread, measured_point(r0), name)
-
-
-def _aicon_record_of(
-    found: dict[str, str], spread: dict[str, float], family: Family, name: str
-) -> CameraRecord:
-    values = np.array([number(found.get(key, 0.0), key) for key in _AICON_NAMES])
-    values[0] = abs(values[0])
-    sizes = [number(found[key], key) for key in _AICON_SIZES]
-    r0 = number(found.get("R0", 0.0), "R0")
-    if not 0 <= r0 < 1000:
-        raise ConfigurationError(f"R0 is {r0:g} mm; it is a radius in the image")
-    if not 1 <= sizes[2] < 1e6:
-        raise ConfigurationError(f"{sizes[2]:g} columns of pixels are impossible")
-    covariance = None
-    if spread:
-        covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _AICON_NAMES])
-    size = int(sizes[2]), int(sizes[3])
-    return CameraRecord(size, family, values, name, covariance, sizes[0] / sizes[2])
+    return found, spread, name
 
 
 AICON = Format(
@@ -461,9 +458,8 @@ def _decode_metashape(text: str) -> CameraRecord:
     for tag in ("p3", "p4"):
         if number(calibration.findtext(tag, "0"), f"<{tag}>") != 0:
             raise ConfigurationError(f"<{tag}> has no counterpart in this model")
-    width, height = int(number(size[0], "width")), int(number(size[1], "height"))
-    covariance = _metashape_covariance(root)
-    return CameraRecord((width, height), METASHAPE_FRAME, values, covariance=covariance)
+    pixels = number(size[0], "width"), number(size[1], "height")
+    return CameraRecord(pixels, METASHAPE_FRAME, values, covariance=_metashape_covariance(root))
 
 
 def _metashape_covariance(root: ET.Element) -> Array | None:

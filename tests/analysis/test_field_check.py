@@ -53,7 +53,7 @@ def test_predicted_are_the_standard_deviations_of_an_adjustment(exact):
     )  # fmt: skip
     assert result.status == "ok"
     stated = np.sqrt(np.diag(result.covariance))[_COLUMNS] / result.sigma0
-    predicted = check.precision.epoch if exact else check.precision.level
+    predicted = check.precision["epoch" if exact else "level"]
     # the adjustment linearises at its own estimate, the check at the plan
     assert predicted == pytest.approx(stated, rel=0.03)
 
@@ -62,7 +62,7 @@ def test_design_figures_of_the_corner_field():
     """DESIGN idea 3: 147 targets, 0.04 px: sd(x0) 0.3 px per image, 0.005 px in a series."""
     field = corner_field()
     check = check_field(CAMERA, field, usual_station(CAMERA, field), 0.04)
-    epoch, series, _ = check.precision.pixels(CAMERA.sensor.pixel_pitch)["x0"]
+    epoch, series, _ = check.sds_px["x0"]
     assert 0.2 < epoch < 0.6
     assert 0.003 < series < 0.007
 
@@ -109,8 +109,8 @@ def test_a_plane_field_never_tells_all_in_one_image_and_needs_depth(aside_deg):
     centre, angle = field.points.mean(axis=0), np.radians(aside_deg)
     place = centre + 700 * np.array([np.sin(angle), 0.1, np.cos(angle)])
     check = check_field(CAMERA, field, station_at(place, centre, 0.3))
-    assert np.isinf(check.precision.epoch[0])
-    assert np.isfinite(check.precision.series[:3]).all()
+    assert np.isinf(check.precision["epoch"][0])
+    assert np.isfinite(check.precision["series"][:3]).all()
     first, second = advise(check)[:2]
     assert "one plane" in first
     assert "in front of the field" in second
@@ -131,8 +131,8 @@ def test_proposed_targets_bring_what_is_said():
     added = station.centre + (rays * (depth / -rays[:, 2:])) @ station.rotation.T
     points = np.concatenate([field.points, added])
     then = precision(CAMERA, station, points, np.full(points.shape, 0.02), 0.03)
-    assert then.epoch[which] / 0.00112 == pytest.approx(promised, rel=0.05)
-    assert promised < 0.85 * check.precision.epoch[which] / 0.00112
+    assert then["epoch"][which] / 0.00112 == pytest.approx(promised, rel=0.05)
+    assert promised < 0.85 * check.precision["epoch"][which] / 0.00112
 
 
 def test_empty_parts_and_unsurveyed_print_are_named():

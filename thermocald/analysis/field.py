@@ -59,25 +59,6 @@ _ONE_PLANE = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Precision:
-    """Standard deviations that a station reaches, by `DEFAULT_FREE`; c, x0, y0 … in mm etc.
-
-    epoch: one image, its orientation free, image noise alone; series: of one epoch relative to the
-    others where the camera stands still, many epochs; level: one image, the test field's own
-    uncertainty included: what is common to all epochs. inf where nothing determines a parameter.
-    """
-
-    epoch: Array
-    series: Array
-    level: Array
-
-    def pixels(self, sensor_pitch: float) -> dict[str, tuple[float, float, float]]:
-        """Sd of c, x0, y0 in px: (epoch, series, level) by name."""
-        rows = np.stack([self.epoch, self.series, self.level], axis=1)[:3] / sensor_pitch
-        return {name: tuple(row) for name, row in zip(DEFAULT_FREE, rows.tolist(), strict=False)}
-
-
 @dataclass(frozen=True, eq=False)
 class FieldCheck:
     """The result: rows of visible targets, why the others are not, how they fill image and depth.
@@ -85,8 +66,8 @@ class FieldCheck:
     sigma_px: of an image coordinate; sizes: smaller diameter in px of each visible circle; cells:
     targets per part of the image (rows, columns); coverage: share of the image inside the targets'
     hull; depth_relief: range of depth over mean depth; distance: mean depth mm; flatness: how far
-    the targets lie off their best plane, over that distance; weak: why the program would call an
-    image of it too weak for a result, empty if it would not.
+    the targets lie off their best plane, over that distance; precision: what `precision` returns;
+    weak: why the program would call an image of it too weak for a result, empty if it would not.
     """
 
     camera: CameraModel
@@ -101,8 +82,14 @@ class FieldCheck:
     depth_relief: float
     distance: float
     flatness: float
-    precision: Precision
+    precision: dict[str, Array]
     weak: tuple[str, ...]
+
+    @property
+    def sds_px(self) -> dict[str, tuple[float, float, float]]:
+        """Sd of c, x0, y0 in px: (epoch, series, level) by name."""
+        rows = np.stack([*self.precision.values()], axis=1)[:3] / self.camera.sensor.pixel_pitch
+        return {name: tuple(row) for name, row in zip(DEFAULT_FREE, rows.tolist(), strict=False)}
 
     @cached_property
     def advice(self) -> list[str]:
@@ -112,8 +99,7 @@ class FieldCheck:
     def as_dict(self) -> dict[str, Any]:
         """Return the document that `testfield check` writes with `--json`."""
         sds = {}
-        for kind in ("epoch", "series", "level"):
-            values = getattr(self.precision, kind)
+        for kind, values in self.precision.items():
             named = zip(DEFAULT_FREE, values, strict=True)
             sds[kind] = {f"sd_{n}": float(v) if v < _NONE else None for n, v in named}
         sizes = sorted(self.sizes)
@@ -153,7 +139,7 @@ class FieldCheck:
         lines.append(
             "  standard deviations in px    one image    in a series    with the field's own"
         )
-        for name, row in self.precision.pixels(self.camera.sensor.pixel_pitch).items():
+        for name, row in self.sds_px.items():
             cells = [f"{v:.3g}" if v < _NONE else "none" for v in row]
             lines.append(f"    {name:<24} {cells[0]:>12} {cells[1]:>14} {cells[2]:>20}")
         return lines + [f"  better: {note}" for note in self.advice]
@@ -167,9 +153,14 @@ def usual_station(camera: CameraModel, field: TestField) -> ExteriorOrientation:
     centre = (field.points.min(axis=0) + field.points.max(axis=0)) / 2
     towards = _front(field)
     low, high = 1e-3 * _extent(field), 1e3 * _extent(field)
+    # the pinhole decides: a distortion polynomial folds back far outside of the image
+    pinhole = CameraModel(camera.sensor, type(camera.interior)(c=camera.interior.c))
+    middle_px = camera.sensor.centre
     for _ in range(60):
         middle = np.sqrt(low * high)
-        inside = _fits(camera, field, station_at(centre + middle * towards, centre))
+        image = pinhole.project(station_at(centre + middle * towards, centre), field.points)
+        # NaN, behind the camera, is not inside
+        inside = np.all(np.abs(image - middle_px) < middle_px * _FILL)
         low, high = (low, middle) if inside else (middle, high)
     return station_at(centre + high * towards, centre)
 
@@ -214,16 +205,6 @@ def _front(field: TestField) -> Array:
     mean = (n * sign[:, None]).mean(axis=0)
     length = float(np.linalg.norm(mean))
     return mean / length if length > 1e-6 else np.asarray(n[0] * sign[0])
-
-
-def _fits(camera: CameraModel, field: TestField, station: ExteriorOrientation) -> bool:
-    # the pinhole decides: a distortion polynomial folds back far outside of the image
-    pinhole = CameraModel(camera.sensor, type(camera.interior)(c=camera.interior.c))
-    image = pinhole.project(station, field.points)
-    if not np.all(np.isfinite(image)):
-        return False
-    half = camera.sensor.centre * _FILL
-    return bool(np.all(np.abs(image - camera.sensor.centre) < half))
 
 
 def check_field(
@@ -321,17 +302,23 @@ def precision(
     points: Array,
     sigmas: Array,
     sigma_px: float,
-) -> Precision:
-    """The standard deviations that targets at points (n, 3) mm with sigmas (n, 3) mm give."""
+) -> dict[str, Array]:
+    """The standard deviations that targets at points (n, 3) mm with sigmas (n, 3) mm give, by
+    `DEFAULT_FREE`; c, x0, y0 … in mm etc.
+
+    epoch: one image, its orientation free, image noise alone; series: of one epoch relative to the
+    others where the camera stands still, many epochs; level: one image, the test field's own
+    uncertainty included: what is common to all epochs. inf where nothing determines a parameter.
+    """
     A, by_point = _partials(camera, station, points)
     k, noise = len(DEFAULT_FREE), np.eye(2) * sigma_px**2
     of_field = (by_point * sigmas[:, None, :] ** 2) @ np.swapaxes(by_point, 1, 2)
     N = _normal_matrix(A, noise)
-    return Precision(
-        epoch=_sds(N)[:k],
-        series=_sds(N[:k, :k]),
-        level=_sds(_normal_matrix(A, noise + of_field))[:k],
-    )
+    return {
+        "epoch": _sds(N)[:k],
+        "series": _sds(N[:k, :k]),
+        "level": _sds(_normal_matrix(A, noise + of_field))[:k],
+    }
 
 
 def _partials(
@@ -391,19 +378,22 @@ def advise(check: FieldCheck) -> list[str]:
     """
     points, sigmas = check.field.points[check.visible], check.field.sigmas[check.visible]
     typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
-    now = check.precision.epoch
+    now, pitch = check.precision["epoch"], check.camera.sensor.pixel_pitch
     proposals: list[tuple[float, str]] = []
 
     def propose(added: Array, what: str) -> None:
         both = np.concatenate([points, added])
         spread = np.concatenate([sigmas, np.repeat(typical, len(added), axis=0)])
-        then = precision(check.camera, check.station, both, spread, check.sigma_px).epoch
+        then = precision(check.camera, check.station, both, spread, check.sigma_px)["epoch"]
         with np.errstate(invalid="ignore"):  # what is not determined now is worth everything
             gain = np.where(np.isfinite(now), then / now, 0.0)[:3]
         gain = np.where(np.isfinite(then[:3]), gain, 1.0)
         best = int(np.argmin(gain))
         if gain[best] < _WORTH and np.all(np.isfinite(then[:3])):
-            proposals.append((float(gain[best]), f"{what}: {_change(check, best, now, then)}"))
+            before = f"{now[best] / pitch:.2g} px" if np.isfinite(now[best]) else "not determined"
+            name = parameter_label(DEFAULT_FREE[best])
+            change = f"sd({name}) of one image {before} → {then[best] / pitch:.2g} px"
+            proposals.append((float(gain[best]), f"{what}: {change}"))
 
     near = check.distance * (1 - _RAISED)
     propose(
@@ -440,20 +430,13 @@ def _remarks(check: FieldCheck) -> list[str]:
     outside = sum("outside" in reason for reason in check.hidden.values())
     if outside:
         notes.append(f"{outside} targets are outside of the image: step back, or look elsewhere")
-    level, epoch = check.precision.level[:3], check.precision.epoch[:3]
+    level, epoch = check.precision["level"][:3], check.precision["epoch"][:3]
     if np.all(np.isfinite(level)) and np.any(level > 2 * epoch):
         notes.append(
             "the test field's own uncertainty is larger than what the image could give: survey it "
             "(thermocald testfield survey)"
         )
     return notes
-
-
-def _change(check: FieldCheck, which: int, now: Array, then: Array) -> str:
-    pitch = check.camera.sensor.pixel_pitch
-    before = f"{now[which] / pitch:.2g} px" if np.isfinite(now[which]) else "not determined"
-    name = parameter_label(DEFAULT_FREE[which])
-    return f"sd({name}) of one image {before} → {then[which] / pitch:.2g} px"
 
 
 def _along(

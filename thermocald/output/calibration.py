@@ -263,7 +263,7 @@ def render_field_check(result: FieldCheck) -> str:
     """Return the report as HTML text."""
     field, model = result.field, result.camera
     pitch = model.sensor.pixel_pitch
-    sds = result.precision.pixels(pitch)
+    sds = result.sds_px
     said = ", ".join(f"{parameter_label(n)} to ± {_sd(one)}" for n, (one, *_) in sds.items())
     if result.weak:
         sentence = f"Not enough for a result from there: {'; '.join(result.weak)}."

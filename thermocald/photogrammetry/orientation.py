@@ -95,21 +95,26 @@ def _interiors(
 ) -> list[InteriorOrientation]:
     if interior is not None:
         return [interior]
-    width_mm = sensor.width * sensor.pixel_pitch
     if nominal_c is not None:
         return [InteriorOrientation(nominal_c * f) for f in (1.0, 0.97, 1.03, 0.93, 1.07)]
-    views = np.radians(np.array(_FIELDS_OF_VIEW_DEG))
-    lengths = list(width_mm / 2 / np.tan(views / 2))
+    lengths = _distances(sensor, _FIELDS_OF_VIEW_DEG)
     direct = _direct_linear_transformation(sensor, X, uv)
     if direct is not None and lengths[-1] / 2 < direct < lengths[0] * 2:
         lengths += [direct]
-    coarse = [InteriorOrientation(float(c)) for c in lengths]
+    coarse = [InteriorOrientation(c) for c in lengths]
     scores = []
     for candidate in coarse:
         found = _robust_resection(sensor, candidate, X, uv)
         scores.append(np.inf if found is None else float(np.median(found[1])))
     c = coarse[int(np.argmin(scores))].c
     return [InteriorOrientation(c * f) for f in (1.0, 0.96, 1.04, 0.92, 1.08, 0.88, 1.12)]
+
+
+def _distances(sensor: Sensor, views_deg: tuple[float, ...]) -> list[float]:
+    """The principal distances in mm of cameras with these fields of view."""
+    half_mm = sensor.width * sensor.pixel_pitch / 2
+    found: list[float] = (half_mm / np.tan(np.radians(views_deg) / 2)).tolist()
+    return found
 
 
 def _robust_resection(
@@ -298,14 +303,8 @@ def _quick_start(
     nominal_c: float | None,
     interior: InteriorOrientation | None,
 ) -> tuple[InteriorOrientation, ExteriorOrientation] | None:
-    width = sensor.width * sensor.pixel_pitch
-    if interior is not None:
-        candidates = [interior]
-    elif nominal_c is not None:
-        candidates = [InteriorOrientation(nominal_c)]
-    else:
-        views = np.radians(_QUICK_VIEWS_DEG)
-        candidates = [InteriorOrientation(float(width / 2 / np.tan(v / 2))) for v in views]
+    lengths = _distances(sensor, _QUICK_VIEWS_DEG) if nominal_c is None else [nominal_c]
+    candidates = [InteriorOrientation(c) for c in lengths] if interior is None else [interior]
     best = None
     for candidate in candidates:
         try:

@@ -339,7 +339,7 @@ class CameraDifference(Result):
             "parameters": rows,
             "largest_px": lengths[worst],
             "largest_at": self._grid[worst],
-            "rms_px": _rms(self.shifts),
+            "rms_px": self.rms_px,
             "largest_turned_px": turned.max(),
             "rms_turned_px": _rms(self.turned_shifts),
         }
@@ -408,7 +408,7 @@ class CameraDifference(Result):
     def _image_sds(self, worst: int) -> tuple[float, float]:
         """Standard deviations px of the largest shift's length, and of the RMS."""
         along_shifts = self.shifts / np.linalg.norm(self.shifts, axis=1)[:, None].clip(1e-300)
-        weights = self.shifts / (len(self.shifts) * max(_rms(self.shifts), 1e-300))
+        weights = self.shifts / (len(self.shifts) * max(self.rms_px, 1e-300))
         largest = rms = 0.0
         cameras = (self.first, self.second)
         for camera, covariance in zip(cameras, self.covariances, strict=True):

@@ -309,7 +309,7 @@ def _centre(
         return values
 
     windows = [window(*at) for at in starts]
-    alike = [float(_correlation(w, w[::-1, ::-1], weight)) for w in windows]
+    alike = [_symmetry(w, weight) for w in windows]
     p = starts[int(np.argmax(alike))].copy()
     for _ in range(_ITERATIONS):
         w = window(*p)
@@ -326,7 +326,7 @@ def _centre(
         if np.abs(step).max() < _CONVERGED_PX:
             break
     w = window(*p)
-    symmetric = float(_correlation(w, w[::-1, ::-1], weight))
+    symmetric = _symmetry(w, weight)
     if symmetric < _SYMMETRY:
         return None
     inverse = np.linalg.inv(N)
@@ -351,14 +351,12 @@ def _searched(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Arr
     return np.array([left + column + half, top + row + half], dtype=float)
 
 
-def _correlation(a: Array, b: Array, weight: Array) -> Array:
-    """Weighted correlation along the last axes, as many as weights (…) have; 0 without contrast."""
-    axes = tuple(range(-weight.ndim, 0))
-    da, db = (x - (weight * x).sum(axis=axes, keepdims=True) / weight.sum() for x in (a, b))
-    both, ours, theirs = ((weight * x).sum(axis=axes) for x in (da * db, da**2, db**2))
-    scale = np.sqrt(ours * theirs)
-    found: Array = np.where(scale > 0, both / np.where(scale > 0, scale, 1.0), 0.0)
-    return found
+def _symmetry(window: Array, weight: Array) -> float:
+    """Weighted correlation of a window with itself turned by 180°; 0 without contrast."""
+    # the weights are symmetric too: both have one mean and one variance
+    off = window - (weight * window).sum() / weight.sum()
+    variance = float((weight * off**2).sum())
+    return float((weight * off * off[::-1, ::-1]).sum()) / variance if variance > 0 else 0.0
 
 
 def _correlated(r: Array) -> Array:

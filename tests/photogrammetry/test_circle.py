@@ -172,7 +172,6 @@ def _one(diameter_px: float, at: tuple[float, float], spoil=None, **render):
     size = diameter_px * np.linalg.norm(centre) * PI_SENSOR.pixel_pitch / PI_CAMERA.interior.c
     scene = Scene(**{k: v for k, v in render.items() if k in ("paper", "ink")})
     scene.disc(centre, -ray, size)
-    image = np.full((300, 400), scene.paper)
     image = scene.render(PI_CAMERA, AT_ORIGIN, (0, 0, 400, 300), render.get("blur", 0.8))
     frame = noisy(image, np.random.default_rng(3))
     if spoil is not None:

@@ -340,12 +340,12 @@ def online(draws: int, rng: np.random.Generator) -> list[Row]:
         for _ in range(draws):
             scene = Scene(rng, sigma, factor * NOISE_PX)
             errors = FieldErrors(scene.sensor, scene.field)
-            found = OnlineFilter(scene.sensor, common_variances=errors.variances)
+            found = OnlineFilter(scene.sensor, errors.variances)
             for k in range(10):
                 seen = scene.observe(scene.iop, scene.eop)
                 result = scene.adjust(seen)
                 one = found.update(result, 25.0, errors.split(result, seen))
-                if k >= 4 and one is not None:
+                if k >= 4:
                     chi2.append(one.chi2 / one.dof)
             sd = np.sqrt(np.diag(found.covariance()))[:3]
             off.append((found.values() - np.concatenate([scene.iop, scene.eop]))[:3] / sd)

@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermocald.analysis.online.equilibrium import (
-    EquilibriumWatch,
-    GivenInterior,
-    fit_approach,
-    slope,
-)
+from thermocald.analysis.online.equilibrium import EquilibriumWatch, fit_approach, slope
+
+GAIN, POSE = np.zeros((3, 6)), np.zeros(6)
 
 
 def test_a_slope_scatters_as_its_sd_says():
@@ -35,7 +32,7 @@ def test_the_time_to_steady_is_within_its_sds():
         values = size * np.exp(-t / tau) + rng.normal(0, 0.03, 60)
         approach = fit_approach(t, values, np.full(60, 0.03), bound)
         assert approach is not None
-        found.append((approach.ready_in, approach.sd_ready_in))
+        found.append(approach[:2])
     ready, sds = np.array(found).T
     off = (ready - truth) / sds
     assert abs(ready.mean() - truth) < 0.05 * truth
@@ -53,27 +50,27 @@ def watch(values_of, epochs: int = 60, noise: float = 0.02) -> EquilibriumWatch:
     made = EquilibriumWatch()
     for k in range(epochs):
         values = values_of(10.0 * k) + rng.normal(0, noise, 3)
-        made.add(GivenInterior(10.0 * k, values, np.zeros((3, 6)), np.full(3, noise)))
+        made.add(10.0 * k, values, GAIN, np.full(3, noise))
     return made
 
 
 def test_warm_is_ready_and_warming_is_not():
-    steady = watch(lambda t: np.zeros(3)).assess()
+    steady = watch(lambda t: np.zeros(3)).assess(POSE)
     assert steady.state == "ready"
-    warming = watch(lambda t: np.array([1.0, 2.0, -2.0]) * np.exp(-t / 400.0)).assess()
+    warming = watch(lambda t: np.array([1.0, 2.0, -2.0]) * np.exp(-t / 400.0)).assess(POSE)
     assert warming.state == "drifting"
     truth = 60.0 * 3.0 / 400.0 * np.exp(-500.0 / 400.0)  # at the middle of the last 3 min
     assert warming.drift == pytest.approx(truth, rel=0.15)
     assert "ready in about" in warming.sentence
-    assert watch(lambda t: np.zeros(3), epochs=4).assess().state == "unknown"
+    assert watch(lambda t: np.zeros(3), epochs=4).assess(POSE).state == "unknown"
 
 
 def test_a_held_parameter_is_not_asked():
     made = EquilibriumWatch()
     for k in range(30):
         values, sds = np.array([np.nan, 0.0, 0.0]), np.array([np.nan, 0.01, 0.01])
-        made.add(GivenInterior(10.0 * k, values, np.zeros((3, 6)), sds))
-    assert made.assess().state == "ready"
+        made.add(10.0 * k, values, GAIN, sds)
+    assert made.assess(POSE).state == "ready"
 
 
 def test_at_20_hz_an_epoch_costs_what_one_a_second_costs():
@@ -83,11 +80,11 @@ def test_at_20_hz_an_epoch_costs_what_one_a_second_costs():
     for k in range(20 * 900):
         time = 0.05 * k
         values = np.array([1.0, 2.0, -2.0]) * np.exp(-time / 400.0) + rng.normal(0, 0.02, 3)
-        quick.add(GivenInterior(time, values, np.zeros((3, 6)), np.full(3, 0.02)))
+        quick.add(time, values, GAIN, np.full(3, 0.02))
         if k % 200 == 0:
-            seldom.add(GivenInterior(time, values, np.zeros((3, 6)), np.full(3, 0.02)))
+            seldom.add(time, values, GAIN, np.full(3, 0.02))
     assert len(quick._past) <= 4 * 180 + 1
-    found, rough = quick.assess(), seldom.assess()
+    found, rough = quick.assess(POSE), seldom.assess(POSE)
     assert found.state == "drifting"
     assert found.drift == pytest.approx(rough.drift, abs=3.0 * rough.sd_drift)
     assert found.sd_drift < 0.3 * rough.sd_drift  # nothing of the 200 times as many is lost

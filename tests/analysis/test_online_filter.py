@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+from benchmarks.audit_camera import Scene
 from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter, chi2_quantile
@@ -15,130 +17,11 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     project,
 )
-from thermocald.photogrammetry.epoch.adjustment import adjust
+from thermocald.photogrammetry.epoch.adjustment import adjust, failed
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.physics.testfields import corner_field, demonstration_model
 
 RATES = np.array([2.0e-4, -4.5e-4, -3.0e-4])
-
-
-@pytest.fixture(scope="module")
-def camera():
-    """seed → function (temperature, change of the 16 parameters) → adjustment."""
-    field = corner_field("plain", per_side=4, pitch_mm=150.0)
-    model = demonstration_model(field)
-    iop, eop = model.interior.as_array(), model.exterior.as_array()
-    rows = np.arange(len(field))
-
-    def make(seed: int):
-        rng = np.random.default_rng(seed)
-
-        def epoch(temperature: float, change=None):
-            values = np.concatenate([iop, eop])
-            values[:3] += RATES * (temperature - 25.0)
-            if change is not None:
-                values = values + change
-            points = project(model.sensor, values[:10], values[10:], field.points)
-            points = points + rng.normal(0, 0.04, points.shape)
-            seen = Observations(rows, points, np.full(points.shape, 0.04))
-            result = adjust(
-                model.sensor, field, seen, InteriorOrientation.from_array(iop),
-                ExteriorOrientation.from_array(eop),
-            )  # fmt: skip
-            assert result.ok
-            return result
-
-        return epoch
-
-    make.sensor = model.sensor
-    make.truth = lambda temperature: iop[:3] + RATES * (temperature - 25.0)
-    make.eop = eop
-    return make
-
-
-def run(camera, seed: int, epochs: int = 40):
-    rng = np.random.default_rng([seed, 9])
-    epoch, found = camera(seed), OnlineFilter(camera.sensor)
-    for k in range(epochs):
-        temperature = 25.0 + 0.25 * k
-        found.update(epoch(temperature), temperature + rng.normal(0, 0.05))
-    return found
-
-
-def test_the_scatter_of_estimate_and_rates_is_what_its_covariance_says(camera):
-    deviations = []
-    for seed in range(40):
-        found = run(camera, seed)
-        sd = np.sqrt(np.diag(found.covariance()))[:3]
-        # the estimate is that at the last temperature read, which has noise of its own
-        at = found.last_temperature
-        sd_rate = np.sqrt(np.diag(found.rates_covariance))
-        deviations.append([*((found.values()[:3] - camera.truth(at)) / sd),
-                           *((found.rates - RATES) / sd_rate)])  # fmt: skip
-    rms = np.sqrt(np.mean(np.square(deviations), axis=0))
-    # wander and lag are allowed for, and this camera has none: conservative, not by much more
-    assert np.all(rms < 1.3)
-    assert np.all(rms > 0.2)
-    assert np.sqrt(np.diag(found.covariance()))[1] < 0.35 * camera(0)(25.0).sd[1]
-
-
-def test_no_alarm_over_a_warm_up(camera):
-    for seed in range(5):
-        rng = np.random.default_rng([seed, 3])
-        epoch, found = camera(seed), OnlineFilter(camera.sensor)
-        for k in range(60):
-            temperature = 25.0 + (0.0 if k < 20 else 0.35 * (k - 20))
-            innovation = found.update(epoch(temperature), temperature + rng.normal(0, 0.05))
-            assert innovation.change == ""
-
-
-@pytest.mark.parametrize(
-    ("name", "parameter", "size"),
-    [("knock", 13, 0.5), ("knock", 12, 0.002), ("slip", 0, 3e-3), ("wrong_lens", 0, 0.2)],
-)
-def test_a_change_that_stays_is_named_at_its_second_epoch(camera, name, parameter, size):
-    epoch, found = camera(1), OnlineFilter(camera.sensor)
-    for _ in range(20):
-        found.update(epoch(25.0), 25.0)
-    change = np.zeros(16)
-    change[parameter] = size
-    named = [found.update(epoch(25.0, change), 25.0).change for _ in range(6)]
-    assert named == ["outlier", name, "", "", "", ""]
-
-
-def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone(camera):
-    epoch, found = camera(2), OnlineFilter(camera.sensor)
-    for _ in range(20):
-        found.update(epoch(25.0), 25.0)
-    before = found.values()
-    change = np.zeros(16)
-    change[13] = 2.0
-    assert found.update(epoch(25.0, change), 25.0).change == "outlier"
-    assert np.abs((found.values() - before)[:3]).max() < 1e-9
-    assert found.update(epoch(25.0), 25.0).change == ""
-
-
-def test_with_the_exterior_known_an_epoch_tells_the_interior_ten_times_better(camera):
-    result = camera(3)(25.0)
-    one = given_exterior(0.0, result.values, result.covariance, 1.0)
-    assert np.all(one.sds[1:] < 0.1 * result.sd[1:3])
-    assert np.all(np.abs(one.at(camera.eop) - camera.truth(25.0)) < 4 * one.sds)
-
-
-def test_chi2_quantiles():
-    from scipy.stats import chi2
-
-    for dof in (6, 8, 11, 14, 16):
-        for p in (0.95, 0.999, 1 - 1e-6):
-            assert chi2_quantile(p, dof) == pytest.approx(chi2.ppf(p, dof), rel=0.04)
-
-
-def test_an_epoch_without_a_result_changes_nothing(camera):
-    from thermocald.photogrammetry.epoch.adjustment import failed
-
-    found = OnlineFilter(camera.sensor)
-    assert found.update(failed("bad_frame", ""), 25.0) is None
-    assert found.epochs == 0
 
 
 class Surveyed:
@@ -170,7 +53,7 @@ class Surveyed:
     def filter(self):
         """The filter, and a function that gives it an epoch."""
         errors = FieldErrors(self.model.sensor, self.field)
-        found = OnlineFilter(self.model.sensor, common_variances=errors.variances)
+        found = OnlineFilter(self.model.sensor, errors.variances)
 
         def take(rise: float = 0.0, change=0.0):
             seen, result = self.epoch(rise, change)
@@ -178,6 +61,81 @@ class Surveyed:
             return found.update(result, reading, errors.split(result, seen))
 
         return found, take
+
+
+def one_changed(parameter: int, size: float) -> np.ndarray:
+    return size * np.eye(16)[parameter]
+
+
+def test_the_scatter_of_estimate_and_rates_is_what_its_covariance_says():
+    deviations = []
+    for seed in range(40):
+        camera = Surveyed(0.0, seed)
+        found, take = camera.filter()
+        for k in range(40):
+            take(0.25 * k)
+        sd = np.sqrt(np.diag(found.covariance()))[:3]
+        # the estimate is that at the last temperature read, which has noise of its own
+        truth = camera.iop[:3] + RATES * (found.last_temperature - 25.0)
+        sd_rate = np.sqrt(np.diag(found.rates_covariance))
+        deviations.append(
+            [*((found.values()[:3] - truth) / sd), *((found.rates - RATES) / sd_rate)]
+        )
+    rms = np.sqrt(np.mean(np.square(deviations), axis=0))
+    # wander and lag are allowed for, and this camera has none: conservative, not by much more
+    assert np.all(rms < 1.3)
+    assert np.all(rms > 0.2)
+    assert sd[1] < 0.35 * camera.epoch()[1].sd[1]
+
+
+def test_no_alarm_over_a_warm_up():
+    for seed in range(5):
+        _, take = Surveyed(0.0, seed).filter()
+        assert all(take(0.35 * max(k - 20, 0)).change == "" for k in range(60))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "size"),
+    [("knock", 13, 0.5), ("knock", 12, 0.002), ("slip", 0, 3e-3), ("wrong_lens", 0, 0.2)],
+)
+def test_a_change_that_stays_is_named_at_its_second_epoch(name, parameter, size):
+    _, take = Surveyed(0.0, 1).filter()
+    for _ in range(20):
+        take()
+    named = [take(change=one_changed(parameter, size)).change for _ in range(6)]
+    assert named == ["outlier", name, "", "", "", ""]
+
+
+def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone():
+    found, take = Surveyed(0.0, 2).filter()
+    for _ in range(20):
+        take()
+    before = found.values()
+    assert take(change=one_changed(13, 2.0)).change == "outlier"
+    assert np.abs((found.values() - before)[:3]).max() < 1e-9
+    assert take().change == ""
+
+
+def test_with_the_exterior_known_an_epoch_tells_the_interior_ten_times_better():
+    camera = Surveyed(0.0, 3)
+    _, result = camera.epoch()
+    values, gain, sds = given_exterior(result.values, result.covariance, 1.0)
+    assert np.all(sds[1:] < 0.1 * result.sd[1:3])
+    assert np.all(np.abs(values + gain @ camera.eop - camera.iop[:3]) < 4 * sds)
+
+
+def test_chi2_quantiles():
+    for dof in (6, 8, 11, 14, 16):
+        for p in (0.95, 0.999, 1 - 1e-6):
+            assert chi2_quantile(p, dof) == pytest.approx(chi2.ppf(p, dof), rel=0.04)
+
+
+def test_an_epoch_without_a_result_changes_nothing():
+    camera = Surveyed(0.0, 4)
+    observer = OnlineObserver(camera.model.sensor, camera.field, lambda *_: None)
+    epoch = Epoch(1, 0.0, 0.0, {"temperature": 25.0}, None, camera.epoch()[0])
+    assert observer.observe(CalibratedEpoch(epoch, failed("bad_frame", ""), {})) == {}
+    assert observer.filter.epochs == 0
 
 
 @pytest.mark.parametrize("missing", mostly_slow([0.0, 0.1], 0.1))
@@ -219,8 +177,7 @@ def test_a_knock_of_a_tenth_of_a_pixel_is_noticed(sigma_mm):
         camera = Surveyed(sigma_mm, seed)
         _, take = camera.filter()
         assert all(take().change == "" for _ in range(20))
-        change = np.zeros(16)
-        change[11] = 0.1 * camera.model.sensor.pixel_pitch / camera.iop[0]  # of phi, rad
+        change = one_changed(11, 0.1 * camera.model.sensor.pixel_pitch / camera.iop[0])  # phi, rad
         noticed += any(take(change=change).change not in ("", "outlier") for _ in range(4))
     assert noticed >= 18
 
@@ -256,13 +213,11 @@ def test_the_noise_is_measured_apart_from_the_field():
 
 def test_noise_twice_as_large_as_stated_is_followed_from_the_first_epoch():
     """The first epoch was weighted by the stated noise: error over sd 1.5 after six epochs."""
-    from benchmarks.audit_camera import Scene
-
     off = []
     for seed in range(30):
         scene = Scene(np.random.default_rng(seed), 0.0, 0.08)
         errors = FieldErrors(scene.sensor, scene.field)
-        found = OnlineFilter(scene.sensor, common_variances=errors.variances)
+        found = OnlineFilter(scene.sensor, errors.variances)
         for _ in range(6):
             seen = scene.observe(scene.iop, scene.eop)
             result = scene.adjust(seen)

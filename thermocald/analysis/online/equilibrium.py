@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 if TYPE_CHECKING:
-    from thermocald.arrays import Array
-
-__all__ = ["Approach", "Equilibrium", "EquilibriumWatch", "GivenInterior", "fit_approach", "slope"]
+    from thermocald.arrays import Array, Mask
 
 State = Literal["unknown", "drifting", "ready"]
 
@@ -31,37 +29,6 @@ _WEIGHTY = 9  # points of the grid that carry the weight
 _SETTLED_SD = 2.0
 _CURVED_SD = 3.0
 _WORST_MISFIT = 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class Approach:
-    """An exponential approach: tau s, and s from the last epoch until it is steady, with sds;
-    misfit: reduced chi-square.
-    """
-
-    tau: float
-    sd_tau: float
-    ready_in: float
-    sd_ready_in: float
-    misfit: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GivenInterior:
-    """(c, x0, y0) of one epoch as a function of the exterior orientation that one assumes.
-
-    time s; values (3,) px at the exterior orientation 0; gain (3, 6): px per unit of the exterior
-    orientation; sds (3,) px of the epoch's noise, NaN for what is not estimated.
-    """
-
-    time: float
-    values: Array
-    gain: Array
-    sds: Array
-
-    def at(self, exterior: Array | None) -> Array:
-        """(3,) px, given the exterior orientation (6,)."""
-        return self.values if exterior is None else self.values + self.gain @ exterior
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,11 +80,14 @@ def slope(times: Array, values: Array, sds: Array) -> tuple[Array, Array]:
     return slopes, result
 
 
-def fit_approach(times: Array, values: Array, sds: Array, bound: float) -> Approach | None:
+def fit_approach(
+    times: Array, values: Array, sds: Array, bound: float
+) -> tuple[float, float, float] | None:
     """Fit a + b·exp(-t/tau) to values (n,) at times (n,) s; None if nothing approaches.
 
-    bound: speed per s below which it counts as steady. tau runs over a grid from a few epochs to
-    ten times the span; every tau is weighted by its likelihood.
+    bound: speed per s below which it counts as steady. Returns s from the last epoch until it is
+    steady, with its sd, and the misfit: reduced chi-square. tau runs over a grid from a few epochs
+    to ten times the span; every tau is weighted by its likelihood.
     """
     span = float(times[-1] - times[0])
     step = span / (len(times) - 1)
@@ -133,15 +103,9 @@ def fit_approach(times: Array, values: Array, sds: Array, bound: float) -> Appro
         best = int(weight.argmax())
         taus = np.geomspace(taus[max(best - 1, 0)], taus[min(best + 1, _TAUS - 1)], _TAUS)
     weight /= weight.sum()
-    tau = float(weight @ taus)
     ready_in = float(weight @ ready)
-    return Approach(
-        tau,
-        float(np.sqrt(weight @ (taus - tau) ** 2)),
-        ready_in,
-        float(np.sqrt(weight @ ((ready - ready_in) ** 2 + factor * variance))),
-        factor,
-    )
+    sd = float(np.sqrt(weight @ ((ready - ready_in) ** 2 + factor * variance)))
+    return ready_in, sd, factor
 
 
 def _profile(
@@ -160,111 +124,85 @@ def _profile(
     return chi2, ready, variance
 
 
-class _Group:
-    """Epochs within a second, as weighted sums."""
-
-    def __init__(self, begin: float) -> None:
-        self.begin = begin
-        self._count = 0
-        self._time = 0.0
-        self._weight: Array = np.zeros(3)
-        self._values: Array = np.zeros(3)
-        self._gain: Array = np.zeros((3, 6))
-
-    def with_one(self, one: GivenInterior) -> GivenInterior:
-        """Add an epoch; returns the mean of all, the epoch itself where it is the only one."""
-        weight = 1.0 / one.sds**2
-        self._count += 1
-        self._time += one.time
-        self._weight = self._weight + weight
-        self._values = self._values + weight * one.values
-        self._gain = self._gain + weight[:, None] * one.gain
-        if self._count == 1:
-            return one
-        return GivenInterior(
-            self._time / self._count,
-            self._values / self._weight,
-            self._gain / self._weight[:, None],
-            1.0 / np.sqrt(self._weight),
-        )
-
-
 class EquilibriumWatch:
-    """Watches (c, x0, y0) in px over a sliding window."""
+    """Watches (c, x0, y0) in px over a sliding window.
+
+    Epochs that follow each other within a second are averaged: at 20 Hz the cost of an epoch is
+    that of one per second, and does not grow.
+    """
 
     def __init__(self) -> None:
-        self._past: deque[GivenInterior] = deque()
-        self._group = _Group(float("-inf"))
+        # of each second: when it began, epochs, sum of their times, and (3, 8) of their weights,
+        # of weights times values, and of weights times gains
+        self._past: deque[tuple[float, int, float, Array]] = deque()
 
     def clear(self) -> None:
         """Start again, after a knock."""
         self._past.clear()
-        self._group = _Group(float("-inf"))
 
-    def add(self, one: GivenInterior) -> None:
-        """Add an epoch; the sds of what is not estimated are NaN.
+    def add(self, time: float, values: Array, gain: Array, sds: Array) -> None:
+        """Add (c, x0, y0) of an epoch as a function of the exterior orientation that one assumes.
 
-        Epochs that follow each other within a second are averaged: at 20 Hz the cost of an epoch is
-        that of one per second, and does not grow.
+        time s; values (3,) px at the exterior orientation 0; gain (3, 6): px per unit of the
+        exterior orientation; sds (3,) px of the epoch's noise, NaN for what is not estimated.
         """
-        if one.time - self._group.begin < _GROUP_S and self._past:
-            self._past[-1] = self._group.with_one(one)
-        else:
-            self._group = _Group(one.time)
-            self._past.append(self._group.with_one(one))
-        while self._past and one.time - self._past[0].time > 4.0 * _WINDOW_S:
+        sums = np.column_stack([np.ones(3), values, gain]) / sds[:, None] ** 2
+        begin, count, total = time, 1, time
+        if self._past and time - self._past[-1][0] < _GROUP_S:
+            begin, others, earlier, before = self._past.pop()
+            count, total, sums = others + 1, earlier + time, before + sums
+        self._past.append((begin, count, total, sums))
+        while time - self._past[0][2] / self._past[0][1] > 4.0 * _WINDOW_S:
             self._past.popleft()
 
-    def assess(self, exterior: Array | None = None) -> Equilibrium:
+    def assess(self, exterior: Array) -> Equilibrium:
         """How steady the camera is, given its exterior orientation (6,) as it is known now.
 
         All of the past is seen from the same exterior orientation: what was known of it at each
         epoch improves with time, and would look like drift.
         """
+        nothing = Equilibrium("unknown", float("nan"), float("nan"))
         if len(self._past) < _FEWEST:
-            return Equilibrium("unknown", float("nan"), float("nan"))
-        times = np.array([one.time for one in self._past])
-        values = np.array([one.at(exterior) for one in self._past])
-        sds = np.array([one.sds for one in self._past])
+            return nothing
+        times = np.array([total / count for _, count, total, _ in self._past])
+        sums = np.array([one for *_, one in self._past])
+        values = (sums[..., 1] + sums[..., 2:] @ exterior) / sums[..., 0]
+        sds = 1.0 / np.sqrt(sums[..., 0])
         good = np.isfinite(values).all(axis=0) & np.isfinite(sds).all(axis=0)
         if not good.any():
-            return Equilibrium("unknown", float("nan"), float("nan"))
+            return nothing
         values, sds = values[:, good], sds[:, good]
-        rate, sd_rate = self._rate(times, values, sds)
-        speed = 60.0 * float(np.linalg.norm(rate))
-        direction = rate / max(float(np.linalg.norm(rate)), 1e-300)
-        sd_speed = 60.0 * float(np.sqrt(np.sum((direction * sd_rate) ** 2)))
+        # from the longest past that straight lines describe, else from the window
+        for multiple in (4.0, 2.0, 1.0):
+            recent = _last(times, multiple)
+            recent[-_FEWEST:] = True
+            if multiple == 1.0 or _straight(times[recent], values[recent], sds[recent]):
+                break
+        rate, sd_rate = slope(times[recent], values[recent], sds[recent])
+        size = float(np.linalg.norm(rate))
+        direction = rate / max(size, 1e-300)
+        speed, sd_speed = 60.0 * size, 60.0 * float(np.sqrt(np.sum((direction * sd_rate) ** 2)))
         if speed + _SETTLED_SD * sd_speed < _STEADY:
             return Equilibrium("ready", speed, sd_speed)
         if speed - _SETTLED_SD * sd_speed < _STEADY:
             return Equilibrium("unknown", speed, sd_speed)
-        along = values @ direction
-        sd_along = np.sqrt((sds**2) @ direction**2)
-        approach = self._approach(times, along, sd_along)
-        if approach is None:
-            return Equilibrium("drifting", speed, sd_speed)
-        return Equilibrium("drifting", speed, sd_speed, approach.ready_in, approach.sd_ready_in)
-
-    def _rate(self, times: Array, values: Array, sds: Array) -> tuple[Array, Array]:
-        """Slope from the longest past that straight lines describe, else from the window."""
+        along, sd_along = values @ direction, np.sqrt((sds**2) @ direction**2)
+        # from the longest past that one exponential describes: heating may just have begun
         for multiple in (4.0, 2.0, 1.0):
-            recent = times >= times[-1] - multiple * _WINDOW_S
+            recent = _last(times, multiple)
             if recent.sum() < _FEWEST:
-                recent[-_FEWEST:] = True
-            if multiple == 1.0 or _straight(times[recent], values[recent], sds[recent]):
                 break
-        return slope(times[recent], values[recent], sds[recent])
+            found = fit_approach(times[recent], along[recent], sd_along[recent], _STEADY / 60.0)
+            if found is None:
+                break
+            ready_in, sd_ready_in, misfit = found
+            if misfit < _WORST_MISFIT:
+                return Equilibrium("drifting", speed, sd_speed, ready_in, sd_ready_in)
+        return Equilibrium("drifting", speed, sd_speed)
 
-    def _approach(self, times: Array, values: Array, sds: Array) -> Approach | None:
-        """From the longest past that one exponential describes: heating may just have begun."""
-        for fraction in (1.0, 0.5, 0.25):
-            recent = times >= times[-1] - 4.0 * fraction * _WINDOW_S
-            if recent.sum() < _FEWEST:
-                return None
-            found = fit_approach(times[recent], values[recent], sds[recent], _STEADY / 60.0)
-            if found is None or found.misfit < _WORST_MISFIT:
-                return found
-        return None
+
+def _last(times: Array, windows: float) -> Mask:
+    return np.asarray(times >= times[-1] - windows * _WINDOW_S)
 
 
 def _straight(times: Array, values: Array, sds: Array) -> bool:

@@ -49,18 +49,6 @@ _OTHER_LENS = 0.02  # of c: another lens, and partials that correlate otherwise
 _LOWEST, _HIGHEST = 0.05, 20.0  # of the measured over the stated variance of an image point
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EpochErrors:
-    """How one epoch's 16 parameters err.
-
-    noise (16, 16): covariance from the image points alone, zero where held; influence (16, 3 T): of
-    the coordinates of all T targets, per mm, zero for targets that the epoch did not use.
-    """
-
-    noise: Array
-    influence: Array
-
-
 class FieldErrors:
     """Splits the covariance of consecutive epochs before one test field.
 
@@ -80,11 +68,14 @@ class FieldErrors:
 
     def split(
         self, adjustment: Adjustment, observations: Observations, field_variance: float = 1.0
-    ) -> EpochErrors:
-        """The errors of an epoch that has a result, from its own adjustment.
+    ) -> tuple[Array, Array]:
+        """How the 16 parameters of an epoch that has a result err, from its own adjustment.
 
         adjustment: of these observations; its covariance tells which parameters are free;
         field_variance: by what the stated covariance of the coordinates is to be multiplied.
+        Returns noise (16, 16): covariance from the image points alone, zero where held, and
+        influence (16, 3 T): of the coordinates of all T targets, per mm, zero for targets that the
+        epoch did not use.
         """
         free = np.flatnonzero(np.diag(adjustment.covariance) > 0)
         used = observations.select(~np.isin(observations.targets, adjustment.rejected))
@@ -108,7 +99,7 @@ class FieldErrors:
             self.level = own if redundancy >= _LEAST_DEGREES else max(own, 1.0)
         covariance = np.zeros((16, 16))
         covariance[np.ix_(free, free)] = self.level * noise
-        return EpochErrors(covariance, influence.reshape(16, -1))
+        return covariance, influence.reshape(16, -1)
 
     def _design(self, values: Array) -> tuple[Array, Array]:
         """Partials of all targets, at one orientation while the camera stays about there.
@@ -174,7 +165,7 @@ def _blocks(covariance: Array) -> Array:
 Change = Literal["", "outlier", "knock", "slip", "wrong_lens", "change"]
 
 _WARM = (0, 1, 2)  # c, x0, y0 follow the temperature
-_EOP = tuple(range(10, 16))
+_BLOCKS: dict[Change, tuple[int, ...]] = {"slip": _WARM, "knock": tuple(range(10, 16))}
 _FAR = 1e4  # prior sd of what is not known, in sd of the first epoch
 _TRUSTED, _DOUBTFUL = 4.0, 2.0  # a rise of temperature from here on, in sd of a reading
 _FEW_READINGS = 5
@@ -218,37 +209,56 @@ class OnlineFilter:
     """The estimate, epoch after epoch.
 
     common_variances (m,): of errors that all epochs have in common, in the units of the influence
-    that `update` is given; None: there are none. Attributes: epochs taken in; T0,
-    last_temperature °C. All in the units of CONVENTIONS §2.
+    that `update` is given. Attributes: epochs taken in; T0, last_temperature °C. All in the units
+    of CONVENTIONS §2.
     """
 
-    def __init__(self, sensor: Sensor, common_variances: Array | None = None) -> None:
+    def __init__(self, sensor: Sensor, common_variances: Array) -> None:
         self.sensor = sensor
         self.epochs = 0
         self.T0 = self.last_temperature = float("nan")
-        self._common = np.empty(0) if common_variances is None else common_variances
+        self._common = common_variances
         self._free: NDArray[np.int64] = np.empty(0, dtype=np.int64)
-        self._surprised = 0
-        self._rise = self._rise_variance = 0.0
-        self._readings, self._warmed = 0, False
         self._history: deque[float] = deque(maxlen=_HISTORY)
 
+    def _start(
+        self, adjustment: Adjustment, errors: tuple[Array, Array], free: NDArray[np.int64],
+        temperature: float, tremble: Array | None,
+    ) -> None:  # fmt: skip
+        self._free = free
+        self._tremble = np.zeros((6, 6)) if tremble is None else tremble
+        self._held = adjustment.values.copy()
+        n, sd = len(free), np.sqrt(np.diag(adjustment.covariance))[free]
+        self._scale = np.concatenate([sd, np.full(3, self.sensor.pixel_pitch)])
+        self._warm = np.flatnonzero(np.isin(free, _WARM))
+        # what the scaled rates (3,) change the scaled free parameters (n,) by, per kelvin
+        self._by_rate = np.zeros((n, 3))
+        for k in self._warm:
+            self._by_rate[k, free[k]] = self._scale[n + free[k]] / self._scale[k]
+        R, K = self._scaled(errors)
+        self._P = np.zeros((n + 3, n + 3))
+        self._P[:n, :n] = R + K * self._common @ K.T
+        self._P[n:, n:] = np.eye(3) * _RATE_SD_PX**2
+        # Truth minus estimate against the common errors: what they did to the first epoch.
+        self._C = np.zeros((n + 3, len(self._common)))
+        self._C[:n] = -K * self._common
+        self._x = np.zeros(n + 3)
+        self.T0 = self.last_temperature = temperature
+        self._readings, self._warmed = 1, False
+        self._rise = self._rise_variance = 0.0
+        self.epochs, self._surprised = 1, 0
+
     def update(
-        self, adjustment: Adjustment, temperature: float, errors: EpochErrors | None = None,
+        self, adjustment: Adjustment, temperature: float, errors: tuple[Array, Array],
         tremble: Array | None = None,
-    ) -> Innovation | None:  # fmt: skip
-        """Take an epoch in; None if it has no result.
+    ) -> Innovation:  # fmt: skip
+        """Take an epoch in that has a result.
 
         temperature: °C at the frame, NaN where it is not known: the last one then still holds;
-        errors: the epoch's covariance split into noise and common errors, by default all is noise;
-        tremble (6, 6): covariance of the mount's movements about its mean, of the epochs so far.
+        errors: noise (16, 16) and common errors of the epoch, as of `FieldErrors.split`; tremble
+        (6, 6): covariance of the mount's movements about its mean, of the epochs so far.
         """
-        if not adjustment.ok:
-            return None
-        if errors is None:
-            errors = EpochErrors(adjustment.covariance, np.zeros((16, len(self._common))))
-        variance = np.diag(adjustment.covariance)
-        free = np.flatnonzero(variance > 0)
+        free = np.flatnonzero(np.diag(adjustment.covariance) > 0)
         if not self.epochs or not np.array_equal(free, self._free):
             self._start(adjustment, errors, free, temperature, tremble)
             return Innovation(0.0, 0.0, len(free), "")
@@ -256,7 +266,11 @@ class OnlineFilter:
         if not np.isnan(temperature):
             self._read(temperature)
         unknown = _UNKNOWN_STEP if np.isnan(self.T0) else 0.0
-        self._predict(np.hypot(self._rise - before, unknown))
+        step = np.hypot(self._rise - before, unknown)
+        n, warm = len(free), self._warm
+        wander = _WANDER_PX * self.sensor.pixel_pitch
+        self._P[warm, warm] += (wander / self._scale[warm]) ** 2
+        self._P[:n, :n] += self._rate_moment() * (step * _LAG) ** 2
         innovation = self._take_in(adjustment, errors)
         if not self._surprised and tremble is not None:
             # a knock is not judged by a movement that it is part of
@@ -312,55 +326,18 @@ class OnlineFilter:
             self._readings += 1
             self.T0 += (temperature - self.T0) / self._readings
 
-    def _start(
-        self,
-        adjustment: Adjustment,
-        errors: EpochErrors,
-        free: NDArray[np.int64],
-        temperature: float,
-        tremble: Array | None,
-    ) -> None:
-        self._free = free
-        self._tremble = np.zeros((6, 6)) if tremble is None else tremble
-        self._held = adjustment.values.copy()
-        sd = np.sqrt(np.diag(adjustment.covariance))[free]
-        rate_scale = np.full(3, self.sensor.pixel_pitch)
-        self._scale = np.concatenate([sd, rate_scale])
-        self._warm = np.array([k for k, i in enumerate(free) if i in _WARM], dtype=np.int64)
-        self._rate_of = np.array([int(free[k]) for k in self._warm], dtype=np.int64)
-        n = len(free)
-        R, K = self._scaled(errors)
-        self._P = np.zeros((n + 3, n + 3))
-        self._P[:n, :n] = R + K * self._common @ K.T
-        self._P[n:, n:] = np.eye(3) * _RATE_SD_PX**2
-        # Truth minus estimate against the common errors: what they did to the first epoch.
-        self._C = np.zeros((n + 3, len(self._common)))
-        self._C[:n] = -K * self._common
-        self._x = np.zeros(n + 3)
-        self.T0 = self.last_temperature = temperature
-        self._readings = 1
-        self._rise = 0.0
-        self._rise_variance = 0.0
-        self._warmed = False
-        self.epochs = 1
-        self._surprised = 0
-
-    def _scaled(self, errors: EpochErrors) -> tuple[Array, Array]:
+    def _scaled(self, errors: tuple[Array, Array]) -> tuple[Array, Array]:
         """Noise (n, n) and influence (n, m) of the scaled free parameters."""
         s = self._scale[: len(self._free)]
-        moves = np.zeros((16, 16))
-        moves[EOP, EOP] = self._tremble
-        noise: Array = (errors.noise + moves)[np.ix_(self._free, self._free)] / np.outer(s, s)
-        influence: Array = errors.influence[self._free] / s[:, None]
-        return noise, influence
+        noise = errors[0].copy()
+        noise[EOP, EOP] += self._tremble
+        return noise[np.ix_(self._free, self._free)] / np.outer(s, s), (
+            errors[1][self._free] / s[:, None]
+        )
 
     def _H(self) -> Array:
         """Scaled state → scaled free parameters, at the last temperature."""
-        n = len(self._free)
-        H = np.hstack([np.eye(n), np.zeros((n, 3))])
-        for k, i in zip(self._warm, self._rate_of, strict=True):
-            H[k, n + i] = self._rise * self._scale[n + i] / self._scale[k]
-        return H
+        return np.hstack([np.eye(len(self._free)), self._rise * self._by_rate])
 
     def _rate_moment(self) -> Array:
         """E[r rᵀ] of the rates r as a column of scaled free parameters per kelvin, (n, n).
@@ -370,19 +347,10 @@ class OnlineFilter:
         """
         n = len(self._free)
         moment = np.outer(self._x[n:], self._x[n:]) + self._P[n:, n:]
-        to = np.zeros((n, 3))
-        for k, i in zip(self._warm, self._rate_of, strict=True):
-            to[k, i] = self._scale[n + i] / self._scale[k]
-        result: Array = to @ moment @ to.T
+        result: Array = self._by_rate @ moment @ self._by_rate.T
         return result
 
-    def _predict(self, step: float) -> None:
-        n = len(self._free)
-        wander = _WANDER_PX * self.sensor.pixel_pitch
-        self._P[self._warm, self._warm] += (wander / self._scale[self._warm]) ** 2
-        self._P[:n, :n] += self._rate_moment() * (step * _LAG) ** 2
-
-    def _take_in(self, adjustment: Adjustment, errors: EpochErrors) -> Innovation:
+    def _take_in(self, adjustment: Adjustment, errors: tuple[Array, Array]) -> Innovation:
         n = len(self._free)
         z = (adjustment.values - self._held)[self._free] / self._scale[:n]
         R, K = self._scaled(errors)
@@ -390,9 +358,20 @@ class OnlineFilter:
         H = self._H()
         v = z - H @ self._x
         common = K * self._common
-        S, cross = self._innovation(H, K, common, R)
+
+        def covariances() -> tuple[Array, Array]:
+            """Of the innovation (n, n), and of the state with it (n + 3, n)."""
+            cross = self._P @ H.T + self._C @ K.T
+            S: Array = H @ cross + K @ self._C.T @ H.T + common @ K.T + R
+            return 0.5 * (S + S.T), cross
+
+        S, cross = covariances()
         chi2 = float(v @ np.linalg.solve(S, v))
-        bound = self._bound(n)
+        bound = chi2_quantile(1.0 - _ALPHA, n)
+        if len(self._history) >= _FEWEST:
+            # A mount in the wind sways by more than the normal distribution has: what it did in a
+            # tenth of the epochs is nothing to report.
+            bound = max(bound, _BEYOND * float(np.quantile(self._history, _USUAL)))
         self._history.append(chi2)
         change: Change = ""
         if chi2 > bound:
@@ -400,39 +379,22 @@ class OnlineFilter:
             if self._surprised < 2:
                 return Innovation(chi2, bound, n, "outlier")
             change = self._name(adjustment, v, S)
-            self._open(change)
-            S, cross = self._innovation(H, K, common, R)
+            # what the change has made untrue is forgotten
+            block = _BLOCKS.get(change, tuple(range(16)))
+            rows = np.flatnonzero(np.isin(self._free, block))
+            self._P[rows, rows] += _FAR**2
+            S, cross = covariances()
         self._surprised = 0
         gain: Array = np.asarray(np.linalg.solve(S, cross.T).T, dtype=np.float64)
         self._x = self._x + gain @ v
-        self._update_covariance(H, K, common, R, gain)
-        self.epochs += 1
-        return Innovation(chi2, bound, n, change)
-
-    def _bound(self, n: int) -> float:
-        """Chi-square (n) beyond which an epoch is a surprise.
-
-        A mount in the wind sways by more than the normal distribution has: what it did in a tenth
-        of the epochs is nothing to report.
-        """
-        bound = chi2_quantile(1.0 - _ALPHA, n)
-        if len(self._history) < _FEWEST:
-            return bound
-        return max(bound, _BEYOND * float(np.quantile(self._history, _USUAL)))
-
-    def _innovation(self, H: Array, K: Array, common: Array, R: Array) -> tuple[Array, Array]:
-        """Covariance (n, n) of the innovation, and of the state with it (n + 3, n)."""
-        cross = self._P @ H.T + self._C @ K.T
-        S: Array = H @ cross + K @ self._C.T @ H.T + common @ K.T + R
-        return 0.5 * (S + S.T), cross
-
-    def _update_covariance(self, H: Array, K: Array, common: Array, R: Array, gain: Array) -> None:
-        """Joseph's form, which stays positive where a change has opened the state."""
+        # Joseph's form, which stays positive where a change has opened the state
         left = np.eye(len(self._x)) - gain @ H
         mixed = left @ self._C @ (gain @ K).T
         P = left @ self._P @ left.T - mixed - mixed.T + gain @ (common @ K.T + R) @ gain.T
         self._P = 0.5 * (P + P.T)
         self._C = left @ self._C - gain @ common
+        self.epochs += 1
+        return Innovation(chi2, bound, n, change)
 
     def _name(self, adjustment: Adjustment, v: Array, S: Array) -> Change:
         """Which parameters, freed alone, explain the innovation."""
@@ -442,23 +404,13 @@ class OnlineFilter:
             return "wrong_lens"
         weight = np.linalg.inv(S)
         left: dict[Change, float] = {}
-        blocks: tuple[tuple[Change, tuple[int, ...]], ...] = (("slip", _WARM), ("knock", _EOP))
-        for name, block in blocks:
-            columns = [k for k, i in enumerate(self._free) if i in block]
-            if not columns:
+        for name, block in _BLOCKS.items():
+            A = np.eye(len(v))[:, np.isin(self._free, block)]
+            if not A.size:
                 continue
-            A = np.eye(len(v))[:, columns]
-            x = np.linalg.solve(A.T @ weight @ A, A.T @ weight @ v)
-            rest = v - A @ x
-            degrees = max(1, len(v) - len(columns))
-            bound = chi2_quantile(1.0 - _ALPHA, degrees)
+            rest = v - A @ np.linalg.solve(A.T @ weight @ A, A.T @ weight @ v)
+            bound = chi2_quantile(1.0 - _ALPHA, max(1, len(v) - A.shape[1]))
             left[name] = float(rest @ weight @ rest) / bound
         best = min(left, key=lambda name: left[name])
         # x0, y0 and the tilt are nearly the same thing: what explains, not what explains alone
         return best if left[best] < 1.0 or left[best] < 0.1 * max(left.values()) else "change"
-
-    def _open(self, change: Change) -> None:
-        """Forget what a change has made untrue."""
-        block = {"slip": _WARM, "knock": _EOP}.get(change, tuple(range(16)))
-        rows = [k for k, i in enumerate(self._free) if i in block]
-        self._P[rows, rows] += _FAR**2

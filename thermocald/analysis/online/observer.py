@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.analysis.online.equilibrium import Equilibrium, EquilibriumWatch, GivenInterior
+from thermocald.analysis.online.equilibrium import Equilibrium, EquilibriumWatch
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
     from thermocald.photogrammetry.field.testfield import TestField
 
-__all__ = ["OnlineObserver", "given_exterior"]
-
 _IOP = slice(0, 3)
 _MOVED_AFTER = 5  # epochs in a row
 _SENTENCES = {
@@ -33,11 +31,12 @@ _SENTENCES = {
 }
 
 
-def given_exterior(time: float, values: Array, covariance: Array, unit: float) -> GivenInterior:
+def given_exterior(values: Array, covariance: Array, unit: float) -> tuple[Array, Array, Array]:
     """(c, x0, y0) of an epoch, to be seen from any exterior orientation.
 
-    time s; values (16,), covariance (16, 16) of the epoch's noise; unit: mm that count as one, the
-    pixel pitch. Errors of the test field are in both orientations alike and cancel.
+    values (16,), covariance (16, 16) of the epoch's noise; unit: mm that count as one, the pixel
+    pitch. Returns values (3,), gain (3, 6) and sds (3,) as `EquilibriumWatch.add` takes them.
+    Errors of the test field are in both orientations alike and cancel.
     """
     block = covariance[10:, 10:]
     cross = covariance[_IOP, 10:]
@@ -48,7 +47,7 @@ def given_exterior(time: float, values: Array, covariance: Array, unit: float) -
         gain = np.linalg.solve(block / np.outer(s, s), (cross / s).T).T / s
     variance = np.diag(covariance[_IOP, _IOP] - gain @ cross.T)
     sds = np.sqrt(np.where(variance > 0, variance, np.nan))
-    return GivenInterior(time, (values[_IOP] - gain @ values[10:]) / unit, gain / unit, sds / unit)
+    return (values[_IOP] - gain @ values[10:]) / unit, gain / unit, sds / unit
 
 
 class OnlineObserver:
@@ -64,7 +63,7 @@ class OnlineObserver:
         tell: Callable[[str, str, float, int], None],
     ) -> None:
         self._errors = FieldErrors(sensor, testfield)
-        self.filter = OnlineFilter(sensor, common_variances=self._errors.variances)
+        self.filter = OnlineFilter(sensor, self._errors.variances)
         self.watch = EquilibriumWatch()
         self._pitch = sensor.pixel_pitch
         self._field = testfield
@@ -89,17 +88,14 @@ class OnlineObserver:
             return {}
         errors = self._errors.split(adjustment, epoch.observations, field_variance)
         innovation = self.filter.update(adjustment, temperature, errors, tremble)
-        if innovation is None:
-            return {}
         self._watch_targets(calibrated, adjustment)
         event = innovation.change if innovation.change in _SENTENCES else ""
         if event:
             self._tell(event, _SENTENCES[event], epoch.frame_time, epoch.number)
             self.watch.clear()
         if innovation.change != "outlier":
-            self.watch.add(
-                given_exterior(epoch.frame_time, adjustment.values, errors.noise, self._pitch)
-            )
+            given = given_exterior(adjustment.values, errors[0], self._pitch)
+            self.watch.add(epoch.frame_time, *given)
         self._equilibrium = self.watch.assess(self.filter.values()[10:])
         columns = {
             "innovation_chi2": innovation.chi2,

@@ -167,12 +167,9 @@ class RunningSeries:
         exterior: Exterior,
         offsets: bool,
     ) -> None:
-        self._sensor = sensor
-        self._field = testfield
+        self._sensor, self._field = sensor, testfield
         offsets = offsets and bool((testfield.sigmas > 0).any())
-        series = replace(SeriesSettings.of(settings, exterior), target_offsets=offsets)
-        self._asked = series
-        self._own = replace(series, exterior="per_epoch")
+        self._asked = replace(SeriesSettings.of(settings, exterior), target_offsets=offsets)
         size = min(_WINDOW, max(_WINDOW_POINTS // max(len(testfield), 1), _FEWEST))
         self._kept: deque[_Kept] = deque(maxlen=size)
         self._restarted = 0
@@ -246,18 +243,21 @@ class RunningSeries:
         self._keep(calibrated, seen)
         own, whole = self._adjusted()
         columns |= self._columns(whole)
-        if not weak and self._doubted(own, whole):  # what is weak contradicts nothing
-            columns["series_restarted"] = 1.0
-        values = None if own is None else own.values - self._level
-        if own is None or own.status != "ok" or values is None:
-            if not weak or whole is None or whole.status != "ok" or self._series is None:
-                return alone, columns
+        if not weak:  # what is weak contradicts nothing
+            against = any(e is not None and e.status in _AGAINST for e in (own, whole))
+            self._doubts = self._doubts + 1 if against else 0
+            if self._doubts >= _DOUBTED:
+                self._restart(self._kept[-1].number)
+                columns["series_restarted"] = 1.0
+        if own is not None and own.status == "ok":
+            values = own.values - self._level
+            self._kept[-1].reported = values
+        elif weak and whole.status == "ok" and self._series is not None:
             # too weak by itself, carried by its series: with what the series' level is sure to
-            own, values = whole, whole.values
-            level = np.diag(self._series.sample.level_sd**2)
+            values, level = whole.values, np.diag(self._series.sample.level_sd**2)
             own = replace(whole, covariance=whole.covariance + level)
         else:
-            self._kept[-1].reported = values
+            return alone, columns
         wrong = self._wrong & self._kept[-1].grid.observed[0]
         return (
             replace(
@@ -279,15 +279,7 @@ class RunningSeries:
         """For status and page: how the camera's orientation is taken, and on how many epochs."""
         if self._series is None:
             return {}
-        return {
-            "orientation": self._sentence(self._series),
-            "exterior": self._series.sample.exterior,
-            "series_epochs": len(self._kept),
-        }
-
-    def _sentence(self, series: _Together) -> str:
-        """How the exterior orientation is estimated, for people."""
-        n, asked = len(self._kept), self._asked.exterior
+        series, n, asked = self._series, len(self._kept), self._asked.exterior
         if series.sample.exterior == "mount":
             said = f"the mount moves by {series.image_px:.3f} px about one orientation ({n} epochs)"
         elif series.sample.exterior == "series":
@@ -306,11 +298,11 @@ class RunningSeries:
             said += f"; left out, seen elsewhere than the test field says: {', '.join(names)}"
         if self._restarted:
             said += f"; begun again after epoch {self._restarted}"
-        return said
+        return {"orientation": said, "exterior": series.sample.exterior, "series_epochs": n}
 
-    def _columns(self, whole: _Epoch | None) -> dict[str, float]:
+    def _columns(self, whole: _Epoch) -> dict[str, float]:
         """The epoch's result in its series, as columns for the store."""
-        if whole is None or self._series is None or whole.status != "ok":
+        if self._series is None or whole.status != "ok":
             return {}
         sd, level = np.sqrt(np.diag(whole.covariance)), self._series.sample.level_sd
         columns = {"series_epochs": float(len(self._kept))}
@@ -336,15 +328,6 @@ class RunningSeries:
             )
         )
 
-    def _doubted(self, own: _Epoch | None, whole: _Epoch | None) -> bool:
-        """Whether the series has contradicted so many epochs in a row that it starts again."""
-        against = any(e is not None and e.status in _AGAINST for e in (own, whole))
-        self._doubts = self._doubts + 1 if against else 0
-        if self._doubts < _DOUBTED:
-            return False
-        self._restart(self._kept[-1].number)
-        return True
-
     def _restart(self, number: int) -> None:
         self.reset()
         self._restarted = number
@@ -362,14 +345,14 @@ class RunningSeries:
         )
         return bool(np.median(np.abs(here - there)) > _TURNED_PX)
 
-    def _adjusted(self) -> tuple[_Epoch | None, _Epoch | None]:
+    def _adjusted(self) -> tuple[_Epoch | None, _Epoch]:
         """The last epoch's own result, None where epochs share nothing that changes it, and that
         in the series.
         """
-        newest, n = self._without_wrong(self._kept[-1].grid), len(self._kept)
-        known = self._series is not None and not self._shows_more(newest)
-        if self._series is not None and known and self.epochs < self._look_at[1]:
-            whole = self._series.further(newest, n)
+        newest = self._without_wrong(self._kept[-1].grid)
+        more = (newest.observed[0] & ~self._shown).any()  # targets that none of the others showed
+        if self._series is not None and not more and self.epochs < self._look_at[1]:
+            whole = self._series.further(newest, len(self._kept))
             if whole.status not in _AGAINST:
                 return self._further(newest, whole), whole
         row = self._look()
@@ -408,10 +391,6 @@ class RunningSeries:
     def _binds(self) -> bool:
         """Whether the series has one orientation, or one and small movements about it."""
         return self._series is not None and self._series.sample.exterior != "per_epoch"
-
-    def _shows_more(self, grid: ObservationGrid) -> bool:
-        """Whether an epoch shows targets that none of those adjusted together did."""
-        return bool((grid.observed[0] & ~self._shown).any())
 
     def _again(self, share: float) -> int:
         """The epoch at which all are adjusted together again."""
@@ -484,13 +463,19 @@ class RunningSeries:
         if self._binds or first is not None:
             grid = taken_off(self._without_wrong(grid), each.moved).reject(self._gross())
             kept, grid = kept[:first], ObservationGrid(grid.points[:first], grid.weights[:first])
-            s = replace(self._own, drift_period=self._period)
+            s = replace(self._asked, exterior="per_epoch", drift_period=self._period)
             if self._binds:
                 # the series has tested every point: only what is far off is left to a second test
                 s = replace(s, snooping_alpha=_LEFT * s.snooping_alpha)
             # epochs by themselves do not show how well the field is known
             each = self._together(grid, start, s, each.moved, self.field_variance)
-        self._level = self._moved_level(kept, each.sample)
+        # by how much the epochs as adjusted now differ from what was reported of them
+        change = [
+            now - then.reported
+            for now, then, ok in zip(each.sample.values, kept, each.sample.ok, strict=True)
+            if ok and then.reported is not None
+        ]
+        self._level = np.median(change, axis=0) if change else np.zeros(16)
         self._look_at[0] = self._own_looks()[1]
         return each
 
@@ -505,12 +490,3 @@ class RunningSeries:
         )  # fmt: skip
         sample = result(found, affinity=False).spread(seen, len(self._field))
         return _Together(seen, found, sample, moved)
-
-    def _moved_level(self, kept: list[_Kept], sample: SeriesAdjustment) -> Array:
-        """By how much (16,) the epochs as adjusted now differ from what was reported of them."""
-        change = [
-            now - then.reported
-            for now, then, ok in zip(sample.values, kept, sample.ok, strict=True)
-            if ok and then.reported is not None
-        ]
-        return np.median(change, axis=0) if change else np.zeros(16)

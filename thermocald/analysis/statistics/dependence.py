@@ -38,7 +38,7 @@ line. Am. J. Phys. 72, 367-375, for uncorrelated errors. With equal weights this
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -77,17 +77,14 @@ _LONG_MEMORY = 0.15  # of the series
 class SlopeNoise:
     """The noise of a series and what it makes of the slope on `x`.
 
-    sd: of the slope; n: values; n_effective: independent values that determine it as well;
-    lag_one: correlation of the noise of neighbouring epochs; memory: epochs after which the
-    correlated part has fallen to 1/e; too_short: the memory is so long against the series that the
-    sd is an order of magnitude only.
+    sd: of the slope; n_effective: independent values that determine it as well; lag_one:
+    correlation of the noise of neighbouring epochs; too_short: the memory is so long against the
+    series that the sd is an order of magnitude only.
     """
 
     sd: float
-    n: int
     n_effective: float
     lag_one: float
-    memory: float
     too_short: bool
 
 
@@ -139,13 +136,10 @@ def slope_noise(
     variance = float(plausible @ (residual / freedom / information + off**2))
     # Geometric: models that a short series cannot exclude would rule an arithmetic mean.
     inflation = np.exp(plausible @ np.log(spectrum @ uu / uu.sum()))
-    best = int(np.argmax(plausible))
     return SlopeNoise(
         float(np.sqrt(variance)),
-        n,
         n / max(1.0, float(inflation)),
         float(plausible @ (phi * coloured)),
-        float(tau[best]),
         bool(plausible[tau > _LONG_MEMORY * n].sum() > 0.5),
     )
 
@@ -154,42 +148,21 @@ _ITERATIONS = 100
 _CONVERGED = 1e-7  # of the slope's standard deviation
 
 
-@dataclass(frozen=True, slots=True)
-class StraightLine:
-    """y = intercept + slope·x; the sds hold for the stated sds of the points (not scaled).
-
-    chi2: weighted square sum of the residuals; degrees: n - 2.
-    """
-
-    slope: float
-    sd_slope: float
-    intercept: float
-    sd_intercept: float
-    chi2: float
-    degrees: int
-
-    @property
-    def misfit(self) -> float:
-        """Scatter over stated sds (1 when they agree)."""
-        return float(np.sqrt(self.chi2 / self.degrees)) if self.degrees > 0 else float("nan")
-
-
 def fit_straight_line(
-    x: Array, y: Array, sd_x: ArrayLike, sd_y: ArrayLike, extra_sd_y: float = 0.0
-) -> StraightLine:
+    x: Array, y: Array, sd_x: ArrayLike, sd_y: ArrayLike, extra_variance_y: float = 0.0
+) -> tuple[float, float, float]:
     """Best straight line through x, y (n,) with standard deviations of both, scalars or (n,).
 
-    extra_sd_y: scatter of y about the line that neither sd explains, added in quadrature. Raises
-    ValueError for fewer than 3 points or constant x.
+    extra_variance_y: scatter of y about the line that neither sd explains. Returns the slope, its
+    sd (that of the stated sds, not scaled), and chi-square of the residuals with n - 2 degrees of
+    freedom. Raises ValueError for fewer than 3 points or constant x.
     """
-    n = len(x)
-    if n < 3 or not np.ptp(x) > 0:
+    if len(x) < 3 or not np.ptp(x) > 0:
         raise ValueError("a straight line needs three points and x that varies")
     var_x = np.square(np.asarray(sd_x, dtype=float))
-    var_y = np.square(np.asarray(sd_y, dtype=float)) + extra_sd_y**2
+    var_y = np.square(np.asarray(sd_y, dtype=float)) + extra_variance_y
     # About the means: the intercept far outside the data would cost the digits of the slope.
-    mean_x, mean_y = float(np.mean(x)), float(np.mean(y))
-    u0, v0 = x - mean_x, y - mean_y
+    u0, v0 = x - float(np.mean(x)), y - float(np.mean(y))
     slope = float(np.dot(u0, v0) / np.dot(u0, u0))
     for _ in range(_ITERATIONS):
         weight = np.broadcast_to(1.0 / (var_y + slope**2 * var_x), x.shape)
@@ -206,17 +179,9 @@ def fit_straight_line(
     middle = float(np.dot(weight, adjusted)) / total
     sd_slope = float(1.0 / np.sqrt(np.dot(weight, (adjusted - middle) ** 2)))
     residual = v0 - yb - (u0 - xb) * slope
-    return StraightLine(
-        slope,
-        sd_slope,
-        mean_y + yb - slope * (mean_x + xb),
-        float(np.hypot(1 / np.sqrt(total), (middle + mean_x) * sd_slope)),
-        float(np.dot(weight, residual**2)),
-        n - 2,
-    )
+    return slope, sd_slope, float(np.dot(weight, residual**2))
 
 
-_LEAST_EFFECTIVE = 3.0
 _CHANCE = 0.01
 _UNUSUAL = 3.0  # times the median sd of an epoch
 _FEW = 30  # epochs: fewer do not show their own noise
@@ -249,17 +214,6 @@ class Dependence:
     too_short: bool = False
 
 
-def pearson_p_value(r: float, n: float) -> float:
-    """Two-sided p-value of Pearson's r by the t-test with n - 2 degrees of freedom."""
-    from scipy.stats import t
-
-    if n < _LEAST_EFFECTIVE:
-        return 1.0
-    if abs(r) >= 1.0:
-        return 0.0
-    return float(2 * t.sf(abs(r) * np.sqrt((n - 2) / (1 - r * r)), n - 2))
-
-
 def slope_p_value(values: Array, temperature: Array, times: Array | None = None) -> float:
     """Two-sided p-value of no linear dependence, whatever the memory of the noise.
 
@@ -290,24 +244,25 @@ def dependence(
     spaced by default: noise forgets in a gap. Raises ValueError for
     fewer than 4 epochs, or where values or temperature are constant.
     """
-    from scipy.stats import chi2
+    from scipy.stats import chi2, t
 
     n = len(values)
     if n < 4 or not np.ptp(values) > 0 or not np.ptp(temperature) > 0:
         raise ValueError("a dependence needs four epochs, values and a temperature that vary")
     x, y = temperature - temperature.mean(), values - values.mean()
     r = float(np.clip(np.dot(x, y) / np.sqrt(np.dot(x, x) * np.dot(y, y)), -1.0, 1.0))
+    size = abs(r) * np.sqrt((n - 2) / (1 - r * r)) if abs(r) < 1.0 else np.inf
 
-    line = fit_straight_line(temperature, values, temperature_sd, sds)
-    misfit = line.misfit
-    if line.chi2 > chi2.isf(_CHANCE, line.degrees):
+    slope, sd_slope, square = fit_straight_line(temperature, values, temperature_sd, sds)
+    misfit = float(np.sqrt(square / (n - 2)))
+    if square > chi2.isf(_CHANCE, n - 2):
         # What the line does not explain is scatter of the parameter, not of the thermometer. Not
         # done for what is chance: weight taken from the thermometer's noise flattens the line.
         unexplained = (misfit**2 - 1) * float(
-            np.mean(np.square(sds)) + (line.slope * temperature_sd) ** 2
+            np.mean(np.square(sds)) + (slope * temperature_sd) ** 2
         )
-        line = fit_straight_line(
-            temperature, values, temperature_sd, sds, float(np.sqrt(unexplained))
+        slope, sd_slope, _ = fit_straight_line(
+            temperature, values, temperature_sd, sds, unexplained
         )
     # An epoch with few targets left is no part of the noise of the others.
     usual = sds <= _UNUSUAL * float(np.median(sds))
@@ -315,19 +270,18 @@ def dependence(
     if usual.all() or not np.ptp(temperature[usual]) > 0:
         those = slice(None)  # without a copy
     noise = slope_noise(
-        values[those], temperature[those], line.slope, temperature_sd,
+        values[those], temperature[those], slope, temperature_sd,
         None if times is None else times[those],
     )  # fmt: skip
-    sd_slope = noise.sd if n >= _FEW else max(noise.sd, line.sd_slope)
     return Dependence(
         n,
         r,
-        pearson_p_value(r, n),
+        float(2 * t.sf(size, n - 2)),
         noise.n_effective,
         noise.lag_one,
         slope_p_value(values, temperature, times),
-        line.slope,
-        sd_slope,
+        slope,
+        noise.sd if n >= _FEW else max(noise.sd, sd_slope),
         misfit,
         noise.too_short,
     )
@@ -371,48 +325,17 @@ _CHUNK = 1 << 15
 _STRETCH = 1.5
 
 
-@dataclass(frozen=True, eq=False)
-class MovingFTest:
-    """The F-test of every epoch of a series.
+def moving(values: Array, window: int, statistic: Callable[..., Any], **options: int) -> Array:
+    """Return a statistic of `window` consecutive values (n,) → (n - window + 1,).
 
-    index: epochs (m,) that are window centres; ratio (m,): of the moving variance over the moving
-    mean of the squared standard deviations; critical (m,): of it at the level; degrees_sd (m,): of
-    freedom of the mean squared standard deviations.
+    statistic: np.mean, or np.var and its options.
     """
-
-    index: NDArray[np.int64]
-    ratio: Array
-    critical: Array
-    degrees_sd: NDArray[np.int32]
-
-    @property
-    def success(self) -> NDArray[np.bool_]:
-        """Where the variance is significantly the greater one (m,)."""
-        return np.asarray(self.ratio > self.critical)
-
-    @property
-    def success_ratio(self) -> float:
-        """Fraction of epochs with success; NaN where nothing could be tested."""
-        return float(np.mean(self.success)) if len(self.index) else float("nan")
-
-
-def moving_mean(values: Array, window: int) -> Array:
-    """Return means of `window` consecutive values (n,) → (n - window + 1,)."""
-    return _moving(values, window, np.mean)
-
-
-def moving_variance(values: Array, window: int) -> Array:
-    """Return sample variances (n-1) of `window` consecutive values (n,) → (n - window + 1,)."""
-    return _moving(values, window, partial(np.var, ddof=1))
-
-
-def _moving(values: Array, window: int, statistic: Callable[..., Any]) -> Array:
     if len(values) < window:
         return np.empty(0)
     views = np.lib.stride_tricks.sliding_window_view(values, window)
     # In chunks: running sums would cancel where the drift is large against the noise.
     parts = (views[start : start + _CHUNK] for start in range(0, len(views), _CHUNK))
-    return np.concatenate([statistic(part, axis=1) for part in parts])
+    return np.concatenate([statistic(part, axis=1, **options) for part in parts])
 
 
 def unbroken_windows(time_s: Array, window: int) -> NDArray[np.int64]:
@@ -426,33 +349,32 @@ def unbroken_windows(time_s: Array, window: int) -> NDArray[np.int64]:
 
 
 def moving_f_test(
-    values: Array,
-    sds: Array,
-    redundancy: Array,
-    time_s: Array,
-    window: int = 31,
-    alpha: float = 0.05,
-) -> MovingFTest:
+    values: Array, sds: Array, redundancy: Array, time_s: Array, window: int, alpha: float
+) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int32]]:
     """The reference's F-test at every epoch.
 
     values, sds (n,): parameter and its standard deviations, finite; redundancy (n,): degrees of
     freedom of each standard deviation (those of its adjustment); time_s (n,): finds gaps; window:
     odd number of measurements; alpha: level of the one-sided test. The squared standard deviations
-    of a window carry the sum of its redundancies as degrees of freedom.
+    of a window carry the sum of its redundancies as degrees of freedom. Returns the epochs (m,)
+    that are window centres; (m,) ratios of the moving variance over the moving mean of the squared
+    standard deviations; the critical ratios, above which the variance is significantly the greater
+    one; the degrees of freedom of the mean squared standard deviations.
     """
     from scipy.stats import f
 
     if window < 3 or window % 2 == 0:
         raise ValueError(f"the window must be an odd number of at least 3, not {window}")
     starts = unbroken_windows(time_s, window)
-    degrees = np.rint(moving_mean(redundancy, window)[starts] * window)
+    degrees = np.rint(moving(redundancy, window, np.mean)[starts] * window)
     degrees_sd = np.maximum(degrees, 0).astype(np.int32)
     # one quantile for every number of degrees that occurs, looked up
     different = np.flatnonzero(np.bincount(degrees_sd))
     quantiles = np.zeros(int(different.max(initial=0)) + 1)
     quantiles[different] = f.isf(alpha, window - 1, np.maximum(different, 1.0))
-    ratio = moving_variance(values, window)[starts] / moving_mean(sds**2, window)[starts]
-    return MovingFTest(starts + window // 2, ratio, quantiles[degrees_sd], degrees_sd)
+    variance, mean = moving(values, window, np.var, ddof=1), moving(sds**2, window, np.mean)
+    ratio = variance[starts] / mean[starts]
+    return starts + window // 2, ratio, quantiles[degrees_sd], degrees_sd
 
 
 @dataclass(frozen=True, eq=False)
@@ -481,14 +403,11 @@ def correlations_of(covariances: Array) -> Array:
     return np.asarray(np.clip(r, -1.0, 1.0))
 
 
-def median_correlations(series: list[Array]) -> IopCorrelations:
-    """Medians over the correlation matrices (n_i, k, k) of several series together.
-
-    Raises ValueError where there is no matrix at all.
-    """
+def median_correlations(series: list[Array]) -> IopCorrelations | None:
+    """Medians over the correlation matrices (n_i, k, k) of several series, None without any."""
     matrices = [m for m in series if len(m)]
     if not matrices:
-        raise ValueError("no epoch has a covariance matrix")
+        return None
     every = np.concatenate(matrices)
     median = np.median(every, axis=0)
     within = np.concatenate([m - m.mean(axis=0) for m in matrices])

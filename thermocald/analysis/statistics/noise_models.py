@@ -79,24 +79,21 @@ def grid(first: ArrayLike, coloured: ArrayLike) -> tuple[Array, Array]:
     return np.append(0.0, firsts), np.append(0.0, parts)
 
 
-def _flicker() -> NoiseModels:
-    """Flicker noise with white noise beside it; the memories of the parts have these weights."""
+def _models() -> NoiseModels:
+    """Autoregressive noise, and flicker noise, whose parts have these weights, beside white."""
+    one = mixtures(*grid(_PHI, _COLOURED))
     shape = np.array([_MEMORIES ** (a - 1.0) for a in _FLICKER])
     shape /= shape.sum(axis=1, keepdims=True)
     coloured = np.tile(_COLOURED, len(_FLICKER))
     shares = coloured[:, None] * np.repeat(shape, len(_COLOURED), axis=0)
-    phi = np.append(0.0, np.exp(-1.0 / _MEMORIES))
-    return NoiseModels(phi, np.column_stack([1.0 - coloured, shares]))
+    shares = np.column_stack([1.0 - coloured, shares])
+    both = np.zeros((len(one.shares) + len(shares), len(one.phi) + shares.shape[1]))
+    both[: len(one.shares), : len(one.phi)] = one.shares
+    both[len(one.shares) :, len(one.phi) :] = shares
+    return NoiseModels(np.concatenate([one.phi, [0.0], np.exp(-1.0 / _MEMORIES)]), both)
 
 
-def _either(a: NoiseModels, b: NoiseModels) -> NoiseModels:
-    """The models of both."""
-    upper = np.hstack([a.shares, np.zeros((len(a.shares), len(b.phi)))])
-    lower = np.hstack([np.zeros((len(b.shares), len(a.phi))), b.shares])
-    return NoiseModels(np.append(a.phi, b.phi), np.vstack([upper, lower]))
-
-
-MODELS = _either(mixtures(*grid(_PHI, _COLOURED)), _flicker())
+MODELS = _models()
 """The models that tests run through."""
 
 
@@ -113,7 +110,7 @@ class Frequencies:
     pieces: tuple[slice, ...]
     contrasts: Array
     pauses: Array
-    order: NDArray[np.int64] | None
+    order: NDArray[np.int64] | slice
     starts: NDArray[np.int64]
     count: Array
     mean: Array
@@ -125,25 +122,17 @@ class Frequencies:
         lengths = [p.stop - p.start for p in pieces]
         each = [np.arange(1, size) / size for size in lengths]
         K = len(pieces)
-        if K == 1:
-            order, m = None, lengths[0] - 1
-            own = np.zeros(0)
-        else:
-            own = np.concatenate([np.zeros(K - 1), *each])
-            order, m = np.argsort(own, kind="stable"), len(own)
+        own = np.concatenate([np.zeros(K - 1), *each])
+        order = slice(None) if K == 1 else np.argsort(own, kind="stable")
+        m = len(own)
         if m <= _SINGLE_FREQUENCIES + _POOLED_FREQUENCIES:
             starts = np.arange(m)
         else:
             edges = np.geomspace(_SINGLE_FREQUENCIES, m, _POOLED_FREQUENCIES + 1)[:-1].astype(int)
             starts = np.concatenate([np.arange(_SINGLE_FREQUENCIES), np.unique(edges)])
         count = np.diff(starts, append=m).astype(float)
-        if order is None:
-            mean = np.pi * (starts + (count + 1) / 2) / (m + 1)
-        else:
-            mean = np.pi * np.add.reduceat(own[order], starts) / count
+        mean = np.pi * np.add.reduceat(own[order], starts) / count
         found = cls(pieces, np.zeros((0, K)), pauses, order, starts, count, mean)
-        if K == 1:
-            return found
         # orthonormal, orthogonal to a constant, and independent for noise with a long memory
         root = np.sqrt(np.array(lengths) / sum(lengths))
         flat = np.linalg.svd(root[None])[2][1:]
@@ -165,8 +154,6 @@ class Frequencies:
 
     def coefficients(self, y: Array) -> Array:
         """Orthonormal coefficients of a series about its mean, without the constant one."""
-        if self.order is None:
-            return cosines(y)
         sizes = np.array([p.stop - p.start for p in self.pieces])
         means = np.array([y[p].mean() for p in self.pieces])
         slow = self.contrasts @ (means * np.sqrt(sizes))
@@ -181,10 +168,9 @@ class Frequencies:
         """Mean variances (g, m) of the coefficients of noises of unit variance."""
         phi = models.phi[:, None]
         parts = (1 - phi**2) / (1 + phi**2 - 2 * phi * np.cos(self.mean))
-        if C := len(self.contrasts):
-            for part, one in zip(parts, models.phi.tolist(), strict=True):
-                slow = self.means_covariance(one)
-                part[:C] = np.einsum("ij,jk,ik->i", self.contrasts, slow, self.contrasts)
+        for part, one in zip(parts, models.phi.tolist(), strict=True):
+            slow = self.means_covariance(one)
+            part[: len(slow) - 1] = np.diag(self.contrasts @ slow @ self.contrasts.T)
         return np.asarray(models.shares @ parts)
 
 

@@ -348,16 +348,14 @@ def _significance(
     result = {}
     for name in series.free:
         values, sds = series.column(name)
-        test = moving_f_test(
+        index, ratio, critical, degrees_sd = moving_f_test(
             values, sds, series.redundancy, series.time_s, settings.window, settings.alpha
         )
-        ratio = test.ratio
         some = slice(None, None, max(1, -(-len(ratio) // _COURSE)))
         result[name] = Significance(
-            test.success_ratio, len(ratio), len(values) - len(ratio), settings.window - 1,
-            float(np.median(test.degrees_sd)), float(np.median(test.critical)),
-            float(np.median(ratio)),
-            np.column_stack([series.time_s[test.index[some]], ratio[some]]),
+            float(np.mean(ratio > critical)), len(ratio), len(values) - len(ratio),
+            settings.window - 1, float(np.median(degrees_sd)), float(np.median(critical)),
+            float(np.median(ratio)), np.column_stack([series.time_s[index[some]], ratio[some]]),
             drifts[name], p_holm.get(name, float("nan")), p_excess.get(name, float("nan")),
         )  # fmt: skip
     return result

@@ -112,10 +112,8 @@ def study_camera(
     studies = tuple(study_series(one, settings) for one in series)
     iop = np.mean([one.mean for one in series], axis=0)
     sds = sds_over_time(series)
-    correlations = None
-    if any(len(one.correlations) for one in series):
-        correlations = median_correlations([one.correlations for one in series])
-    else:
+    correlations = median_correlations([one.correlations for one in series])
+    if correlations is None:
         notes.append(
             "No epoch has a covariance matrix: correlations within the adjustments are not known."
         )

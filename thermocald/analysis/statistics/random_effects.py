@@ -104,36 +104,32 @@ class Population:
         """
         known = np.where(np.diag(information) > 0, values, 0.0)
         push = information @ (known - self.mean) + (0.0 if gradient is None else gradient)
-        found, covariance = self._update(self.between, push, information)
-        scatter, correlations = self._weights_error(found, push, information)
-        return Shrunk(
-            found, covariance + scatter + correlations, self, information, push, correlations
-        )
+        covariance = _posterior(self.prior, information)
+        found = self.mean + covariance @ push
 
-    def _update(self, between: Array, push: Array, information: Array) -> tuple[Array, Array]:
-        covariance = _posterior(between + self.mean_covariance, information)
-        return self.mean + covariance @ push, covariance
+        def moved(between: Array) -> Array:
+            other = _posterior(between + self.mean_covariance, information)
+            step: Array = (self.mean + other @ push - found) / _STEP
+            return step
 
-    def _weights_error(self, found: Array, push: Array, information: Array) -> tuple[Array, Array]:
-        """Return what Σ's own errors do to the values, (k, k): its variances, and its correlations.
-
-        After Kackar and Harville (1984).
-        """
+        # what Σ's own errors do to the values, after Kackar and Harville (1984): of its variances,
+        # and of its correlations
         size = len(found)
         sd = np.sqrt(np.diag(self.between))
         scatter, correlations = np.zeros((size, size)), np.zeros((size, size))
         for j in range(size):
             factors = np.ones(size)
             factors[j] = 1 + _STEP / 2
-            other = self.between * np.outer(factors, factors)
-            move = (self._update(other, push, information)[0] - found) / _STEP
+            move = moved(self.between * np.outer(factors, factors))
             scatter += np.outer(move, move) * 2.0 / self.freedom
             for k in range(j):
                 other = self.between.copy()
                 other[[j, k], [k, j]] += _STEP * sd[j] * sd[k]
-                move = (self._update(other, push, information)[0] - found) / _STEP
+                move = moved(other)
                 correlations += np.outer(move, move) * self.correlation_variance[j, k]
-        return scatter, correlations
+        return Shrunk(
+            found, covariance + scatter + correlations, self, information, push, correlations
+        )
 
 
 def population(values: Array, covariances: Array) -> Population:

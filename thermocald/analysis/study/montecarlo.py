@@ -50,43 +50,31 @@ if TYPE_CHECKING:
 _ANGLES = 720
 
 
-@dataclass(frozen=True, eq=False)
-class DistanceLaw:
-    """Law of the distances |d| of a centred bivariate normal error d.
+def shares_within(axes: Array, distance: ArrayLike) -> Array:
+    """P(|d| < distance) (k, m) of centred bivariate normal errors d, for distances (m,) mm.
 
     axes (k, 2): standard deviations along the two axes of each point's ellipse, mm.
     """
+    r2 = np.square(np.asarray(distance, dtype=float))
+    theta = (np.arange(_ANGLES) + 0.5) * (np.pi / _ANGLES)
+    spread = (axes[:, :1] * np.cos(theta)) ** 2 + (axes[:, 1:] * np.sin(theta)) ** 2
+    with np.errstate(divide="ignore", over="ignore"):
+        inside = -np.expm1(-r2[None, :, None] / (2 * spread[:, None, :]))
+    return np.asarray(np.mean(inside, axis=-1))
 
-    axes: Array
 
-    def cumulative(self, distance: ArrayLike) -> Array:
-        """P(|d| < distance) of each point (k, m), for distances (m,) mm."""
-        r2 = np.square(np.atleast_1d(np.asarray(distance, dtype=float)))
-        theta = (np.arange(_ANGLES) + 0.5) * (np.pi / _ANGLES)
-        spread = (self.axes[:, :1] * np.cos(theta)) ** 2 + (self.axes[:, 1:] * np.sin(theta)) ** 2
-        with np.errstate(divide="ignore", over="ignore"):
-            inside = -np.expm1(-r2[None, :, None] / (2 * spread[:, None, :]))
-        return np.asarray(np.mean(inside, axis=-1))
+def mean_and_largest(axes: Array, draws: int) -> tuple[Array, Array]:
+    """E|d| (k,) mm, and the expected largest |d| among `draws` independent errors; axes (k, 2)."""
+    from scipy.special import ellipe
 
-    def mean(self) -> Array:
-        """E|d| of each point (k,) mm."""
-        from scipy.special import ellipe
-
-        large = np.max(self.axes, axis=1)
-        small = np.min(self.axes, axis=1)
-        ratio = np.divide(small, large, out=np.zeros_like(small), where=large > 0)
-        return np.asarray(np.sqrt(2 / np.pi) * large * ellipe(1 - ratio**2))
-
-    def expected_maximum(self, draws: int) -> Array:
-        """Expected largest |d| among `draws` independent errors, of each point (k,) mm."""
-        large = np.max(self.axes, axis=1)
-        steps = np.linspace(0.0, 8.0, 1601)
-        result = np.zeros(len(large))
-        for k in np.flatnonzero(large > 0):
-            law = DistanceLaw(self.axes[k : k + 1])
-            missing = 1 - law.cumulative(steps * large[k])[0] ** draws
-            result[k] = large[k] * float(np.sum((missing[1:] + missing[:-1]) * np.diff(steps)) / 2)
-        return result
+    small, large = np.sort(axes, axis=1).T
+    ratio = np.divide(small, large, out=np.zeros_like(small), where=large > 0)
+    steps = np.linspace(0.0, 8.0, 1601)
+    largest = np.zeros(len(large))
+    for k in np.flatnonzero(large > 0):
+        missing = 1 - shares_within(axes[k : k + 1], steps * large[k])[0] ** draws
+        largest[k] = large[k] * float(np.sum((missing[1:] + missing[:-1]) * np.diff(steps)) / 2)
+    return np.asarray(np.sqrt(2 / np.pi) * large * ellipe(1 - ratio**2)), largest
 
 
 def on_plane(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: float) -> Array:

@@ -15,12 +15,13 @@ import numpy as np
 
 from thermocald.analysis.statistics.dependence import IopCorrelations, median_correlations
 from thermocald.analysis.study.montecarlo import (
-    DistanceLaw,
     MonteCarlo,
     Trajectory,
     correlations_over_time,
     draw_root,
+    mean_and_largest,
     plane_jacobian,
+    shares_within,
     simulate_errors,
     trajectories,
 )
@@ -169,7 +170,7 @@ def _object_space(
     root = draw_root(sds, correlation)
     jacobian = plane_jacobian(one.sensor, iop, montecarlo.image_points, s.distance_mm)
     covariance = jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
-    law = DistanceLaw(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0)))
-    below = np.mean(law.cumulative(s.clusters_mm), axis=0)
+    axes = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
+    below = np.mean(shares_within(axes, s.clusters_mm), axis=0)
     shares = np.diff(below, prepend=0.0, append=1.0)
-    return montecarlo, FirstOrder(covariance, law.mean(), law.expected_maximum(s.sets), shares)
+    return montecarlo, FirstOrder(covariance, *mean_and_largest(axes, s.sets), shares)

@@ -24,6 +24,8 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.linalg import inverse_of_determined
 from thermocald.photogrammetry.series.normals import chunks, linearise
+from thermocald.physics import catalogue
+from thermocald.physics.model import ModelEffect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -148,6 +150,13 @@ class Moved:
     time: float
     vector: Array
     covariance: Array
+
+    def effect(self, listed: ModelEffect) -> ModelEffect:
+        """The effect that names the targets, with when and by how much they moved."""
+        kind = catalogue.get(listed.name)
+        time = {n: self.time for n, p in kind.nonlinear.items() if p.role == "event"}
+        vector = dict(zip(kind.linear, self.vector.tolist(), strict=True))
+        return ModelEffect(listed.name, {**listed.values, **vector, **time})
 
 
 def moved_targets(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:

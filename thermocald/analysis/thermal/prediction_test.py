@@ -262,9 +262,8 @@ def predicted_error(
             f"{source.sensor.height} px): a thermal model belongs to one camera"
         )
     series = _as_fitted(model, series)
-    rows = np.array(
-        [source.field.index[t] for t in targets_of(model.effects) if t in source.field.index]
-    )
+    index = source.field.index
+    rows = np.array([index[t] for t in targets_of(model.effects) if t in index], dtype=np.int64)
     model = _of_series(model, series, rows)
     history = series.readings_history
     prediction = model.predict(history, source.field)
@@ -282,7 +281,11 @@ def predicted_error(
     residuals = points - projected(series, prediction, whole)
     residuals = np.where(used, residuals, 0.0)
     residuals = residuals - residuals.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
-    A = _partials(series, rows)
+    # ∂ image points / ∂ parameters (T, 2, 22): camera, scales of the field, a displacement
+    at = series.at
+    moving = np.zeros((len(at.B), 2, 3))
+    moving[rows] = at.B[rows]
+    A = np.concatenate([at.A, at.B * source.field.points[:, None, :], moving], axis=2)
     noise = (model.image_sigma * prediction.noise_factor[:, None, None]) ** 2
     floor = noise + _variance(A, _thermometers(series, model, thermometer_sd))
     rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
@@ -313,35 +316,20 @@ def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int6
     others = without_targets(series, rows) if len(rows) else series
     model = with_own(model, others)
     if len(rows):
-        m = moved_targets(others, rows)
-        listed = []
-        for e in model.effects:
-            kind = catalogue.get(e.name)
-            if kind.seen_in == "targets":
-                time = {n: m.time for n, p in kind.nonlinear.items() if p.role == "event"}
-                vector = dict(zip(kind.linear, m.vector.tolist(), strict=True))
-                e = replace(e, values={**e.values, **vector, **time})
-            listed.append(e)
-        model = replace(model, effects=tuple(listed))
+        moved = moved_targets(others, rows)
+        effects = tuple(
+            moved.effect(e) if catalogue.get(e.name).seen_in == "targets" else e
+            for e in model.effects
+        )
+        model = replace(model, effects=effects)
     start = replace(model, exterior=ExteriorOrientation.from_array(series.at.eop))
     ((placed,), _) = estimate_level([others], [start], interior=False)
     return placed
 
 
-def _partials(series: ReducedSeries, rows: NDArray[np.int64]) -> Array:
-    """∂ image points / ∂ parameters (T, 2, 22): camera, scales of the field, a displacement."""
-    at = series.at
-    moving = np.zeros((len(at.B), 2, 3))
-    if len(rows):
-        moving[rows] = at.B[rows]
-    points = series.source.field.points[:, None, :]
-    return np.concatenate([at.A, at.B * points, moving], axis=2)
-
-
 def _variance(A: Array, covariance: Array) -> Array:
     """Variances (E, T, 2) px² of the image points from parameters' covariances (E, 22, 22)."""
-    found: Array = np.einsum("tcp,epq,tcq->etc", A, covariance, A, optimize=True)
-    return found
+    return np.asarray(np.einsum("tcp,epq,tcq->etc", A, covariance, A, optimize=True))
 
 
 def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: float) -> Array:
@@ -368,7 +356,10 @@ def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
     history = series.readings_history
     if model.covariance is None:
         return np.zeros((len(history.times), 22, 22))
-    own = {f"{e.name}.{n}" for e in model.effects for n in _fresh(e.name)}
+    own = set()  # the numbers that a series has of its own
+    for e in model.effects:
+        kind = catalogue.get(e.name)
+        own |= {f"{e.name}.{n}" for n in (*kind.fresh, *(kind.linear if kind.is_event else ()))}
     names = [
         n for n in model.covariance_names
         if not n.startswith(("exterior.", "interior.")) and n not in own
@@ -379,9 +370,3 @@ def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
     drift = J - J.mean(axis=0)
     found: Array = np.einsum("epi,ij,eqj->epq", drift, Q, drift, optimize=True)
     return found
-
-
-def _fresh(name: str) -> tuple[str, ...]:
-    """The numbers of an effect that a series has of its own."""
-    kind = catalogue.get(name)
-    return (*kind.fresh, *kind.linear) if kind.is_event else kind.fresh

@@ -11,19 +11,13 @@ interior orientation that the model predicts.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from thermocald.analysis.thermal.level import (
-    AFFINITY_SD,
-    estimate_level,
-    projected,
-    series_means,
-)
-from thermocald.analysis.thermal.terms import unknowns_of_base, unknowns_of_term
+from thermocald.analysis.thermal.level import AFFINITY_SD, estimate_level, projected, series_means
+from thermocald.analysis.thermal.terms import unknowns_of
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -44,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.analysis.thermal.level import Moved
-    from thermocald.analysis.thermal.terms import Unknown
+    from thermocald.analysis.thermal.terms import Unknowns
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit
@@ -170,131 +164,91 @@ class SeriesFit:
         return self.rms_px / self.noise_px
 
 
-@dataclass(eq=False)
-class _Parts:
-    """A fit on its way to a model: series as they came, and the numbers of its terms."""
+def _effect(
+    e: ModelEffect, k: int, fitter: HypothesisFitter, fit: Fit, unknowns: Unknowns,
+    growth: NoiseGrowth | None, moved: Sequence[Moved],
+) -> ModelEffect:  # fmt: skip
+    """One effect with the values of series k."""
+    kind = catalogue.get(e.name)
+    if kind.seen_in == "noise":
+        assert growth is not None
+        (key,) = kind.linear
+        return ModelEffect(e.name, {key: growth.factor}, {key: growth.sd})
+    if kind.seen_in == "targets":
+        return moved[k].effect(e)
+    own = next(t for t in fit.terms if t.effect == e.name).values(k)
+    values = {**e.values, **dict.fromkeys((n for n in kind.linear if n in e.values), 0.0)}
+    for name, value in (own or {}).items():
+        if kind.nonlinear[name].role == "event":  # it lies anywhere between two frames
+            times = fitter.series[k].times
+            before = max(int(np.searchsorted(times, float(value) - 1e-6)) - 1, 0)
+            value = float(0.5 * (float(value) + times[before]))
+        values[name] = value
+    for key in dict.fromkeys((*values, *kind.nonlinear, *kind.linear)):
+        name = f"{e.name}.{key}"
+        if kind.is_event or key in kind.fresh:
+            name = f"{name}@{k}" if k else name
+            if own is None:
+                continue
+        if name in unknowns:
+            values[key] = unknowns[name][0]
+    return ModelEffect(e.name, values)
 
-    fitter: HypothesisFitter
-    fit: Fit
-    series: Sequence[ReducedSeries]
-    listed: Sequence[ModelEffect]
-    growth: NoiseGrowth | None
-    moved: Sequence[Moved]
 
-    @cached_property
-    def unknowns(self) -> list[Unknown]:
-        """The numbers of the model that have a standard deviation in the fit."""
-        scale = self.series[0].scale
-        found = unknowns_of_base(self.fit, scale)
-        for i in range(len(self.fit.terms)):
-            found += unknowns_of_term(self.fit, i, scale)
-        return found
+def _covariance(
+    fitter: HypothesisFitter, fit: Fit, first: ReducedSeries, numbers: Unknowns, unknowns: Array,
+    parameters: Array,
+) -> tuple[list[str], Array]:  # fmt: skip
+    """Return names and covariance of interior, drifts, and the first series' own numbers.
 
-    def effect(self, e: ModelEffect, k: int) -> ModelEffect:
-        """One effect with the values of series k."""
-        kind = catalogue.get(e.name)
-        if kind.seen_in == "noise":
-            assert self.growth is not None
-            (key,) = kind.linear
-            return ModelEffect(e.name, {key: self.growth.factor}, {key: self.growth.sd})
-        if kind.seen_in == "targets":
-            m = self.moved[k]
-            vector = dict(zip(kind.linear, m.vector.tolist(), strict=True))
-            time = {n: m.time for n, p in kind.nonlinear.items() if p.role == "event"}
-            return ModelEffect(e.name, {**e.values, **vector, **time})
-        term = next(t for t in self.fit.terms if t.effect == e.name)
-        own = term.values(k)
-        values = {**e.values, **dict.fromkeys((n for n in kind.linear if n in e.values), 0.0)}
-        for name, value in (own or {}).items():
-            event = kind.nonlinear[name].role == "event"
-            values[name] = self._between(float(value), k) if event else value
-        for u in self.unknowns:
-            group, key = u.name.split("@")[0].split(".")
-            series = int(u.name.split("@")[1]) if "@" in u.name else 0
-            shared = key not in kind.fresh and not kind.is_event
-            if group == e.name and (shared or (series == k and own is not None)):
-                values[key] = u.value
-        return ModelEffect(e.name, values)
+    unknowns, parameters: what the rest adds, as of `examine_rest`.
+    """
+    n, size = len(_INTERIOR), len(fit.covariance)
+    Q = scaled_inverse(_joint_normal(fitter, fit))[: n + size, : n + size]
+    Q[:n, :n] += parameters
+    Q[n:, n:] += unknowns
+    rows = {name: row for name, (_, row) in numbers.items() if "@" not in name}
+    R = np.zeros((n + len(rows), n + size))
+    R[:n, :n] = first.along[np.ix_(_INTERIOR, _INTERIOR)] / first.scale[_INTERIOR, None]
+    R[n:, n:] = list(rows.values())
+    return [*(f"interior.{p}" for p in IOP_NAMES), *rows], R @ Q @ R.T
 
-    def _between(self, time: float, k: int) -> float:
-        """An event lies anywhere between two frames."""
-        times = self.fitter.series[k].times
-        return float(0.5 * (time + times[max(int(np.searchsorted(times, time - 1e-6)) - 1, 0)]))
 
-    def model(self, k: int) -> ThermalModel:
-        """The model with what belongs to series k, at the level that it was linearised at."""
-        s = self.series[k]
-        rates = {u.name.split(".")[1]: u.value for u in self.unknowns[: len(RATED)]}
-        return ThermalModel(
-            s.source.camera,
-            s.source.sensor,
-            s.T0,
-            InteriorOrientation.from_array(self.series[0].at.iop),
-            rates,
-            tuple(self.effect(e, k) for e in self.listed),
-            ExteriorOrientation.from_array(s.at.eop),
-            distortion=s.distortion,
-            name=s.source.camera,
-            version=1,
-        )
+def _image_sigma(series: Sequence[ReducedSeries], growth: NoiseGrowth | None) -> float:
+    """The noise of an image coordinate at T₀, px."""
+    total, count = 0.0, 0
+    for k, s in enumerate(series):
+        ok = s.n > 0
+        weights = s.weights[ok, :, :2]
+        w = weights.mean(axis=(1, 2), where=weights > 0) / s.source.per_row[ok]
+        rise = growth.noise[k][ok] if growth else np.ones(len(w))
+        total += float(np.sum(s.n[ok] / w / rise**2))
+        count += int(s.n[ok].sum())
+    return float(np.sqrt(total / count))
 
-    def covariance(
-        self, unknowns: Array, parameters: Array, field: Array
-    ) -> tuple[list[str], Array]:
-        """Return names and covariance of interior, drifts, and the first series' own numbers.
 
-        unknowns, parameters: what the rest adds, as of `examine_rest`; field (10, 10): what the
-        test field's coordinates add to the interior orientation.
-        """
-        n, size = len(_INTERIOR), len(self.fit.covariance)
-        Q = scaled_inverse(_joint_normal(self.fitter, self.fit))[: n + size, : n + size]
-        Q[:n, :n] += parameters
-        Q[n:, n:] += unknowns
-        scale = self.series[0].scale
-        first = [u for u in self.unknowns if "@" not in u.name]
-        names = [*(f"interior.{p}" for p in IOP_NAMES), *(u.name for u in first)]
-        R = np.zeros((len(names), n + size))
-        R[:n, :n] = self.series[0].along[np.ix_(_INTERIOR, _INTERIOR)] / scale[_INTERIOR, None]
-        for row, u in zip(R[n:], first, strict=True):
-            row[n:] = u.row
-        covariance = R @ Q @ R.T
-        covariance[:n, :n] += field
-        if self.moved:
-            e = next(e for e in self.listed if catalogue.get(e.name).seen_in == "targets")
-            names += [f"{e.name}.{key}" for key in catalogue.get(e.name).linear]
-            covariance = block_diag(covariance, self.moved[0].covariance)
-        return names, covariance
+def _assessed(
+    s: ReducedSeries, model: ThermalModel, sigma: float, reading_sd: float, noise: Array | None
+) -> SeriesFit:
+    """Assess how well a series is explained.
 
-    def image_sigma(self) -> float:
-        """The noise of an image coordinate at T₀, px."""
-        total, count = 0.0, 0
-        for k, s in enumerate(self.series):
-            ok = s.n > 0
-            weights = s.weights[ok, :, :2]
-            w = weights.mean(axis=(1, 2), where=weights > 0) / s.source.per_row[ok]
-            rise = self.growth.noise[k][ok] if self.growth else np.ones(len(w))
-            total += float(np.sum(s.n[ok] / w / rise**2))
-            count += int(s.n[ok].sum())
-        return float(np.sqrt(total / count))
-
-    def fit_of(self, k: int, model: ThermalModel, sigma: float) -> SeriesFit:
-        """Assess how well series k is explained; sigma px: noise of a coordinate at T₀."""
-        s = self.series[k]
-        averaged = float(np.sqrt(np.median(s.source.per_row)))
-        reading = self.fitter.series[k].thermometers[s.history.reference].noise * averaged
-        # a constant of each target is taken off: of the thermometer's noise nothing else is
-        drift = s.columns[..., :10] @ (model.rate_vector * s.scale[:10])
-        noise = np.hypot(sigma / averaged, reading / averaged * np.sqrt(np.mean(drift**2)))
-        if self.growth is not None:
-            noise *= float(np.sqrt(np.mean(self.growth.noise[k] ** 2)))
-        return SeriesFit(
-            s.source.series or s.source.name,
-            s.source.epochs(s.n > 0),
-            _rms(s, model),
-            reading,
-            None if s.source.counts is None else int((s.n > 0).sum()),
-            float(noise),
-        )
+    sigma px: noise of a coordinate at T₀; reading_sd K: of a row's temperature; noise (E,): of the
+    image over that at T₀, None where it does not grow.
+    """
+    averaged = float(np.sqrt(np.median(s.source.per_row)))
+    # a constant of each target is taken off: of the thermometer's noise nothing else is
+    drift = s.columns[..., :10] @ (model.rate_vector * s.scale[:10])
+    left = np.hypot(sigma / averaged, reading_sd * np.sqrt(np.mean(drift**2)))
+    if noise is not None:
+        left *= float(np.sqrt(np.mean(noise**2)))
+    return SeriesFit(
+        s.source.series or s.source.name,
+        s.source.epochs(s.n > 0),
+        _rms(s, model),
+        reading_sd * averaged,
+        None if s.source.counts is None else int((s.n > 0).sum()),
+        float(left),
+    )
 
 
 def fitted_camera(
@@ -311,14 +265,39 @@ def fitted_camera(
     series: as they came, unblocked; growth, moved: of effects beyond the fit; distortion_sigmas:
     how sure it is what the distortion follows, None where that was given.
     """
-    parts = _Parts(fitter, fit, series, listed, growth, moved)
-    models, field = estimate_level(series, [parts.model(k) for k in range(len(series))])
+    numbers = unknowns_of(fit, series[0].scale)
+    starts = [
+        ThermalModel(
+            s.source.camera,
+            s.source.sensor,
+            s.T0,
+            InteriorOrientation.from_array(series[0].at.iop),
+            {n: numbers[f"rates.{n}"][0] for n in RATED},
+            tuple(_effect(e, k, fitter, fit, numbers, growth, moved) for e in listed),
+            ExteriorOrientation.from_array(s.at.eop),
+            distortion=s.distortion,
+            name=s.source.camera,
+        )
+        for k, s in enumerate(series)
+    ]
+    models, field = estimate_level(series, starts)
     verdict, unknowns, parameters = examine_rest(fitter, fit, _INTERIOR)
-    names, covariance = parts.covariance(unknowns, parameters, field)
+    names, covariance = _covariance(fitter, fit, series[0], numbers, unknowns, parameters)
+    covariance[: len(_INTERIOR), : len(_INTERIOR)] += field
+    if moved:
+        e = next(e for e in listed if catalogue.get(e.name).seen_in == "targets")
+        names += [f"{e.name}.{key}" for key in catalogue.get(e.name).linear]
+        covariance = block_diag(covariance, moved[0].covariance)
     sd = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
-    sigma = parts.image_sigma()
+    sigma = _image_sigma(series, growth)
     stated = np.concatenate([s.source.grid.weights[s.source.grid.observed][:, 0] for s in series])
-    fits = tuple(parts.fit_of(k, m, sigma) for k, m in enumerate(models))
+    fits = tuple(
+        _assessed(
+            s, models[k], sigma, fitter.series[k].thermometers[s.history.reference].noise,
+            None if growth is None else growth.noise[k],
+        )
+        for k, s in enumerate(series)
+    )  # fmt: skip
     found = verdict["effect_missing"]
     verdict["left_over_in_noise"] = round(float(max(f.left_over for f in fits)), 3)
     verdict["not_examined"] = None if found is not None else f"fewer than {_FEWEST} epochs"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,16 +22,11 @@ if TYPE_CHECKING:
 _EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what its search may find by chance
 
 
-@dataclass(frozen=True, eq=False)
-class Unknown:
-    """One number of a model: its name there, value, and row (K + L,) of the fit's unknowns.
+Unknowns = dict[str, tuple[float, "Array"]]
+"""Numbers of a model by their names there: value, and row (K + L,) of the fit's unknowns.
 
-    A name ends with `@k` where the number belongs to series k > 0.
-    """
-
-    name: str
-    value: float
-    row: Array
+A name ends with `@k` where the number belongs to series k > 0.
+"""
 
 
 def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
@@ -88,52 +83,47 @@ def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...
     return tuple(terms)
 
 
-def unknowns_of_base(fit: Fit, scale: Array) -> list[Unknown]:
-    """The rates; scale (19,): px per unit of the columns."""
-    return _linear(fit, fit.blocks[0], scale, {n: f"rates.{n}" for n in BASE})
+def unknowns_of(fit: Fit, scale: Array) -> Unknowns:
+    """All numbers that have a standard deviation in the fit, the rates first.
 
-
-def unknowns_of_term(fit: Fit, number: int, scale: Array) -> list[Unknown]:
-    """All numbers of one term that have a standard deviation in the fit."""
-    term = fit.terms[number]
-    kind = term.kind
-    names = {kind.column(n): f"{term.effect}.{n}" for n in kind.linear}
-    blocks = [b for b in fit.blocks if b.term == number]
-    size = len(fit.covariance)
-    found = []
-    for place, (i, key) in enumerate(fit.searched):
-        if i == number:
-            row = np.zeros(size)
-            row[len(fit.coefficients) + place] = 1.0
-            value = float(dict(term.nonlinear)[key])
-            found.append(Unknown(f"{term.effect}.{key}", value, row))
-    if kind.is_periodic:
-        return found + _oscillation(fit, blocks, scale, names)
-    for block in blocks:
-        suffix = f"@{block.series}" if block.series else ""
-        found += _linear(fit, block, scale, {k: n + suffix for k, n in names.items()})
+    scale (19,): px per unit of the columns.
+    """
+    found = _linear(fit, fit.blocks[0], scale, {n: f"rates.{n}" for n in BASE})
+    for number, term in enumerate(fit.terms):
+        kind = term.kind
+        names = {kind.column(n): f"{term.effect}.{n}" for n in kind.linear}
+        blocks = [b for b in fit.blocks if b.term == number]
+        for place, (i, key) in enumerate(fit.searched, len(fit.coefficients)):
+            if i == number:
+                row = np.zeros(len(fit.covariance))
+                row[place] = 1.0
+                found[f"{term.effect}.{key}"] = float(dict(term.nonlinear)[key]), row
+        if kind.is_periodic:
+            found |= _oscillation(fit, blocks, scale, names)
+            continue
+        for block in blocks:
+            suffix = f"@{block.series}" if block.series else ""
+            found |= _linear(fit, block, scale, {k: n + suffix for k, n in names.items()})
     return found
 
 
-def _linear(fit: Fit, block: Block, scale: Array, names: dict[str, str]) -> list[Unknown]:
-    found = []
-    for j, parameter in enumerate(block.parameters):
+def _linear(fit: Fit, block: Block, scale: Array, names: dict[str, str]) -> Unknowns:
+    found: Unknowns = {}
+    for place, parameter in enumerate(block.parameters, block.start):
         unit = scale[COLUMNS.index(parameter)]
         row = np.zeros(len(fit.covariance))
-        row[block.start + j] = 1.0 / unit
-        value = float(fit.coefficients[block.start + j] / unit)
-        found.append(Unknown(names[parameter], value, row))
+        row[place] = 1.0 / unit
+        found[names[parameter]] = float(fit.coefficients[place] / unit), row
     return found
 
 
-def _oscillation(
-    fit: Fit, blocks: list[Block], scale: Array, names: dict[str, str]
-) -> list[Unknown]:
+def _oscillation(fit: Fit, blocks: list[Block], scale: Array, names: dict[str, str]) -> Unknowns:
     """Amplitudes, which all series share, and a phase of each, from pairs of sine and cosine."""
     phase_name = names[blocks[0].parameters[0]].split(".")[0] + ".phase"
     size = len(fit.covariance)
     P = len(blocks[0].parameters)
-    amplitudes, rows, weights, phases = [], [], [], []
+    amplitudes, rows, weights = [], [], []
+    phases: Unknowns = {}
     first: Array | None = None
     for block in blocks:
         pair = fit.coefficients[block.start : block.stop].reshape(2, -1)
@@ -149,14 +139,14 @@ def _oscillation(
         across = np.zeros(size)
         across[place.ravel()] = np.kron([-side[1], side[0]], shape) / s[0]
         suffix = f"@{block.series}" if block.series else ""
-        phases.append(Unknown(phase_name + suffix, float(np.arctan2(side[1], side[0])), across))
+        phases[phase_name + suffix] = float(np.arctan2(side[1], side[0])), across
         amplitudes.append(s[0] * shape)
         rows.append(own)
         weights.append(1.0 / np.trace(own @ fit.covariance @ own.T))
     w = np.array(weights) / np.sum(weights)
     mean, row = np.tensordot(w, amplitudes, 1), np.tensordot(w, rows, 1)
-    out = []
+    out: Unknowns = {}
     for j, parameter in enumerate(blocks[0].parameters):
         unit = scale[COLUMNS.index(parameter)]
-        out.append(Unknown(names[parameter], float(mean[j] / unit), row[j] / unit))
-    return out + phases
+        out[names[parameter]] = float(mean[j] / unit), row[j] / unit
+    return out | phases

@@ -16,9 +16,10 @@ from tests.analysis.test_gauge import RATES, SD_RATE, START, thermal_camera
 from tests.commands import call
 from thermocald.analysis.thermal.scene import (
     SceneCourse,
-    SceneTracker,
     common_movement,
+    features,
     follow_scene,
+    followed,
 )
 from thermocald.analysis.thermal.scene_recording import write_scene
 from thermocald.errors import DataError
@@ -75,11 +76,13 @@ def test_turn_and_principal_distance_have_true_sds():
     ratio = []
     for seed in range(40):
         bank, thermal = Bank(seed), camera()
-        tracker = SceneTracker(bank.frame(bank.cold))
+        reference = bank.frame(bank.cold)
+        points = features(reference)
         now = thermal.at(20.0 + bank.rng.uniform(-15, 15))
         turn = bank.rng.normal(0, 1e-3, 3)
-        rows, moved = tracker.follow(bank.frame(now, turn, bank.rng.uniform(0.8, 1.1)))
-        found = common_movement(bank.cold, now, tracker.points[rows], moved)
+        frame = bank.frame(now, turn, bank.rng.uniform(0.8, 1.1))
+        rows, moved = followed(reference, points, frame)
+        found = common_movement(bank.cold, now, points[rows], moved)
         ratio.append((found.values - [*turn, 0.0]) / np.sqrt(np.diag(found.covariance)))
     rms = np.sqrt(np.mean(np.square(ratio), axis=0))
     assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.15), rms
@@ -271,7 +274,7 @@ def test_a_frame_of_night_and_one_of_elsewhere_have_no_movement(tmp_path):
 
 def test_nothing_to_follow_is_said(tmp_path):
     with pytest.raises(DataError, match="features"):
-        SceneTracker(np.full((HEIGHT, WIDTH), 90, np.uint8))
+        features(np.full((HEIGHT, WIDTH), 90, np.uint8))
     with pytest.raises(DataError, match="at least one more"):
         follow_scene(camera(), TemperatureLog(np.array([START]), {}), [])
 
@@ -291,15 +294,15 @@ def test_what_does_not_move_is_a_recording(tmp_path):
     """Its c, x0 and y0 change as the camera's did, within their sds; features that leave go."""
     rng = np.random.default_rng(41)
     times, T, states = warm_day(40, 1800.0)
-    features = rng.uniform([5, 5], [WIDTH - 5, HEIGHT - 5], (150, 2))
+    corners = rng.uniform([5, 5], [WIDTH - 5, HEIGHT - 5], (150, 2))
     tracks = []
     for state in states:
-        at = states[0].as_seen_by(features, state.interior) + rng.normal(0, 0.04, features.shape)
+        at = states[0].as_seen_by(corners, state.interior) + rng.normal(0, 0.04, corners.shape)
         rows = np.flatnonzero(np.arange(150) % 10 != 0) if len(tracks) > 4 else np.arange(150)
         tracks.append((rows, at[rows]))
     tracks[7] = None
     log = TemperatureLog(times, {"housing": T})
-    kept = write_scene(tmp_path / "R", "bank", states[0], log, times[::4], features, tracks)
+    kept = write_scene(tmp_path / "R", "bank", states[0], log, times[::4], corners, tracks)
     series = tc.open(tmp_path / "R")
     epochs = series.calibrate(exterior="series")
     assert (kept, len(series), len(series.testfield), int(epochs.ok.sum())) == (135, 40, 135, 39)
@@ -311,7 +314,7 @@ def test_what_does_not_move_is_a_recording(tmp_path):
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 1.1
     short = [None if t is None else (t[0][:11], t[1][:11]) for t in tracks]
     with pytest.raises(DataError, match="11 features"):
-        write_scene(tmp_path / "S", "bank", states[0], log, times[::4], features, short)
+        write_scene(tmp_path / "S", "bank", states[0], log, times[::4], corners, short)
     assert not (tmp_path / "S").exists()
 
 

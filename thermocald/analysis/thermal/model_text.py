@@ -93,9 +93,10 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         lines.append(f"  {effect['effect']}: {', '.join(parts)}")
     lines += [f"    {say_together(known)}" for known in document.get("known_together", ())]
     lines += [
-        f"  {s['name']}: {s['epochs']} epochs{_on_means(s['means'])}, {s['rms_px']:.4f} px "
-        f"left over beside {s['noise_px']:.4f} px of noise, thermometer "
-        f"± {s['thermometer_sd']:.3f} K"
+        f"  {s['name']}: {s['epochs']} epochs"
+        + ("" if s["means"] is None else f" on {s['means']} means")
+        + f", {s['rms_px']:.4f} px left over beside {s['noise_px']:.4f} px of noise, "
+        f"thermometer ± {s['thermometer_sd']:.3f} K"
         for s in document.get("series", ())
     ]
     lines += [
@@ -110,7 +111,3 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
     ]
     lines += [f"  {line}" for line in doubt_lines(document.get("doubts", ()))]
     return [part for line in lines for part in line.split("\n")]
-
-
-def _on_means(count: int | None) -> str:
-    return "" if count is None else f" on {count} means"

@@ -24,7 +24,6 @@ from thermocald.analysis.thermal.terms import event_worth
 from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
-    IOP_NAMES,
     PARAMETER_NAMES,
     ExteriorOrientation,
 )
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.history import History
-    from thermocald.physics.model import ModelEffect, Prediction, ThermalModel
+    from thermocald.physics.model import ModelEffect, ThermalModel
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
@@ -66,24 +65,21 @@ def derivatives(
         if group != "rates" and (searched := catalogue.get(group).nonlinear.get(key)):
             step = searched.difference_step(value)
         sides = (model.with_values({name: moved}) for moved in (value + step, value - step))
-        one, other = (_packed(m.predict(history, field)) for m in sides)
-        found.append((one - other) / (2.0 * step))
+        columns = []
+        for side in sides:
+            d, p = np.zeros((len(history.times), 22)), side.predict(history, field)
+            d[:, :10], d[:, 10:16], d[:, 16:19] = p.iop, p.eop, p.scale
+            for displacement in p.displacements:
+                d[:, 19:22] += displacement.active[:, None] * displacement.vector
+            columns.append(d)
+        found.append((columns[0] - columns[1]) / (2.0 * step))
     return np.stack(found, axis=2) if found else np.zeros((len(history.times), 22, 0))
-
-
-def _packed(prediction: Prediction) -> Array:
-    """Return a prediction as parameters (E, 22)."""
-    d = np.zeros((len(prediction.iop), len(_COLUMNS)))
-    d[:, :10], d[:, 10:16], d[:, 16:19] = prediction.iop, prediction.eop, prediction.scale
-    for displacement in prediction.displacements:
-        d[:, 19:22] += displacement.active[:, None] * displacement.vector
-    return d
 
 
 def reading_operators(history: History, model: ThermalModel) -> list[tuple[Array, str, csr_array]]:
     """Return how reading errors reach the parameters: weights (22,), channel, operator (E, R)."""
     found: list[tuple[Array, str, csr_array]] = []
-    rates = _rates(model)
+    rates = _weights(model)
     if np.any(rates):
         operator = drive_matrix(history, model.drives)
         assert operator is not None
@@ -111,27 +107,27 @@ def unresolved(
         if kind.kind == "image":
             continue
         left = kind.unresolved(history, rate_jump, **nonlinear)
-        weights = _rates(model) if kind.is_drive else _weights(model, effect.name, coefficients)
+        weights = _weights(model)
+        if not kind.is_drive:
+            weights = _weights(model, effect.name, coefficients)
         if np.any(left) and np.any(weights):
             found.append((weights, left))
     return found
 
 
-def _rates(model: ThermalModel) -> Array:
+def _weights(
+    model: ThermalModel, name: str = "", coefficients: Mapping[str, float] | None = None
+) -> Array:
+    """Weights (22,) of an effect's signal, or of the temperature: the rates.
+
+    The distortion follows what moves c, about T₀.
+    """
     weights = np.zeros(len(_COLUMNS))
-    weights[: len(IOP_NAMES)] = model.rate_vector
-    return _carried(model, weights)
-
-
-def _weights(model: ThermalModel, name: str, coefficients: Mapping[str, float]) -> Array:
-    weights = np.zeros(len(_COLUMNS))
-    for key, value in coefficients.items():
-        weights[_COLUMNS.index(catalogue.get(name).column(key))] = value
-    return _carried(model, weights)
-
-
-def _carried(model: ThermalModel, weights: Array) -> Array:
-    """Let the distortion follow what moves c, about T₀."""
+    if coefficients is None:
+        weights[:10] = model.rate_vector
+    else:
+        for key, value in coefficients.items():
+            weights[_COLUMNS.index(catalogue.get(name).column(key))] = value
     moved = model.carried_derivatives(model.interior.as_array(), weights[:10, None])[:, 0]
     return np.concatenate([moved, weights[10:]])
 

@@ -105,7 +105,9 @@ class Predictor:
         read = self._recent[-1][0]
         age = max(time - read, 0.0)
         if self._recent[0][0] < time < read - _BACK_S:  # an epoch that had to wait
-            camera, age = self._earlier(time), 0.0
+            times = [t for t, _ in self._recent]
+            rows = {n: np.array([row[n] for _, row in self._recent]) for n in self._recent[0][1]}
+            camera, age = self._free.along(times, rows, [time])[0], 0.0
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
         covariance = camera.covariance + np.outer(unknown, unknown)
@@ -172,11 +174,6 @@ class Predictor:
         v = self.thermal.validity
         spread = (_USUAL_RANGE_K if v is None else v.high - v.low) / math.sqrt(12.0)
         return spread * math.sqrt(-math.expm1(-2.0 * seconds / _DAY_S))
-
-    def _earlier(self, time: float) -> Camera:
-        times = [t for t, _ in self._recent]
-        rows = {n: np.array([row[n] for _, row in self._recent]) for n in self._recent[0][1]}
-        return self._free.along(times, rows, [time])[0]
 
     def _largest_px(self, values: Array, shift: Array) -> float:
         """Return by how much a change of the interior orientation moves an image point at most."""

@@ -79,40 +79,37 @@ class SceneMovement:
     follow: NDArray[np.bool_]
 
 
-class SceneTracker:
-    """Follows the features of a reference frame (H, W)."""
-
-    def __init__(self, reference: NDArray[Any]) -> None:
-        self._reference = _eight_bit(reference)
-        corners = cv2.goodFeaturesToTrack(
-            self._reference, _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
+def features(reference: NDArray[Any]) -> NDArray[np.float32]:
+    """Features (F, 2) px of a reference frame (H, W); DataError where it has too few."""
+    corners = cv2.goodFeaturesToTrack(
+        _eight_bit(reference), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
+    )
+    found = np.zeros((0, 2)) if corners is None else np.asarray(corners).reshape(-1, 2)
+    last = np.array(reference.shape[::-1]) - _WINDOW_PX
+    points = found[((found >= _WINDOW_PX) & (found < last)).all(axis=1)].astype(np.float32)
+    if len(points) < _FEWEST:
+        raise DataError(
+            f"the reference frame has {len(points)} features; at least {_FEWEST} are needed that "
+            "do not move: another frame, more light"
         )
-        found = np.zeros((0, 2)) if corners is None else np.asarray(corners).reshape(-1, 2)
-        margin = _WINDOW_PX
-        height, width = reference.shape
-        inside = ((found >= margin) & (found < np.array([width, height]) - margin)).all(axis=1)
-        self.points: NDArray[np.float32] = found[inside].astype(np.float32)
-        if len(self.points) < _FEWEST:
-            raise DataError(
-                f"the reference frame has {len(self.points)} features; at least {_FEWEST} are "
-                "needed that do not move: another frame, more light"
-            )
+    return points
 
-    def follow(self, image: NDArray[Any]) -> tuple[NDArray[np.int64], Array]:
-        """Rows of the features that are found again, and how far they moved (n, 2) px."""
-        image = _eight_bit(image)
-        options: dict[str, Any] = {
-            "winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3,
-            "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3),
-        }  # fmt: skip
-        start: Any = None
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._reference, image, self.points, start, **options
-        )
-        back, again, _ = cv2.calcOpticalFlowPyrLK(image, self._reference, there, start, **options)
-        same = np.abs(back - self.points).max(axis=1) < _BACK_PX
-        rows = np.flatnonzero((found.ravel() == 1) & (again.ravel() == 1) & same)
-        return rows, (there - self.points)[rows].astype(float)
+
+def followed(
+    reference: NDArray[Any], points: NDArray[np.float32], image: NDArray[Any]
+) -> tuple[NDArray[np.int64], Array]:
+    """Rows of the features (F, 2) px that are found again, and how far they moved (n, 2) px."""
+    first, now, start = _eight_bit(reference), _eight_bit(image), None
+    options: dict[str, Any] = {
+        "winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3),
+    }  # fmt: skip
+    flow: Any = cv2.calcOpticalFlowPyrLK
+    there, found, _ = flow(first, now, points, start, **options)
+    back, again, _ = flow(now, first, there, start, **options)
+    same = np.abs(back - points).max(axis=1) < _BACK_PX
+    rows = np.flatnonzero((found.ravel() == 1) & (again.ravel() == 1) & same)
+    return rows, (there - points)[rows].astype(float)
 
 
 def common_movement(
@@ -396,12 +393,12 @@ def follow_scene(
         log.times, log.channels, times, extrapolate, float(along.temperatures[0]),
         thermal.reading_sd,
     ).sd  # fmt: skip
-    tracker = SceneTracker(reference)
+    corners = features(reference)
     E = len(frames)
     values, covariance = np.full((E, 4), np.nan), np.full((E, 4, 4), np.nan)
     locked = np.zeros(4)
-    features, reasons = np.zeros(E, dtype=np.int64), [""] * E
-    points = tracker.points.astype(float)
+    count, reasons = np.zeros(E, dtype=np.int64), [""] * E
+    points = corners.astype(float)
     tracks: list[Track | None] = [(np.arange(len(points)), points), *[None] * (E - 1)]
     for k, (path, _) in enumerate(frames):
         if k == 0:
@@ -413,17 +410,16 @@ def follow_scene(
             status = inspect_frame(image, (reference.shape[1], reference.shape[0]))
             reasons[k] = status.reason
             if status.ok:
-                rows, moved = tracker.follow(image)
+                rows, moved = followed(reference, corners, image)
                 found = common_movement(along[0], along[k], points[rows], moved, k)
                 reasons[k] = "" if found else "too few features have a common movement"
-                if found:
-                    follow = found.follow
-                    tracks[k] = rows[follow], points[rows][follow] + moved[follow]
         except ImageError as error:
             reasons[k] = str(error)
         if found is not None:
+            follow = found.follow
+            tracks[k] = rows[follow], points[rows][follow] + moved[follow]
             values[k], covariance[k] = found.values, found.covariance
-            features[k], locked = int(found.follow.sum()), found.locked
+            count[k], locked = int(follow.sum()), found.locked
         advance(1)
     if recording is not None:
         write_scene(recording, thermal.model.camera, along[0], log, times, points, tracks)
@@ -431,7 +427,7 @@ def follow_scene(
     unsure = since[:, [2, 1, 0, 0]] / [interior.c, interior.c, np.inf, 1.0]
     return SceneCourse(
         thermal.model.camera, tuple(path.name for path, _ in frames), times, along.temperatures,
-        values, covariance, unsure, features, tuple(reasons), locked,
+        values, covariance, unsure, count, tuple(reasons), locked,
         thermal.model.sensor.pixel_pitch / interior.c,
     )  # fmt: skip
 

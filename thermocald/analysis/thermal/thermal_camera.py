@@ -264,8 +264,10 @@ class ThermalCamera(Result):
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
             beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
-        plain = channels is None and not self._uses_channels
-        values, slope, J = (self._steady if plain else self._with(channels)).at(T)
+        if channels is None:
+            values, slope, J = self._steady.at(T)
+        else:
+            values, slope, J = steady_camera(self.model, self.parameters, channels).at(T)
         covariance = J @ self.covariance @ J.T
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
@@ -391,22 +393,15 @@ class ThermalCamera(Result):
         return None if limits is None else Validity(*limits)
 
     @cached_property
-    def _uses_channels(self) -> bool:
-        return any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects)
-
-    @cached_property
     def _steady(self) -> SteadyCamera:
-        return self._with(None)
-
-    def _with(self, channels: Mapping[str, float] | None) -> SteadyCamera:
-        return steady_camera(self.model, self.parameters, channels)
+        return steady_camera(self.model, self.parameters, None)
 
     def steady_polynomials(self) -> tuple[Array, Array, Array]:
         """The linear parameters of the steady camera as polynomials in T - T0: three times (10,).
 
         UsageError for a model that needs more than one thermometer.
         """
-        if self._uses_channels:
+        if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
         return self._steady.p
 
@@ -444,19 +439,19 @@ def _influence(model: ThermalModel, name: str, history: History) -> Array:
     return catalogue.get(name).influence(history, effect.values, None).iop
 
 
-class _Drive:
-    """The temperature behind the linear terms: readings through all drives of a model, in order."""
+def _followers(model: ThermalModel) -> list[Any]:
+    """What follows the readings through each drive of a model, in order; None of one that asks all.
 
-    def __init__(self, model: ThermalModel) -> None:
-        found = [catalogue.get(name).follower(values) for name, values in model.drives]
-        self._stages = [stage for stage in found if stage is not None]
-        self.known = len(self._stages) == len(found)
+    Called one after the other, they give the temperature behind the linear terms.
+    """
+    return [catalogue.get(name).follower(values) for name, values in model.drives]
 
-    def push(self, time: float, value: float) -> Array:
-        """Take a reading °C, and return what drives now, (1,) °C."""
-        for stage in self._stages:
-            value = stage(time, value)
-        return np.array([value])
+
+def _pushed(followers: list[Any], time: float, value: float) -> Array:
+    """Take a reading °C, and return what drives now, (1,) °C."""
+    for one in followers:
+        value = one(time, value)
+    return np.array([value])
 
 
 class LiveCamera:
@@ -478,8 +473,8 @@ class LiveCamera:
     def __init__(self, thermal: ThermalCamera) -> None:
         self.thermal = thermal
         model = thermal.model
-        self._drive = _Drive(model)
-        self.keeps_all = not (self._drive.known and _is_of_now(model))
+        self._drive = _followers(model)
+        self.keeps_all = None in self._drive or not _is_of_now(model)
         self._times: list[float] = []
         self._rows: list[tuple[float, ...]] = []
         self._channels: tuple[str, ...] = ()
@@ -487,7 +482,7 @@ class LiveCamera:
         self._maps: Maps | None = None
         drives = {name for name, _ in model.drives}
         self._moved = {
-            (name, sign): _Drive(thermal._moved(name, sign))
+            (name, sign): _followers(thermal._moved(name, sign))
             for name in thermal.parameters
             for sign in (1.0, -1.0)
             if name.split(".")[0] in drives
@@ -514,8 +509,8 @@ class LiveCamera:
         if self.keeps_all:
             self._now = thermal.along(times, readings, [t], extrapolate=True)[0]
             return self._now
-        drive = self._drive.push(t, row[0])
-        driven = {key: drive.push(t, row[0]) for key, drive in self._moved.items()}
+        drive = _pushed(self._drive, t, row[0])
+        driven = {key: _pushed(moved, t, row[0]) for key, moved in self._moved.items()}
         begin, model = times[0], thermal.model
         history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
         linear = thermal._linear(history, drive)

@@ -211,14 +211,14 @@ def _with_small_factors(n: int) -> int:
     """The largest number up to n without a prime factor above 31; n itself where it is small."""
     if n <= _ANY_LENGTH:
         return n
-    return next(m for m in range(n, 0, -1) if _is_product(m))
-
-
-def _is_product(m: int) -> bool:
-    for prime in _SMALL_PRIMES:
-        while m % prime == 0:
-            m //= prime
-    return m == 1
+    for found in range(n, 0, -1):
+        rest = found
+        for prime in _SMALL_PRIMES:
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            break
+    return found
 
 
 def largest_p_value(p: Array, deviance: Array) -> float:
@@ -288,7 +288,10 @@ def drift_test(
     power = at.sums(whole**2)
     single = int(np.argmax(at.count > 1)) if at.count[-1] > 1 else len(at.count)
     bands = _bands(n, window, at)
-    trend = _trend(at, np.arange(n, dtype=float) if times is None else times, single)
+    # the first coefficients of a line and a parabola
+    t = np.arange(n, dtype=float) if times is None else times
+    t = 2.0 * (t - t[0]) / max(float(t[-1] - t[0]), 1e-9) - 1.0
+    trend = np.stack([at.coefficients(t**k)[:single] for k in (1, 2)], axis=1)
     spectra = at.spectra(MODELS)
     fast_power = at.sums(fast**2)
     results = [
@@ -297,14 +300,16 @@ def drift_test(
         )
         for band in bands
     ]
-    noise_ratio, sd_noise_ratio = _noise(values, sds)
+    # From third differences, to which a drift of a thousand sds adds nothing, by their median.
+    third = np.abs(np.diff(values, n=3)) / sds[1:-2]
+    noise_ratio = float(np.median(third)) / (_NORMAL_MEDIAN * np.sqrt(20.0))
     mean_square = float(np.mean(sds**2))
     return DriftTest(
         min(1.0, len(bands) * min(results)),
         _excess(power, fast_power, at, spectra, bands[0], float(np.sum(redundancy))),
         float(np.var(values, ddof=1)) / mean_square,
         noise_ratio,
-        sd_noise_ratio,
+        noise_ratio * _MEDIAN_SD / float(np.sqrt(len(third))),
         n,
     )
 
@@ -382,12 +387,6 @@ def _without_trend(power: Array, first: Array, trend: Array, band: int) -> Array
     return power
 
 
-def _trend(at: Frequencies, times: Array, count: int) -> Array:
-    """The first coefficients (count, 2) of a line and a parabola over times (n,)."""
-    t = 2.0 * (times - times[0]) / max(float(times[-1] - times[0]), 1e-9) - 1.0
-    return np.stack([at.coefficients(t**k)[:count] for k in (1, 2)], axis=1)
-
-
 def _excess(
     power: Array, fast: Array, at: Frequencies, models: Array, band: int, redundancy: float
 ) -> float:
@@ -402,13 +401,3 @@ def _excess(
     return largest_p_value(
         np.asarray(f.sf(power.sum() / expected, degrees, max(redundancy, 1.0))), deviance
     )
-
-
-def _noise(values: Array, sds: Array) -> tuple[float, float]:
-    """Scatter between neighbours over the stated sds, and its sd.
-
-    From third differences, to which a drift of a thousand sds adds nothing, by their median.
-    """
-    third = np.abs(np.diff(values, n=3)) / sds[1:-2]
-    ratio = float(np.median(third)) / (_NORMAL_MEDIAN * np.sqrt(20.0))
-    return ratio, ratio * _MEDIAN_SD / float(np.sqrt(len(third)))

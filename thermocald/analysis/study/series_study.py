@@ -276,9 +276,12 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
         *(t.values for t in series.thermometers),
     ]
     focus = _focus(series, settings, deviations, notes)
+    # over all parameters, root mean
+    ratios = [one.drift.noise_ratio for one in significance.values() if one.drift is not None]
+    noise_ratio = float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan")
     return SeriesStudy(
         series, deviations, focus, grid, displacement, significance, channels, names,
-        correlation_matrix(columns), tuple(notes), _noise_ratio(significance),
+        correlation_matrix(columns), tuple(notes), noise_ratio,
     )  # fmt: skip
 
 
@@ -359,12 +362,6 @@ def _significance(
             drifts[name], p_holm.get(name, float("nan")), p_excess.get(name, float("nan")),
         )  # fmt: skip
     return result
-
-
-def _noise_ratio(significance: Mapping[str, Significance]) -> float:
-    """Scatter between neighbouring epochs over the stated sds: over all parameters, root mean."""
-    found = [one.drift.noise_ratio for one in significance.values() if one.drift is not None]
-    return float(np.sqrt(np.mean(np.square(found)))) if found else float("nan")
 
 
 def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:

@@ -149,7 +149,8 @@ def fit_calibrations(
     for basis in BASES:
         M = np.eye(10) if basis == "image" else distortion_along(mean)
         M = M[np.ix_(free, free)]
-        A = np.vstack([_design(M, rated, t - at) for t in T])
+        # ∂ parameters of each calibration / ∂ (interior, rates), which take A and B along
+        A = np.vstack([np.hstack([np.eye(len(M)), (t - at) * M[:, rated]]) for t in T])
         found_in[basis] = _adjusted(A, y, blocks, M[:, rated], temperature_sd)
     distortion, sure = choose_basis({basis: s for basis, (_, _, s) in found_in.items()})
     x, covariance, square = found_in[distortion]
@@ -212,11 +213,6 @@ def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
             f"{other.path}: other parameters were estimated than in {first.path}; calibrate both "
             "with the same --free"
         )
-
-
-def _design(moved: Array, rated: list[int], dT: float) -> Array:
-    """∂ parameters of one calibration / ∂ (interior, rates); moved: what a rate takes along."""
-    return np.hstack([np.eye(len(moved)), dT * moved[:, rated]])
 
 
 def _adjusted(

@@ -337,6 +337,7 @@ def seconds_of(text: str, clock: DeviceClock) -> float:
 def _lines(path: Path) -> Iterator[list[str]]:
     """Lists of whole lines: what has come in, of a file some megabytes."""
     standard = path == STANDARD_INPUT
+    errors = "replace" if standard else "strict"
     rest = b""
     try:
         with nullcontext(sys.stdin.buffer) if standard else path.open("rb") as file:
@@ -344,16 +345,12 @@ def _lines(path: Path) -> Iterator[list[str]]:
             while chunk := stream.read1(_CHUNK):
                 whole, mark, rest = (rest + chunk).rpartition(b"\n")
                 if mark:
-                    yield _text(whole, standard).splitlines()
+                    yield whole.decode("utf-8-sig", errors).splitlines()
             if rest:
-                yield [_text(rest, standard)]
+                yield [rest.decode("utf-8-sig", errors)]
     except (OSError, UnicodeDecodeError) as cause:
         what = cause.strerror if isinstance(cause, OSError) else "is not UTF-8 text"
         raise DataError(f"{path}: cannot be read: {what}") from cause
-
-
-def _text(data: bytes, standard: bool) -> str:
-    return data.decode("utf-8-sig", errors="replace" if standard else "strict")
 
 
 def _block(

@@ -60,6 +60,10 @@ _CONFIRMED = 2  # epochs in a row that show another pose
 _MOVED_CHI2 = 38.3  # six degrees of freedom, one in a million
 _SUDDEN_K = 2.0  # between two frames: by less a model that lacks an effect is not off by much
 _UNMODELLED_PX = 0.05  # of a control point from frame to frame: light, air, the template
+_USUAL = {
+    "predicted": "predicted by its thermal model",
+    "resected": "predicted by its thermal model, posed by control points",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,16 +315,14 @@ class GaugeCalibrator:
             return
         self._moved.append(pose)
         if len(self._moved) >= _CONFIRMED:
-            sudden = self._is_step(self._still or self._reference, self._moved[0])
-            self.movement = replace(found, since=self._moved[0].time, sudden=sudden)
+            # two frames, one after the other, that show a movement which is not of heat
+            then, now = self._still or self._reference, self._moved[0]
+            step = self.compare(then, now)
+            warmer = now.predicted.camera.temperature - then.predicted.camera.temperature
+            sudden = step is not None and step.chi2 > _MOVED_CHI2 and abs(warmer) < _SUDDEN_K
+            self.movement = replace(found, since=now.time, sudden=sudden)
             self._reference = self._still = pose
             self._moved.clear()
-
-    def _is_step(self, then: Pose, now: Pose) -> bool:
-        """Return whether two frames, one after the other, show a movement that is not of heat."""
-        step = self.compare(then, now)
-        warmer = now.predicted.camera.temperature - then.predicted.camera.temperature
-        return step is not None and step.chi2 > _MOVED_CHI2 and abs(warmer) < _SUDDEN_K
 
     def compare(self, then: Pose, now: Pose) -> Movement | None:
         """Return how the camera moved between two poses, None where too few points are in both.
@@ -380,7 +382,7 @@ class GaugeObserver:
         epoch, result = calibrated.epoch, calibrated.adjustment
         if (moved := self._gauge.movement) is not None:
             self._tell("camera_moved", moved.sentence(), moved.since, epoch.number)
-        if result.status != self._status and (self._status or not _usual(result.status)):
+        if result.status != self._status and (self._status or result.status not in _USUAL):
             text = result.reason or f"{result.status} again"
             self._tell(result.status, text, epoch.frame_time, epoch.number)
         self._status, self._reason = result.status, result.reason
@@ -388,11 +390,7 @@ class GaugeObserver:
 
     def report(self) -> dict[str, Any]:
         """For status and page."""
-        words = {
-            "predicted": "predicted by its thermal model",
-            "resected": "predicted by its thermal model, posed by control points",
-        }
-        return {"state": self._status, "sentence": self._reason or words.get(self._status, "")}
+        return {"state": self._status, "sentence": self._reason or _USUAL.get(self._status, "")}
 
 
 def plan_gauge(
@@ -430,7 +428,3 @@ def _matching(seen: Observations) -> Array:
     """Standard deviations (n, 2) px from frame to frame: what all frames share is not in them."""
     own = seen.quality.get(MATCHING_SD)
     return seen.sigmas if own is None else np.stack([own, own], axis=1)
-
-
-def _usual(status: str) -> bool:
-    return status in ("predicted", "resected")

@@ -72,7 +72,11 @@ def examine_rest(
         s: examine(fitter, fit, s) for s, count in enumerate(epochs) if count >= _FEWEST_TO_CARRY
     }
     short = [s for s in tests if epochs[s] < _FEWEST]
-    together = _together([tests[s] for s in short])
+    # the short ones tested as one, in standard deviations
+    scores = [tests[s].scores for s in short]
+    free_scores = sum(a.size for a in scores)
+    total = sum(float(np.sum(a**2)) for a in scores)
+    together = (total - free_scores) / float(np.sqrt(2.0 * free_scores)) if free_scores else 0.0
     examined = sum(epochs[s] for s in short) >= _FEWEST
     for s, alone in tests.items():
         a = replace(alone, significance=together) if s in short else alone
@@ -95,13 +99,6 @@ def examine_rest(
         "significance_sigmas": round(float(significance), 1),
     }
     return verdict, unknowns, parameters
-
-
-def _together(tests: list[Adequacy]) -> float:
-    """The significance of several tests as one, in standard deviations."""
-    free = sum(a.scores.size for a in tests)
-    total = sum(float(np.sum(a.scores**2)) for a in tests)
-    return (total - free) / float(np.sqrt(2.0 * free)) if free else 0.0
 
 
 def _power(a: Adequacy) -> Array:

@@ -4,17 +4,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from tests.analysis.test_drift_test import noise
 from thermocald.analysis.statistics.dependence import slope_noise
 
 N = 150
 WARM_UP = 1 - np.exp(-np.arange(N) / 30)
 UP_AND_DOWN = np.where(np.arange(N) < 75, WARM_UP, WARM_UP[75] * np.exp(-(np.arange(N) - 75) / 30))
-
-
-def noise(rng, coloured, phi, n=N):
-    """Noise of unit variance: first-order autoregressive plus white."""
-    slow = signal.lfilter([1], [1, -phi], rng.standard_normal(n + 600))[600:] * np.sqrt(1 - phi**2)
-    return np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * rng.standard_normal(n)
 
 
 def slope(y, x):

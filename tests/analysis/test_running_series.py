@@ -62,11 +62,16 @@ class Scene:
         return Epoch(k + 1, time, time, {"t": 20.0 + 10 * warm}, None, seen), now
 
 
+def begun(sensor, field, c=3.04, exterior="auto", settings=None, offsets=True):
+    """A calibrator and a running series that have seen nothing."""
+    settings = settings or AdjustmentSettings()
+    calibrator = Calibrator(sensor, field, settings, nominal_c=c)
+    return calibrator, RunningSeries(sensor, field, settings, exterior=exterior, offsets=offsets)
+
+
 def take(scene, epochs, exterior="auto", settings=None, offsets=True):
     """The running series, its results with their columns, and the epochs by themselves."""
-    settings = settings or AdjustmentSettings()
-    calibrator = Calibrator(scene.sensor, scene.field, settings, nominal_c=3.04)
-    running = RunningSeries(scene.sensor, scene.field, settings, exterior=exterior, offsets=offsets)
+    calibrator, running = begun(scene.sensor, scene.field, 3.04, exterior, settings, offsets)
     results, alone, truth = [], [], []
     for k in range(epochs):
         epoch, now = scene.epoch(k)
@@ -203,9 +208,7 @@ def test_a_camera_that_is_carried_elsewhere_begins_another_series():
 def test_a_program_started_again_goes_on_where_it_was():
     scene = Scene(7)
     _, results, alone, _ = take(scene, 32)
-    again = RunningSeries(
-        scene.sensor, scene.field, AdjustmentSettings(), exterior="auto", offsets=True
-    )
+    _, again = begun(scene.sensor, scene.field)
     for calibrated, (result, _) in zip(alone[:22], results, strict=False):
         again.remember(calibrated, calibrated.epoch.observations, result.values)
     for calibrated, (whole, columns) in zip(alone[22:], results[22:], strict=True):
@@ -219,10 +222,7 @@ def test_a_program_started_again_goes_on_where_it_was():
 
 def test_gross_errors_in_most_epochs_are_found():
     scene = Scene(8, hidden=8)
-    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
-    running = RunningSeries(
-        scene.sensor, scene.field, AdjustmentSettings(), exterior="auto", offsets=True
-    )
+    calibrator, running = begun(scene.sensor, scene.field)
     for k in range(24):
         epoch, _ = scene.epoch(k)
         points = epoch.observations.points.copy()
@@ -237,10 +237,7 @@ def test_gross_errors_in_most_epochs_are_found():
 def test_a_clock_that_is_set_back_breaks_nothing():
     """By two hours in the middle, and to the very first time at the end."""
     scene = Scene(11)
-    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
-    running = RunningSeries(
-        scene.sensor, scene.field, AdjustmentSettings(), exterior="auto", offsets=True
-    )
+    calibrator, running = begun(scene.sensor, scene.field)
     for k in range(32):
         epoch, _ = scene.epoch(k)
         back = 1e9 if k == 31 else epoch.frame_time - 7200.0 * (k >= 24)
@@ -300,10 +297,7 @@ def real(shared):
 
 
 def test_a_real_camera_is_live_what_replay_finds(real):
-    calibrator = Calibrator(real.camera.sensor, real.testfield, nominal_c=12.7)
-    running = RunningSeries(
-        real.camera.sensor, real.testfield, AdjustmentSettings(), exterior="auto", offsets=True
-    )
+    calibrator, running = begun(real.camera.sensor, real.testfield, 12.7)
     epochs = list(real.epochs)[:27]
     for n, epoch in enumerate(epochs, 1):
         result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)

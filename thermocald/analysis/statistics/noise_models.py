@@ -56,12 +56,8 @@ _GAP = 3.0  # usual intervals between neighbours: a longer one ends a stretch
 _TYPICAL_PHI = 0.97
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseModels:
-    """Noises of unit variance: shares (g, P) of the variance of autoregressive parts of φ (P,)."""
-
-    phi: Array
-    shares: Array
+NoiseModels = tuple["Array", "Array"]
+"""Noises of unit variance: φ (P,) of autoregressive parts, their shares (g, P) of the variance."""
 
 
 def mixtures(phi: Array, coloured: Array) -> NoiseModels:
@@ -70,7 +66,7 @@ def mixtures(phi: Array, coloured: Array) -> NoiseModels:
     shares = np.zeros((len(phi), len(parts)))
     shares[:, column[0]] = 1.0 - coloured
     shares[np.arange(len(phi)), column[1:]] += coloured
-    return NoiseModels(parts, shares)
+    return parts, shares
 
 
 def grid(first: ArrayLike, coloured: ArrayLike) -> tuple[Array, Array]:
@@ -81,16 +77,15 @@ def grid(first: ArrayLike, coloured: ArrayLike) -> tuple[Array, Array]:
 
 def _models() -> NoiseModels:
     """Autoregressive noise, and flicker noise, whose parts have these weights, beside white."""
-    one = mixtures(*grid(_PHI, _COLOURED))
+    phi, mixed = mixtures(*grid(_PHI, _COLOURED))
     shape = np.array([_MEMORIES ** (a - 1.0) for a in _FLICKER])
     shape /= shape.sum(axis=1, keepdims=True)
     coloured = np.tile(_COLOURED, len(_FLICKER))
     shares = coloured[:, None] * np.repeat(shape, len(_COLOURED), axis=0)
     shares = np.column_stack([1.0 - coloured, shares])
-    both = np.zeros((len(one.shares) + len(shares), len(one.phi) + shares.shape[1]))
-    both[: len(one.shares), : len(one.phi)] = one.shares
-    both[len(one.shares) :, len(one.phi) :] = shares
-    return NoiseModels(np.concatenate([one.phi, [0.0], np.exp(-1.0 / _MEMORIES)]), both)
+    both = np.zeros(np.add(mixed.shape, shares.shape))
+    both[: len(mixed), : len(phi)], both[len(mixed) :, len(phi) :] = mixed, shares
+    return np.concatenate([phi, [0.0], np.exp(-1.0 / _MEMORIES)]), both
 
 
 MODELS = _models()
@@ -166,12 +161,12 @@ class Frequencies:
 
     def spectra(self, models: NoiseModels) -> Array:
         """Mean variances (g, m) of the coefficients of noises of unit variance."""
-        phi = models.phi[:, None]
+        (phis, shares), phi = models, models[0][:, None]
         parts = (1 - phi**2) / (1 + phi**2 - 2 * phi * np.cos(self.mean))
-        for part, one in zip(parts, models.phi.tolist(), strict=True):
+        for part, one in zip(parts, phis.tolist(), strict=True):
             slow = self.means_covariance(one)
             part[: len(slow) - 1] = np.diag(self.contrasts @ slow @ self.contrasts.T)
-        return np.asarray(models.shares @ parts)
+        return np.asarray(shares @ parts)
 
 
 def _pieces(n: int, times: Array | None) -> tuple[tuple[slice, ...], Array]:

@@ -142,15 +142,6 @@ class _Together:
         )  # fmt: skip
 
 
-def _going_on(times: Array) -> Array:
-    """Return the times (E,) s of epochs in their order, as if the clock had never been set back."""
-    steps = np.diff(times)
-    ahead = steps > 0
-    usual = float(np.median(steps[ahead])) if ahead.any() else 1.0
-    since = np.cumsum(np.where(ahead, steps, usual))
-    return np.concatenate([times[:1], times[0] + since])
-
-
 class RunningSeries:
     """The epochs of one series as they come, in any order, one thread at a time.
 
@@ -412,7 +403,11 @@ class RunningSeries:
     def _look(self) -> int:
         """Adjust the kept epochs as `replay` does; the row of the newest among them."""
         kept, grid, start, row = self._laid_out()
-        time = _going_on(np.array([k.time for k in kept]))
+        # as if the clock had never been set back
+        time = np.array([k.time for k in kept])
+        steps = np.diff(time)
+        usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+        time[1:] = time[0] + np.cumsum(np.where(steps > 0, steps, usual))
         self._period = drift_period(time, np.array([k.temperature for k in kept]))
         self._shown = np.asarray(grid.observed.any(axis=0))
         self._offsets = self._asked.target_offsets and self._shown.sum() <= _MOST_TARGETS

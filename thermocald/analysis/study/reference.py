@@ -168,7 +168,13 @@ def _changes(camera: CameraStudy, quoted: Quoted) -> list[_Row]:
     moved = [np.hypot(d["x0"].change, d["y0"].change) / pitch for d in deviations]
     px = float(np.mean(moved))
     rows = _about("principal point, last − first", "px", quoted.moved_px, px, 0.5)
-    where = _direction(camera)
+    # where the principal point stands at its farthest, degrees from right towards up
+    steps = []
+    for study in camera.series:
+        path = study.series.values[:, 1:3] - study.series.values[0, 1:3]
+        steps.append(path[int(np.argmax(np.linalg.norm(path, axis=1)))])
+    right, up = np.mean(steps, axis=0)
+    where = float(np.degrees(np.arctan2(up, right)))
     rows.append(
         ("principal point, direction", "°", quoted.direction, where, *_DIRECTIONS[quoted.direction])
     )
@@ -180,16 +186,6 @@ def _changes(camera: CameraStudy, quoted: Quoted) -> list[_Row]:
         rows += _about("depth of field at 1 m, change", "mm", quoted.focus_mm, depth, 1.0)
     ratio = max(float(s.series.sigma0.max() / s.series.sigma0[0]) for s in camera.series)
     return rows + _about("σ₀ at its highest over the first", "", quoted.sigma0_ratio, ratio, 0.35)
-
-
-def _direction(camera: CameraStudy) -> float:
-    """Return where the principal point stands at its farthest, degrees from right towards up."""
-    steps = []
-    for study in camera.series:
-        path = study.series.values[:, 1:3] - study.series.values[0, 1:3]
-        steps.append(path[int(np.argmax(np.linalg.norm(path, axis=1)))])
-    x, y = np.mean(steps, axis=0)
-    return float(np.degrees(np.arctan2(y, x)))
 
 
 def _correlations(camera: CameraStudy, quoted: Quoted) -> list[_Row]:

@@ -112,7 +112,13 @@ def study_camera(
     notes: list[str] = []
     studies = tuple(study_series(one, settings) for one in series)
     iop = np.mean([one.mean for one in series], axis=0)
-    sds = sds_over_time(series)
+    squares, degrees = np.zeros(10), 0
+    for one in series:
+        if len(one) > 1:
+            for name in one.free:
+                squares[IOP_NAMES.index(name)] += np.var(one.column(name)[0]) * len(one)
+            degrees += len(one) - 1
+    sds = np.sqrt(squares / max(degrees, 1))
     correlations = median_correlations([one.correlations for one in series])
     if correlations is None:
         notes.append(
@@ -145,17 +151,6 @@ def study_camera(
         label, studies, iop, sds, correlations, montecarlo, first_order,
         correlations_over_time(series), paths, tuple(notes),
     )  # fmt: skip
-
-
-def sds_over_time(series: Sequence[MeasuredSeries]) -> Array:
-    """Standard deviations (10,) of the IOP over time, about each series' own mean; 0 where held."""
-    squares, degrees = np.zeros(10), 0
-    for one in series:
-        if len(one) > 1:
-            for name in one.free:
-                squares[IOP_NAMES.index(name)] += np.var(one.column(name)[0]) * len(one)
-            degrees += len(one) - 1
-    return np.asarray(np.sqrt(squares / max(degrees, 1)))
 
 
 def _object_space(

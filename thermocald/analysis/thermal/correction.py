@@ -22,7 +22,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import cv2
 import numpy as np
@@ -227,32 +227,24 @@ class FrameCorrector:
             pixels = 1.0 / sensor.pixel_pitch
             when = calibrated.epoch.frame_time
             jpeg = with_exif(jpeg, self._camera, when, self._steady.interior.c, pixels)
-        return with_comment(jpeg, json.dumps(self._document(calibrated), allow_nan=False))
-
-    def _document(self, calibrated: CalibratedEpoch) -> dict[str, Any]:
-        epoch, result = calibrated.epoch, calibrated.adjustment
-        pose = None
+        epoch, pose = calibrated.epoch, None
         if result.exterior is not None:
             sd = np.sqrt(np.diag(result.covariance)[EOP])
             six = with_sds(EOP_NAMES, result.exterior.as_array(), sd)
             pose = {**six, "origin_mm": self._origin}
-        document: dict[str, Any] = jsonable(
-            {
-                "format": "thermocald-frame/1",
-                "camera": self._camera,
-                "epoch": epoch.number,
-                "time": epoch.frame_time,
-                "temperature": next(iter(epoch.temperatures.values()), None),
-                "corrected_to": self.to,
-                "status": result.status,
-                "reason": result.reason,
-                "opencv": opencv_terms(
-                    self.sensor, self._steady.values, result.covariance[IOP, IOP]
-                ),
-                "pose": pose,
-            }
-        )
-        return document
+        document = {
+            "format": "thermocald-frame/1",
+            "camera": self._camera,
+            "epoch": epoch.number,
+            "time": epoch.frame_time,
+            "temperature": next(iter(epoch.temperatures.values()), None),
+            "corrected_to": self.to,
+            "status": result.status,
+            "reason": result.reason,
+            "opencv": opencv_terms(sensor, self._steady.values, result.covariance[IOP, IOP]),
+            "pose": pose,
+        }
+        return with_comment(jpeg, json.dumps(jsonable(document), allow_nan=False))
 
 
 STANDARD_INPUT = Path("-")

@@ -39,7 +39,6 @@ def year(epochs: int) -> MeasuredSeries:
             values[:, k] += SDS[k] * rng.standard_normal(epochs)
         sds[:, k] = SDS[k]
     true += 15 + 0.05 * rng.standard_normal(epochs)
-    sample = np.linspace(0, epochs - 1, 5000).astype(np.int64)
     return MeasuredSeries(
         "rpi",
         "year",
@@ -54,7 +53,6 @@ def year(epochs: int) -> MeasuredSeries:
         1 + 0.03 * rng.standard_normal(epochs),
         np.full(epochs, 280.0),
         np.tile(np.eye(10), (5000, 1, 1)),
-        sample,
         "series",
     )
 

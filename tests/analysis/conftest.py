@@ -58,7 +58,6 @@ class WarmUp:
             "sigma0": 1 + 0.04 * rng.standard_normal(n),
             "redundancy": np.full(n, 284.0),
             "correlations": np.tile(correlation, (n, 1, 1)),
-            "correlation_rows": np.arange(n),
             "exterior": "series",
             "without_result": {},
         }

@@ -41,7 +41,7 @@ def test_first_order_agrees_where_errors_are_small(warm_up):
 
 
 def test_without_covariances_there_is_no_monte_carlo_but_a_reason(warm_up):
-    series = warm_up()(correlations=np.empty((0, 10, 10)), correlation_rows=np.empty(0, int))
+    series = warm_up()(correlations=np.empty((0, 10, 10)))
     camera = study([series], StudySettings(sets=100)).cameras[0]
     assert camera.montecarlo is None
     assert "No epoch has a covariance matrix" in " ".join(camera.notes)
@@ -51,10 +51,7 @@ def test_two_hundred_thousand_epochs_in_seconds(warm_up):
     """A sixteenth of a year; the year itself is in benchmarks/study.py."""
     import time
 
-    series = warm_up(epochs=200_000)(
-        correlations=np.tile(np.eye(10), (5000, 1, 1)),
-        correlation_rows=np.arange(5000) * 40,
-    )
+    series = warm_up(epochs=200_000)(correlations=np.tile(np.eye(10), (5000, 1, 1)))
     begin = time.process_time()  # other jobs may share the machine
     result = study([series], StudySettings())
     assert time.process_time() - begin < 12

@@ -84,9 +84,7 @@ def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told
 @pytest.mark.slow
 def test_a_years_report_is_as_small_and_as_quick_to_open(warm_up, html, page_of, tmp_path):
     """3,155,760 epochs, one every 10 s: at most 3 MB, opened in the time of one of 150 epochs."""
-    series = warm_up(epochs=3_155_760)(
-        correlations=np.tile(np.eye(10), (100, 1, 1)), correlation_rows=np.arange(100)
-    )
+    series = warm_up(epochs=3_155_760)(correlations=np.tile(np.eye(10), (100, 1, 1)))
     year = render_study(study([series], StudySettings(sets=500)))
     assert len(year) < 3e6
     assert len(year) < 1.5 * len(html)

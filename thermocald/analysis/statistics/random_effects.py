@@ -76,7 +76,7 @@ class Shrunk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """A type: mean (k,), its covariance (k, k), Σ `between` (k, k); specimens: how many.
+    """A type: mean (k,), its covariance (k, k), Σ `between` (k, k).
 
     correlation_variance (k, k): expected square of the error of each correlation in Σ; freedom:
     of Σ.
@@ -87,7 +87,6 @@ class Population:
     between: Array
     correlation_variance: Array
     freedom: float
-    specimens: int
 
     @property
     def prior(self) -> Array:
@@ -151,7 +150,7 @@ def population(values: Array, covariances: Array) -> Population:
     share = weight / weight.sum(axis=0)
     total = between[None] + covariances
     mean_covariance = np.einsum("ij,ijk,ik->jk", share, total, share)
-    return Population(mean, mean_covariance, between, error, count - 1.0, count)
+    return Population(mean, mean_covariance, between, error, count - 1.0)
 
 
 def odd_specimens(values: Array, covariances: Array) -> Array:

@@ -70,7 +70,7 @@ class MeasuredSeries:
     label: what the study treats as one camera; name: the series; number (E,), time_s (E,): s since
     the first epoch of the series; thermometers: the first is the reference; values (E, 10): IOP;
     sds (E, 10): NaN where held fixed; sigma0, redundancy (E,); correlations (m, 10, 10) of the IOP
-    in the adjustments of the epochs `correlation_rows` (m,), a sample where a series is long;
+    in the adjustments of the epochs, of a sample where a series is long;
     exterior: how the exterior orientation was estimated, choice: why; without_result: {reason:
     epochs}; start_utc: s UTC of the first epoch, 0 where it has no date; image_noise_ratio: noise
     of the image points found over the one stated, NaN where epochs were adjusted one by one;
@@ -91,7 +91,6 @@ class MeasuredSeries:
     sigma0: Array
     redundancy: Array
     correlations: Array
-    correlation_rows: NDArray[np.int64]
     exterior: str
     without_result: Mapping[str, int] = field(default_factory=dict)
     clip: Clip | None = None
@@ -167,22 +166,20 @@ def measured_series(
         rows = spread_rows(int(ok.sum()), _MOST_MATRICES)
         numbers = table.number[ok][rows].tolist()
         covariances = source.store.covariances(source.series, numbers)[:, :10, :10]
-        have = np.isfinite(covariances).all(axis=(1, 2))
-        rows, covariances = rows[have], covariances[have]
+        covariances = covariances[np.isfinite(covariances).all(axis=(1, 2))]
     else:
         assert adjustment is not None  # a table with a result has one
         redundancy, exterior = table.redundancy, table.exterior
         of = np.arange(len(ok)) if table.sampled is None else table.sampled
         some = np.flatnonzero(ok[of] & adjustment.ok)
         some = some[spread_rows(len(some), _MOST_MATRICES)]
-        rows = (np.cumsum(ok) - 1)[of[some]]
         covariances = adjustment.covariance[some][:, :10, :10]
     time_s = table.frame_time[ok]
     return MeasuredSeries(
         label, source.head.series, source.head.camera.name, source.head.camera.sensor, source.title,
         table.number[ok], time_s - time_s[0], _thermometers(source, time_s, thermometer_sd),
         table.values[ok, :10], table.sd[ok, :10], table.sigma0[ok], redundancy[: len(ok)][ok],
-        correlations_of(covariances), rows, exterior, without_result,
+        correlations_of(covariances), exterior, without_result,
         _clip(source, ok, observations), float(time_s[0]),
         "" if adjustment is None else adjustment.choice,
         float("nan") if adjustment is None else adjustment.noise_ratio, table.field_movements,

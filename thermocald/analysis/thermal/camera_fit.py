@@ -135,7 +135,6 @@ def shrunk_to_type(
         prior * n / (n + 1),
         np.zeros_like(prior),
         n - 1.0,
-        n,
     )
     free = (np.diag(own) > 0) & (np.diag(prior) > 0)
     information = np.zeros_like(prior)

@@ -48,10 +48,6 @@ KEPT = {
 }
 """The tables that grow while a daemon runs: numbers and texts, in the order of the checksum."""
 ROW = {table: (*numbers, *texts, "checksum") for table, (numbers, texts) in KEPT.items()}
-_SELECT = {
-    table: f"SELECT {', '.join(f'{table}.{name}' for name in names)} FROM {table}"
-    for table, names in ROW.items()
-}
 _INSERT = {
     table: f"INSERT INTO {table} ({', '.join(names)}) VALUES ({', '.join('?' * len(names))})"
     for table, names in ROW.items()
@@ -95,13 +91,6 @@ def require_checksum(
         )
 
 
-def require_sound(table: str, values: Sequence[Any]) -> None:
-    """Raise DamageError where the values of `ROW[table]` are not as they were written."""
-    count = len(KEPT[table][0])
-    name = values[ROW[table].index("number" if table == "epoch" else "id")]
-    require_checksum(values[-1], f"{table} {name}", values[:count], values[count:-1])
-
-
 def next_id(connection: sqlite3.Connection, table: str) -> int:
     """Return the id of the next row; not left to SQLite, since the checksum covers it."""
     (found,) = connection.execute(f"SELECT ifnull(max(id), 0) + 1 FROM {table}").fetchone()
@@ -116,20 +105,31 @@ def insert_row(connection: sqlite3.Connection, table: str, row: Mapping[str, Any
         raise sqlite3.IntegrityError(f"a trigger that is not ours keeps rows out of {table}")
 
 
-def select_rows(
+def examined_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
-) -> sqlite3.Cursor:
-    """Return the rows of a table, the values of `ROW[table]` each, as they lie in the file."""
-    return connection.execute(f"{_SELECT[table]} {condition}", values)
+) -> Iterator[tuple[dict[str, Any], StoreError | None]]:
+    """Yield rows by column, each with what says that it is not as it was written, or None."""
+    names, count = ROW[table], len(KEPT[table][0])
+    called = "number" if table == "epoch" else "id"
+    select = f"SELECT {', '.join(f'{table}.{name}' for name in names)} FROM {table} {condition}"
+    for found in connection.execute(select, values):
+        row, damage = dict(zip(names, found, strict=True)), None
+        try:
+            what = f"{table} {row[called]}"
+            require_checksum(row["checksum"], what, found[:count], found[count:-1])
+        except DamageError as error:
+            damage = error
+        yield row, damage
 
 
 def read_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[dict[str, Any]]:
     """Yield rows by column, one by one; raises DamageError for one that is damaged."""
-    for found in select_rows(connection, table, condition, values):
-        require_sound(table, found)
-        yield dict(zip(ROW[table], found, strict=True))
+    for row, damage in examined_rows(connection, table, condition, values):
+        if damage is not None:
+            raise damage
+        yield row
 
 
 def read_epochs(
@@ -163,7 +163,7 @@ def _columns(
     for field in CHUNKED if names is None else dict.fromkeys(n.split(".")[0] for n in names):
         column = [row[field] for row in rows]
         if field == "status":
-            codes = {status: code for code, status in _statuses(connection).items()}
+            codes = dict(connection.execute("SELECT status, code FROM status_code"))
             columns[field] = np.array([codes[status] for status in column], dtype=np.float64)
         elif field in _MAPPINGS:
             found = [json.loads(text) for text in column]
@@ -179,18 +179,13 @@ def _columns(
     return {name: columns.get(name, absent) for name in names}
 
 
-def _statuses(connection: sqlite3.Connection) -> dict[int, str]:
-    """Return the words that the codes in the column `status` stand for."""
-    return dict(connection.execute("SELECT code, status FROM status_code"))
-
-
 def _name_statuses(
     connection: sqlite3.Connection, columns: dict[str, Array]
 ) -> dict[str, NDArray[Any]]:
     """Put words in the place of the codes in the column `status`."""
     named: dict[str, NDArray[Any]] = dict(columns)
     if "status" in columns:
-        codes = _statuses(connection)
+        codes = dict(connection.execute("SELECT code, status FROM status_code"))
         words = np.array([codes.get(i, "") for i in range(max(codes, default=0) + 1)])
         named["status"] = words[columns["status"].astype(np.int64)]
     return named
@@ -251,8 +246,8 @@ def insert_chunk(
     """Write columns (n,) of epochs `first_row` to number `last`, as they are now, as one chunk."""
     last_id = next_id(connection, "epoch") - 1
     rows = [
-        (series, name, first_row, last, last_id, data)
-        for name, data in ((name, values.tobytes()) for name, values in columns.items())
+        (series, name, first_row, last, last_id, values.tobytes())
+        for name, values in columns.items()
     ]
     connection.executemany(
         "INSERT INTO column_chunk (series_id, name, first_row, last_number, last_id, data, "

@@ -34,15 +34,13 @@ from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.store.database.columns import (
     KEPT,
-    ROW,
     checked_chunks,
+    examined_rows,
     insert_row,
     next_id,
     read_epochs,
     require_checksum,
-    require_sound,
     row_checksum,
-    select_rows,
 )
 from thermocald.store.recording.head import head_document, parse_head
 from thermocald.store.recording.observation_file import ObservationRows
@@ -227,9 +225,7 @@ def _parts(
 ) -> list[tuple[int, bytes]]:
     """Covariance and observations as rows of the table `detail`."""
     first = id_ * _PARTS
-    parts: list[tuple[int, bytes]] = []
-    if covariance is not None:
-        parts.append((first, pack_covariance(covariance)))
+    parts = [] if covariance is None else [(first, pack_covariance(covariance))]
     if seen is not None:
         data = pack_observations(seen)
         cuts = range(0, len(data), _PART_BYTES)
@@ -423,9 +419,6 @@ def to_json(mapping: Mapping[str, Any]) -> str:
     return json.dumps(dict(mapping), default=str)
 
 
-_CHECKSUMS = ("checksum", "detail_checksum")
-
-
 @dataclass(frozen=True, slots=True)
 class Gap:
     """Epochs `first` to `last` of a series are not in the store."""
@@ -467,8 +460,7 @@ def examine(connection: sqlite3.Connection) -> Examination:
     epochs = 0
     cameras = dict(connection.execute("SELECT id, camera || '/' || name FROM series"))
     for table in KEPT:
-        for values in select_rows(connection, table, "NOT INDEXED ORDER BY id"):
-            row = _read_row(connection, table, values)
+        for row in whole_rows(connection, table, "NOT INDEXED ORDER BY id"):
             epochs += table == "epoch"
             if row["damage"] and table == "epoch":
                 series = row["series_id"]
@@ -482,50 +474,31 @@ def examine(connection: sqlite3.Connection) -> Examination:
     ).fetchone()
     if orphans:
         damaged.append(f"{orphans} epochs have observations but no row")
-    return Examination(tuple(damaged), tuple(_gaps(connection)), epochs)
+    gaps = connection.execute(
+        "SELECT camera, name, before + 1, number - 1 FROM (SELECT series_id, number, "
+        "lag(number, 1, 0) OVER (PARTITION BY series_id ORDER BY number) AS before "
+        "FROM (SELECT DISTINCT series_id, number FROM epoch)) JOIN series ON series.id = series_id "
+        "WHERE number > before + 1 ORDER BY series_id, number"
+    )
+    return Examination(tuple(damaged), tuple(Gap(*gap) for gap in gaps), epochs)
 
 
-def _gaps(connection: sqlite3.Connection) -> Iterator[Gap]:
-    query = "SELECT id, camera, name FROM series ORDER BY id"
-    for series, camera, name in connection.execute(query).fetchall():
-        before = 0
-        for (number,) in connection.execute(
-            "SELECT DISTINCT number FROM epoch WHERE series_id = ? ORDER BY number", (series,)
-        ):
-            if number > before + 1:
-                yield Gap(camera, name, before + 1, number - 1)
-            before = number
-
-
-def rows_after(
-    connection: sqlite3.Connection, table: str, after: int, limit: int
+def whole_rows(
+    connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[dict[str, Any]]:
-    """Up to `limit` rows of a table in KEPT with an id above `after`, as {column: value}.
+    """Rows of a table in KEPT as {column: value}, read as they lie in the file.
 
-    An epoch also has `covariance` and `observations`, bytes as `blob` packs them, or None. Every
-    row has `damage`: empty, or in a sentence how it is not as it was written.
+    An epoch also has `covariance` and `observations`, packed bytes or None. Every row has `damage`:
+    empty, or in a sentence how it is not as it was written.
     """
-    for values in select_rows(
-        connection, table, "WHERE id > ? ORDER BY id LIMIT ?", (after, limit)
-    ):
-        row = _read_row(connection, table, values)
-        for name in _CHECKSUMS:  # of this file's rows, as SQLite gives them back
-            row.pop(name, None)
-        yield row
-
-
-def _read_row(connection: sqlite3.Connection, table: str, values: Sequence[Any]) -> dict[str, Any]:
-    """Return a row by column, an epoch's with its details, and its `damage`."""
-    row = dict(zip(ROW[table], values, strict=True))
-    row["damage"] = ""
-    try:
-        require_sound(table, values)
-        if table == "epoch":
-            covariance, observations = read_details(connection, row)
-            row |= {"covariance": covariance or None, "observations": observations or None}
-    except StoreError as error:
-        row["damage"] = str(error)
-    return row
+    for row, damage in examined_rows(connection, table, condition, values):
+        if table == "epoch" and damage is None:
+            try:
+                covariance, observations = read_details(connection, row)
+                row |= {"covariance": covariance or None, "observations": observations or None}
+            except StoreError as error:
+                damage = error
+        yield {**row, "damage": "" if damage is None else str(damage)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -212,35 +212,31 @@ class Store(SeriesReader):
         after = -1
         while True:
             with self._reads("readings") as connection:
-                page = columns.select_rows(
-                    connection,
-                    "reading",
-                    "WHERE id > ? AND thermometer = ifnull(?, thermometer) ORDER BY id LIMIT ?",
-                    (after, thermometer, _READINGS_AT_ONCE),
-                ).fetchall()
-                for row in _sound_rows("reading", page):
+                condition = (
+                    "WHERE id > ? AND thermometer = ifnull(?, thermometer) ORDER BY id LIMIT ?"
+                )
+                wanted = (after, thermometer, _READINGS_AT_ONCE)
+                page = list(columns.examined_rows(connection, "reading", condition, wanted))
+                for row in _sound(page):
                     name = file_name(row["thermometer"], "thermometer", StoreError)
                     values, trusted = json.loads(row["temperatures"]), bool(row["clock_trusted"])
                     yield LoggedReading(name, row["utc"], values, trusted)
             if len(page) < _READINGS_AT_ONCE:
                 return
-            after = page[-1][0]
+            after = page[-1][0]["id"]
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
         """What happened, oldest first; of one series, or all."""
         with self._reads("events") as connection:
-            rows = columns.select_rows(
-                connection,
-                "event",
-                "WHERE utc >= ? AND series_id IS ifnull(?, series_id) ORDER BY id",
-                (since_utc, None if series is None else series.id),
-            )
+            condition = "WHERE utc >= ? AND series_id IS ifnull(?, series_id) ORDER BY id"
+            wanted = (since_utc, None if series is None else series.id)
+            rows = columns.examined_rows(connection, "event", condition, wanted)
             return [
                 Event(
                     row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
                     json.loads(row["data"]),
                 )
-                for row in _sound_rows("event", rows)
+                for row in _sound(rows)
             ]  # fmt: skip
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
@@ -249,9 +245,20 @@ class Store(SeriesReader):
         return [event for event in self.events() if event.kind == "clock_step"]
 
     def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
-        """Rows of a growing table as they were kept, see `database.epochs`: for a forwarder."""
+        """Up to `limit` rows of a growing table with ids above `after`: for a forwarder.
+
+        As `database.epochs.whole_rows` has them, without this file's checksums.
+        """
         with self._reads(f"{table}s") as connection:
-            return list(epochs.rows_after(connection, table, after, limit))
+            found = list(
+                epochs.whole_rows(
+                    connection, table, "WHERE id > ? ORDER BY id LIMIT ?", (after, limit)
+                )
+            )
+        for row in found:
+            row.pop("checksum")
+            row.pop("detail_checksum", None)
+        return found
 
     def frames_after(self, after: int, limit: int) -> list[epochs.KeptFrame]:
         """Epochs' frames as they were kept, see `database.epochs`: for a forwarder."""
@@ -273,12 +280,12 @@ class Store(SeriesReader):
         with self._reads("the store") as connection:
             found = epochs.examine(connection)
         tail = read_wal_tail(helper(self.path, "wal"))
+        damaged = list(found.damaged)
         if tail.lost:
             many = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
             many = "all transactions" if tail.lost < 0 else many
-            damaged = (f"the -wal file: {many} in it cannot be read", *found.damaged)
-            found = replace(found, damaged=damaged)
-        found = replace(found, unfinished=tail.unfinished)
+            damaged.insert(0, f"the -wal file: {many} in it cannot be read")
+        found = replace(found, damaged=tuple(damaged), unfinished=tail.unfinished)
         if not found.damaged:
             for series in self.all_series():
                 names = ["epoch", *COLUMN_NAMES[1:], "status", *series.head.channels]
@@ -330,12 +337,10 @@ class Store(SeriesReader):
                     f"{self.path}: camera {head.camera.name!r} has a series {head.series!r} "
                     "already; choose another name"
                 )
-            epochs.insert_series(
-                self._db,
-                StoredSeries(
-                    0, head, testfield, start, identity or {}, settings or {}, created_utc
-                ),
+            begun = StoredSeries(
+                0, head, testfield, start, identity or {}, settings or {}, created_utc
             )
+            epochs.insert_series(self._db, begun)
         return self.find_series(head.camera.name, head.series)
 
     def append(
@@ -404,10 +409,8 @@ class Store(SeriesReader):
     ) -> None:
         """Keep a later calibration of an epoch; observations None: as before; extra: added."""
         with self._transaction(f"the calibration of epoch {number} was not kept"):
-            then = next(
-                epochs.select_epochs(self._db, series.id, number, number, details=False), None
-            )
-            if then is None:
+            found = epochs.select_epochs(self._db, series.id, number, number, details=False)
+            if (then := next(found, None)) is None:
                 raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
             stored = StoredEpoch(
                 replace(then.epoch, observations=observations),
@@ -463,15 +466,15 @@ class Store(SeriesReader):
                 raise
 
 
-def _sound_rows(table: str, rows: Iterable[tuple[Any, ...]]) -> Iterator[dict[str, Any]]:
-    """Yield rows by column; leave out what is damaged, with a warning: no result depends on it."""
-    for values in rows:
-        try:
-            columns.require_sound(table, values)
-        except StoreError as error:
-            log.warning("%s; it is left out", error)
+def _sound(
+    rows: Iterable[tuple[dict[str, Any], StoreError | None]],
+) -> Iterator[dict[str, Any]]:
+    """Yield rows; leave out what is damaged, with a warning: no result depends on it."""
+    for row, damage in rows:
+        if damage is None:
+            yield row
         else:
-            yield dict(zip(columns.ROW[table], values, strict=True))
+            log.warning("%s; it is left out", damage)
 
 
 def _source(name: str, series: StoredSeries) -> str:

@@ -79,7 +79,7 @@ def test_it_is_the_adjustment_of_all_at_once(case):
     assert np.quantile(np.abs(apart - level) / whole.sd[:, OWN], 0.95) < 0.1
     assert np.quantile(np.abs(parts.rows.sd[:, OWN] / whole.sd[:, OWN] - 1), 0.95) < 0.05
     np.testing.assert_allclose(parts.level_sd[OWN], whole.level_sd[OWN], rtol=0.05)
-    assert parts.rows.rejected[200] == 1
+    assert parts.rows.n_rejected[200] == 1
     error = (parts.rows.values - truth)[:, OWN]
     ratio = np.sqrt(np.mean(((error - error.mean(axis=0)) / parts.rows.sd[:, OWN]) ** 2, axis=0))
     # 480 epochs know a standard deviation to 3.2 %: four of them, for eight parameters
@@ -96,7 +96,7 @@ def test_what_the_sample_never_saw_is_still_adjusted(case):
         hidden[window, :6] = True
     r = blocked((field, truth, grid.reject(hidden)), 60)
     assert r.passes > 1
-    seen = np.flatnonzero(~hidden[:, 0] & r.rows.ok)
+    seen = np.flatnonzero(~hidden[:, 0] & np.isfinite(r.rows.values[:, 0]))
     z = (r.rows.values - truth)[:, OWN]
     z = (z - z.mean(axis=0)) / r.rows.sd[:, OWN]
     assert np.sqrt(np.mean(z[seen] ** 2)) < 1.15

@@ -35,7 +35,7 @@ from thermocald.photogrammetry.field.testfield import find_misplaced
 from thermocald.photogrammetry.series.adjustment import adjusted, result
 from thermocald.photogrammetry.series.field_motion import taken_off
 from thermocald.photogrammetry.series.long_series import KnownSeries
-from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period
+from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period, image_px
 from thermocald.photogrammetry.series.normals import ObservationGrid, misplaced_targets
 from thermocald.photogrammetry.series.result import SeriesSettings
 
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.epoch.adjustment import Adjustment, AdjustmentSettings
     from thermocald.photogrammetry.field.testfield import Observations, TestField
-    from thermocald.photogrammetry.series.adjustment import Adjusted
+    from thermocald.photogrammetry.series.estimator import Estimate, SeriesEstimator
     from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.photogrammetry.series.result import Exterior, SeriesAdjustment
 
@@ -104,23 +104,24 @@ class _Together:
     """
 
     seen: Index
-    found: Adjusted
+    series: SeriesEstimator
+    estimate: Estimate
     sample: SeriesAdjustment
     moved: tuple[FieldMovement, ...]
 
     @cached_property
     def known(self) -> KnownSeries:
         """What they say of further epochs."""
-        return KnownSeries.of(self.found, self.sample)
+        return KnownSeries.of(self.series, self.estimate, self.sample)
 
     @property
     def image_px(self) -> float:
         """How far the mount moves in the image."""
-        return self.sample.movement.image_px(self.found.estimate.system.design.at.A)
+        return image_px(self.sample.movement.covariance, self.estimate.system.design.at.A)
 
-    def epoch(self, row: int) -> _Epoch:
-        """Return one of the epochs."""
-        s = self.sample
+    def epoch(self, row: int, s: SeriesAdjustment | None = None) -> _Epoch:
+        """Return one of the epochs, or of a series whose epochs came later."""
+        s = s or self.sample
         return _Epoch(
             s.status[row], s.reasons[row], s.values[row], s.covariance[row], float(s.sigma0[row]),
             int(s.redundancy[row]), s.rejected[row], s.residuals[row],
@@ -131,15 +132,8 @@ class _Together:
         if self.moved:
             grid = taken_off(grid, self.moved, slice(-1, None))
         seen = grid.targets(self.seen)
-        block = self.known.adjusted(seen, epochs)
-        rejected = np.zeros(grid.observed.shape, dtype=bool)
-        residuals = np.full_like(grid.points, np.nan)
-        rejected[:, self.seen] = seen.observed & ~block.use
-        residuals[:, self.seen] = block.estimate.residuals
-        return _Epoch(
-            block.status[0], block.reasons[0], block.estimate.values[0], block.covariance[0],
-            float(block.sigma0[0]), int(block.redundancy[0]), rejected[0], residuals[0],
-        )  # fmt: skip
+        _, block = self.known.adjusted(seen, epochs)
+        return self.epoch(0, block.spread(self.seen, grid.points.shape[1]))
 
 
 class RunningSeries:
@@ -197,7 +191,7 @@ class RunningSeries:
     @property
     def field_variance(self) -> float:
         """By what the stated covariance of the field's coordinates is to be multiplied."""
-        return 1.0 if self._series is None else self._series.found.series.field_variance
+        return 1.0 if self._series is None else self._series.series.field_variance
 
     @property
     def any(self) -> bool:
@@ -277,7 +271,7 @@ class RunningSeries:
             still = "the camera stands still" if asked == "auto" else "as configured"
             said = f"{still}: one orientation for {n} epochs"
         elif asked == "auto":
-            good = int(series.found.estimate.system.good.sum())
+            good = int(series.estimate.system.good.sum())
             said = (
                 f"each epoch has its own orientation until {FEWEST_EPOCHS} good epochs show "
                 f"whether the camera stands still; {good} so far"
@@ -479,9 +473,9 @@ class RunningSeries:
         moved: tuple[FieldMovement, ...], field_variance: float = 1.0,
     ) -> _Together:  # fmt: skip
         seen = np.flatnonzero(grid.observed.any(axis=0))
-        found = adjusted(
+        series, estimate = adjusted(
             self._sensor, self._field.subset(seen), grid.targets(seen), start, s,
             field_variance=field_variance,
         )  # fmt: skip
-        sample = result(found, affinity=False).spread(seen, len(self._field))
-        return _Together(seen, found, sample, moved)
+        sample = result(series, estimate, affinity=False).spread(seen, len(self._field))
+        return _Together(seen, series, estimate, sample, moved)

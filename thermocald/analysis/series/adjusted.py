@@ -209,7 +209,7 @@ def _table(
     """Return the table of adjusted epochs; sample: those that are known in full."""
     rows, groups = whole.rows, {}
     # what the epoch itself said of a frame without a result says more than "no observations"
-    for row in np.flatnonzero(~rows.ok & ~apart.ok).tolist():
+    for row in np.flatnonzero(~apart.ok).tolist():
         if rows.status[row] == "no_observations":
             rows.status[row], rows.reasons[row] = apart.status[row], apart.reasons[row]
     seen = np.flatnonzero(sample.observed.any(axis=0))
@@ -218,19 +218,11 @@ def _table(
         groups[testfield.names[members[0]]] = members
     return replace(
         apart,
-        values=rows.values,
-        sd=rows.sd,
-        sigma0=rows.sigma0,
-        n_observations=rows.observed,
-        n_rejected=rows.rejected,
-        status=tuple(rows.status),
-        reasons=tuple(rows.reasons),
+        **vars(rows) | {"status": tuple(rows.status), "reasons": tuple(rows.reasons)},
         exterior=sample.exterior,
         level_sd=whole.level_sd,
         adjustment=sample,
         groups=groups,
         trend_sd=whole.trend_sd,
         perspective_sd=sample.perspective_sd,
-        redundancy=rows.redundancy,
-        stillness=rows.stillness,
     )

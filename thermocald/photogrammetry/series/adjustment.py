@@ -15,7 +15,7 @@ Source: DESIGN idea 3; the test for standing still is Rao's score test (1948).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,9 +51,10 @@ from thermocald.photogrammetry.series.mount import (
     STILL,
     Movement,
     estimate_movement,
+    image_px,
     together,
 )
-from thermocald.photogrammetry.series.normals import ObservationGrid, linearise, sums_of_squares
+from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
 from thermocald.photogrammetry.series.result import (
     Exterior,
     SeriesAdjustment,
@@ -80,58 +81,43 @@ if TYPE_CHECKING:
 _LOOSE_PX = 3.0  # far beyond what a mount trembles, and what one epoch knows of its perspective
 
 
-def loose_bound(series: SeriesEstimator, start: Array) -> Array:
-    """A bound (6, 6) of the mount to some pixels in the image by each parameter."""
-    A = linearise(series.sensor, series.testfield, start[IOP], start[EOP]).A[..., EOP]
-    return np.diag((A**2).sum(axis=1).mean(axis=0)) / _LOOSE_PX**2
-
-
 def choose(
-    series: SeriesEstimator, asked: Exterior, estimate: Estimate
-) -> tuple[SeriesEstimator, str]:
-    """The series with the exterior orientation that a first estimate allows, and why."""
-    good = int(estimate.system.good.sum())
-    if asked == "auto" and good < FEWEST_EPOCHS:
-        return of_few_epochs(series, good)
-    movement = observed_movement(series, estimate)
-    px = movement.image_px(estimate.system.design.at.A)
-    noise = movement.noise_px(estimate.system.design.at.A)
+    series: SeriesEstimator, asked: Exterior, good: int, estimate: Estimate | None = None
+) -> SeriesEstimator:
+    """The series with the exterior orientation that its good epochs and a first estimate allow."""
+    if estimate is None or (asked == "auto" and good < FEWEST_EPOCHS):
+        why = f"{good} epochs do not show how the mount moves, {FEWEST_EPOCHS} would"
+        s = replace(series.s, exterior="per_epoch")
+        return replace(series, s=s, bound=None, choice=why)
+    movement, A = observed_movement(series, estimate), estimate.system.design.at.A
+    px = image_px(movement.covariance, A)
     if movement.still and asked == "auto":
-        still = replace(series, s=replace(series.s, exterior="series"), bound=None)
-        return still, f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px)"
-    mount = replace(series, bound=movement.precision(), movement=movement)
+        noise = image_px(movement.noise, A)
+        why = f"no movement of the mount beyond the noise of an epoch ({noise:.3f} px)"
+        return replace(series, s=replace(series.s, exterior="series"), bound=None, choice=why)
     how = ""
     if movement.memory:
-        part = movement.slow_fraction(estimate.system.design.at.A)
+        part = (image_px(movement.slow, A) / max(px, 1e-12)) ** 2
         slowly = f"over about {movement.memory:.0f} epochs"
         how = f", {part:.0%} of it {slowly if movement.memory < good / 3 else 'slowly'}"
     if movement.jumps:
         how += f", with jumps at row {', '.join(map(str, movement.jumps))}"
-    return mount, f"the mount moves by {px:.3f} px about its mean pose{how}"
-
-
-def of_few_epochs(series: SeriesEstimator, good: int) -> tuple[SeriesEstimator, str]:
-    """The series with an exterior orientation for each of its few good epochs, and why."""
-    own = replace(series, s=replace(series.s, exterior="per_epoch"), bound=None)
-    return own, f"{good} epochs do not show how the mount moves, {FEWEST_EPOCHS} would"
+    why = f"the mount moves by {px:.3f} px about its mean pose{how}"
+    return replace(series, bound=movement.precision(), movement=movement, choice=why)
 
 
 def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
     """The variance components of the mount's movements."""
-    system = estimate.system
-    variance = series.variance(estimate)
-    at = system.design.at
+    system, variance = estimate.system, series.variance(estimate)
+    at, N = system.design.at, system.N
     before = np.concatenate([at.iop, at.eop])
     b = system.gradient(estimate.residuals)
-    N = system.N
     b = b + np.einsum("eij,ej->ei", N, estimate.values - before)
     correlated = None
-    if series.s.target_noise:
-        pairs = series.pairs(estimate, system.use)
-        if len(pairs):
-            typical = (series.grid.weights * system.use[..., None])[system.good].mean(axis=0)
-            extra = pairs.normal_matrices(typical[None], at.A[..., EOP])[0]
-            correlated = extra / variance**2
+    if series.s.target_noise and len(pairs := series.pairs(estimate)):
+        typical = (series.grid.weights * system.use[..., None])[system.good].mean(axis=0)
+        extra = pairs.normal_matrices(typical[None], at.A[..., EOP])[0]
+        correlated = extra / variance**2
     free = np.array(free_columns(series.s.free), dtype=np.int64)
     good = system.good & np.isfinite(b).all(axis=1)  # without epochs that diverged
     found, starts = [], []
@@ -146,18 +132,6 @@ def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
             )
         )  # fmt: skip
     return together(found, starts) if found else STILL
-
-
-@dataclass(frozen=True, eq=False)
-class Adjusted:
-    """A series as adjusted: the estimator in its last state, what it found, which image points
-    (E, T) take part, and why the exterior orientation was estimated as it was.
-    """
-
-    series: SeriesEstimator
-    estimate: Estimate
-    use: Mask
-    choice: str
 
 
 def adjust_series(
@@ -180,7 +154,7 @@ def adjust_series(
     seen = np.flatnonzero(epochs.observed.any(axis=0))
     start = np.concatenate([interior.as_array(), exterior.as_array()])
     found = adjusted(sensor, testfield.subset(seen), epochs.targets(seen), start, s)
-    return result(found).spread(seen, len(testfield))
+    return result(*found).spread(seen, len(testfield))
 
 
 def adjusted(
@@ -191,11 +165,12 @@ def adjusted(
     s: SeriesSettings,
     windows: tuple[slice, ...] = (),
     field_variance: float = 1.0,
-) -> Adjusted:
+) -> tuple[SeriesEstimator, Estimate]:
     """Estimate a series on a grid of epochs × all targets of its field, from values (16,).
 
-    windows: runs of consecutive epochs, where the series is a sample of a longer one;
-    field_variance: by what the field's stated covariance is to be multiplied, as far as is known.
+    Returns the estimator in its last state, too. windows: runs of consecutive epochs, where the
+    series is a sample of a longer one; field_variance: by what the field's stated covariance is to
+    be multiplied, as far as is known.
     """
     use = grid.observed & enough_targets(grid, s)[:, None]
     first = State(np.tile(start, (len(use), 1)), np.zeros((len(testfield), 2)), start[EOP])
@@ -203,39 +178,34 @@ def adjusted(
         sensor, testfield, grid, grid.weights, s, windows=windows, field_variance=field_variance
     )
     if s.exterior == "auto" and len(use) < FEWEST_EPOCHS:
-        series, why = of_few_epochs(series, len(use))
+        series = choose(series, "auto", len(use))
     elif s.exterior in ("mount", "auto"):
         # Loosely bound at first, so that no movement is taken for gross errors.
-        bound = loose_bound(series, start)
+        A = linearise(sensor, testfield, start[IOP], start[EOP]).A[..., EOP]
+        bound = np.diag((A**2).sum(axis=1).mean(axis=0)) / _LOOSE_PX**2
         loose = replace(series, s=replace(s, exterior="mount"), bound=bound)
-        loose, estimate, use = loose.adjusted(first, use)
-        series, why = choose(loose, s.exterior, estimate)
+        loose, estimate = loose.adjusted(first, use)
+        use = estimate.system.use
+        series = choose(loose, s.exterior, int(estimate.system.good.sum()), estimate)
         if series.s.exterior != "series" and np.isfinite(estimate.values).all():
             first = estimate
-    else:
-        why = "as asked for"
-    series, estimate, use = series.adjusted(first, use)
-    return Adjusted(series, estimate, use, why)
+    return series.adjusted(first, use)
 
 
-def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
+def result(
+    series: SeriesEstimator, estimate: Estimate, *, affinity: bool = True
+) -> SeriesAdjustment:
     """Judge the epochs and scale the covariances.
 
     affinity: whether to say what a held affinity does to the level.
     """
-    series, estimate, use = found.series, found.estimate, found.use
     finite = np.isfinite(estimate.values).all(axis=1)
     system = replace(estimate.system, good=estimate.system.good & finite)
-    estimate, s = replace(estimate, system=system), series.s
-    vPv, redundancy = series.sums(estimate)
-    positive = redundancy > 0
-    unit = vPv / np.where(positive, redundancy, 1.0)
+    estimate, s, use = replace(estimate, system=system), series.s, system.use
+    unit, sigma0, redundancy = series.noise(estimate)
     pooled = series.variance(estimate)
-    stated = sums_of_squares(series.stated, estimate.residuals, system.use)
-    sigma0 = np.sqrt(stated / np.where(positive, redundancy, 1.0))
     if series.shown_share(estimate) < NOISE_SHOWN:
         unit, sigma0 = np.maximum(unit, pooled), np.maximum(sigma0, np.sqrt(pooled))
-    sigma0[~positive] = np.nan
     relative, level, trend = all_cofactors(system)
     excess, own, sound = np.zeros(16), system.design.own, system.good
     block = (slice(None), own[:, None], own)
@@ -245,7 +215,8 @@ def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
     # What priors contribute is known as well as they are, not as the epoch.
     bound = of_priors(system)
     relative[block] -= bound
-    pairs = series.pairs(estimate, use) if s.target_noise and len(use) >= FEW_EPOCHS else None
+    many = s.target_noise and len(use) >= FEW_EPOCHS
+    pairs = series.pairs(estimate) if many else None
     if pairs is not None and len(pairs):
         relative += of_correlated(system, pairs, pooled)
     else:
@@ -264,7 +235,7 @@ def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
         G = typical_sensitivity(system)
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
     slow = np.zeros((16, 16))
-    if s.target_noise and len(use) >= FEW_EPOCHS:
+    if many:
         slow = of_slow_targets(
             system, slow_errors(estimate.residuals, use), series.testfield.groups
         )
@@ -279,7 +250,7 @@ def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
     relative[~sound] = 0.0
     still = np.full(len(sigma0), np.nan)
     if s.exterior == "series":
-        still = stillness(system, estimate.residuals) / np.where(positive, unit, 1.0)
+        still = stillness(system, estimate.residuals) / np.where(redundancy > 0, unit, 1.0)
     values = estimate.values.copy()
     observed = series.grid.observed
     status, reasons = judge(
@@ -292,15 +263,15 @@ def result(found: Adjusted, *, affinity: bool = True) -> SeriesAdjustment:
         estimate.residuals, estimate.offsets if series.has_offsets else estimate.offsets * np.nan,
         tuple(status), tuple(reasons), still,
         np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
-        _sds(by_perspective(system) * pooled), float(np.sqrt(series.field_variance)),
+        np.sqrt(pooled) * by_perspective(system), float(np.sqrt(series.field_variance)),
         _outer_noise(series, estimate),
-        _noise_ratio(sigma0, sound),
+        float(np.median(known)) if len(known := sigma0[sound & np.isfinite(sigma0)]) else 1.0,
         of_held_affinity(
             series.sensor, series.testfield, system, estimate, estimate.residuals,
             series.field_variance,
         )
         if affinity and sound.any() else None,
-        movement, found.choice, slow, pairs,
+        movement, series.choice, slow, pairs,
     )  # fmt: skip
 
 
@@ -319,12 +290,6 @@ def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, fl
     return noise_by_radius(tests, offered, radius)
 
 
-def _sds(variances: Array) -> Array:
-    """Standard deviations; NaN where rounding has left nothing of a variance."""
-    known = variances >= 0
-    return np.where(known, np.sqrt(np.where(known, variances, 0.0)), np.nan)
-
-
 def _excess(series: SeriesEstimator, values: Array, variances: Array, sound: Mask) -> Array:
     """Variances (p,) by which neighbouring epochs scatter beyond theirs; windows one by one."""
     kinks, drift = series.s.exterior != "per_epoch", series.s.drift_period > 0
@@ -335,12 +300,6 @@ def _excess(series: SeriesEstimator, values: Array, variances: Array, sound: Mas
     ]
     out: Array = np.mean(parts, axis=0) if parts else np.zeros(values.shape[1])
     return out
-
-
-def _noise_ratio(sigma0: Array, sound: Mask) -> float:
-    """The noise found over the one stated."""
-    found = sigma0[sound & np.isfinite(sigma0)]
-    return float(np.median(found)) if len(found) else 1.0
 
 
 def epoch_variance(unit: Array, redundancy: Array, pooled: float) -> Array:

@@ -141,15 +141,17 @@ def typical_sensitivity(system: SeriesSystem) -> Array:
 
 
 def by_perspective(system: SeriesSystem) -> Array:
-    """Cofactors (16,) of a typical epoch's parameters if the mount could stand anywhere in each.
+    """Roots of the cofactors (16,) of a typical epoch's parameters if the mount could stand
+    anywhere in each.
 
-    NaN for what is held, and where nothing is common to the epochs.
+    NaN for what is held, where nothing is common to the epochs or where rounding has left nothing.
     """
     out = np.full(16, np.nan)
     if len(system.design.common) and system.good.any():
         free = np.union1d(system.design.own, EOP_COLUMNS)
         N = system.N[system.good].mean(axis=0)[free[:, None], free]
-        out[free] = np.diag(inverse_of_determined(N))
+        cofactor = np.diag(inverse_of_determined(N))
+        out[free] = np.sqrt(np.where(cofactor >= 0, cofactor, np.nan))
     return out
 
 
@@ -186,7 +188,7 @@ def of_held_affinity(
     weights = np.stack([(system.weights[..., k] * use).sum(axis=0) for k in range(3)], axis=1)
     seen = (weights[:, :2] > 0).all(axis=1)
     noise, of_field = inverse_2x2(_full(weights[seen])), np.zeros((2, 2))
-    if design.offset_prior is not None:
+    if len(design.offset_prior):
         of_field = inverse_2x2(_full(design.offset_prior[seen]))
     N = _normals(A[seen], inverse_2x2(noise + of_field))
     moves = np.zeros((len(held), 16))

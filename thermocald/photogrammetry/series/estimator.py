@@ -79,12 +79,12 @@ class SeriesEstimator:
 
     grid: the observations with the weights in use; stated (E, T, 3): their weights as stated;
     bound (6, 6): inverse covariance of the movements of the mount; movement: what that rests on;
-    held: the linearisation at which common unknowns are known, None where they are estimated; unit:
-    variance of unit weight that the priors start with; windows: runs of consecutive epochs, where
-    the series is a sample of a longer one; typical: variance of unit weight for epochs too poor to
-    tell their own, None: that of these epochs; field_variance: by what the stated covariance of the
-    field's coordinates is multiplied; freedom (T,): degrees of freedom with which each target's
-    noise is known, None: it is as stated.
+    choice: why the exterior orientation is estimated as it is; held: the linearisation at which
+    common unknowns are known, None where they are estimated; unit: variance of unit weight that the
+    priors start with; windows: runs of consecutive epochs, where the series is a sample of a longer
+    one; typical: variance of unit weight for epochs too poor to tell their own, None: that of these
+    epochs; field_variance: by what the stated covariance of the field's coordinates is multiplied;
+    freedom (T,): degrees of freedom with which each target's noise is known, None: as stated.
     """
 
     sensor: Sensor
@@ -94,6 +94,7 @@ class SeriesEstimator:
     s: SeriesSettings
     bound: Array | None = None
     movement: Movement = STILL
+    choice: str = "as asked for"
     held: Partials | None = None
     unit: float = 1.0
     windows: tuple[slice, ...] = ()
@@ -101,8 +102,11 @@ class SeriesEstimator:
     field_variance: float = 1.0
     freedom: Array | None = None
 
-    def adjusted(self, start: State, use: Mask) -> tuple[SeriesEstimator, Estimate, Mask]:
-        """Solve, find the gross errors and the targets' own noise; the series with that noise."""
+    def adjusted(self, start: State, use: Mask) -> tuple[SeriesEstimator, Estimate]:
+        """Solve, find the gross errors and the targets' own noise; the series with that noise.
+
+        use (E, T): the image points offered.
+        """
         series, s, offered = self, self.s, use
         estimate = series.solve(start, use, self.unit)
         found = (estimate.converged & estimate.system.good) | ~use.any(axis=1)
@@ -113,20 +117,21 @@ class SeriesEstimator:
             offered = offered & use.any(axis=1, keepdims=True)
             estimate = series.solve(start, use, self.unit)
         if s.snooping_alpha > 0:
-            estimate, use = series.snoop(estimate, use, offered)
+            estimate = series.snoop(estimate, offered)
             first_look = self.grid.weights is self.stated
             if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE and first_look:
-                series = series.with_target_noise(estimate, use)
-                estimate = series.solve(estimate, use, 1.0)
-                estimate, use = series.snoop(estimate, use, offered)
+                series = series._with_target_noise(estimate)
+                estimate = series.solve(estimate, estimate.system.use, 1.0)
+                estimate = series.snoop(estimate, offered)
             for _ in range(_FIELD_ROUNDS):
                 variance = series.estimate_field_variance(estimate)
                 if variance is None or abs(variance / series.field_variance - 1.0) < _SAME_FIELD:
                     break
                 series = replace(series, field_variance=variance)
+                use = estimate.system.use
                 estimate = series.solve(estimate, use, series.variance(estimate))
-                estimate, use = series.snoop(estimate, use, offered)
-        return series, estimate, use
+                estimate = series.snoop(estimate, offered)
+        return series, estimate
 
     def estimate_field_variance(self, estimate: Estimate) -> float | None:
         """Estimate what the field's stated covariance is to be multiplied by, at least 1.
@@ -138,7 +143,7 @@ class SeriesEstimator:
         design, q = estimate.system.design, len(estimate.system.design.common)
         Q = estimate.system.Q_common
         alone = self.s.exterior == "per_epoch"  # takes up what offsets have in common
-        if alone or design.offset_prior is None or self.held is not None or len(Q) <= q:
+        if alone or not len(design.offset_prior) or self.held is not None or len(Q) <= q:
             return None
         (wx, wy, wxy), (x, y) = design.offset_prior.T, estimate.offsets.T
         T = len(wx)
@@ -163,8 +168,7 @@ class SeriesEstimator:
         alone = replace(self, s=s, bound=None, windows=())
         first = State(np.tile(middle, (len(use), 1)), np.zeros_like(start.offsets), middle[EOP])
         own = alone.solve(first, use, self.unit)
-        _, kept = alone.snoop(own, use, use)
-        return kept & own.converged[:, None]
+        return alone.snoop(own, use).system.use & own.converged[:, None]
 
     @property
     def has_offsets(self) -> bool:
@@ -205,14 +209,15 @@ class SeriesEstimator:
                 system = self._linearised(values, use, variance)
         return Estimate(values, offsets, pose, residuals, system, sizes < _NEAR)
 
-    def snoop(self, estimate: Estimate, use: Mask, offered: Mask) -> tuple[Estimate, Mask]:
-        """Find the gross errors; the estimate without them and what of the offered takes part."""
+    def snoop(self, estimate: Estimate, offered: Mask) -> Estimate:
+        """The estimate without gross errors; offered (E, T): points that may come back."""
         shared = estimate.system.design.width > 0
-        return (self._snoop_together if shared else self._snoop_apart)(estimate, use, offered)
+        return (self._snoop_together if shared else self._snoop_apart)(estimate, offered)
 
-    def with_target_noise(self, estimate: Estimate, use: Mask) -> SeriesEstimator:
+    def _with_target_noise(self, estimate: Estimate) -> SeriesEstimator:
         """The series with every target's weights from the scatter of its own residuals."""
         # where epochs are few, what their offsets take of the targets' residuals counts
+        use = estimate.system.use
         lost = int(self.has_offsets and len(use) < FEW_EPOCHS)
         ratios, freedom = noise_ratios(
             estimate.residuals, self.grid.weights, use, self.redundancy_share(use), lost
@@ -222,7 +227,9 @@ class SeriesEstimator:
         weights[..., 2] /= np.sqrt(ratios.prod(axis=1))
         return replace(self, grid=ObservationGrid(self.grid.points, weights), freedom=freedom)
 
-    def pairs(self, estimate: Estimate, use: Mask) -> CorrelatedPairs:
+    def pairs(self, estimate: Estimate) -> CorrelatedPairs:
+        """Image coordinates whose errors correlate."""
+        use = estimate.system.use
         return correlated_pairs(
             estimate.residuals, use, self.testfield.groups, self.redundancy_share(use)
         )
@@ -240,14 +247,12 @@ class SeriesEstimator:
         own = len(self.s.per_epoch) * int(use.any(axis=1).sum())
         return max((n - own) / max(n, 1), 0.05)
 
-    def _snoop_together(
-        self, estimate: Estimate, use: Mask, offered: Mask
-    ) -> tuple[Estimate, Mask]:
+    def _snoop_together(self, estimate: Estimate, offered: Mask) -> Estimate:
         """Data snooping where all epochs share unknowns: every round solves the series again."""
-        variance = 1.0
-        rejections = Rejections(use)
-        typical = None
+        variance, typical = 1.0, None
+        rejections = Rejections(estimate.system.use)
         for _ in range(_ROUNDS):
+            use = estimate.system.use
             tests = point_tests(estimate.system, estimate.residuals)
             if typical is None:
                 typical = typical_variance(tests, use)
@@ -262,15 +267,14 @@ class SeriesEstimator:
             settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
             if settled and np.array_equal(keep, use):
                 break
-            use = keep
-            estimate = self.solve(estimate, use, variance)
-        return estimate, use
+            estimate = self.solve(estimate, keep, variance)
+        return estimate
 
-    def _snoop_apart(self, estimate: Estimate, use: Mask, offered: Mask) -> tuple[Estimate, Mask]:
+    def _snoop_apart(self, estimate: Estimate, offered: Mask) -> Estimate:
         """Data snooping where epochs share nothing: only those that changed are solved again."""
         values, residuals = estimate.values, estimate.residuals
-        system = whole = replace(estimate.system, use=use.copy())
-        use, rows = whole.use, np.arange(len(use))
+        system = whole = replace(estimate.system, use=estimate.system.use.copy())
+        use, rows = whole.use, np.arange(len(whole.use))
         rejections = Rejections(use)
         part: slice | Index = slice(None)  # without a copy
         typical = self.typical
@@ -292,8 +296,9 @@ class SeriesEstimator:
             values[rows], residuals[rows] = some._without(
                 system, values[rows], residuals[rows], estimate
             )
-            whole.replace(rows, system)
-        return replace(estimate, values=values, residuals=residuals, system=whole), use
+            use[rows], whole.Q[rows], whole.good[rows] = system.use, system.Q, system.good
+            whole.alike = None
+        return replace(estimate, values=values, residuals=residuals, system=whole)
 
     def _without(
         self, system: SeriesSystem, values: Array, left: Array, known: State
@@ -335,8 +340,7 @@ class SeriesEstimator:
         return Design(
             at, own, common, known, own_prior, weight[common], self.bound is not None,
             offset_weights(self.testfield, at) * (variance / self.field_variance)
-            if offsets
-            else None,
+            if offsets else np.empty((0, 3)),
         )  # fmt: skip
 
     def _residuals(self, values: Array, offsets: Array, out: Array) -> Array:
@@ -353,9 +357,28 @@ class SeriesEstimator:
         """Weighted sum of squares (E,) and redundancy (E,) of every epoch."""
         use = estimate.system.use
         vPv = sums_of_squares(self.grid.weights, estimate.residuals, use)
-        n = use.sum(axis=1) * estimate.system.good
-        share = estimate.system.common_share() * n / max(int(n.sum()), 1)
-        return vPv, 2 * n - estimate.system.own_count() - share
+        system = estimate.system
+        n = use.sum(axis=1) * system.good
+        share = system.common_share * n / max(int(n.sum()), 1)
+        # a prior leaves an epoch less than p parameters of its own
+        held = np.einsum("epq,qp->e", system.Q, system.design.own_prior)
+        return vPv, 2 * n - (len(system.design.own) - held) - share
+
+    def noise(self, estimate: Estimate, used: float = 0.0) -> tuple[Array, Array, Array]:
+        """Variance of unit weight by the weights in use, sigma0 by the stated ones, NaN without
+        redundancy, and redundancy (E,) of every epoch.
+
+        used: observations of each epoch that common unknowns, which are held, have used up.
+        """
+        vPv, redundancy = self.sums(estimate)
+        redundancy = redundancy - used
+        positive = redundancy > 0
+        stated = sums_of_squares(self.stated, estimate.residuals, estimate.system.use)
+        return (
+            vPv / np.where(positive, redundancy, 1.0),
+            np.sqrt(stated / np.where(positive, redundancy, np.nan)),
+            redundancy,
+        )
 
     def variance(self, estimate: Estimate) -> float:
         """Variance of unit weight of the series: the median over its epochs, and what was stated
@@ -372,4 +395,5 @@ class SeriesEstimator:
         whole = float(self.sums(estimate)[1][system.good].sum())
         if whole > _MANY * system.design.width:
             return 1.0  # an unknown's prior holds at most a quarter of an observation
-        return 1.0 - system.prior_share() / whole if whole > 0 else 0.0
+        held, twice = system.held
+        return 1.0 - (held - twice) / whole if whole > 0 else 0.0

@@ -29,7 +29,7 @@ import numpy as np
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
-from thermocald.photogrammetry.series.adjustment import Adjusted, adjusted, epoch_variance, result
+from thermocald.photogrammetry.series.adjustment import adjusted, epoch_variance, result
 from thermocald.photogrammetry.series.covariances import (
     line_weights,
     of_correlated,
@@ -44,7 +44,6 @@ from thermocald.photogrammetry.series.normals import (
     normal_matrices,
     planes,
     spread_windows,
-    sums_of_squares,
 )
 from thermocald.photogrammetry.series.result import (
     EpochRows,
@@ -58,7 +57,7 @@ from thermocald.photogrammetry.series.system import Design, SeriesSystem, State
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from thermocald.arrays import Array, Index, Mask
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.camera.camera_model import (
         ExteriorOrientation,
         InteriorOrientation,
@@ -75,28 +74,6 @@ if TYPE_CHECKING:
 _FEW = 0.02  # share of a block's epochs that is worth a matrix of its own
 _MOST = 12  # kinds of epochs in a block
 _MOST_PATTERNS = 300  # of targets seen, over the series; the epochs of others count together
-
-
-@dataclass(frozen=True, eq=False)
-class Shared:
-    """What is known of the common unknowns: offsets (T, 2) px, pose (6,), their cofactors (q + 2T,
-    q + 2T), the mean G (p, q + 2T) by which own parameters follow an error of theirs; used: how
-    many observations they use up.
-    """
-
-    offsets: Array
-    pose: Array
-    cofactors: Array
-    mean: Array
-    used: float
-
-    def level(self, design: Design) -> Array:
-        """Return the cofactors (16, 16) of what the common unknowns do to all epochs alike."""
-        whole = np.zeros((16, design.width))
-        whole[design.common, np.arange(len(design.common))] = 1.0
-        whole[design.own] -= self.mean
-        level: Array = whole @ self.cofactors @ whole.T
-        return level
 
 
 @dataclass(eq=False)
@@ -151,22 +128,19 @@ class CommonSums:
             bits = b""
         self.patterns[bits] = self.patterns.get(bits, 0.0) + part
 
-    def solved(self, known: Shared) -> tuple[Shared, Array, Array, float]:
+    def solved(self, known: KnownSeries) -> tuple[KnownSeries, Array, Array, float]:
         """Return what is known of the common unknowns with these sums, and what that changes.
 
         By how much own parameters (p,) change in the mean; by how much (p, q + 2T) the common
         unknowns tilt a straight line from the first to the last epoch; by how many of their
         standard deviations single kinds of epochs change otherwise.
         """
-        design, p = self.design, len(self.design.own)
-        q, width, prior = len(design.common), design.width, design.prior_matrix()
-        sums = np.array(list(self.patterns.values())).reshape(-1, 3 + p + 3 * len(design.at.A))
-        count, times, squares = sums[:, :3].T
-        right, weights = (
-            sums[:, 3 : 3 + p],
-            sums[:, 3 + p :].reshape(len(sums), len(design.at.A), 3),
-        )
-        kinds = _typical(design, weights / count[:, None, None])
+        design, p, T = self.design, len(self.design.own), len(self.design.at.A)
+        q, width = len(design.common), design.width
+        sums = np.array(list(self.patterns.values())).reshape(-1, 3 + p + 3 * T)
+        (count, times, squares), right = sums[:, :3].T, sums[:, 3 : 3 + p]
+        weights = sums[:, 3 + p :].reshape(-1, T, 3) / count[:, None, None]
+        kinds = SeriesSystem.formed(design, weights, weights[..., 0] > 0)
         gradient = self.gradient + design.common_pull(known.pose, known.offsets)
         mean, tilt = np.zeros((2, p, width))
         for part, C in kinds.couplings():
@@ -176,11 +150,10 @@ class CommonSums:
             tilt += np.tensordot(times[part], G, axes=1)
         n = max(count.sum(), 1.0)
         mean /= n
-        cofactors = inverse_of_determined(prior + kinds.common_normals(count))
+        cofactors = inverse_of_determined(kinds.common_normals(count))
         change = cofactors @ gradient
-        offsets = known.offsets
-        if design.offset_prior is not None:
-            offsets = offsets + change[q:].reshape(2, -1).T
+        offsets = known.offsets.copy()
+        offsets[: len(design.offset_prior)] += change[q:].reshape(2, -1).T
         rest = 0.0
         for part, C in kinds.couplings():
             sd = np.sqrt(np.diagonal(kinds.Q[part], axis1=1, axis2=2))
@@ -191,14 +164,15 @@ class CommonSums:
         line = np.zeros((p, width))
         if spread > 0 and self.ends is not None:
             line = (tilt - middle * n * mean) / spread * (self.ends[1] - self.ends[0])
-        pose = known.pose + change[:q] if q else known.pose
-        used = float(width - np.einsum("ij,ji->", cofactors, prior))
-        return Shared(offsets, pose, cofactors, mean, used), -mean @ change, line, rest
-
-
-def _typical(design: Design, weights: Array) -> SeriesSystem:
-    """Return the system of epochs with weights (K, T, 3), without the priors of what is common."""
-    return SeriesSystem.formed(design.without_common_priors(), weights, weights[..., 0] > 0)
+        later = replace(
+            known,
+            offsets=offsets,
+            pose=known.pose + change[:q] if q else known.pose,
+            cofactors=cofactors,
+            mean=mean,
+            used=float(width - np.einsum("ij,ji->", cofactors, design.prior_matrix())),
+        )
+        return later, -mean @ change, line, rest
 
 
 def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
@@ -220,7 +194,8 @@ def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
         groups.append(rest)
     out = []
     for rows in groups:
-        one = _typical(design, system.used(rows).mean(axis=0, keepdims=True))
+        weights = system.used(rows).mean(axis=0, keepdims=True)
+        one = SeriesSystem.formed(design, weights, weights[..., 0] > 0)
         if one.good[0]:
             G = np.zeros((len(design.own), design.width))
             for _, C in one.couplings():
@@ -230,45 +205,25 @@ def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
 
 
 @dataclass(frozen=True, eq=False)
-class AdjustedBlock:
-    """Epochs adjusted with what is known of their series.
-
-    use (E, T): which points took part; covariance (E, 16, 16): without what all epochs have in
-    common; status, reasons: of each epoch; unit, redundancy, sigma0 (E,): variance of unit weight
-    by the weights in use, its degrees of freedom, and the noise against the stated sigmas.
-    """
-
-    estimate: Estimate
-    use: Mask
-    covariance: Array
-    status: list[str]
-    reasons: list[str]
-    unit: Array
-    redundancy: Array
-    sigma0: Array
-
-    def sums(self, first: int, design: Design) -> CommonSums:
-        """Return what the block, which begins at epoch `first`, adds to the sums of its series."""
-        sums, estimate = CommonSums(design), self.estimate
-        right = estimate.system.own_gradient(estimate.residuals, estimate)
-        sums.add(first, estimate.system, estimate.residuals, right)
-        return sums
-
-
-@dataclass(frozen=True, eq=False)
 class KnownSeries:
     """What epochs adjusted together say of their series.
 
     estimator: as it adjusts further epochs, the common unknowns held; design: the unknowns of the
-    series; shared: the common ones; excess (16,): variance by which epochs scatter beyond theirs;
-    ratios (T, 3): by what weights are multiplied; middle (16,): where epochs start; pairs,
-    movement: errors that targets share, and the mount's; slow (16, 16): covariance of a straight
-    line over the series from slow errors of targets.
+    series; offsets (T, 2) px, pose (6,): the common ones, their cofactors (q + 2T, q + 2T), the
+    mean G (p, q + 2T) by which own parameters follow an error of theirs; used: how many
+    observations they use up; excess (16,): variance by which epochs scatter beyond theirs; ratios
+    (T, 3): by what weights are multiplied; middle (16,): where epochs start; pairs, movement:
+    errors that targets share, and the mount's; slow (16, 16): covariance of a straight line over
+    the series from slow errors of targets.
     """
 
     estimator: SeriesEstimator
     design: Design
-    shared: Shared
+    offsets: Array
+    pose: Array
+    cofactors: Array
+    mean: Array
+    used: float
     excess: Array
     ratios: Array
     middle: Array
@@ -277,19 +232,13 @@ class KnownSeries:
     slow: Array
 
     @classmethod
-    def of(cls, found: Adjusted, sample: SeriesAdjustment) -> KnownSeries:
+    def of(
+        cls, series: SeriesEstimator, estimate: Estimate, sample: SeriesAdjustment
+    ) -> KnownSeries:
         """Collect what adjusted epochs say of a series."""
-        series, estimate = found.series, found.estimate
         system, unit = estimate.system, series.variance(estimate)
         at = system.design.at
         design = series.design(at, unit)
-        sums = CommonSums(design)
-        sums.add(0, system, estimate.residuals, np.zeros((len(found.use), len(design.own))))
-        shared = Shared(
-            estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
-            system.common_share(),
-        )  # fmt: skip
-        shared = replace(shared, mean=sums.solved(shared)[0].mean)
         good = sample.ok
         middle = np.median(sample.values[good] if good.any() else estimate.values, axis=0)
         T = series.grid.points.shape[1]
@@ -297,55 +246,54 @@ class KnownSeries:
         held = replace(
             series, grid=none, stated=none.weights, held=at, unit=unit, windows=(), typical=unit
         )
-        return cls(
-            held, design, shared, sample.excess_sd**2, _ratios(series), middle,
+        known = cls(
+            held, design, estimate.offsets, estimate.pose, system.Q_common, np.zeros((0, 0)),
+            system.common_share, sample.excess_sd**2, _ratios(series), middle,
             sample.pairs, sample.movement, sample.slow,
         )  # fmt: skip
-
-    @property
-    def s(self) -> SeriesSettings:
-        """How the series is adjusted."""
-        return self.estimator.s
-
-    @property
-    def unit(self) -> float:
-        """Variance of unit weight."""
-        return self.estimator.unit
+        sums = CommonSums(design)
+        right = np.zeros((len(sample.values), len(design.own)))
+        sums.add(0, system, estimate.residuals, right)
+        return replace(known, mean=sums.solved(known)[0].mean)
 
     def adjusted(
         self, grid: ObservationGrid, epochs: int, line: Array | None = None
-    ) -> AdjustedBlock:
+    ) -> tuple[Estimate, SeriesAdjustment]:
         """Adjust epochs.
 
         epochs: how many there are, which the common unknowns rest on; line (E,): where in the
-        series each is, from -0.5 for the first of all to 0.5 for the last.
+        series each is, from -0.5 for the first of all to 0.5 for the last. The level and what
+        belongs to the series as a whole are not in the result.
         """
-        s, shared = self.s, self.shared
+        s, pooled = self.estimator.s, self.estimator.unit
         weighted = ObservationGrid(grid.points, grid.weights * self.ratios)
         values = np.tile(self.middle, (len(grid), 1))
         if len(self.design.common):
-            values[:, EOP] = shared.pose
-        held, estimate, use = replace(self.estimator, grid=weighted, stated=grid.weights).adjusted(
-            State(values, shared.offsets, shared.pose),
+            values[:, EOP] = self.pose
+        held, estimate = replace(self.estimator, grid=weighted, stated=grid.weights).adjusted(
+            State(values, self.offsets, self.pose),
             grid.observed & enough_targets(grid, s)[:, None],
         )
         system = estimate.system
-        vPv, redundancy = held.sums(estimate)
-        redundancy = redundancy - shared.used / epochs
-        positive = redundancy > 0
-        unit = vPv / np.where(positive, redundancy, 1.0)
-        stated = sums_of_squares(grid.weights, estimate.residuals, system.use)
-        covariance = self._covariance(system, epoch_variance(unit, redundancy, self.unit))
+        unit, sigma0, redundancy = held.noise(estimate, self.used / epochs)
+        covariance = self._covariance(system, epoch_variance(unit, redundancy, pooled))
+        still = np.full(len(grid), np.nan)
         if line is not None and self.slow.any():
             # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
             covariance += (line * system.good)[:, None, None] ** 2 * self.slow
+        if line is not None and s.exterior == "series":
+            N = normal_matrices(system.used(), system.design.at.A)
+            score = stillness(replace(system, N=N), estimate.residuals)
+            still = score / np.where(redundancy > 0, unit, 1.0)
         status, reasons = judge(
-            held.sensor, held.testfield, grid, s, estimate.values, use, system.good, covariance,
-            unit / self.unit, redundancy,
+            held.sensor, held.testfield, grid, s, estimate.values, system.use, system.good,
+            covariance, unit / pooled, redundancy,
         )  # fmt: skip
-        return AdjustedBlock(
-            estimate, use, covariance, status, reasons, unit, redundancy,
-            np.sqrt(stated / np.where(positive, redundancy, np.nan)),
+        values = estimate.values.copy()
+        values[[word != "ok" for word in status]] = np.nan
+        return estimate, SeriesAdjustment(
+            s, values, covariance, np.zeros((16, 16)), sigma0, redundancy, system.use,
+            grid.observed & ~system.use, estimate.residuals, self.offsets, status, reasons, still,
         )  # fmt: skip
 
     def _covariance(self, system: SeriesSystem, unit: Array) -> Array:
@@ -353,19 +301,19 @@ class KnownSeries:
 
         unit (E,): variance of unit weight that scales each.
         """
-        s, own = self.s, self.design.own
+        s, own, pooled = self.estimator.s, self.design.own, self.estimator.unit
         mine, kinds = system.Q.copy(), _kinds_of(self.design, system)
         for rows, _, G in kinds:
-            away = G - self.shared.mean
-            mine[rows] += away @ self.shared.cofactors @ away.T
+            away = G - self.mean
+            mine[rows] += away @ self.cofactors @ away.T
         # What priors contribute is known as well as they are, not as the epoch.
         bound = of_priors(system) if system.design.own_prior.any() else 0.0
         mine -= bound
         if self.pairs is not None:
             for rows, one, _ in kinds:
-                mine[rows] += of_correlated(one, self.pairs, self.unit)[0][np.ix_(own, own)]
+                mine[rows] += of_correlated(one, self.pairs, pooled)[0][np.ix_(own, own)]
         mine *= unit[:, None, None]
-        mine += self.unit * bound
+        mine += pooled * bound
         if s.exterior == "series" and self.movement.covariance.any():
             for rows, _, G in kinds:
                 swayed = G[:, :6]
@@ -436,7 +384,11 @@ def adjust_long_series(
     epochs = len(source)
     windows = spread_windows(epochs, together or together_at_most(len(testfield)))
     start = np.concatenate([interior.as_array(), exterior.as_array()])
-    known, sample = _adjust_sample(sensor, testfield, source, windows, start, settings)
+    ends = np.cumsum([0, *(w.stop - w.start for w in windows)]).tolist()
+    inside = tuple(slice(a, b) for a, b in pairwise(ends)) if len(windows) > 1 else ()
+    found = adjusted(sensor, testfield, gathered(source, windows), start, settings, inside)
+    sample = result(*found)
+    known = KnownSeries.of(*found, sample)
     rows = EpochRows.empty(epochs)
     for passes in range(1, _PASSES + 1):
         sums = CommonSums(known.design)
@@ -445,26 +397,13 @@ def adjust_long_series(
             sums.merge(part)
             if advance is not None and passes == 1:
                 advance(len(block.values))
-        shared, own, line, rest = sums.solved(known.shared)
+        later, own, line, rest = sums.solved(known)
         if rest <= _SAME or passes == _PASSES:
             break
-        known = replace(known, shared=shared)
-    level, trend = _carry(known, replace(known, shared=shared), own, line, rows)
+        known = later
+    level, trend = _carry(known, later, own, line, rows)
     sampled = np.concatenate([np.arange(w.start, w.stop) for w in windows])
     return LongAdjustment(rows, level, trend, sample, sampled, passes)
-
-
-def _adjust_sample(
-    sensor: Sensor, testfield: TestField, source: ObservationBlocks, windows: tuple[slice, ...],
-    start: Array, settings: SeriesSettings,
-) -> tuple[KnownSeries, SeriesAdjustment]:  # fmt: skip
-    """Adjust the epochs of some windows together: what they say of the others, and the result."""
-    ends = np.cumsum([0, *(w.stop - w.start for w in windows)]).tolist()
-    inside = tuple(slice(a, b) for a, b in pairwise(ends)) if len(windows) > 1 else ()
-    grid = gathered(source, windows)
-    found = adjusted(sensor, testfield, grid, start, settings, inside)
-    sample = result(found)
-    return KnownSeries.of(found, sample), sample
 
 
 def _adjust_block(
@@ -473,48 +412,41 @@ def _adjust_block(
     """Adjust the block of epochs from `first` on: its rows, and what it adds to the sums."""
     (known, epochs), (first, grid) = state, item
     line = (first + np.arange(len(grid))) / max(epochs - 1, 1) - 0.5
-    block = known.adjusted(grid, epochs, line)
-    ok = np.array([word == "ok" for word in block.status], dtype=bool)
-    estimate, still = block.estimate, np.full(len(grid), np.nan)
-    if known.s.exterior == "series":
-        system = estimate.system
-        N = normal_matrices(system.used(), system.design.at.A)
-        score = stillness(replace(system, N=N), estimate.residuals)
-        still = score / np.where(block.redundancy > 0, block.unit, 1.0)
-    variance = np.where(ok[:, None], np.diagonal(block.covariance, axis1=1, axis2=2), 0.0)
-    rows = EpochRows(
-        np.where(ok[:, None], estimate.values, np.nan),
-        np.sqrt(np.where(variance > 0, variance, np.nan)), ok,
-        np.where(ok, block.sigma0, np.nan), block.redundancy, still,
-        (grid.observed | block.use).sum(axis=1), (grid.observed & ~block.use).sum(axis=1),
-        block.status, block.reasons,
-    )  # fmt: skip
-    return first, rows, block.sums(first, known.design)
+    estimate, block = known.adjusted(grid, epochs, line)
+    sums, system = CommonSums(known.design), estimate.system
+    right = system.own_gradient(estimate.residuals, estimate)
+    sums.add(first, system, estimate.residuals, right)
+    return first, block.rows, sums
 
 
 def _carry(
-    known: KnownSeries, later: KnownSeries, own: Array, line: Array, rows: EpochRows
+    known: KnownSeries, later: KnownSeries, d_own: Array, line: Array, rows: EpochRows
 ) -> tuple[Array, Array]:
     """Put the last change of the common unknowns on all epochs, in place.
 
-    later: with the common unknowns from all sums; own, line: as of `CommonSums.solved`. Returns the
-    standard deviations (16,) of what all epochs have in common, and of a straight line.
+    later: with the common unknowns from all sums; d_own, line: as of `CommonSums.solved`. Returns
+    the standard deviations (16,) of what all epochs have in common, and of a straight line.
     """
-    shared, design = later.shared, known.design
-    level = np.diag(shared.level(design)) * known.unit
-    total = np.zeros(16)
-    total[design.own] += own
-    total[design.common] += (shared.pose - known.shared.pose)[: len(design.common)]
-    for column in np.flatnonzero(total):
-        rows.values[:, column] += total[column]
-    for column in design.common:
+    unit, design = known.estimator.unit, known.design
+    own, common, q = design.own, design.common, len(design.common)
+    whole = np.zeros((16, design.width))
+    whole[common, np.arange(q)] = 1.0
+    whole[own] -= later.mean
+    level = np.diag(whole @ later.cofactors @ whole.T) * unit
+    change = np.zeros(16)
+    change[own] += d_own
+    change[common] += (later.pose - known.pose)[:q]
+    ok = np.array([word == "ok" for word in rows.status], dtype=bool)
+    for column in np.flatnonzero(change):
+        rows.values[:, column] += change[column]
+    for column in common:
         old = np.nan_to_num(rows.sd[:, column])
-        rows.sd[:, column] = np.where(rows.ok, np.sqrt(old**2 + level[column]), np.nan)
-    trend, block = known.slow.copy(), np.ix_(design.own, design.own)
-    if len(shared.cofactors):
-        tilt = line @ root_of(shared.cofactors)
-        trend[block] += tilt @ tilt.T * known.unit
-    if known.movement.covariance.any() and len(design.common):
-        G = shared.mean[:, :6]
-        trend[block] += G @ known.movement.tilt(line_weights(rows.ok)) @ G.T
+        rows.sd[:, column] = np.where(ok, np.sqrt(old**2 + level[column]), np.nan)
+    trend, block = known.slow.copy(), np.ix_(own, own)
+    if len(later.cofactors):
+        tilt = line @ root_of(later.cofactors)
+        trend[block] += tilt @ tilt.T * unit
+    if known.movement.covariance.any() and q:
+        G = later.mean[:, :6]
+        trend[block] += G @ known.movement.tilt(line_weights(ok)) @ G.T
     return np.sqrt(np.clip(level, 0.0, None)), np.sqrt(np.diag(trend))

@@ -251,18 +251,6 @@ class Movement:
         inside = T @ self.covariance @ T.T
         return T.T @ symmetric_power(inside, -1.0, _FLAT) @ T
 
-    def image_px(self, A: Array) -> float:
-        """Movement of the image, px, by partials (T, 2, 16): RMS over targets, per coordinate."""
-        return _rms_px(A, self.covariance)
-
-    def noise_px(self, A: Array) -> float:
-        """The same of what an epoch's noise is mistaken for."""
-        return _rms_px(A, self.noise)
-
-    def slow_fraction(self, A: Array) -> float:
-        """Fraction of the movement's variance in the image that has a memory."""
-        return (_rms_px(A, self.slow) / max(self.image_px(A), 1e-12)) ** 2
-
     def tilt(self, weights: Array) -> Array:
         """Covariance (6, 6) of Σ w m over the epochs, weights (E,): of a line, say."""
         white: Array = self.white * float(weights @ weights)
@@ -296,7 +284,11 @@ def together(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
     )
 
 
-def _rms_px(A: Array, covariance: Array) -> float:
+def image_px(covariance: Array, A: Array) -> float:
+    """What a movement of some covariance (6, 6) does to the image, px, by partials (T, 2, 16).
+
+    RMS over targets, per coordinate.
+    """
     E = A[..., EOP]
     return float(np.sqrt(np.einsum("tki,ij,tkj->tk", E, covariance, E).mean()))
 

@@ -30,6 +30,8 @@ from thermocald.photogrammetry.epoch.snooping import (
 from thermocald.photogrammetry.series.mount import STILL, Movement
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Index, Mask
@@ -94,19 +96,18 @@ class SeriesSettings(AdjustmentSettings):
 class EpochRows:
     """Epochs of a series as adjusted, one by one.
 
-    values, sd (E, 16): NaN where an epoch has no result or a parameter was held; ok (E,): epochs
-    with a result; sigma0, redundancy, stillness (E,): NaN where there is none; observed, rejected
-    (E,): how many targets, in `observed` the rejected too; status, reasons: E words and sentences.
+    values, sd (E, 16): NaN where an epoch has no result or a parameter was held; sigma0,
+    redundancy, stillness (E,): NaN where there is none; n_observations, n_rejected (E,): how many
+    targets, the rejected in both; status, reasons: E words and sentences.
     """
 
     values: Array
     sd: Array
-    ok: Mask
     sigma0: Array
     redundancy: Array
     stillness: Array
-    observed: Index
-    rejected: Index
+    n_observations: Index
+    n_rejected: Index
     status: list[str]
     reasons: list[str]
 
@@ -116,10 +117,8 @@ class EpochRows:
         values, sd = np.empty((2, epochs, 16))
         sigma0, redundancy, stillness = np.empty((3, epochs))
         observed, rejected = np.empty((2, epochs), dtype=np.int64)
-        return cls(
-            values, sd, np.zeros(epochs, dtype=bool), sigma0, redundancy, stillness, observed,
-            rejected, [""] * epochs, [""] * epochs,
-        )  # fmt: skip
+        words, sentences = [""] * epochs, [""] * epochs
+        return cls(values, sd, sigma0, redundancy, stillness, observed, rejected, words, sentences)
 
     def put(self, first: int, part: EpochRows) -> None:
         """Put consecutive epochs in, from epoch `first` on."""
@@ -163,12 +162,12 @@ class SeriesAdjustment:
     rejected: Mask
     residuals: Array
     offsets: Array
-    status: tuple[str, ...]
-    reasons: tuple[str, ...]
+    status: Sequence[str]
+    reasons: Sequence[str]
     stillness: Array
-    excess_sd: Array
-    trend_sd: Array
-    perspective_sd: Array
+    excess_sd: Array = field(default_factory=lambda: np.zeros(16))
+    trend_sd: Array = field(default_factory=lambda: np.zeros(16))
+    perspective_sd: Array = field(default_factory=lambda: np.full(16, np.nan))
     field_ratio: float = 1.0
     outer_noise: tuple[float, float] = (float("nan"), float("nan"))
     noise_ratio: float = 1.0
@@ -206,9 +205,9 @@ class SeriesAdjustment:
     @property
     def rows(self) -> EpochRows:
         """The epochs one by one."""
-        ok, rejected = self.ok, self.rejected.sum(axis=1)
+        rejected = self.rejected.sum(axis=1)
         return EpochRows(
-            self.values, self.sd, ok, np.where(ok, self.sigma0, np.nan), self.redundancy,
+            self.values, self.sd, np.where(self.ok, self.sigma0, np.nan), self.redundancy,
             self.stillness, self.observed.sum(axis=1) + rejected, rejected, list(self.status),
             list(self.reasons),
         )  # fmt: skip

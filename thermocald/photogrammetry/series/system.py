@@ -51,7 +51,7 @@ class Design:
     at: the linearisation; own (p,), common (q,): positions of the parameters; known (16,): the
     values that priors draw parameters to; own_prior (p, p), common_prior (q,): their weights, 0 for
     those without; sways: whether an epoch's exterior orientation is drawn to the common one
-    instead; offset_prior (T, 3) px⁻²: weights xx, yy, xy of the offsets, None without offsets.
+    instead; offset_prior (T, 3) px⁻²: weights xx, yy, xy of the offsets, (0, 3) without offsets.
     """
 
     at: Partials
@@ -61,89 +61,41 @@ class Design:
     own_prior: Array
     common_prior: Array
     sways: bool
-    offset_prior: Array | None
+    offset_prior: Array
 
     @property
     def width(self) -> int:
         """How many common unknowns there are, q or q + 2T."""
-        return len(self.common) + (0 if self.offset_prior is None else 2 * len(self.at.A))
-
-    def own_pull(self, values: Array, pose: Array) -> Array:
-        """Gradient (E, p) by which priors draw own parameters, at values (E, 16)."""
-        centre = self.known.copy()
-        if self.sways:
-            centre[EOP] = pose
-        pull: Array = (centre - values)[:, self.own] @ self.own_prior
-        return pull
+        return len(self.common) + 2 * len(self.offset_prior)
 
     def common_pull(self, pose: Array, offsets: Array) -> Array:
         """Gradient (width,) by which priors draw the common unknowns."""
         pull: Array = self.common_prior * (self.known[self.common] - pose[: len(self.common)])
-        if self.offset_prior is None:
-            return pull
-        (wx, wy, wxy), (x, y) = self.offset_prior.T, offsets.T
+        (wx, wy, wxy), (x, y) = self.offset_prior.T, offsets[: len(self.offset_prior)].T
         return np.concatenate([pull, -wx * x - wxy * y, -wxy * x - wy * y])
-
-    def without_common_priors(self) -> Design:
-        """The same unknowns, nothing known beforehand of the common ones."""
-        offsets = None if self.offset_prior is None else np.zeros_like(self.offset_prior)
-        return replace(self, common_prior=np.zeros(len(self.common)), offset_prior=offsets)
 
     def gradient(self, weights: Array, residuals: Array) -> Array:
         """Gradient (width,) of the common unknowns: weights (E, T, 3), residuals (E, T, 2) px."""
         b = right_hand_sides(weights, residuals, self.at.A[..., self.common])
-        total: Array = b.sum(axis=0)
-        if self.offset_prior is None:
-            return total
-        v = np.nan_to_num(residuals)
-        x = (weights[..., 0] * v[..., 0] + weights[..., 2] * v[..., 1]).sum(axis=0)
-        y = (weights[..., 2] * v[..., 0] + weights[..., 1] * v[..., 1]).sum(axis=0)
-        return np.concatenate([total, x, y])
+        t = len(self.offset_prior)
+        v, w = np.nan_to_num(residuals[:, :t]), weights[:, :t]
+        x = (w[..., 0] * v[..., 0] + w[..., 2] * v[..., 1]).sum(axis=0)
+        y = (w[..., 2] * v[..., 0] + w[..., 1] * v[..., 1]).sum(axis=0)
+        return np.concatenate([b.sum(axis=0), x, y])
 
     def prior_matrix(self) -> Array:
         """Weights (width, width) of the priors of the common unknowns."""
         out = np.zeros((self.width, self.width))
         q = len(self.common)
         out[np.arange(q), np.arange(q)] = self.common_prior
-        if self.offset_prior is not None:
-            _add_blocks(out[q:, q:], self.offset_prior)
+        _add_blocks(out[q:, q:], self.offset_prior)
         return out
 
-    def by_prior(self, Q: Array) -> Array:
-        """Q (width, width) times the priors' weights."""
-        q = len(self.common)
-        out: Array = np.empty_like(Q)
-        out[:, :q] = Q[:, :q] * self.common_prior
-        if self.offset_prior is not None:
-            (wx, wy, wxy), T = self.offset_prior.T, len(self.offset_prior)
-            x, y = Q[:, q : q + T], Q[:, q + T :]
-            out[:, q : q + T], out[:, q + T :] = x * wx + y * wxy, x * wxy + y * wy
-        return out
-
-    def common_matrix(self, N: Array, weights: Array) -> Array:
-        """Normal matrix (width, width) of the common unknowns, own ones held, with the priors.
-
-        N (16, 16), weights (T, 3): summed over the epochs.
-        """
-        out, q = self.prior_matrix(), len(self.common)
-        out[:q, :q] += N[self.common[:, None], self.common]
-        if self.offset_prior is not None:
-            _add_blocks(out[q:, q:], weights)
-            out[:q, q:] = self._with_offsets(weights[None], self.common)[0]
-            out[q:, :q] = out[:q, q:].T
-        return out
-
-    def coupling(self, N: Array, weights: Array) -> Array:
-        """Blocks (E, p, width) of own with common unknowns: N (E, 16, 16), weights (E, T, 3)."""
-        parameters: Array = N[:, self.own[:, None], self.common]
-        if self.offset_prior is None:
-            return parameters
-        return np.concatenate([parameters, self._with_offsets(weights, self.own)], axis=2)
-
-    def _with_offsets(self, weights: Array, columns: Index) -> Array:
+    def with_offsets(self, weights: Array, columns: Index) -> Array:
         """Blocks (E, k, 2T) of some parameters with the offsets."""
-        wx, wy, wxy = np.moveaxis(weights, -1, 0)[:, :, None]
-        ax, ay = self.at.A[:, 0, columns].T, self.at.A[:, 1, columns].T
+        t = len(self.offset_prior)
+        wx, wy, wxy = np.moveaxis(weights[:, :t], -1, 0)[:, :, None]
+        ax, ay = self.at.A[:t, 0, columns].T, self.at.A[:t, 1, columns].T
         return np.concatenate([wx * ax + wxy * ay, wxy * ax + wy * ay], axis=2)
 
 
@@ -238,10 +190,14 @@ class SeriesSystem:
         count (E,): how many epochs each of these stands for, one by default.
         """
         n = np.ones(len(self.good)) if count is None else count
-        full = self.design.common_matrix(
-            np.tensordot(n[self.good], self.N[self.good], axes=1),
-            np.tensordot(n[self.good], self.used(self.good), axes=1),
-        )
+        design, q = self.design, len(self.design.common)
+        full = design.prior_matrix()
+        N = np.tensordot(n[self.good], self.N[self.good], axes=1)
+        full[:q, :q] += N[design.common[:, None], design.common]
+        weights = np.tensordot(n[self.good], self.used(self.good), axes=1)
+        _add_blocks(full[q:, q:], weights[: len(design.offset_prior)])
+        full[:q, q:] = design.with_offsets(weights[None], design.common)[0]
+        full[q:, :q] = full[:q, q:].T
         for part, C in self.couplings():
             half = np.swapaxes(np.linalg.cholesky(self.Q[part]), 1, 2) @ C
             half *= np.sqrt(n[part, None, None])
@@ -254,12 +210,16 @@ class SeriesSystem:
         if self.coupled is not None:
             yield from self.coupled
             return
-        rows = np.flatnonzero(self.good)
-        if self.design.width == 0 or len(self.design.own) == 0:
+        rows, design = np.flatnonzero(self.good), self.design
+        if design.width == 0 or len(design.own) == 0:
             return
         for start in range(0, len(rows), _CHUNK):
             part = rows[start : start + _CHUNK]
-            yield part, self.design.coupling(self.N[part], self.used(part))
+            C: Array = self.N[part][:, design.own[:, None], design.common]
+            if len(design.offset_prior):
+                offsets = design.with_offsets(self.used(part), design.own)
+                C = np.concatenate([C, offsets], axis=2)
+            yield part, C
 
     def step(self, residuals: Array, state: State) -> Step:
         """One Gauss-Newton step from a state, which leaves residuals (E, T, 2) px."""
@@ -281,8 +241,8 @@ class SeriesSystem:
         solved[~self.good] = 0.0
         sizes = np.sqrt(np.maximum((right * solved).sum(axis=1), 0.0))
         size += float(sizes.max(initial=0.0))
-        offsets = design.offset_prior is not None
-        d_offsets = d_all[q:].reshape(2, -1).T if offsets else np.zeros_like(state.offsets)
+        d_offsets = np.zeros_like(state.offsets)
+        d_offsets[: len(design.offset_prior)] = d_all[q:].reshape(2, -1).T
         return Step(self._bounded(solved), d_all[:q], d_offsets, size, sizes)
 
     def _bounded(self, d_own: Array) -> Array:
@@ -307,14 +267,6 @@ class SeriesSystem:
             residuals[part, :, 0] -= step.d_own[part] @ Ax
             residuals[part, :, 1] -= step.d_own[part] @ Ay
 
-    def replace(self, rows: Index, part: SeriesSystem) -> None:
-        """Put some epochs in from another system of the same linearisation, in place.
-
-        Only where nothing is common: the common unknowns would not follow.
-        """
-        self.use[rows], self.Q[rows], self.good[rows] = part.use, part.Q, part.good
-        self.alike = None
-
     def gradient(self, residuals: Array) -> Array:
         """Aᵀ P l (E, 16) of every epoch."""
         return right_hand_sides(self.weights, residuals, self.design.at.A, self.use)
@@ -324,31 +276,28 @@ class SeriesSystem:
         own, A = self.design.own, self.design.at.A
         b = right_hand_sides(self.weights, residuals, A[..., own], self.use)
         if self.design.own_prior.any():
-            b += self.design.own_pull(state.values, state.pose)
+            centre = self.design.known.copy()
+            if self.design.sways:
+                centre[EOP] = state.pose
+            b += (centre - state.values)[:, own] @ self.design.own_prior
         return b
 
-    def own_count(self) -> Array:
-        """How many parameters of its own every epoch uses up (E,); a prior leaves less than p."""
-        held = np.einsum("epq,qp->e", self.Q, self.design.own_prior)
-        count: Array = len(self.design.own) - held
-        return count
-
+    @property
     def common_share(self) -> float:
         """How many of the observations the common unknowns use up."""
-        return self.design.width - self._held[0]
-
-    def prior_share(self) -> float:
-        """How much of the redundancy rests on priors of the common unknowns being as stated.
-
-        Along a direction of which the prior tells the share h, that is h - h² of an observation: of
-        one epoch alone a wrong prior and another noise look the same, and many tell them apart.
-        """
-        return self._held[0] - self._held[1]
+        return self.design.width - self.held[0]
 
     @cached_property
-    def _held(self) -> tuple[float, float]:
-        """Traces of how far priors hold the common unknowns, Q P, and of its square."""
-        held = self.design.by_prior(self.Q_common)
+    def held(self) -> tuple[float, float]:
+        """Traces of how far priors hold the common unknowns, Q P, and of its square.
+
+        Along a direction of which the prior tells the share h, h - h² of an observation rests on
+        the prior being as stated: of one epoch alone a wrong prior and another noise look the same,
+        and many tell them apart.
+        """
+        prior, (wx, wy, wxy) = self.design.common_prior, self.design.offset_prior.T
+        pose, x, y = np.split(self.Q_common, [len(prior), len(prior) + len(wx)], axis=1)
+        held = np.hstack([pose * prior, x * wx + y * wxy, x * wxy + y * wy])
         return float(np.trace(held)), float(np.einsum("ij,ji->", held, held))
 
 

@@ -27,6 +27,15 @@ from thermocald.store.series import EpochResult
 SIGMA = 0.05
 
 
+def table_of(values, sd, exterior):
+    """The epochs of a series, 10 s apart."""
+    n, none = len(values), np.zeros(len(values), dtype=np.int64)
+    return Epochs(
+        np.arange(n), 10.0 * np.arange(n), np.full(n, np.nan), values, sd, np.ones(n), none, none,
+        ("ok",) * n, ("",) * n, exterior,
+    )  # fmt: skip
+
+
 def series(
     seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int = 60, targets: int = 60,
     field_mm: float = 0.02,
@@ -49,12 +58,7 @@ def series(
         points += rng.normal(0, SIGMA, points.shape)
         observations.append(Observations(np.arange(targets), points, np.full(points.shape, SIGMA)))
     start = np.tile(np.r_[iop, eop], (epochs, 1))
-    zero = np.zeros(epochs, dtype=np.int64)
-    apart = Epochs(
-        np.arange(epochs), 10.0 * np.arange(epochs), np.full(epochs, np.nan), start,
-        np.ones((epochs, 16)), np.ones(epochs), zero, zero, ("ok",) * epochs, ("",) * epochs,
-        "per_epoch",
-    )  # fmt: skip
+    apart = table_of(start, np.ones((epochs, 16)), "per_epoch")
     head = SimpleNamespace(name="test", camera=SimpleNamespace(sensor=model.sensor))
     grid = ObservationGrid.from_observations(field, observations)
     return table_of_series(head, field, apart, grid, SeriesSettings(exterior="auto"))
@@ -118,12 +122,7 @@ def test_more_epochs_than_a_line_needs_are_averaged():
     sd = np.full((n, 16), 1e-4)
     values = rng.normal(0, 1e-4, (n, 16))
     values[:, 1] += 3e-4 * np.sin(np.linspace(0, 20, n))
-    none = np.zeros(n, dtype=np.int64)
-    table = Epochs(
-        np.arange(n), 10.0 * np.arange(n), np.full(n, np.nan), values, sd, np.ones(n), none, none,
-        ("ok",) * n, ("",) * n, "series",
-    )  # fmt: skip
-    assert [c.drifts for c in courses(table)] == [False, True, False]
+    assert [c.drifts for c in courses(table_of(values, sd, "series"))] == [False, True, False]
 
 
 def test_a_group_is_left_out_once_for_all_parameters(monkeypatch):
@@ -172,16 +171,12 @@ def test_what_is_stored_is_what_is_exported(tmp_path):
 )
 def test_replay_claims_no_drift_of_noise_with_a_memory(coloured, phi, epochs):
     """At 1 %; a line of its own claimed 7 to 17 % where the study held its level."""
-    rng, claims, none = np.random.default_rng(16), [], np.zeros(epochs, dtype=np.int64)
+    rng, claims = np.random.default_rng(16), []
     for _ in range(120):
         values = np.zeros((epochs, 16))
         slow = signal.lfilter([1], [1, -phi], rng.standard_normal((600 + epochs, 3)), axis=0)[600:]
         values[:, :3] = np.sqrt(coloured * (1 - phi**2)) * slow
         values[:, :3] += np.sqrt(1 - coloured) * rng.standard_normal((epochs, 3))
-        table = Epochs(
-            np.arange(epochs), 10.0 * np.arange(epochs), np.full(epochs, np.nan), values,
-            np.ones((epochs, 16)), np.ones(epochs), none, none, ("ok",) * epochs, ("",) * epochs,
-            "series",
-        )  # fmt: skip
+        table = table_of(values, np.ones((epochs, 16)), "series")
         claims += [c.drifts for c in courses(table)]
     assert np.mean(claims) <= 0.025

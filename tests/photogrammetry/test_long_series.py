@@ -46,11 +46,11 @@ def case():
     return scenery()
 
 
-def blocked(case, size, exterior="series", **other):
+def blocked(case, size, exterior="series", jobs=1, **other):
     field, _, grid = case
     return adjust_long_series(
         scene.SENSOR, field, InBlocks(grid, size), scene.INTERIOR, scene.EXTERIOR,
-        SeriesSettings(exterior=exterior, **other), together=120,
+        SeriesSettings(exterior=exterior, **other), together=120, jobs=jobs,
     )  # fmt: skip
 
 
@@ -104,14 +104,7 @@ def test_what_the_sample_never_saw_is_still_adjusted(case):
 
 def test_processes_do_not_matter(case):
     """Blocks on two processes give the bits of one."""
-    field, _, grid = case
-    one, two = (
-        adjust_long_series(
-            scene.SENSOR, field, InBlocks(grid, 60), scene.INTERIOR, scene.EXTERIOR,
-            SeriesSettings(exterior="mount"), together=120, jobs=jobs,
-        )
-        for jobs in (1, 2)
-    )  # fmt: skip
+    one, two = (blocked(case, 60, "mount", jobs) for jobs in (1, 2))
     np.testing.assert_array_equal(two.rows.values, one.rows.values)
     np.testing.assert_array_equal(two.rows.sd, one.rows.sd)
     np.testing.assert_array_equal(two.rows.sigma0, one.rows.sigma0)

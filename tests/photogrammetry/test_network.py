@@ -97,25 +97,6 @@ def test_standard_deviations_and_correlations_are_true():
     assert 0.8 < np.sqrt(np.mean(squares)) < 1.2
 
 
-@pytest.mark.slow
-def test_full_covariance_predicts_distances():
-    """The stated sd of distances between targets uses the correlations: normalised errors are 1.
-
-    Distances of targets that neighbour each other are far better than the sigmas alone say.
-    """
-    field = cases.bent_sheet(6, 5)
-    stations = cases.convergent_stations(field, 8)
-    rng = np.random.default_rng(7)
-    pairs = [tuple(rng.choice(30, 2, replace=False)) for _ in range(25)]
-    squares = []
-    for seed in range(100, 140):
-        network, truth, _ = _survey(
-            field, stations, 0.05, seed, loss=0.0, nominal=field, interior=cases.INTERIOR
-        )
-        squares += _distance_squares(network, truth, pairs)
-    assert 0.8 < np.sqrt(np.mean(squares)) < 1.2
-
-
 def test_inner_constraints_give_the_smallest_trace():
     """Any other datum of the same network has a larger trace of the covariance (Granshaw 1980)."""
     field = cases.bent_sheet(6, 5)

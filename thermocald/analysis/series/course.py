@@ -8,10 +8,22 @@ from typing import TYPE_CHECKING, ClassVar
 from thermocald.numbers import signed
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 LEVEL = 0.01
 """A change that chance gives more rarely is a drift."""
+
+
+_CARRIED = 0.5  # standard deviations of a change that an error of c may carry into it
+
+
+def carried_by_c(share: float, changes: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Return how many of their sds changes may be off by what c is; empty where it is few for all.
+
+    share: sd of c over c, as an image shows a change as a share of c; changes: with their sds.
+    """
+    sds = {name: abs(v) * share / sd for name, (v, sd) in changes.items() if v and sd > 0}
+    return sds if max(sds.values(), default=0.0) > _CARRIED else {}
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import calibrated_epochs
-from thermocald.analysis.series.course import Course, table_of
+from thermocald.analysis.series.course import Course, carried_by_c, table_of
 from thermocald.errors import DataError, DriverMissing
 from thermocald.figures import BAND
 from thermocald.files import write_parts
@@ -54,7 +54,6 @@ CAUSES_OF_SIGMA0 = (
     "it can be the noise of the image points, a test field worse than stated, or a lens that the "
     "distortion does not describe"
 )
-_CARRIED = 0.5  # standard deviations of a change that an error of c may carry into it
 _TESTS_A_FIELD = 18  # redundant coordinates of a level: 16 targets
 _SHOWN_SDS = 5.0  # of an affinity that the targets show
 _LEVEL_OF_FEW = 1.6  # error over sd of 12 to 14 targets whose field is 3 to 10 times worse
@@ -312,17 +311,14 @@ class Epochs(Result):
         return out
 
     def _hang_on_c(self) -> dict[str, float] | None:
-        """Return how well c is known, and how many sds of a change that may make; None: few.
-
-        An image shows a change as a share of c.
-        """
+        """Return how well c is known, and how many sds of a change that may make; None: few."""
         if not self.drifts or not self.level_sd[0] > 0:
             return None
         share = float(self.level_sd[0] / np.nanmedian(self.values[self.ok, 0]))
-        changes = [(c.per_kelvin, c.sd_per_kelvin) for c in self.drifts]
-        changes += [(c.last_minus_first, c.sd_last_minus_first) for c in self.drifts]
-        sds = max((abs(v) / sd * share for v, sd in changes if sd > 0), default=0.0)
-        return {"c_known_to": share, "sds": sds} if sds > _CARRIED else None
+        changes = {c.name: (c.last_minus_first, c.sd_last_minus_first) for c in self.drifts}
+        changes |= {f"{c.name}/K": (c.per_kelvin, c.sd_per_kelvin) for c in self.drifts}
+        sds = carried_by_c(share, changes)
+        return {"c_known_to": share, "sds": max(sds.values())} if sds else None
 
     def _cause_of_noise(self) -> str:
         """Return what a sigma0 beyond 1 can be, "" where it is not."""
@@ -361,12 +357,8 @@ class Epochs(Result):
 
     def to_csv(self, path: Path | str) -> Path:
         """Write what `thermocald export` writes, CONVENTIONS §4; returns the file's path."""
-        write_parts(Path(path), self.csv_lines())
+        write_parts(Path(path), csv_text(part.columns() for part in self.parts()))
         return Path(path)
-
-    def csv_lines(self) -> Iterable[str]:
-        """Yield the lines of `to_csv`."""
-        return csv_text(part.columns() for part in self.parts())
 
     @property
     def without_result(self) -> dict[str, int]:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from scipy.linalg import block_diag
 
+from thermocald.analysis.series.course import carried_by_c
 from thermocald.analysis.thermal.level import AFFINITY_SD, estimate_level, projected, series_means
 from thermocald.analysis.thermal.terms import unknowns_of
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -133,7 +134,6 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
 
 
 _SELDOM = 0.05  # of a reading's interval that the course between two of them makes of a delay
-_MATERIAL_SDS = 0.5  # of a rate: what c lets it be off by
 _INTERIOR = [COLUMNS.index(n) for n in IOP_NAMES]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
@@ -333,10 +333,9 @@ def fitted_camera(
     bulge = max(s.thermometers[s.history.reference].bulge for s in fitter.series)
     if delays and bulge > _SELDOM:
         fitted["read_seldom"] = {"effects": delays, "bulge": bulge}
-    # an image shows the change of c as a share of c: the rates are as wrong as c itself
     share = sd["interior.c"] / model.interior.c
-    carried = {p: abs(r) * share / sd[f"rates.{p}"] for p, r in model.rates.items() if r}
-    if max(carried.values(), default=0.0) > _MATERIAL_SDS:
+    rates = {p: (r, sd[f"rates.{p}"]) for p, r in model.rates.items() if r}
+    if carried := carried_by_c(share, rates):
         fitted["rates_hang_on_c"] = {"c_known_to": share, "sds": carried}
     return ThermalCamera(model, {**fitted, "prediction_test": []})
 

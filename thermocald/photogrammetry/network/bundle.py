@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.field.testfield import Observations
 
+    _Normals = tuple[Array, Array, Array, Array, Array]
+
 
 _N_IOP = len(IOP_NAMES)
 # Eigenvalues of the scaled matrix below this are rounding errors of its elements.
@@ -63,18 +65,6 @@ class KnownTargets(NamedTuple):
     places: Array
     weights: Array
     uncertain: NDArray[np.bool_]
-
-
-class _Normals(NamedTuple):
-    """Normal equations in blocks: of the cameras (u, u), interior first, then six per photograph,
-    between them and the targets (u, 3m), of the targets (m, 3, 3); right-hand sides (u,), (m, 3).
-    """
-
-    cameras: Array
-    between: Array
-    targets: Array
-    camera_side: Array
-    target_side: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,7 +256,7 @@ class BundleAdjustment:
                 Q = scaled_inverse(S)
             except np.linalg.LinAlgError:
                 raise GeometryError(_SEPARATE_NOTHING) from None
-        B3 = normals.between.reshape(len(Q), -1, 3)
+        B3 = normals[1].reshape(len(Q), -1, 3)
         follow = -np.einsum("mij,umj->umi", inverses, B3).reshape(len(Q), -1)
         return Cofactors(Q, Q @ follow, follow, inverses, weakest)
 
@@ -325,6 +315,9 @@ class BundleAdjustment:
         return v, root @ by_camera, root @ by_point
 
     def _normal_equations(self, bundle: Bundle, weights: Array) -> _Normals:
+        """Return blocks: of the cameras (u, u), interior first, then six per photograph, between
+        them and the targets (u, 3m), of the targets (m, 3, 3); right-hand sides (u,), (m, 3).
+        """
         v, by_camera, by_point = self._linearised(bundle, weights)
         rays, f = self.rays, len(self.free)
         by_interior, by_pose = np.split(by_camera, [f], axis=2)
@@ -357,7 +350,7 @@ class BundleAdjustment:
         if self.known is not None:
             D += self.known.weights[:, :, None] * np.eye(3)
             d += self.known.weights * (self.known.places - bundle.points)
-        return _Normals(A, B, D, a, d)
+        return A, B, D, a, d
 
     def _step(
         self, bundle: Bundle, normals: _Normals, damping: float

@@ -301,45 +301,19 @@ _SURE = 4.0  # standard deviations by which the perspective must exclude a movem
 _UNSEEN = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class Jumps:
-    """rows: epochs from which on the pose stood elsewhere, by steps (n, k); variances (n, k)."""
+def jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array, Array]:
+    """Find the jumps of a trajectory (E, k), in units of its noise, that are the mount's.
 
-    rows: tuple[int, ...]
-    steps: Array
-    variances: Array
-
-    def removed(self, trajectory: Array) -> Array:
-        """The trajectory (E, k) without the jumps."""
-        trajectory = trajectory.copy()
-        for row, step in zip(self.rows, self.steps, strict=True):
-            trajectory[row:] -= step
-        return trajectory
-
-    def covariance(self, epochs: int) -> Array:
-        """Covariance (k, k) of the pose about its mean over so many epochs."""
-        stairs = np.zeros((epochs, self.steps.shape[1]))
-        for row, step in zip(self.rows, self.steps, strict=True):
-            stairs[row:] += step
-        stairs -= stairs.mean(axis=0)
-        out: Array = stairs.T @ stairs / max(epochs, 1)
-        for row, variance in zip(self.rows, self.variances, strict=True):
-            fraction = row / epochs
-            out += np.diag(variance) * fraction * (1 - fraction)
-        return out
-
-
-def jumps(trajectory: Array, M: Array, g: Array) -> Jumps:
-    """Return the jumps of a trajectory (E, k), in units of its noise, that are the mount's.
-
-    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free.
+    M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free. Returns
+    the epochs from which on the pose stood elsewhere, the stairs (E, k) that it made, and the
+    covariance (k, k) of the pose about its mean that they are.
     """
+    E = len(trajectory)
     rows: list[int] = []
-    steps: list[Array] = []
-    variances: list[Array] = []
+    stairs, uncertain = np.zeros_like(trajectory), np.zeros(trajectory.shape[1])
     left = trajectory.copy()
     examined: set[int] = set()
-    while len(examined) < _MOST and len(left) >= 4 * _SIDE:
+    while len(examined) < _MOST and E >= 4 * _SIDE:
         change = np.diff(left, axis=0)
         size = np.abs(change) / np.maximum(mad_sd(change, axis=0), 1e-12)
         for row in examined:
@@ -355,10 +329,11 @@ def jumps(trajectory: Array, M: Array, g: Array) -> Jumps:
         left[row:] -= step
         if not _is_the_cameras(row, step, M, g):
             rows.append(row)
-            steps.append(step)
-            variances.append(factor * mad_sd(change, axis=0) ** 2 / 2)
-    shape = (len(rows), trajectory.shape[1])
-    return Jumps(tuple(rows), np.array(steps).reshape(shape), np.array(variances).reshape(shape))
+            stairs[row:] += step
+            variance = factor * mad_sd(change, axis=0) ** 2 / 2
+            uncertain += variance * (row / E) * (1 - row / E)
+    about = stairs - stairs.mean(axis=0)
+    return rows, stairs, about.T @ about / max(E, 1) + np.diag(uncertain)
 
 
 def _step(trajectory: Array, row: int) -> tuple[Array, float]:
@@ -413,12 +388,7 @@ def drift_period(time_s: Array, temperature: Array) -> float:
     warms = len(known) > 1 and float(np.ptp(known)) >= _LEAST_WARMING_K
     if interval <= 0 or (float(np.ptp(time_s)) < FASTEST_DRIFT_S and not warms):
         return 0.0
-    return fastest_period(interval)
-
-
-def fastest_period(interval_s: float) -> float:
-    """The shortest period of a camera's drift in epochs, which are so far apart."""
-    return max(FASTEST_DRIFT_S / interval_s, _FEWEST_A_PERIOD)
+    return max(FASTEST_DRIFT_S / interval, _FEWEST_A_PERIOD)
 
 
 def estimate_movement(
@@ -452,8 +422,8 @@ def estimate_movement(
     back = np.linalg.inv(root) @ np.linalg.inv(whiten)
     # what the perspective alone says of the pose, the interior orientation eliminated
     M, g = pose_equations(N, b, own, stacked_inverses(N[:, own[:, None], own])[0])
-    found = jumps(trajectory, back.T @ M @ back, g @ back)
-    trajectory = found.removed(trajectory)
+    jumped, stairs, of_jumps = jumps(trajectory, back.T @ M @ back, g @ back)
+    trajectory = trajectory - stairs
     period = min(period, len(trajectory) / _PERIODS)
     if period:
         smooth = _smoothed(trajectory, int(_CUBIC * period))
@@ -466,13 +436,13 @@ def estimate_movement(
     directions = _directions(rough, whiten @ _visible(N, own, root) @ whiten)
     white, slow, memory = components((smooth + rough) @ directions, period)
     axes = back @ directions
-    if found.rows:
+    if jumped:
         memory = max(memory, len(trajectory) / 2.0)
     return Movement(
         (axes * white) @ axes.T,
-        (axes * slow) @ axes.T + back @ found.covariance(len(trajectory)) @ back.T,
+        (axes * slow) @ axes.T + back @ of_jumps @ back.T,
         memory, back @ back.T,
-        tuple(int(rows[k]) for k in found.rows),
+        tuple(int(rows[k]) for k in jumped),
     )  # fmt: skip
 
 

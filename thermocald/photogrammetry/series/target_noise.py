@@ -76,17 +76,12 @@ def noise_ratios(
     freedom = np.broadcast_to(worth, ratio.shape)[shown]
     common = float(np.median((ratio / of_usual)[shown]))
     # the freedom of a prior that lets the logarithms scatter by as much: trigamma(prior/2) = it
-    between = float(np.var(np.log(ratio[shown]))) - float(np.mean(_log_variance(freedom)))
+    of_chance = float(np.mean(2.0 / freedom + 2.0 / freedom**2))  # of ln χ²: trigamma(freedom/2)
+    between = float(np.var(np.log(ratio[shown]))) - of_chance
     prior = (1.0 + np.sqrt(1.0 + 2.0 * between)) / between if between > 0 else _ALIKE
     prior = min(prior, _ALIKE)
     drawn: Array = (worth * np.where(shown, ratio, common) + prior * common) / (worth + prior)
     return np.maximum(drawn, 1e-12), worth[:, 0] + prior
-
-
-def _log_variance(freedom: Array) -> Array:
-    """Variance of the logarithm of a chi-square: trigamma of half its degrees of freedom."""
-    variance: Array = 2.0 / freedom + 2.0 / freedom**2
-    return variance
 
 
 @dataclass(frozen=True, eq=False)

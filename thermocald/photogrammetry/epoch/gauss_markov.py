@@ -77,13 +77,6 @@ class Whitening:
         pairs *= self.factor
         return pairs
 
-    def colour(self, pair: Array) -> Array:
-        """The inverse of `whiten` for one pair (2, n), as a copy."""
-        coloured: Array = pair / self.factor
-        if self.slope is not None:
-            coloured[1] += self.slope * coloured[0]
-        return coloured
-
 
 _ITERATIONS = 30
 _SMALL = 0.3  # standard deviations: a last step that leaves less than 1e-3 px in c, x0, y0
@@ -204,7 +197,10 @@ class Solution:
     @property
     def residuals(self) -> Array:
         """Residuals (2, n) px."""
-        return self.whitening.colour(self.whitened[-1])
+        coloured: Array = self.whitened[-1] / self.whitening.factor
+        if self.whitening.slope is not None:
+            coloured[1] += self.whitening.slope * coloured[0]
+        return coloured
 
 
 def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -> Array:

@@ -12,20 +12,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
-from thermocald.photogrammetry.epoch.snooping import Rejections
+from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, Rejections
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
     Partials,
+    chunks,
     linearise,
     planes,
-    series_residuals,
     sums_of_squares,
 )
 from thermocald.photogrammetry.series.snooping import (
     point_tests,
-    pooled_variance,
-    pooled_with_stated,
     snoop_series,
     typical_variance,
 )
@@ -344,11 +342,15 @@ class SeriesEstimator:
         )  # fmt: skip
 
     def _residuals(self, values: Array, offsets: Array, out: Array) -> Array:
+        """Measured minus predicted (E, T, 2) px at each epoch's own values (E, 16), into `out`."""
         if (values == values[:1]).all():
             first = project(self.sensor, values[0, IOP], values[0, EOP], self.testfield.points)
             np.subtract(self.grid.points, first, out=out)
         else:
-            series_residuals(self.sensor, self.grid, self.testfield.points, values, out)
+            for part in chunks(*out.shape[:2]):
+                iop, eop = values[part, IOP], values[part, EOP]
+                predicted = project(self.sensor, iop, eop, self.testfield.points)
+                np.subtract(self.grid.points[part], predicted, out=out[part])
         if offsets.any():
             out -= offsets
         return out
@@ -386,8 +388,10 @@ class SeriesEstimator:
         """
         vPv, redundancy = self.sums(estimate)
         good = estimate.system.good
-        shown = float(redundancy[good].sum()) * self.shown_share(estimate)
-        return pooled_with_stated(pooled_variance(vPv, redundancy, good), shown)
+        known = max(float(redundancy[good].sum()) * self.shown_share(estimate), 0.0)
+        good = good & (redundancy > 0)
+        found = float(np.median(vPv[good] / redundancy[good])) or 1.0 if good.any() else 1.0
+        return (known * found + TRUSTED_REDUNDANCY) / (known + TRUSTED_REDUNDANCY)
 
     def shown_share(self, estimate: Estimate) -> float:
         """Which share of the redundancy shows the noise, however wrong the priors are."""

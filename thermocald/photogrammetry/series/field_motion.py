@@ -380,9 +380,7 @@ def refined(s: FieldSeries, movement: FieldMovement) -> FieldMovement:
     M, r = _board_equations(free, movement.rows, rigid)
     step = _gains(M, r, movement.trajectory[None])[1][0]
     image = movement.image + (rigid @ step).reshape(-1, 2)
-    covariance = inverse_of_determined(_information(M, movement.trajectory))
-    size, sd = _across(s.B[movement.rows], image, rigid, covariance)
-    size_px = float(np.sqrt(np.mean(image**2)))
+    size, sd, size_px = _across(s.B[movement.rows], image, rigid, M, movement.trajectory)
     return replace(movement, image=image, size_mm=size, sd_mm=sd, size_px=size_px)
 
 
@@ -412,11 +410,9 @@ def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
     each = np.sum(w * c * v, axis=0) ** 2 / np.maximum(np.sum(w * c**2, axis=0), 1e-12)
     one_by_one = float(each.sum()) - 2 * len(rows)
     image = (rigid @ step).reshape(-1, 2)
-    size_px = float(np.sqrt(np.mean(image**2)))
+    size, sd, size_px = _across(s.B[rows], image, rigid, M, trajectory)
     if share < _SHARE or gain[best] < _RIGID * one_by_one or size_px < LEAST_PX:
         return None
-    covariance = inverse_of_determined(_information(M, trajectory))
-    size, sd = _across(s.B[rows], image, rigid, covariance)
     before, after = s.times[max(epoch - 1, 0)], s.times[epoch]
     return FieldMovement(
         "knock" if epoch else "creep", rows, tuple(s.names[r] for r in rows),
@@ -481,20 +477,22 @@ def _gains(M: Array, r: Array, trajectories: Array) -> tuple[Array, Array]:
     return gains, steps
 
 
-def _information(M: Array, trajectory: Array) -> Array:
-    """Normal matrix (6, 6) of a movement along one trajectory, the board's level eliminated."""
+def _across(
+    B: Array, image: Array, rigid: Array, M: Array, trajectory: Array
+) -> tuple[float, float, float]:
+    """RMS over targets of the movement across the rays, mm, its standard deviation, and px.
+
+    M (E, 6, 6): normal equations of the board, whose level is eliminated; trajectory (E,).
+    """
     flat = M.reshape(len(M), -1)
     N12 = (trajectory @ flat).reshape(6, 6)
-    out: Array = (trajectory**2 @ flat).reshape(6, 6) - N12 @ np.linalg.pinv(M.sum(axis=0)) @ N12
-    return out
-
-
-def _across(B: Array, image: Array, rigid: Array, covariance: Array) -> tuple[float, float]:
-    """RMS over targets of the movement across the rays, mm, and its standard deviation."""
+    information = (trajectory**2 @ flat).reshape(6, 6) - N12 @ np.linalg.pinv(M.sum(axis=0)) @ N12
+    covariance = inverse_of_determined(information)
     inverse = np.linalg.pinv(B)  # (k, 3, 2)
     moved = np.einsum("kij,kj->ki", inverse, image)
     size = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
     # of the RMS, to first order
     by_step = np.einsum("kij,kjp->kip", inverse, rigid.reshape(len(B), 2, 6))
     slope = np.einsum("ki,kip->p", moved, by_step) / max(len(B) * size, 1e-12)
-    return size, float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
+    sd = float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
+    return size, sd, float(np.sqrt(np.mean(image**2)))

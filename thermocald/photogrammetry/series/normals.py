@@ -292,16 +292,6 @@ def _weighted(weights: Array, residuals: Array, use: NDArray[np.bool_] | None) -
     return out
 
 
-def series_residuals(
-    sensor: Sensor, grid: ObservationGrid, field_points: Array, values: Array, out: Array
-) -> Array:
-    """Measured minus predicted (E, T, 2) px at each epoch's own parameters (E, 16), into `out`."""
-    for part in chunks(*grid.points.shape[:2]):
-        predicted = project(sensor, values[part, IOP], values[part, EOP], field_points)
-        np.subtract(grid.points[part], predicted, out=out[part])
-    return out
-
-
 def cofactors(N: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Inverse of each matrix (E, p, p), and which could be inverted (E,); the others get units."""
     inverse, good = np.empty(N.shape), np.empty(len(N), dtype=bool)

@@ -67,18 +67,6 @@ def _test_weights(
     return inverse
 
 
-def pooled_variance(vPv: Array, redundancy: Array, good: Mask) -> float:
-    """The median over epochs of the variance of unit weight; 1 where no residuals show it."""
-    good = good & (redundancy > 0)
-    return float(np.median(vPv[good] / redundancy[good])) or 1.0 if good.any() else 1.0
-
-
-def pooled_with_stated(found: float, freedom: float) -> float:
-    """A variance of unit weight found with some degrees of freedom, and 1, which was stated."""
-    known = max(freedom, 0.0)
-    return (known * found + TRUSTED_REDUNDANCY) / (known + TRUSTED_REDUNDANCY)
-
-
 def typical_variance(tests: Array, used: Mask) -> float:
     """Variance of unit weight that most epochs agree on; 1 where no residuals show it."""
     variances = _variances(tests, used)

@@ -55,10 +55,10 @@ def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
         if not block.series:
             continue
         _, _, index = fit.designs[block.series]
-        reduced = fit.reduced[block.series]
+        whole, c, _ = fit.reduced[block.series]
         inside = (index >= block.start) & (index < block.stop)
-        A = reduced.A[np.ix_(inside, inside)]
-        right = reduced.c[inside] - reduced.A[np.ix_(inside, ~inside)] @ x[index[~inside]]
+        A = whole[np.ix_(inside, inside)]
+        right = c[inside] - whole[np.ix_(inside, ~inside)] @ x[index[~inside]]
         own = index[inside]
         if block.term >= 0 and fit.terms[block.term].kind.is_periodic:
             model = next(b for b in fit.blocks if b.term == block.term and b.series == 0)

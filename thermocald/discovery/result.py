@@ -400,20 +400,14 @@ def estimate_level(fitter: HypothesisFitter, fit: Fit) -> tuple[Array, Array]:
     The scales of the test field are held. The sds hold the noise of image and thermometers, the
     drifts' own errors, and the stated errors of the test field's coordinates.
     """
-    C, V = fitter.design(fit.terms, fit.blocks, 0, centred=False)[:2]
-    index, weighting = fit.designs[0][2], fit.weightings[0]
-    searched = list(fit.searched)
-    dC, dV, mapping = fitter.derivatives(fit, searched, 0, centred=False)
-    A, _, coupling = weighting.joint(np.hstack([C, dC]), np.hstack([V, dV]))
-    drifts = coupling[:, : C.shape[1]] @ fit.coefficients[index]
+    weighting, index = fit.weightings[0], fit.designs[0][2]
+    X, V, places = fitter.tangent(fit, fit.searched, 0, centred=False)
+    A, _, coupling = weighting.joint(X, V)
+    drifts = coupling[:, : len(index)] @ fit.coefficients[index]
     own = weighting.level_normal[:_P, :_P]
     level = inverse_of_determined(own) @ (weighting.level_b - drifts)[:_P]
 
-    K = len(fit.coefficients)
-    T = np.zeros((len(A) + _P, _P + K + len(searched)))
-    T[np.arange(C.shape[1]), _P + index] = 1.0
-    T[C.shape[1] : len(A), _P + K :] = mapping
-    T[len(A) :, :_P] = np.eye(_P)
+    T = np.eye(_P + len(fit.covariance))[np.concatenate([_P + places, np.arange(_P)])]
     normal = T.T @ np.block([[A, coupling[:_P].T], [coupling[:_P], own]]) @ T
     empty = np.diag(normal) <= 0
     normal[empty, empty] = 1e12  # a coefficient of another series

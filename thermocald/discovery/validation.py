@@ -79,7 +79,7 @@ def _predict_blocks(
         both = np.linalg.slogdet(known + B)[1] - np.linalg.slogdet(known)[1]
         for s in series:
             chi2[k] += tested.chi2_of(s, trained.coefficients)
-            objective[k] += tested.reduced[s].logdet
+            objective[k] += tested.weightings[s].logdet
         chi2[k] -= float(g @ np.linalg.solve(known + B, g))
         objective[k] += chi2[k] + both
     return chi2, objective

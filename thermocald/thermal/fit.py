@@ -301,7 +301,7 @@ class HypothesisFitter:
             coefficients=x,
             covariance=scaled_inverse(A, _RIDGE),
             chi2=sum(fitted.chi2_of(s, x) for s in chosen),
-            logdet=sum(reduced[s].logdet for s in chosen),
+            logdet=sum(weightings[s].logdet for s in chosen),
         )
 
     def suit_thermometers(self, fit: Fit) -> float:
@@ -338,20 +338,15 @@ class HypothesisFitter:
             if isinstance(value, float) and f"{term.effect}.{name}" not in self.held
         ]
 
-    def derivatives(
-        self,
-        fit: Fit,
-        searched: Sequence[tuple[int, str]],
-        series: int,
-        centred: bool = True,
-    ) -> tuple[Array, Array, Array]:
-        """Return ∂(prediction)/∂(non-linear): trajectories (E, D), directions (P, D), map (D,
-        L).
+    def tangent(
+        self, fit: Fit, searched: Sequence[tuple[int, str]], series: int, centred: bool = True
+    ) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Return the design with ∂(prediction)/∂(non-linear) beside it: trajectories (E, R),
+        directions (P, R) and places (R,) among the coefficients (K) and searched parameters (L).
         """
-        trajectories: list[Array] = []
-        directions: list[Array] = []
-        owner: list[int] = []
-        for position, (i, name) in enumerate(searched):
+        C, V, index = self.design(fit.terms, fit.blocks, series, centred)
+        trajectories, directions, places = [C], [V], [index]
+        for place, (i, name) in enumerate(searched, len(fit.coefficients)):
             value = dict(fit.terms[i].nonlinear)[name]
             step = fit.terms[i].kind.nonlinear[name].difference_step(value)
             sides = []
@@ -360,17 +355,11 @@ class HypothesisFitter:
                 terms[i] = terms[i].with_value(name, value + sign * step)
                 sides.append(self.design(terms, fit.blocks, series, centred)[0])
             slope = (sides[0] - sides[1]) / (2 * step)
-            _, V, index = fit.designs[series]
-            for k in np.flatnonzero(np.abs(slope).max(axis=0) > 0):
-                trajectories.append(slope[:, k])
-                directions.append(V[:, k] * fit.coefficients[index[k]])
-                owner.append(position)
-        if not trajectories:
-            E, P = fit.designs[series][0].shape[0], len(COLUMNS)
-            return np.zeros((E, 0)), np.zeros((P, 0)), np.zeros((0, len(searched)))
-        mapping = np.zeros((len(owner), len(searched)))
-        mapping[np.arange(len(owner)), owner] = 1.0
-        return np.stack(trajectories, axis=1), np.stack(directions, axis=1), mapping
+            moved = np.flatnonzero(np.abs(slope).max(axis=0) > 0)
+            trajectories.append(slope[:, moved])
+            directions.append(V[:, moved] * fit.coefficients[index[moved]])
+            places.append(np.full(len(moved), place))
+        return np.hstack(trajectories), np.hstack(directions), np.concatenate(places)
 
     def normal_equations(
         self, fit: Fit, only: Sequence[int] | None = None
@@ -380,16 +369,11 @@ class HypothesisFitter:
         K, L = len(fit.coefficients), len(searched)
         A, g = np.zeros((K + L, K + L)), np.zeros(K + L)
         for s in range(len(self.series)) if only is None else only:
-            C, V, index = fit.designs[s]
-            dC, dV, mapping = self.derivatives(fit, searched, s)
-            joint = fit.weightings[s].reduce(np.hstack([C, dC]), np.hstack([V, dV]))
-            T = np.zeros((C.shape[1] + dC.shape[1], K + L))
-            T[np.arange(C.shape[1]), index] = 1.0
-            T[C.shape[1] :, K:] = mapping
-            at = np.zeros(T.shape[0])
-            at[: C.shape[1]] = fit.coefficients[index]
-            A += T.T @ joint.A @ T
-            g += T.T @ (joint.c - joint.A @ at)
+            X, V, places = self.tangent(fit, searched, s)
+            own, right, _ = fit.weightings[s].reduce(X, V)
+            T = np.eye(K + L)[places]
+            A += T.T @ own @ T
+            g += T.T @ (right - own @ np.append(fit.coefficients, np.zeros(L))[places])
         for row, (left, information) in enumerate(self.prior_terms(fit), K):
             A[row, row] += information
             g[row] += information * left

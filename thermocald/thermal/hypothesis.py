@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.physics.effect import Effect, Parameter
-    from thermocald.thermal.likelihood import NormalEquations, Weighting
+    from thermocald.thermal.likelihood import Weighting
 
 
 BASE = ("c", "x0", "y0")
@@ -108,8 +108,8 @@ class Fit:
     """A fitted hypothesis.
 
     coefficients (K,) px-scaled; covariance (K + L, K + L) of coefficients and the L shared
-    non-linear parameters `searched` [(term, name)]; chi2, logdet: sums over series; parts: normal
-    equations per series; objective: -2 log L but for a constant.
+    non-linear parameters `searched` [(term, name)]; chi2, logdet: sums over series; reduced: A, c,
+    yy per series after its levels; objective: -2 log L but for a constant.
     """
 
     terms: tuple[Term, ...]
@@ -120,7 +120,7 @@ class Fit:
     logdet: float
     weightings: tuple[Weighting, ...]
     designs: tuple[tuple[Array, Array, NDArray[np.int64]], ...]
-    reduced: tuple[NormalEquations, ...]
+    reduced: tuple[tuple[Array, Array, float], ...]
     searched: tuple[tuple[int, str], ...] = field(default=())
 
     @property
@@ -145,9 +145,9 @@ class Fit:
         size = len(self.coefficients)
         A, c = np.zeros((size, size)), np.zeros(size)
         for s in range(len(self.designs)) if series is None else series:
-            index = self.designs[s][2]
-            A[np.ix_(index, index)] += self.reduced[s].A
-            c[index] += self.reduced[s].c
+            index, (own, right, _) = self.designs[s][2], self.reduced[s]
+            A[np.ix_(index, index)] += own
+            c[index] += right
         return A, c
 
     def forget(self) -> None:
@@ -158,9 +158,8 @@ class Fit:
     def chi2_of(self, series: int, coefficients: Array | None = None) -> float:
         """Return χ² of one series at some coefficients (default: the fitted)."""
         x = self.coefficients if coefficients is None else coefficients
-        _, _, index = self.designs[series]
-        r, part = self.reduced[series], x[index]
-        return float(r.yy - 2 * part @ r.c + part @ r.A @ part)
+        part, (A, c, yy) = x[self.designs[series][2]], self.reduced[series]
+        return float(yy - 2 * part @ c + part @ A @ part)
 
 
 def make_known_term(name: str, values: Mapping[str, Any], series: int) -> Term:

@@ -32,8 +32,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.thermal.random_effects import Couplings, Movement
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -43,15 +41,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """The sums of a series before anything is integrated out, those of random effects included."""
+    """The sums of a series before anything is integrated out, those of its hidden targets included.
 
-    N: Array  # (E, P, P)
-    b: Array  # (E, P)
+    N (E, P, P), b (E, P), yy: of the epochs' parameters; cross (S, E, P), normal (S, S), right
+    (S,): of the offsets of hidden targets.
+    """
+
+    N: Array
+    b: Array
     yy: float
     logdet: float
-    cross: Couplings
-    normal: Array  # (F, F)
-    right: Array  # (F,)
+    cross: Array
+    normal: Array
+    right: Array
 
     def blurred(self, D: Array, epochs: NDArray[np.int64]) -> Sums:
         """Let some epochs (n,) shift at random with unit variance along D (n, P, t): Woodbury."""
@@ -61,64 +63,36 @@ class Sums:
         L = np.linalg.cholesky(np.eye(D.shape[2]) + DtN @ D)
         own = np.linalg.solve(L, DtN)  # (n, t, P)
         data = np.linalg.solve(L, Dt @ b[..., None])  # (n, t, 1)
-        cross, coupled = self.cross.blurred(np.linalg.solve(L, Dt), own, epochs)
-        whole, right = self.N.copy(), self.b.copy()
+        coupled = np.linalg.solve(L, Dt) @ np.moveaxis(self.cross[:, epochs], 0, 2)  # (n, t, S)
+        whole, right, cross = self.N.copy(), self.b.copy(), self.cross.copy()
         whole[epochs] -= np.swapaxes(own, 1, 2) @ own
         right[epochs] -= np.sum(own * data, axis=1)
-        wide = coupled.reshape(data.size, len(self.cross))
-        return replace(
-            self,
-            N=whole,
-            b=right,
-            yy=self.yy - float(np.sum(data**2)),
-            logdet=self.logdet + 2 * float(np.sum(np.log(np.einsum("eii->ei", L)))),
-            cross=cross,
-            normal=self.normal - wide.T @ wide,
-            right=self.right - wide.T @ data.ravel(),
-        )
-
-    def shifted(self, shift: Array) -> Sums:
-        """Take shifts (E, P) of the parameters off the data."""
-        moved = np.einsum("epq,eq->ep", self.N, shift)
-        yy = self.yy - 2 * float(np.sum(shift * self.b)) + float(np.sum(shift * moved))
-        right = self.right - self.cross.onto(shift[..., None])[:, 0]
-        return Sums(self.N, self.b - moved, yy, self.logdet, self.cross, self.normal, right)
-
-    def alongside(self, movement: Movement | None) -> Sums:
-        """Add a movement as random effects before the others."""
-        if movement is None:
-            return self
-        own = movement.own(self.N) + np.eye(len(movement))
-        between = movement.onto(self.cross.others)
-        return replace(
-            self,
-            cross=Couplings(
-                movement.directions.T @ self.N,
-                movement.operator,
-                movement.spans,
-                self.cross.others,
-            ),
-            normal=np.block([[own, between.T], [between, self.normal]]),
-            right=np.concatenate([movement.onto(self.b[None])[0], self.right]),
+        cross[:, epochs] -= np.moveaxis(np.swapaxes(coupled, 1, 2) @ own, 1, 0)
+        wide = coupled.reshape(data.size, len(cross))
+        return Sums(
+            whole,
+            right,
+            self.yy - float(np.sum(data**2)),
+            self.logdet + 2 * float(np.sum(np.log(np.einsum("eii->ei", L)))),
+            cross,
+            self.normal - wide.T @ wide,
+            self.right - wide.T @ data.ravel(),
         )
 
 
 @lru_cache(maxsize=4)
 def sum_series(evidence: ReducedSeries) -> Sums:
-    """Sum a series with what moves: first the movement, then hidden targets; and what trembles from
-    epoch to epoch.
-    """
+    """Sum a series with its hidden targets, and with what trembles from epoch to epoch."""
     hidden = evidence.hidden
     E, P = evidence.b.shape
     cross, normal, right = np.zeros((0, E, P)), np.zeros((0, 0)), np.zeros(0)
     if hidden is not None:
         cross, normal, right = hidden.cross, np.diag(hidden.normal), hidden.right.sum(axis=1)
-    still = Couplings(np.zeros((E, 0, P)), np.zeros((E, 0)), (), cross)
-    sums = Sums(evidence.N, evidence.b, float(evidence.yy.sum()), 0.0, still, normal, right)
-    if evidence.tremble is not None:
-        D = np.broadcast_to(evidence.tremble, (E, *evidence.tremble.shape))
-        sums = sums.blurred(D, np.arange(E))
-    return sums.alongside(evidence.movement)
+    sums = Sums(evidence.N, evidence.b, float(evidence.yy.sum()), 0.0, cross, normal, right)
+    if evidence.tremble is None:
+        return sums
+    D = np.broadcast_to(evidence.tremble, (E, *evidence.tremble.shape))
+    return sums.blurred(D, np.arange(E))
 
 
 _MANY = 0.15  # trajectories per epoch above which epochs are whitened, for all that follow
@@ -128,19 +102,20 @@ _MANY = 0.15  # trajectories per epoch above which epochs are whitened, for all 
 class Weighting:
     """One series with a fixed covariance S: inner products of hypotheses under S⁻¹.
 
-    b (E, P), yy: data with the readings' own deviations put in; logdet: log |C| + log |M|. effects:
-    couplings of the F random effects with the epochs' parameters; they are the first F states, of
-    which the mount's movement has the first `moving`; those of the readings follow.
+    b (E, P), yy: data with the readings' own deviations put in; logdet: log |C| + log |M|. The
+    states are the S offsets of hidden targets, the amplitudes of the mount's movement (`moving`),
+    and the errors of the readings.
     """
 
     N: Array
     b: Array
     yy: float
     logdet: float
-    # of each reading error: operator (E, states), places of its states, d (P,), dᵀN_e (E, P)
+    cross: Array  # couplings (S, E, P) of the offsets of hidden targets
+    # of each direction of the movement and each reading error: operator (E, states), places of its
+    # states, d (P,), dᵀN_e (E, P)
     errors: tuple[tuple[Array, slice, Array, Array], ...]
-    moving: int
-    effects: Couplings
+    moving: slice
     factor: Array  # L (states, states), lower
     data: Array  # L⁻¹ Jᵀ b (R,)
     level: Array  # L⁻¹ Jᵀ constants (R, P)
@@ -159,8 +134,9 @@ class Weighting:
         total = np.zeros((len(self.factor), trajectories.shape[1]))
         for operator, at, _, dN in self.errors:
             total[at] += operator.T @ ((dN @ directions) * trajectories)
-        if len(self.effects):
-            total[: len(self.effects)] = self.effects.driven(trajectories, directions)
+        if len(self.cross):
+            shifts = trajectories[:, None, :] * directions
+            total[: len(self.cross)] = np.tensordot(self.cross, shifts, axes=([1, 2], [0, 1]))
         return whiten(self.factor, total)
 
     def carried_stack(self, s: Array, directions: Array) -> Array:
@@ -179,8 +155,7 @@ class Weighting:
             total = np.zeros((len(self.factor), len(self.N)))
             for operator, at, _, dN in self.errors:
                 total[at] += (operator * (dN @ direction)[:, None]).T
-            if len(self.effects):
-                total[: len(self.effects)] = self.effects.along(direction)
+            total[: len(self.cross)] = self.cross @ direction
             self.kept[key] = whiten(self.factor, total)
         return self.kept[key]
 
@@ -191,10 +166,10 @@ class Weighting:
         from scipy.linalg import cho_solve
 
         b: Array = self.N @ parameters
-        right, few = np.zeros((len(self.factor), b.shape[2])), len(self.effects)
+        right, few = np.zeros((len(self.factor), b.shape[2])), len(self.cross)
         for operator, at, d, _ in self.errors:
             right[at] += operator.T @ (d @ b)
-        right[:few] = self.effects.onto(parameters)
+        right[:few] = np.tensordot(self.cross, parameters, axes=([1, 2], [0, 1]))
         carried = whiten(self.factor, right)
         level_b = b.sum(axis=0) - self.level.T @ carried
         level = cho_solve((self.level_factor, True), level_b)
@@ -202,7 +177,7 @@ class Weighting:
         states = whiten(self.factor, carried - self.level @ level, transposed=True)
         for operator, at, _, dN in self.errors:
             b -= dN[:, :, None] * (operator @ states[at])[:, None, :]
-        return b - self.effects.images(states[:few])
+        return b - np.tensordot(self.cross, states[:few], axes=(0, 0))
 
     def joint(self, trajectories: Array, directions: Array) -> tuple[Array, Array, Array]:
         """Return normal equations alongside the levels: A (R, R), c (R,), K (P, R).
@@ -218,12 +193,14 @@ class Weighting:
         U = self.carried(trajectories, directions)
         return A - U.T @ U, c - U.T @ self.data, K - self.level.T @ U
 
-    def reduce(self, trajectories: Array, directions: Array) -> NormalEquations:
-        """Return normal equations after the levels: trajectories (E, R), directions (P, R)."""
+    def reduce(self, trajectories: Array, directions: Array) -> tuple[Array, Array, float]:
+        """Return normal equations after the levels, A (R, R), c (R,), yy, of trajectories (E, R),
+        directions (P, R).
+        """
         A, c, K = self.joint(trajectories, directions)
         Q = whiten(self.level_factor, np.column_stack([K, self.level_b]))
         Q, q = Q[:, :-1], Q[:, -1]
-        return NormalEquations(A - Q.T @ Q, c - Q.T @ q, self.yy - float(q @ q), self.logdet)
+        return A - Q.T @ Q, c - Q.T @ q, self.yy - float(q @ q)
 
     def scan(
         self, trajectories: Array, directions: Array, base: tuple[Array, Array]
@@ -263,16 +240,6 @@ class Weighting:
         c = c - (Q[:, :n].T @ Q[:, -1]).reshape(G, m * k)
         B = B - (Q[:, :n].T @ Q[:, n:-1]).reshape(G, m * k, R)
         return A, c, B
-
-
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """Normal equations after the levels: A (R, R), c (R,), yy, logdet."""
-
-    A: Array
-    c: Array
-    yy: float
-    logdet: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,12 +284,19 @@ def prepare(
         if c.unresolved is not None and c.unresolved.any():
             bent = np.flatnonzero(c.unresolved)
             sums = sums.blurred(c.unresolved[bent, None, None] * c.direction[:, None], bent)
-    own = _factorise_own(evidence) if sums is sum_series(evidence) else _factorise(sums)
+    E, P = sums.b.shape
+    S = start = len(sums.right)
+    errors = []
+    movement = evidence.movement
+    if movement is not None:
+        for direction, operator in movement.operators:
+            at = slice(start, start + operator.shape[1])
+            errors.append((operator, at, direction, sums.N @ direction))
+            start = at.stop
+    moving = slice(S, start)
     touched = _find_touched(sums.N, carried)
-    P, fixed = sums.N.shape[1], len(sums.right)
     places: dict[str, slice] = {}
-    sds, deviations = [np.zeros(0)], {}
-    start = fixed
+    sds, deviations = [np.ones(start - S)], {}
     for name in dict.fromkeys(c.channel for c in carried):
         sd = evidence.state_sd(name)[touched[name]] * thermometer_factor
         places[name] = slice(start, start + len(sd))
@@ -331,46 +305,40 @@ def prepare(
         start += len(sd)
     whole = np.concatenate(sds)
     # the readings' own deviation from the smooth trajectory, carried to the camera
-    shift = np.zeros((len(sums.N), P))
-    errors = []
+    shift = np.zeros((E, P))
     for item in carried:
         operator = item.operator[:, touched[item.channel]]
         shift += np.outer(operator @ deviations[item.channel], item.direction)
         dN = sums.N @ item.direction
         errors.append((operator, places[item.channel], item.direction, dN))
-    sums = sums.shifted(shift)
-    factor = np.zeros((start, start))
-    factor[:fixed, :fixed] = own
-    logdet = sums.logdet + 2 * float(np.sum(np.log(np.diag(own))))
-    if errors:
-        M, beside = np.diag(1.0 / whole**2), np.zeros((fixed, start - fixed))
-        inner = [(o, slice(at.start - fixed, at.stop - fixed), d, w) for o, at, d, w in errors]
-        _add_products(M, inner)
-        for operator, here, d, _ in inner:
-            beside[:, here] += sums.cross.along(d) @ operator
-        low = whiten(own, beside)
-        M -= low.T @ low
-        factor[fixed:, :fixed] = low.T
-        last = cholesky(M.T, lower=True, overwrite_a=True, check_finite=False)
-        factor[fixed:, fixed:] = last
-        logdet += 2 * float(np.sum(np.log(np.diag(last) * whole)))
+    moved = np.einsum("epq,eq->ep", sums.N, shift)
+    yy = sums.yy - 2 * float(np.sum(shift * sums.b)) + float(np.sum(shift * moved))
+    b = sums.b - moved
+    M = np.zeros((start, start))  # its upper half
+    M[:S, :S] = sums.normal
+    M[S:, S:] = np.diag(1.0 / whole**2)
+    _add_products(M, errors)
     right = np.zeros((start, P + 1))
+    right[:S, :P] = sums.cross.sum(axis=1)
+    right[:S, P] = sums.right - np.tensordot(sums.cross, shift, axes=([1, 2], [0, 1]))
     for operator, at, d, dN in errors:
-        right[at] += operator.T @ np.column_stack([dN, sums.b @ d])
-    right[:fixed, :P] = sums.cross.total()
-    right[:fixed, P] = sums.right
+        M[:S, at] += (sums.cross @ d) @ operator
+        right[at] += operator.T @ np.column_stack([dN, b @ d])
+    factor = np.ascontiguousarray(cholesky(M.T, lower=True, overwrite_a=True, check_finite=False))
+    logdet = sums.logdet + 2 * float(
+        np.sum(np.log(np.diag(factor)[:S])) + np.sum(np.log(np.diag(factor)[S:] * whole))
+    )
     right = whiten(factor, right)
     level, data = right[:, :P], right[:, P]
     N0 = sums.N.sum(axis=0) - level.T @ level
     # levels that the field cannot tell apart are held by 1000 px, or as loosely as rounding allows
     held = 1e-6 + 1e-13 * float(np.trace(N0))
     level_factor = np.linalg.cholesky(N0 + held * np.eye(P))
-    moving = len(evidence.movement) if evidence.movement is not None else 0
-    if moving:  # the movement's size is estimated: the levels' share counts (restricted)
+    if movement is not None:  # its size is estimated: the levels' share counts (restricted)
         logdet += 2 * float(np.sum(np.log(np.diag(level_factor))))
     return Weighting(
-        sums.N, sums.b, sums.yy - float(data @ data), logdet, tuple(errors), moving, sums.cross,
-        factor, data, level, N0, sums.b.sum(axis=0) - level.T @ data, level_factor,
+        sums.N, b, yy - float(data @ data), logdet, sums.cross, tuple(errors), moving, factor,
+        data, level, N0, b.sum(axis=0) - level.T @ data, level_factor,
     )  # fmt: skip
 
 
@@ -404,7 +372,7 @@ def _find_touched(
 
 
 def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> None:
-    """Add JᵀN J of the readings' errors to the upper half of M.
+    """Add JᵀN J of movement and readings' errors to the upper half of M.
 
     Operators on the same states are combined by the root of what they weigh together, epoch by
     epoch: a product of a matrix with itself takes half the work.
@@ -419,34 +387,10 @@ def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> 
         root = turn * np.sqrt(np.maximum(size, 0.0))[:, None, :]
         here = group[0][1]
         for r in range(len(group)):
-            half = _combine([operator for operator, *_ in group], root[:, :, r])
+            half = root[:, :1, r] * group[0][0]
+            for k, (operator, *_) in enumerate(group[1:], 1):
+                half += root[:, k, r, None] * operator
             M[here, here] += half.T @ half
-        for others in own[g + 1 :]:
-            for operator, _, _, dN in group:
-                shares = np.stack([dN @ d for _, _, d, _ in others], axis=1)
-                far = _combine([o for o, *_ in others], shares)
-                M[here, others[0][1]] += operator.T @ far
-
-
-def _combine(operators: list[Array], shares: Array) -> Array:
-    """Sum operators (E, R) with shares (E, k) at each epoch."""
-    out = shares[:, :1] * operators[0]
-    for k, operator in enumerate(operators[1:], 1):
-        out += shares[:, k, None] * operator
-    return out
-
-
-@lru_cache(maxsize=4)
-def _factorise_own(evidence: ReducedSeries) -> Array:
-    """Factorise the normal matrix of the random effects, which no hypothesis changes."""
-    return _factorise(sum_series(evidence))
-
-
-def _factorise(sums: Sums) -> Array:
-    """Return the Cholesky factor (F, F) of the normal matrix of the random effects."""
-    from scipy.linalg import cholesky
-
-    if not len(sums.right):
-        return sums.normal
-    factor: Array = cholesky(sums.normal, lower=True, check_finite=False)
-    return factor
+        for operator, _, _, dN in group:
+            for far, there, d, _ in (error for others in own[g + 1 :] for error in others):
+                M[here, there] += (operator * (dN @ d)[:, None]).T @ far

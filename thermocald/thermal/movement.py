@@ -220,7 +220,7 @@ def _estimate_amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
         level = whiten(F, whiten(F, w.level_b - K @ x), transposed=True)
         data = w.data - U @ x - w.level @ level
         Q = whiten(F, w.level.T).T
-        inverse = whiten(w.factor, np.eye(len(w.factor), w.moving))
+        inverse = whiten(w.factor, np.eye(len(w.factor))[:, w.moving])
         by_level = Q.T @ inverse
         size, turn = np.linalg.eigh(known[np.ix_(index, index)])
         by_x = (turn * np.sqrt(np.maximum(size, 0.0))).T @ (U - Q @ B).T @ inverse

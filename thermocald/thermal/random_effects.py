@@ -6,11 +6,6 @@ one, in the well-determined combinations of the camera's parameters.
 
 Source: Patterson, Thompson (1971), Biometrika 58, 545-554 (variance components); Rasmussen,
 Williams (2006), Gaussian Processes for Machine Learning, section 2.7.
-
-How random effects are coupled with the epochs' parameters in the normal equations.
-
-The movement of the mount has hundreds of amplitudes, but few directions, each with its cosines: its
-couplings are kept as products of the two, never written out over epochs and parameters.
 """
 
 from __future__ import annotations
@@ -136,40 +131,17 @@ class Movement:
         mode, wave = np.nonzero(seen)
         return mode, wave
 
-    def __len__(self) -> int:
-        return len(self.states[0])
-
-    @cached_property
-    def operator(self) -> Array:
-        """Trajectories (E, F) of the amplitudes for unit variance."""
+    @property
+    def operators(self) -> list[tuple[Array, Array]]:
+        """Directions (P,) that count, and trajectories (E, ·) of their amplitudes for unit
+        variance.
+        """
         mode, wave = self.states
-        out: Array = self.trajectories[:, wave] * self.sd[mode, wave]
-        return out
-
-    @cached_property
-    def spans(self) -> tuple[slice, ...]:
-        """Where the amplitudes of each direction that count are."""
-        stops = np.cumsum(np.bincount(self.states[0], minlength=len(self.sd))).tolist()
-        return tuple(slice(a, b) for a, b in zip([0, *stops], stops, strict=False))
-
-    def own(self, N: Array) -> Array:
-        """Sum (F, F) products of the amplitudes' shifts under normal matrices N (E, P, P)."""
-        between = self.directions.T @ N @ self.directions
-        out = np.zeros((len(self), len(self)))
-        for i, here in enumerate(self.spans):
-            for j, there in enumerate(self.spans[i:], i):
-                out[here, there] = self.operator[:, here].T @ (
-                    between[:, i, j, None] * self.operator[:, there]
-                )
-                out[there, here] = out[here, there].T
-        return out
-
-    def onto(self, data: Array) -> Array:
-        """Sum (n, F) data or couplings (n, E, P) over what each amplitude moves."""
-        along = np.moveaxis(data @ self.directions, 2, 0)  # (m, n, E)
-        parts = [along[mode] @ self.operator[:, span] for mode, span in enumerate(self.spans)]
-        out: Array = np.concatenate(parts, axis=1)
-        return out
+        return [
+            (self.directions[:, i], self.trajectories[:, k] * self.sd[i, k])
+            for i in np.unique(mode)
+            for k in [wave[mode == i]]
+        ]
 
     def moments(self, mean: Array, root: Array) -> tuple[Array, Array]:
         """Sum products of amplitudes over the cosines, and their gain in precision, (m, m).
@@ -195,77 +167,3 @@ def waves(times: Array, count: int) -> Array:
     u = (u * (E - 1) + 0.5) / E
     out: Array = np.sqrt(2.0 / E) * np.cos(np.pi * np.arange(1, count + 1) * u[:, None])
     return out
-
-
-@dataclass(frozen=True, eq=False)
-class Couplings:
-    """Couplings of F amplitudes of a movement, and of S other random effects.
-
-    moved (E, m, P): normal matrices times each direction of the movement; operator (E, F):
-    trajectories of its amplitudes, direction after direction; spans: those of each direction;
-    others (S, E, P): written out.
-    """
-
-    moved: Array
-    operator: Array
-    spans: tuple[slice, ...]
-    others: Array
-
-    def __len__(self) -> int:
-        return int(self.operator.shape[1]) + len(self.others)
-
-    def blurred(
-        self, whitened: Array, own: Array, epochs: NDArray[np.int64]
-    ) -> tuple[Couplings, Array]:
-        """Let some epochs (n,) shift at random; also couplings (n, t, F + S) with those shifts.
-
-        whitened (n, t, P): their directions, independent; own: these times the normal matrices.
-        """
-        by_mode = whitened @ np.swapaxes(self.moved[epochs], 1, 2)  # (n, t, m)
-        by_other = whitened @ np.moveaxis(self.others[:, epochs], 0, 2)  # (n, t, S)
-        moved, others = self.moved.copy(), self.others.copy()
-        moved[epochs] -= np.swapaxes(by_mode, 1, 2) @ own
-        others[:, epochs] -= np.moveaxis(np.swapaxes(by_other, 1, 2) @ own, 1, 0)
-        coupled = np.repeat(by_mode, self._counts, axis=2) * self.operator[epochs, None, :]
-        out = Couplings(moved, self.operator, self.spans, others)
-        return out, np.concatenate([coupled, by_other], axis=2)
-
-    def along(self, direction: Array) -> Array:
-        """Return couplings (F + S, E) with a direction (P,) of the parameters."""
-        own: Array = (self.operator * np.repeat(self.moved @ direction, self._counts, axis=1)).T
-        return np.concatenate([own, self.others @ direction]) if len(self.others) else own
-
-    def onto(self, shifts: Array) -> Array:
-        """Sum (F + S, R) over all epochs' shifts (E, P, R) of the parameters."""
-        return np.concatenate([*self._amplitudes(self.moved @ shifts), self._others(shifts)])
-
-    def driven(self, trajectories: Array, directions: Array) -> Array:
-        """Sum (F + S, R) over shifts along directions (P, R) that go as trajectories (E, R)."""
-        shifts = trajectories[:, None, :] * directions
-        along = (self.moved @ directions) * trajectories[:, None, :]
-        return np.concatenate([*self._amplitudes(along), self._others(shifts)])
-
-    def images(self, amplitudes: Array) -> Array:
-        """Return what amplitudes (F + S, R) give in the epochs' right-hand sides, (E, P, R)."""
-        out: Array = np.tensordot(self.others, amplitudes[self.operator.shape[1] :], axes=(0, 0))
-        for m, span in enumerate(self.spans):
-            course = self.operator[:, span] @ amplitudes[span]
-            out += self.moved[:, m, :, None] * course[:, None, :]
-        return out
-
-    def total(self) -> Array:
-        """Return couplings (F + S, P) with the levels of the parameters."""
-        return np.concatenate([*self._amplitudes(self.moved), self.others.sum(axis=1)])
-
-    @property
-    def _counts(self) -> list[int]:
-        """How many amplitudes each direction has."""
-        return [span.stop - span.start for span in self.spans]
-
-    def _others(self, shifts: Array) -> Array:
-        out: Array = np.tensordot(self.others, shifts, axes=([1, 2], [0, 1]))
-        return out
-
-    def _amplitudes(self, along: Array) -> list[Array]:
-        """Sum (·, R) over what each direction's amplitudes move: along (E, m, R)."""
-        return [self.operator[:, span].T @ along[:, m] for m, span in enumerate(self.spans)]

@@ -180,12 +180,12 @@ def normals_beside(
             continue
         C, V, index = fit.designs[s]
         kept = np.array([not any(i in r for r in left_out) for i in index], dtype=bool)
-        joint = (weightings or fit.weightings)[s].reduce(
+        own, right, _ = (weightings or fit.weightings)[s].reduce(
             np.hstack([part[0], C[:, kept]]), np.hstack([part[1], V[:, kept]])
         )
         at = np.concatenate([part[2], size + index[kept]])
-        A[np.ix_(at, at)] += joint.A
-        c[at] += joint.c
+        A[np.ix_(at, at)] += own
+        c[at] += right
     return eliminate(A, c, size)
 
 

@@ -185,10 +185,10 @@ def _phase(
     """A cycle with the phase that fits best, its amplitude as it is."""
     fit, x = _known(fitter, model, listed)
     block = next(b for b in fit.blocks if b.term >= 0 and fit.terms[b.term].effect == name)
-    reduced, index = fit.reduced[0], fit.designs[0][2]
+    (whole, c, _), index = fit.reduced[0], fit.designs[0][2]
     inside = (index >= block.start) & (index < block.stop)
-    A = reduced.A[np.ix_(inside, inside)]
-    right = reduced.c[inside] - reduced.A[np.ix_(inside, ~inside)] @ x[index[~inside]]
+    A = whole[np.ix_(inside, inside)]
+    right = c[inside] - whole[np.ix_(inside, ~inside)] @ x[index[~inside]]
     pair = x[block.start : block.stop].reshape(2, -1)
     key = next(k for k in listed[name].values if k in catalogue.get(name).fresh)
     phase = float(listed[name].values[key])

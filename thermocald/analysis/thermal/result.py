@@ -120,14 +120,9 @@ def _power(a: Adequacy) -> Array:
 
 def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power: Array) -> Array:
     """Return what the rest of one series may have done to the fit's unknowns (K + L, K + L)."""
-    C, V, index = fit.designs[series]
-    dC, dV, mapping = fitter.derivatives(fit, list(fit.searched), series)
-    base = (np.hstack([C, dC]), np.hstack([V, dV]))
-    _, _, B = fit.weightings[series].scan(a.trajectories[:, :, None], a.directions, base)
-    size, K = len(fit.covariance), len(fit.coefficients)
-    T = np.zeros((B.shape[2], size))
-    T[np.arange(C.shape[1]), index] = 1.0
-    T[C.shape[1] :, K:] = mapping
+    X, V, places = fitter.tangent(fit, fit.searched, series)
+    _, _, B = fit.weightings[series].scan(a.trajectories[:, :, None], a.directions, (X, V))
+    T = np.eye(len(fit.covariance))[places]
     lever = fit.covariance @ np.einsum("jdr,rk->jkd", B, T)
     total: Array = np.einsum("jkd,jde,jle->kl", lever, power, lever)
     return total
@@ -366,14 +361,11 @@ def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
     n, K, size = len(_INTERIOR), len(fit.coefficients), len(fit.covariance)
     M = np.zeros((n + size + 6 * len(fitter.series),) * 2)
     for s in range(len(fitter.series)):
-        C, V = fitter.design(fit.terms, fit.blocks, s, centred=False)[:2]
-        index = fit.designs[s][2]
-        dC, dV, mapping = fitter.derivatives(fit, list(fit.searched), s, centred=False)
-        A, _, coupling = fit.weightings[s].joint(np.hstack([C, dC]), np.hstack([V, dV]))
+        X, V, places = fitter.tangent(fit, fit.searched, s, centred=False)
+        A, _, coupling = fit.weightings[s].joint(X, V)
         R, P = len(A), len(coupling)
         T = np.zeros((R + P, len(M)))
-        T[np.arange(C.shape[1]), n + index] = 1.0
-        T[C.shape[1] : R, n + K : n + size] = mapping
+        T[np.arange(R), n + places] = 1.0
         T[R + np.array(_INTERIOR), np.arange(n)] = 1.0
         T[R + np.array(_EXTERIOR), n + size + 6 * s + np.arange(6)] = 1.0
         own = np.block([[A, coupling.T], [coupling, fit.weightings[s].level_normal]])

@@ -55,8 +55,8 @@ CASES = {
     "square(change(board))": ({}, (B - B[0]) ** 2),
     "minimum(temperature)": ({}, np.minimum.accumulate(T)),
     "cube(offset(temperature, a))": ({"a": 25.0}, (T - 25.0) ** 3),
-    "square(wave(temperature, P, phi))": (
-        {"P": 7.0, "phi": 0.4}, np.sin(2 * np.pi * T / 7.0 + 0.4) ** 2),
+    "square(wave(temperature, P, phase))": (
+        {"P": 7.0, "phase": 0.4}, np.sin(2 * np.pi * T / 7.0 + 0.4) ** 2),
     "exponential(temperature, w)": ({"w": 9.0}, np.exp(T / 9.0)),
     'product(column("humidity"), temperature)': ({}, (50.0 + SECONDS / 100.0) * T),
     "play(temperature, r)": ({"r": 1.5}, None),
@@ -131,6 +131,7 @@ def test_text_and_tree_are_the_same():
         ("lag(temperature)", "takes 2 arguments, not 1"),
         ("lag(temperature, [1])", "neither a number nor a name"),
         ("product(above(temperature, k), above(board, k))", "a name of its own"),
+        ("square(wave(temperature, P, phi))", "phi is a parameter of the camera"),
         ("square(" * 20 + "temperature" + ")" * 20, "more than 8 operators"),
         ("square(" * 200, "at most 300 characters"),
         ("lag(", "cannot be read"),

@@ -238,6 +238,11 @@ def parse(text: str) -> Node:
     names = [name for name, _, _ in node.free()]
     if len(set(names)) < len(names):
         raise ConfigurationError(f"formula {text!r}: each constant needs a name of its own")
+    if taken := sorted(set(names) & set(PARAMETER_UNITS)):
+        raise ConfigurationError(
+            f"formula {text!r}: {taken[0]} is a parameter of the camera; "
+            "give the constant another name"
+        )
     return node
 
 

@@ -15,7 +15,7 @@ memory take a polygon of values and give it back at any times:
     magnitude(x)          |x|
     saturation(x, k, w)   tanh((x - k) / w); a switch where w is small
     exponential(x, w)     exp(x / w)
-    wave(x, P, phi)       sin(2π x / P + phi)
+    wave(x, P, phase)     sin(2π x / P + phase)
     product(x, y)         x y
     rate(x)               dx/dt, per s
     integral(x)           ∫ x dt from the first frame, s
@@ -444,9 +444,9 @@ OPERATORS: dict[str, Operator] = {
         lambda x, w: (np.exp(np.clip(x / w, -300.0, 300.0)) / w,), powers=0,
     ),
     "wave": Operator(
-        1, (Constant("P", "scale", True), Constant("phi", "phase", False, same_unit=False)),
-        "sin(2π · {0} / {1} + {2})", lambda x, P, phi: np.sin(2 * np.pi * x / P + phi),
-        lambda x, P, phi: (2 * np.pi / P * np.cos(2 * np.pi * x / P + phi),), powers=0,
+        1, (Constant("P", "scale", True), Constant("phase", "phase", False, same_unit=False)),
+        "sin(2π · {0} / {1} + {2})", lambda x, P, phase: np.sin(2 * np.pi * x / P + phase),
+        lambda x, P, phase: (2 * np.pi / P * np.cos(2 * np.pi * x / P + phase),), powers=0,
     ),
     "product": Operator(2, (), "{0} · {1}", lambda x, y: np.asarray(x * y),
                         lambda x, y: (y, x)),

@@ -146,27 +146,6 @@ class FleetCamera:
         return None if self.state is None else self.state.version
 
 
-class _Series(NamedTuple):
-    """A series, and what the summary says of it: first and last epoch (s UTC), how many epochs,
-    results, and slots with a sample.
-    """
-
-    key: Any
-    station: str
-    camera: str
-    name: str
-    head: str
-    identity: str
-    first: float
-    last: float
-    epochs: int
-    results: int
-    last_ok: float | None
-    low: float | None
-    high: float | None
-    sampled: int
-
-
 class FleetReader(Connected):
     """A server that is asked about all cameras which its address selects."""
 
@@ -188,21 +167,29 @@ class FleetReader(Connected):
 
     def cameras(self, now: float, path: Path) -> list[FleetCamera]:
         """All cameras by station and name; path: of the server, for messages."""
+        from psycopg.rows import namedtuple_row
+
         wanted = self.address
         # an epoch from the future is of a wrong clock: it must not hide those of today
         sane = (_FIRST, now + _DAY_S)
-        rows = self._query(
-            "SELECT s.key, station, camera, name, head, identity, min(first), max(last), "
-            "sum(epochs)::bigint, sum(ok)::bigint, max(last_ok), min(low), max(high), "
-            "count(sample) FROM series s JOIN summary ON series = s.key "
+        # first, last: s UTC, of a series' epochs; sampled: how many of its slots have a sample
+        statement = (
+            "SELECT s.key, station, camera, name, head, identity, min(first) AS first, "
+            "max(last) AS last, sum(epochs)::bigint AS epochs, sum(ok)::bigint AS results, "
+            "max(last_ok) AS last_ok, min(low) AS low, max(high) AS high, "
+            "count(sample) AS sampled FROM series s JOIN summary ON series = s.key "
             f"WHERE {_SLOTS} AND station = coalesce(%s, station) "
             "AND camera = coalesce(%s, camera) AND name = coalesce(%s, name) "
-            "GROUP BY s.key ORDER BY station, camera, max(last)",
-            (*sane, wanted.station, wanted.camera, wanted.series),
+            "GROUP BY s.key ORDER BY station, camera, max(last)"
         )
-        series = [_Series(*row) for row in rows]
+        values = (*sane, wanted.station, wanted.camera, wanted.series)
+        with (
+            self._transaction("it cannot be read") as connection,
+            connection.cursor(row_factory=namedtuple_row) as cursor,
+        ):
+            series: list[Any] = cursor.execute(statement, values).fetchall()
         heads = {one.key: parse_head(json.loads(one.head), path) for one in series}
-        owned: list[tuple[FleetCamera, list[_Series]]] = []
+        owned: list[tuple[FleetCamera, list[Any]]] = []
         for _, found in groupby(series, key=lambda one: (one.station, one.camera)):
             every = list(found)
             newest = every[-1]
@@ -255,7 +242,7 @@ class FleetReader(Connected):
 
     def _read_samples(
         self,
-        owned: Sequence[tuple[FleetCamera, list[_Series]]],
+        owned: Sequence[tuple[FleetCamera, list[Any]]],
         heads: Mapping[Any, Head],
         sane: tuple[float, float],
     ) -> None:

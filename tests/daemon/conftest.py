@@ -250,8 +250,8 @@ def replayed():
 
 @pytest.fixture
 def measured(recording, replayed):
-    """Devices that give measurements five times a second: where no picture matters."""
-    return replayed(recording, 0.2)
+    """Devices that give measurements ten times a second: where no picture matters."""
+    return replayed(recording, 0.1)
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ script; {"ended": id} prints the exit status of a child that has ended.
 
 from __future__ import annotations
 
+import atexit
 import faulthandler
 import json
 import os
@@ -14,8 +15,11 @@ import select
 import signal
 import subprocess
 import sys
+import threading
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NoReturn
 
 
 class Forker:
@@ -90,14 +94,33 @@ class Forked:
         self.send_signal(signal.SIGKILL)
 
 
+def _work(script: str) -> NoReturn:
+    """Run a script or the command line, and end without taking all modules to pieces."""
+    status = 0
+    try:
+        exec(script or "import thermocald.cli; thermocald.cli.main()", {})
+    except SystemExit as ended:
+        status = int(ended.code or 0)
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    threading._shutdown()  # waits for threads as the interpreter's own end does
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        if not stream.closed:
+            stream.flush()
+    os._exit(status)
+
+
 def main() -> None:
     import thermocald_drivers.jsonl
     import thermocald_drivers.mock
     import thermocald_drivers.replay  # noqa: F401
 
     import thermocald.analysis.online.observer
-    import thermocald.cli
-    import thermocald.daemon.service
+    import thermocald.analysis.online.running_series
+    import thermocald.cli.run
+    import thermocald.daemon.service  # noqa: F401
 
     print("ready", flush=True)
     for line in sys.stdin:
@@ -116,11 +139,7 @@ def main() -> None:
             os.dup2(log, 1)
             os.dup2(log, 2)
             faulthandler.enable()  # what ends a process without a word leaves its stack
-            if asked["script"]:
-                exec(asked["script"], {})
-            else:
-                thermocald.cli.main()
-            os._exit(0)
+            _work(asked["script"])
         print(pid, flush=True)
 
 

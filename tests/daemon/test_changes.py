@@ -10,7 +10,6 @@ import pytest
 
 from tests.daemon.conftest import fast_run, make_recording, replayed_camera
 from thermocald.analysis.series.recorded import table_of_stored
-from thermocald.names import channel_fault
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.physics.testfields import demonstration_field, demonstration_model
@@ -114,16 +113,9 @@ def test_every_epoch_has_its_own_result_before_and_after_a_knock(store):
     assert moved == pytest.approx(2.0, abs=4 * np.hypot(*columns["sd_X0"][[WHEN - 2, -1]]))
 
 
-@pytest.mark.parametrize("epochs", [24, pytest.param(600, marks=pytest.mark.slow)])
-def test_the_mock_at_half_a_second_tells_nothing_and_every_column_is_ours(daemon, devices, epochs):
-    """No knock that nobody put in; and no name of a column can be a channel's, which loses it."""
-    daemon.run("--epochs", str(epochs), **devices(period_s=0.5))
+@pytest.mark.slow  # on a virtual clock in test_virtual_clock
+def test_the_mock_at_half_a_second_tells_nothing(daemon, devices):
+    daemon.run("--epochs", "600", **devices(period_s=0.5))
     assert daemon.wait(560.0) == 0
     assert daemon.events() == ["started", "series_begun", "stopped"]
-    with Store.open(daemon.store) as store:
-        kept = list(store.epochs(store.find_series()))
-    assert len(kept) == epochs
-    columns = set().union(*(epoch.extra for epoch in kept))
-    assert {"series_c", "level_sd_c", "series_epochs", "skew_s"} < columns
-    ours = {name for name in columns if not name.startswith("camera_")}  # those give way
-    assert not [name for name in ours if not channel_fault(name)]
+    assert len(daemon.stored()[0]) == 600

@@ -46,7 +46,7 @@ def clocked(daemon, devices, preloaded, tmp_path):
     def start(seconds):
         set_clock(seconds)
         daemon.start(CLOCK_OFFSET_FILE=str(tmp_path / "offset"))
-        daemon.more(5)
+        daemon.more(2)
 
     start.set = set_clock
     return start
@@ -58,7 +58,7 @@ def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, clocked, tmp_path):
     for seconds, steps in ((120 * DAY, 1), (0, 2), (-HOUR, 3), (0, 4)):
         clocked.set(seconds)
         daemon.until(lambda n=steps: daemon.log().count("the clock was set") == n)
-        daemon.more(5)
+        daemon.more(2)
     assert daemon.stop() == 0
     columns, steps, archived = content(daemon, tmp_path)
     told = [(round(step["seconds"] / HOUR), step["adopted"]) for step in steps]
@@ -78,7 +78,7 @@ def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(daemon, c
     clocked(60 - time.time())  # a minute after 1970 began
     clocked.set(0)
     daemon.until(lambda: "time stamps follow" in daemon.log())
-    daemon.more(5)
+    daemon.more(2)
     assert daemon.stop() == 0
     columns, steps, archived = content(daemon, tmp_path)
     assert [step["adopted"] for step in steps] == [True]

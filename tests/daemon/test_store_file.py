@@ -135,7 +135,7 @@ from thermocald.errors import StoreError
 
 sys.setswitchinterval(0.0005)
 path = Path(sys.argv[1])
-guard, end = StoreGuard(path, durable=False), time.monotonic() + 2.5
+guard, end = StoreGuard(path, durable=False), time.monotonic() + 1.5
 series = guard.all_series()[0]
 
 def read(epochs):

@@ -126,7 +126,7 @@ class Pipeline:
         self._items: deque[AcquiredEpoch] = deque()
         self._amended: deque[CalibratedEpoch] = deque()
         self._changed = threading.Condition()
-        self._stopping = False
+        self._stopping = self._all_calibrated = False
         self._busy_since: dict[str, float] = {}
         self._threads = [
             threading.Thread(target=self._calibrate_all, name=f"calibrate {name}", daemon=True),
@@ -205,6 +205,9 @@ class Pipeline:
                     self.caught_up += 1
                     self._changed.notify_all()
             self._busy_since.pop("calibrate", None)
+        with self._changed:  # nothing more is amended
+            self._all_calibrated = True
+            self._changed.notify_all()
 
     def _next_to_calibrate(self) -> AcquiredEpoch | Epoch | None:
         """The oldest that waits; if there is none, one that was deferred; None at the end."""
@@ -294,7 +297,7 @@ class Pipeline:
                     if first.state in ("done", "dropped"):
                         self._changed.notify_all()
                         return self._items.popleft()
-                elif self._stopping and not self._threads[0].is_alive():
+                elif self._all_calibrated:
                     return None
                 self._changed.wait(_IDLE_S)
 

@@ -68,11 +68,11 @@ class DashboardProcess:
         if self.why == _REFUSED or os.environ.get("INVOCATION_ID"):
             return
         child = self._child
-        if (child is not None and child.poll() is None) or time.monotonic() < self._next_at:
-            return
-        if child is not None and child.returncode == _WRONG_CONFIGURATION:
+        if child is not None and child.poll() == _WRONG_CONFIGURATION:
             self.why = _REFUSED
             log.error("%s; acquisition goes on without it", self.why)
+            return
+        if (child is not None and child.returncode is None) or time.monotonic() < self._next_at:
             return
         if child is not None:
             self.why = f"the page ended ({child.returncode}); it is started again"

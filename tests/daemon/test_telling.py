@@ -105,7 +105,7 @@ def test_without_a_journal_it_goes_to_standard_error(log, journal, capsys):
 def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeypatch, tmp_path):
     """Under systemd's environment; the socket's place is the only thing that is not systemd's."""
     journal = Journal(tmp_path / "journal.sock")
-    sections = devices(camera=[{"kind": "unplugged", "at_s": 0.5, "for_s": 0.5}])
+    sections = devices(camera=[{"kind": "unplugged", "at": 3}])
     daemon.configure(**sections)
     script = (
         "import sys, thermocald.daemon.systemd as j; "

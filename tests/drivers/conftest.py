@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from tests.drivers.fakes.adb_server import AdbServer
+from tests.drivers.fakes.adb_server import AdbServer, wait_little
 
 
 @pytest.fixture(scope="module")
 def server():
     running = AdbServer()
-    yield running
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        wait_little(monkeypatch)
+        yield running
     running.close()

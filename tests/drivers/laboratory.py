@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tests.drivers.fakes import picamera2_stand_in
-from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph
+from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph, wait_little
 from tests.drivers.fakes.alert_servers import MailServer, WebServer
 from tests.drivers.fakes.mqtt_broker import Broker
 from tests.drivers.fakes.pty_instrument import Instrument
@@ -152,6 +152,7 @@ def on_adb(options, tmp_path, monkeypatch):
         taken = photograph(when, subsecond=f"{int(when % 1 * 1000):03d}")
         phone.add(f"IMG_{len(phone.files):04d}.jpg", taken)
 
+    wait_little(monkeypatch)
     server, phone = AdbServer(), FakePhone(shoot=shoot)
     phones = {"0A1B2C3D4E": phone}
     server.phones.update(phones)

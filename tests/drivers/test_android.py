@@ -11,7 +11,7 @@ import pytest
 from thermocald_drivers.android import exif, exposure_start, focus_state
 from thermocald_drivers.android_phone import AdbPhone
 
-from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph
+from tests.drivers.fakes.adb_server import AdbServer, FakePhone, photograph, wait_little
 from thermocald import errors
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
@@ -22,7 +22,8 @@ FOCUS = """  android.lens.focusDistance (80007): float[1]
 
 
 @pytest.fixture
-def server():
+def server(monkeypatch):
+    wait_little(monkeypatch)
     server = AdbServer()
     server.phones[SERIAL] = FakePhone(media_camera=FOCUS, shoot=shoot())
     yield server
@@ -153,7 +154,7 @@ def test_a_file_that_grows_is_awaited(server, phone):
 def test_a_file_that_never_ends(server, phone):
     phone.shoot = lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])
     with (
-        camera(server, timeout_s=1.5) as device,
+        camera(server, timeout_s=0.5) as device,
         pytest.raises(errors.BadReading, match="partial photograph, IMG_1"),
     ):
         device.capture()
@@ -188,7 +189,7 @@ def test_two_new_photographs(server, phone):
 def test_no_photograph(server, phone):
     phone.shoot = None
     with (
-        camera(server, timeout_s=1.5) as device,
+        camera(server, timeout_s=0.5) as device,
         pytest.raises(errors.DeviceTimeout, match="is the trigger right"),
     ):
         device.capture()
@@ -286,7 +287,7 @@ def test_a_phone_that_fell_asleep_is_woken(server, phone):
 
 
 def test_a_phone_that_fills_up(server, phone):
-    with camera(server, timeout_s=1.5) as device:
+    with camera(server, timeout_s=0.5) as device:
         phone.shoot, phone.free_kb = None, 10_000
         with pytest.raises(errors.PermanentDeviceError, match="storage is full"):
             device.capture()

@@ -77,7 +77,7 @@ class Mosquitto:
         seen, deadline = -1, time.monotonic() + 10
         while time.monotonic() < deadline and (not found or len(found) != seen):
             seen = len(found)
-            time.sleep(0.3)
+            time.sleep(0.1)
         client.disconnect()
         client.loop_stop()
         return found
@@ -112,13 +112,14 @@ def test_two_cameras_are_two_devices(broker):
     assert set(broker.retained().values()) & {b"offline"}
 
 
-@pytest.mark.parametrize("channel", ["temperature", "a/b", "lens #2", "#", "+"])
-def test_an_alert_is_retained_whatever_the_channel_is_called(channel, broker):
-    when = [{"temperature": channel, "above_c": 60}]
+def test_an_alert_is_retained_whatever_the_channel_is_called(broker):
+    channels = ["temperature", "a/b", "lens #2", "#", "+"]
+    when = [{"temperature": channel, "above_c": 60} for channel in channels]
     with mqtt(broker, "alert_mqtt", when=when) as output:
-        output.emit({"device": "cam.1", "epoch": 1, "status": "ok", channel: 61.0})
+        output.emit({"device": "cam.1", "epoch": 1, "status": "ok"} | dict.fromkeys(channels, 61.0))
     alerts = [json.loads(p) for topic, p in broker.retained().items() if "/alert/" in topic]
-    assert [(alert["condition"], alert["state"]) for alert in alerts] == [(channel, "out")]
+    told = sorted((alert["condition"], alert["state"]) for alert in alerts)
+    assert told == sorted((channel, "out") for channel in channels)
 
 
 def _emit_for(device, seconds):

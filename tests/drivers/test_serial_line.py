@@ -129,13 +129,16 @@ def test_echo_and_garbage_before_the_answer_are_skipped(instrument, before):
 @pytest.mark.parametrize("rubbish", [b"\xf8\x80\x00\xfe" * 20, b"\xf8\x80\r\n" * 20, b"T=\r\n"])
 def test_a_wrong_baud_rate_says_so(instrument, rubbish):
     far = instrument({b"T?\r\n": rubbish})
-    with asked(far) as device, pytest.raises(errors.BadReading, match="is 9600 Bd 8N1 right"):
+    with (
+        asked(far, timeout_s=0.2) as device,
+        pytest.raises(errors.BadReading, match="is 9600 Bd 8N1 right"),
+    ):
         device.read()
 
 
 def test_an_endless_line_does_not_grow(instrument):
     far = instrument({b"T?\r\n": b"U" * 3000})
-    with asked(far) as device:
+    with asked(far, timeout_s=0.2) as device:
         with pytest.raises(errors.BadReading):
             device.read()
         assert len(device._line) <= 1
@@ -145,11 +148,11 @@ def test_an_endless_line_does_not_grow(instrument):
     ("answers", "error", "said"),
     [
         ({b"T?\r\n": b"T=20."}, errors.BadReading, r"'T=20\.'"),
-        ({}, errors.DeviceTimeout, r"silent for 0\.4 s"),
+        ({}, errors.DeviceTimeout, r"silent for 0\.2 s"),
     ],
 )
 def test_half_a_line_and_silence(instrument, answers, error, said):
-    with asked(instrument(answers)) as device, pytest.raises(error, match=said):
+    with asked(instrument(answers), timeout_s=0.2) as device, pytest.raises(error, match=said):
         device.read()
 
 
@@ -166,7 +169,7 @@ def test_checksums(instrument, kind):
         expected["nmea"] ^= byte
     answers = [b"T=20.50*%02X\r\n" % expected[kind], b"T=20.51*%02X\r\n" % expected[kind]]
     far = instrument({b"T?\r\n": answers})
-    with asked(far, pattern=CHECKED, checksum=kind) as device:
+    with asked(far, pattern=CHECKED, checksum=kind, timeout_s=0.2) as device:
         assert device.read().values == {"temperature": 20.5}
         with pytest.raises(errors.BadReading, match="checksum"):
             device.read()

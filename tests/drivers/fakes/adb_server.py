@@ -14,6 +14,7 @@ import struct
 import threading
 import time
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +26,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 OFFLINE = "device offline"
+
+
+def wait_little(monkeypatch) -> None:
+    """Look for photographs in shorter intervals, and have adbutils not wait at each connection."""
+    import adbutils._adb
+    from thermocald_drivers import android
+
+    monkeypatch.setattr(android, "POLL_S", 0.01)
+    monkeypatch.setattr(adbutils._adb, "time", SimpleNamespace(sleep=lambda _: None))
 
 
 def photograph(

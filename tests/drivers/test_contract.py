@@ -75,82 +75,52 @@ each_driver = pytest.mark.parametrize(("kind", "name"), REGISTERED)
 
 
 @each_driver
-def test_driver_is_what_it_is_registered_as(kind, name):
+def test_driver_is_what_it_is_registered_as_and_explains_its_stanza(kind, name):
     driver = load_driver(kind, name)
     assert issubclass(driver, KINDS[kind])
     assert issubclass(driver.Options, DriverOptions)
-
-
-@each_driver
-def test_driver_explains_its_stanza(kind, name):
-    text = sys.modules[load_driver(kind, name).__module__].__doc__ or ""
+    assert all(c.startswith("char-") for c in driver.device_classes)
+    if kind == "output":  # a session replaces the programme of what heats
+        assert driver.heats == ("programme" in option_names(kind, name))
+    text = sys.modules[driver.__module__].__doc__ or ""
     assert f"driver: {name}" in text
     for option in option_names(kind, name):
         assert option in text, f"option {option} is not explained at the top of the file"
 
 
-@each_driver
-def test_driver_imports_no_device_library(kind, name):
+@pytest.mark.parametrize(
+    "path",
+    sorted({Path(inspect.getfile(load_driver(*pair))) for pair in REGISTERED}),
+    ids=lambda path: path.stem,
+)
+def test_driver_imports_no_device_library(path):
     """At its top a driver imports the standard library, numpy, pydantic, thermocald and its own."""
-    path = Path(inspect.getfile(load_driver(kind, name)))
     allowed = {*sys.stdlib_module_names, "numpy", "pydantic", "thermocald", "thermocald_drivers"}
-    for module in _imported_at_the_top(path):
-        assert module.split(".")[0] in allowed
-
-
-def _imported_at_the_top(path: Path) -> list[str]:
     found = []
     for node in ast.parse(path.read_text()).body:
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             found.append(node.module or "")
-    return found
+    assert {module.split(".")[0] for module in found} <= allowed
 
 
 @each_driver
-def test_unknown_options_are_refused(kind, name, bench):
+def test_a_device_is_opened_twice_unplugged_and_back(kind, name, device, bench):
     with pytest.raises(ConfigurationError):
         open_device(kind, name, {**bench.options, "no_such_option": 1}, bench.clock)
-
-
-@each_driver
-def test_closed_device_refuses_and_close_never_fails(kind, device):
     device.close()
-    with pytest.raises(DeviceError):
-        use(kind, device)
-    device.open()
-    use(kind, device)
-    device.close()
-    device.close()
-    with pytest.raises(DeviceError):
-        use(kind, device)
-
-
-@each_driver
-def test_identity_is_text(device):
-    with device:
-        identity = dict(device.identity())
-    assert all(isinstance(part, str) for item in identity.items() for part in item)
-
-
-@each_driver
-def test_what_a_driver_declares(kind, name, device):
-    assert all(c.startswith("char-") for c in type(device).device_classes)
-    assert all(isinstance(text, str) for text in device.warnings())
-    if kind == "output":  # a session replaces the programme of what heats
-        assert type(device).heats == ("programme" in option_names(kind, name))
-
-
-@each_driver
-def test_opened_again_it_works(kind, device):
     for _ in range(2):
+        with pytest.raises(DeviceError):
+            use(kind, device)
         with device:
             use(kind, device)
-
-
-@each_driver
-def test_unplugged_and_back(kind, device, bench):
+            identity = dict(device.identity())
+        device.close()
+    assert all(isinstance(part, str) for item in identity.items() for part in item)
+    assert all(isinstance(text, str) for text in device.warnings())
+    with pytest.raises(DeviceError):
+        use(kind, device)
     device.open()
     use(kind, device)
     bench.unplug()

@@ -18,6 +18,7 @@ import yaml
 from tests.daemon.forking import Forked, Forker
 from tests.drivers.small_camera import write_small_camera
 from thermocald.epoch import Epoch
+from thermocald.files import read_json
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
@@ -80,6 +81,10 @@ class Daemon:
     def log(self) -> str:
         path = self.folder / "log.txt"
         return path.read_text() if path.exists() else ""
+
+    def status(self) -> dict:
+        """What it shows of itself, empty while it shows nothing."""
+        return read_json(self.store.with_name(f"{self.store.name}.live") / "status.json")
 
     def results(self, name: str = "results.jsonl") -> list[dict]:
         path = self.folder / name
@@ -289,6 +294,31 @@ def small_disk(tmp_path: Path):
     yield mount
     for folder in mounted:
         subprocess.run(["umount", "-l", str(folder)], check=False)
+
+
+def tool(*command: object) -> subprocess.CompletedProcess[str]:
+    """A program of the system, which may fail."""
+    return subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def loop_disk(tmp_path: Path):
+    """MB, options of mkfs and mount → (image, folder) of an ext4 disk in a file, as a card is."""
+    image, folder = tmp_path / "disk.img", tmp_path / "card"
+
+    def mount(size_mb: int, *mkfs: str, options: str = "loop") -> tuple[Path, Path]:
+        folder.mkdir()
+        image.write_bytes(bytes(size_mb * 1_000_000))
+        if os.geteuid() or not all(map(shutil.which, ("mkfs.ext4", "mount"))):
+            pytest.skip("needs root, mount and mkfs.ext4")
+        made = tool("mkfs.ext4", "-q", *mkfs, image).returncode
+        if made or tool("mount", "-o", options, image, folder).returncode:
+            pytest.skip("no file system can be mounted from a file here")
+        return image, folder
+
+    yield mount
+    while tool("umount", "-l", folder).returncode == 0:
+        pass
 
 
 class Supervisor:

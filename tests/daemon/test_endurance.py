@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, fast_run, make_recording
-from thermocald.files import read_json
 from thermocald.store.database.store import Store
 
 pytestmark = pytest.mark.slow
@@ -37,8 +36,7 @@ def watched(daemon, run):
         time.sleep(1.0)
         try:
             status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
-            live = read_json(daemon.folder / "thermocald.db.live/status.json")
-            epoch = live["cameras"]["rpi"]["stored"]
+            epoch = daemon.status()["cameras"]["rpi"]["stored"]
             files = len(list((proc / "fd").iterdir()))
             used = sum(map(int, (proc / "stat").read_text().rpartition(")")[2].split()[11:13]))
         except (OSError, ValueError, KeyError):

@@ -13,7 +13,6 @@ import pytest
 
 from tests.daemon.conftest import make_photographs
 from tests.marks import mostly_slow
-from thermocald.files import read_json
 from thermocald.store.database.store import Store
 
 
@@ -68,8 +67,7 @@ def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, dev
     assert "WATCHDOG=1" in supervisor.listen(1.2)
     # on a busy machine it may take long to open or to calculate, which passes
     daemon.until(lambda: sum(r["device"] == "one" for r in daemon.results()) == 7)
-    status = daemon.folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: read_json(status)["stalled"] == ["camera one hangs"])
+    daemon.until(lambda: daemon.status()["stalled"] == ["camera one hangs"])
     supervisor.listen(0.5)
     assert "WATCHDOG=1" not in supervisor.listen(2.5)
     count = len([r for r in daemon.results() if r["device"] == "two"])
@@ -86,8 +84,7 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (8192, before[1]))
     daemon.until(lambda: "results wait in memory" in daemon.log())
-    status = daemon.folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: read_json(status).get("store", {}).get("waiting", 0) >= 5)
+    daemon.until(lambda: daemon.status().get("store", {}).get("waiting", 0) >= 5)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
     daemon.until(lambda: "can be written again" in daemon.log())
     # the output's file was closed for it too, and gets what waited when it is opened again
@@ -114,8 +111,7 @@ def test_a_disk_that_fails_beneath_the_store_loses_nothing(
     daemon.more(4)
     asked.write_text(failing)
     daemon.until(lambda: "results wait in memory" in daemon.log())
-    status = daemon.folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: read_json(status).get("store", {}).get("waiting", 0) >= 5)
+    daemon.until(lambda: daemon.status().get("store", {}).get("waiting", 0) >= 5)
     told = daemon.results()[-1]["epoch"]
     asked.unlink()
     daemon.until(lambda: "can be written again" in daemon.log())

@@ -15,7 +15,6 @@ import pytest
 
 from tests.daemon.conftest import ENVIRONMENT
 from tests.store.small import create_small_series, small_epoch, small_result
-from thermocald.files import read_json
 from thermocald.store.database.store import Store
 
 
@@ -139,8 +138,7 @@ def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, measured):
         daemon.more(4)
         assert daemon.log().count("in use by another program") == 1
         assert "the page is at" not in daemon.log()
-        status = daemon.folder / "thermocald.db.live/status.json"
-        daemon.until(lambda: "cannot be used" in read_json(status)["dashboard"]["why"])
+        daemon.until(lambda: "cannot be used" in daemon.status()["dashboard"]["why"])
         assert daemon.stop() == 0
 
 

@@ -13,7 +13,6 @@ from tests.commands import call
 from thermocald.daemon.control import ask
 from thermocald.daemon.session import Session
 from thermocald.errors import DataError, UsageError
-from thermocald.files import read_json
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 
@@ -113,18 +112,14 @@ def test_it_pauses_while_the_phone_is_away_and_the_command_survives_a_restart(li
 def test_a_camera_without_a_series_rests_until_a_session(live, daemon):
     """A phone that is to be measured from cold must not be warmed by its own frames."""
     live(series=None)
-    daemon.until(lambda: status_of(daemon)["cameras"]["phone-1"]["ticks"] >= 2)
-    assert status_of(daemon)["cameras"]["phone-1"]["device"] == "closed"
+    daemon.until(lambda: daemon.status()["cameras"]["phone-1"]["ticks"] >= 2)
+    assert daemon.status()["cameras"]["phone-1"]["device"] == "closed"
     daemon.ask("session start", session={**SESSION, "epochs": 3})
     daemon.until(lambda: daemon.session()["state"] == "done")
     assert len(daemon.session()["found"]) >= 2
-    daemon.until(lambda: status_of(daemon)["cameras"]["phone-1"]["device"] == "closed")
+    daemon.until(lambda: daemon.status()["cameras"]["phone-1"]["device"] == "closed")
     assert daemon.stop() == 0
     assert series_of(daemon.store) == {"M7": ("cold", [1, 2, 3])}
-
-
-def status_of(daemon) -> dict:
-    return read_json(daemon.live / "status.json")
 
 
 @pytest.mark.slow

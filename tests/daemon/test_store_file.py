@@ -13,11 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.conftest import ENVIRONMENT
+from tests.daemon.conftest import ENVIRONMENT, tool
 from tests.store.small import create_small_series, small_epoch, small_result
 from thermocald.daemon.store_guard import FollowedStore, Row, StoreGuard
 from thermocald.errors import StoreError
-from thermocald.files import read_json
 from thermocald.output.dashboard.view import View
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event
@@ -246,8 +245,7 @@ def test_the_running_daemon_says_so_and_loses_nothing(daemon, measured):
             name.unlink()
     daemon.until(lambda: "was deleted" in daemon.log())
     daemon.more(4)
-    status = daemon.folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: "was deleted" in read_json(status)["store"]["notice"])
+    daemon.until(lambda: "was deleted" in daemon.status()["store"]["notice"])
     daemon.kill()
     stored = {r["epoch"] for r in daemon.results() if r["stored"]}
     numbers, _ = daemon.stored()
@@ -255,42 +253,25 @@ def test_the_running_daemon_says_so_and_loses_nothing(daemon, measured):
 
 
 @pytest.fixture
-def ext4(tmp_path):
+def ext4(loop_disk):
     """A disk of 16 MB with a file system that goes read-only at its first error, as SD cards do:
     its folder, how to break it, and how to mend it.
     """
-    image, folder = tmp_path / "disk.img", tmp_path / "card"
-    folder.mkdir()
-    image.write_bytes(bytes(16_000_000))
-
-    def tool(*command: object) -> subprocess.CompletedProcess[str]:
-        words = [str(word) for word in command]
-        return subprocess.run(words, capture_output=True, text=True, check=False)
-
-    mount = ("mount", "-o", "loop,errors=remount-ro", image, folder)
-    if os.geteuid() or not all(map(shutil.which, ("mkfs.ext4", "mount", "e2fsck"))):
-        pytest.skip("needs root, mount and mkfs.ext4")
-    if tool("mkfs.ext4", "-q", image).returncode or tool(*mount).returncode:
-        pytest.skip("no file system can be mounted from a file here")
+    options = "loop,errors=remount-ro"
+    image, folder = loop_disk(16, options=options)
     device = Path(tool("findmnt", "-no", "SOURCE", folder).stdout.strip()).name
     trigger = Path(f"/sys/fs/ext4/{device}/trigger_fs_error")
-
-    def broken() -> None:
-        trigger.write_text("test")
+    if not trigger.exists() or not shutil.which("e2fsck"):
+        pytest.skip("this kernel cannot be asked for an error of a file system")
 
     def mended() -> None:
         # what is still open keeps the broken one alive: its image is checked and mounted elsewhere
         tool("umount", "-l", folder)
         shutil.copy(image, other := image.with_name("checked.img"))
         tool("e2fsck", "-fy", other)
-        assert tool(*mount[:-2], other, folder).returncode == 0
+        assert tool("mount", "-o", options, other, folder).returncode == 0
 
-    if not trigger.exists():
-        tool("umount", "-l", folder)
-        pytest.skip("this kernel cannot be asked for an error of a file system")
-    yield folder, broken, mended
-    while tool("umount", "-l", folder).returncode == 0:
-        pass
+    return folder, lambda: trigger.write_text("test"), mended
 
 
 def test_a_disk_that_becomes_read_only_while_the_daemon_writes(ext4):
@@ -366,11 +347,10 @@ def card(tmp_path):
     folder = tmp_path / "card"
     folder.mkdir()
 
-    def mount(*words: object) -> bool:
-        done = subprocess.run([*map(str, words)], capture_output=True, check=False)
-        return done.returncode == 0
-
     cards = {}
+
+    def mount(*words: object) -> bool:
+        return tool(*words).returncode == 0
 
     def insert(name: str | None) -> Path:
         if os.path.ismount(folder):
@@ -484,10 +464,12 @@ def test_a_running_daemon_whose_card_is_unmounted_and_mounted_again(card, daemon
     card(None)
     daemon.until(lambda: "not mounted any more" in daemon.log())
     daemon.until(lambda: not daemon.results()[-1]["stored"])
-    status = folder / "thermocald.db.live/status.json"
-    daemon.until(lambda: read_json(status).get("store", {}).get("state") == "out")
+    daemon.until(lambda: daemon.status().get("store", {}).get("state") == "out")
     assert {p.name for p in folder.iterdir()} == {"thermocald.db.live"}
-    assert View(daemon.store, status.parent).healthy() == (False, "the store cannot be written")
+    assert View(daemon.store, folder / "thermocald.db.live").healthy() == (
+        False,
+        "the store cannot be written",
+    )
     daemon.until((daemon.folder / "told").exists)
     card("a")
     daemon.until(lambda: daemon.results()[-1]["stored"])

@@ -64,34 +64,21 @@ def test_a_bus_error_while_reading(bus, name, number, error):
 
 
 @pytest.mark.parametrize("name", CHIPS)
-def test_nobody_at_the_address(bus, name):
-    with pytest.raises(errors.DeviceNotFound, match="dtparam=i2c_arm=on"):
-        thermometer(name).open()
-
-
-@pytest.mark.parametrize("name", CHIPS)
-def test_an_address_that_the_kernel_holds(bus, name):
+def test_what_keeps_a_chip_from_being_opened(bus, name):
     address, chip, _ = CHIPS[name]
-    bus.chips[address] = chip()
-    bus.chips[address].error = errno.EBUSY
-    with pytest.raises(errors.DeviceDenied, match="a kernel driver"):
-        thermometer(name).open()
-
-
-@pytest.mark.parametrize("name", CHIPS)
-@pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES])
-def test_no_bus(bus, name, number):
-    bus.open_error = number
-    with pytest.raises(errors.DeviceNotFound if number == errno.ENOENT else errors.DeviceDenied):
-        thermometer(name).open()
-
-
-@pytest.mark.parametrize("name", CHIPS)
-def test_another_chip_at_the_address(bus, name):
-    address = CHIPS[name][0]
-    bus.chips[address] = Chip()  # every register reads 0xFF
-    with pytest.raises((errors.WrongDevice, errors.BadReading)):
-        thermometer(name).open()
+    held = chip()
+    held.error = errno.EBUSY
+    for chips, bus_error, error, message in [
+        ({}, None, errors.DeviceNotFound, "dtparam=i2c_arm=on"),  # nobody at the address
+        ({address: held}, None, errors.DeviceDenied, "a kernel driver"),
+        ({}, errno.ENOENT, errors.DeviceNotFound, None),
+        ({}, errno.EACCES, errors.DeviceDenied, None),
+        # another chip: every register reads 0xFF
+        ({address: Chip()}, None, (errors.WrongDevice, errors.BadReading), None),
+    ]:
+        bus.chips, bus.open_error = chips, bus_error
+        with pytest.raises(error, match=message):
+            thermometer(name).open()
 
 
 @pytest.mark.parametrize("name", ["mcp9808", "tmp117", "lm75", "bme280"])

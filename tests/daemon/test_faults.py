@@ -173,8 +173,8 @@ def test_a_full_disk_loses_frames_then_observations_but_no_result(daemon, device
     assert not all(kept)
 
 
-def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon, devices):
-    daemon.configure(**devices())
+def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon, measured):
+    daemon.configure(**measured)
     good = daemon.config.read_text()
     daemon.start()
     daemon.more(2)
@@ -183,12 +183,12 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
     daemon.until(lambda: "was not read again" in daemon.log())
     assert "is 'period_s' meant?" in daemon.log()
     daemon.more(2)
-    daemon.config.write_text(good.replace("name: one", "name: other"))
+    daemon.config.write_text(good.replace("name: rpi", "name: other"))
     daemon.signal(signal.SIGHUP)
     daemon.until(lambda: daemon.results()[-1]["device"] == "other")
     daemon.config.write_text(good)
     daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: daemon.results()[-1]["device"] == "one")
+    daemon.until(lambda: daemon.results()[-1]["device"] == "rpi")
     assert daemon.stop() == 0
     with Store.open(daemon.store) as store:
         assert store.examine().damaged == ()

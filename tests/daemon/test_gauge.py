@@ -50,7 +50,9 @@ def at_work(devices, thermal_model, **options):
     return devices(thermal_model=str(thermal_model), series="gauge", **options)
 
 
-def test_predicted_epochs_through_a_restart(daemon, devices, thermal_model):
+def test_predicted_epochs_through_a_restart_are_not_taken_for_calibrations(
+    daemon, devices, thermal_model
+):
     daemon.run(**at_work(devices, thermal_model))
     daemon.until(lambda: len(daemon.results()) >= 5)
     daemon.kill()
@@ -76,13 +78,21 @@ def test_predicted_epochs_through_a_restart(daemon, devices, thermal_model):
     )
     assert last["status"] == "predicted"
     assert float(last["c"]) == pytest.approx(row["c"])
+    for command in (["study"], ["discover"], ["fit", "-o", "m.yaml"]):
+        done = call(*command, daemon.store)
+        assert done.returncode == 1
+        assert "nothing in it was calibrated" in " ".join(done.stderr.split())
+        assert "Traceback" not in done.stderr
 
 
-def test_posed_epochs_are_those_of_the_rendered_camera(
+def test_posed_epochs_are_those_of_the_rendered_camera_and_kept_frames_stand_there_corrected_too(
     daemon, devices, thermal_model, control_points
 ):
-    daemon.configure(**at_work(devices, thermal_model, control_points=str(control_points)))
-    daemon.start("--epochs", "6")
+    """Every second frame, and beside it the same at T₀ with the row's pose."""
+    document = at_work(devices, thermal_model, control_points=str(control_points))
+    folder = daemon.folder / "frames"
+    frames = {"keep": "every_n", "every_n": 2, "corrected": True, "folder": str(folder)}
+    daemon.run("--epochs", "6", **document | {"frames": frames | {"min_free_gb": 0}})
     assert daemon.wait() == 0
     _, words = daemon.stored()
     assert set(words) == {"resected"}
@@ -97,15 +107,6 @@ def test_posed_epochs_are_those_of_the_rendered_camera(
         error = one.result.values[10:] - pose - np.concatenate([np.zeros(3), grid])
         C = one.result.covariance[10:, 10:]
         assert error @ np.linalg.solve(C, error) < 30
-
-
-def test_kept_frames_stand_there_corrected_too(daemon, devices, thermal_model, control_points):
-    """Every second frame, and beside it the same at T₀ with the row's pose."""
-    document = at_work(devices, thermal_model, control_points=str(control_points))
-    folder = daemon.folder / "frames"
-    frames = {"keep": "every_n", "every_n": 2, "corrected": True, "folder": str(folder)}
-    daemon.run("--epochs", "6", **document | {"frames": frames | {"min_free_gb": 0}})
-    assert daemon.wait() == 0
     kept = sorted(p.name for p in folder.rglob("*.*"))
     numbers = ("0000002", "0000004", "0000006")
     assert kept == sorted(f"{n}{tail}" for n in numbers for tail in ("-corrected.jpg", ".png"))
@@ -118,20 +119,8 @@ def test_kept_frames_stand_there_corrected_too(daemon, devices, thermal_model, c
     assert told["pose"]["sd_X0"] == pytest.approx(row["sd_X0"])
     assert told["opencv"]["sd_fx"] == pytest.approx(row["opencv"]["sd_fx"])
     assert told["pose"]["origin_mm"] == [192e6, 313e6, 0.0]
-    with Store.open(daemon.store) as store:
-        frames = [one.epoch.frame for one in store.epochs(store.find_series())]
     # of a busy machine also frames that were kept until there was time for them
-    assert {f"{n}.png" for n in numbers} <= {f.name for f in frames if f}
-
-
-def test_predictions_are_not_taken_for_calibrations(daemon, devices, thermal_model):
-    daemon.run("--epochs", "4", **at_work(devices, thermal_model))
-    assert daemon.wait() == 0
-    for command in (["study"], ["discover"], ["fit", "-o", "m.yaml"]):
-        done = call(*command, daemon.store)
-        assert done.returncode == 1
-        assert "nothing in it was calibrated" in " ".join(done.stderr.split())
-        assert "Traceback" not in done.stderr
+    assert {f"{n}.png" for n in numbers} <= {e.epoch.frame.name for e in epochs if e.epoch.frame}
 
 
 @pytest.mark.parametrize(

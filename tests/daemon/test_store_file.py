@@ -293,10 +293,10 @@ def test_a_disk_that_becomes_read_only_while_the_daemon_writes(ext4):
     assert numbers(path) == [1, 2, 3, 4, 5, 6, 7]
 
 
-def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemon, devices):
+def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemon, measured):
     folder, broken, mended = ext4
     daemon.store = folder / "thermocald.db"
-    daemon.run(**devices())
+    daemon.run(**measured)
     daemon.more(4)
     broken()
     daemon.until(lambda: "results wait in memory" in daemon.log())

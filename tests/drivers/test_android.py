@@ -151,13 +151,29 @@ def test_a_file_that_grows_is_awaited(server, phone):
     assert frame.encoded.endswith(b"\xff\xd9")
 
 
-def test_a_file_that_never_ends(server, phone):
-    phone.shoot = lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])
-    with (
-        camera(server, timeout_s=0.5) as device,
-        pytest.raises(errors.BadReading, match="partial photograph, IMG_1"),
-    ):
-        device.capture()
+SOON = {"timeout_s": 0.5}
+REFUSED = {
+    "never ends": (
+        {"shoot": lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])}, SOON,
+        errors.BadReading, "partial photograph, IMG_1"),
+    "two": ({"shoot": shoot(count=2)}, {}, errors.BadReading, "2 new photographs"),
+    "none": ({"shoot": None}, SOON, errors.DeviceTimeout, "is the trigger right"),
+    "smaller": (
+        {"shoot": shoot(size=(48, 32))}, {}, errors.WrongDevice, "has 48×32 px, not 96×64"),
+    "broken off": ({"cut_transfer": True}, {}, errors.DeviceGone, "broke off"),
+    "no room": (
+        {"shoot": None, "free_kb": 10_000}, SOON, errors.PermanentDeviceError, "storage is full"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_photograph_that_is_none(server, phone, case):
+    knobs, options, error, message = REFUSED[case]
+    with camera(server, **options) as device:
+        for name, value in knobs.items():
+            setattr(phone, name, value)
+        with pytest.raises(error, match=message):
+            device.capture()
 
 
 def test_delete_only_when_told(server, phone):
@@ -180,23 +196,8 @@ def test_pending_files_and_raw_copies_are_not_photographs(server, phone):
         assert device.capture().encoded[:2] == b"\xff\xd8"
 
 
-def test_two_new_photographs(server, phone):
-    phone.shoot = shoot(count=2)
-    with camera(server) as device, pytest.raises(errors.BadReading, match="2 new photographs"):
-        device.capture()
-
-
-def test_no_photograph(server, phone):
-    phone.shoot = None
-    with (
-        camera(server, timeout_s=0.5) as device,
-        pytest.raises(errors.DeviceTimeout, match="is the trigger right"),
-    ):
-        device.capture()
-
-
 def test_exposure_that_moved_is_flagged_or_refused(server, phone):
-    for refuse in (False, True):
+    for refuse in (False, None, True):
         phone.shoot = shoot()
         with camera(server, refuse_unlocked=refuse) as device:
             device.capture()
@@ -240,29 +241,12 @@ def test_a_phone_that_may_focus_is_in_the_warnings(server, phone):
     }  # fmt: skip
 
 
-def test_exposure_alone_is_stored_and_flagged(server, phone):
-    with camera(server) as device:
-        device.capture()
-        phone.shoot = shoot(iso=200)
-        frame = device.capture()
-    assert frame.settings["iso"] == 200.0
-
-
 def test_what_a_phone_does_not_report_is_in_the_warnings(server, phone):
     phone.media_camera = ""
     with camera(server) as device:
         assert device.warnings() == []
         device.capture()
         assert "cannot be checked" in device.warnings()[0]
-
-
-def test_a_smaller_photograph(server, phone):
-    phone.shoot = shoot(size=(48, 32))
-    with (
-        camera(server) as device,
-        pytest.raises(errors.WrongDevice, match="has 48×32 px, not 96×64"),
-    ):
-        device.capture()
 
 
 @pytest.mark.parametrize(
@@ -284,13 +268,6 @@ def test_a_phone_that_fell_asleep_is_woken(server, phone):
         phone.awake = False
         device.capture()
     assert phone.awake
-
-
-def test_a_phone_that_fills_up(server, phone):
-    with camera(server, timeout_s=0.5) as device:
-        phone.shoot, phone.free_kb = None, 10_000
-        with pytest.raises(errors.PermanentDeviceError, match="storage is full"):
-            device.capture()
 
 
 @pytest.mark.parametrize(
@@ -324,14 +301,6 @@ def test_not_attached(server):
     del server.phones[SERIAL]
     with pytest.raises(errors.DeviceNotFound, match="adb lists none"):
         camera(server).open()
-
-
-def test_a_transfer_that_breaks_off(server, phone):
-    phone.shoot = shoot(size=(96, 64))
-    with camera(server) as device:
-        phone.cut_transfer = True
-        with pytest.raises(errors.DeviceGone, match="broke off"):
-            device.capture()
 
 
 def test_a_phone_that_hangs(server, phone):

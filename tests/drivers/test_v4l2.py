@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from thermocald_drivers.v4l2 import V4l2Camera
 
-from tests.drivers.fakes.v4l2_kernel import FakeCamera
+from tests.drivers.fakes.v4l2_kernel import FakeCamera, encode
 from thermocald import errors
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
@@ -105,12 +105,6 @@ def test_a_driver_that_does_not_say_which_clock(kernel):
     kernel.stamp = lambda now: stamps.append(now) or now
     with camera(kernel, exposure_s=0.1) as device:
         assert device.capture().monotonic == pytest.approx(stamps[-1] - 0.05, abs=2e-4)
-
-
-def test_a_stamp_of_another_clock_is_refused(kernel):
-    kernel.stamp = lambda _now: 1_700_000_000.0
-    with camera(kernel) as device, pytest.raises(errors.WrongDevice, match="monotonic clock"):
-        device.capture()
 
 
 def test_manual_controls_are_set(kernel):
@@ -325,28 +319,31 @@ def test_a_single_broken_frame_is_skipped(kernel):
         assert device.capture().sequence >= sequence + 5
 
 
-def test_only_broken_frames(kernel):
-    kernel.broken = set(range(1000))
-    with camera(kernel) as device, pytest.raises(errors.BadReading, match=r"only broken|as broken"):
-        device.capture()
+def first(count):
+    """So many bytes of a frame."""
+    return {"encode": lambda image, fourcc: encode(image, fourcc)[:count]}
 
 
-@pytest.mark.parametrize(("pixel_format", "keep"), [("GREY", 1000), ("MJPG", 200), ("MJPG", 0)])
-def test_a_partial_frame(kernel, pixel_format, keep):
-    full = kernel.encode
-    kernel.encode = lambda image, fourcc: full(image, fourcc)[:keep]
+JPEG = b"\xff\xd8" + b"\x55" * 300 + b"\xff\xd9"
+
+
+@pytest.mark.parametrize(
+    ("knobs", "pixel_format", "error", "message"),
+    [
+        ({"stamp": lambda _now: 1.7e9}, "GREY", errors.WrongDevice, "monotonic clock"),
+        ({"broken": range(1000)}, "GREY", errors.BadReading, r"only broken|as broken"),
+        (first(1000), "GREY", errors.BadReading, "partial frame"),
+        (first(200), "MJPG", errors.BadReading, "partial frame"),
+        (first(0), "MJPG", errors.BadReading, "partial frame"),
+        ({"encode": lambda *_: JPEG}, "MJPG", errors.BadReading, "broken JPEG"),
+    ],
+)
+def test_a_frame_that_is_none(kernel, knobs, pixel_format, error, message):
+    for name, value in knobs.items():
+        setattr(kernel, name, value)
     with (
         camera(kernel, pixel_format=pixel_format) as device,
-        pytest.raises(errors.BadReading, match="partial frame"),
-    ):
-        device.capture()
-
-
-def test_a_jpeg_damaged_in_the_middle(kernel):
-    kernel.encode = lambda _image, _fourcc: b"\xff\xd8" + b"\x55" * 300 + b"\xff\xd9"
-    with (
-        camera(kernel, pixel_format="MJPG") as device,
-        pytest.raises(errors.BadReading, match="broken JPEG"),
+        pytest.raises(error, match=message),
     ):
         device.capture()
 

@@ -112,7 +112,7 @@ def test_it_pauses_while_the_phone_is_away_and_the_command_survives_a_restart(li
 def test_a_camera_without_a_series_rests_until_a_session(live, daemon):
     """A phone that is to be measured from cold must not be warmed by its own frames."""
     live(series=None)
-    daemon.until(lambda: daemon.status()["cameras"]["phone-1"]["ticks"] >= 2)
+    daemon.until(lambda: daemon.status() and daemon.status()["cameras"]["phone-1"]["ticks"] >= 2)
     assert daemon.status()["cameras"]["phone-1"]["device"] == "closed"
     daemon.ask("session start", session={**SESSION, "epochs": 3})
     daemon.until(lambda: daemon.session()["state"] == "done")

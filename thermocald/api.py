@@ -228,8 +228,8 @@ def fit(
     """
     from thermocald.analysis.thermal.camera_fit import (
         fit_camera,
-        fit_camera_of_type,
         fit_type,
+        fit_with_type,
         require_type,
     )
     from thermocald.physics.model import ThermalModel
@@ -256,7 +256,7 @@ def fit(
     reduced = [reduce_series(one.observed(progress, jobs), strict=False) for one in series]
     check_names(listed, reduced)
     if isinstance(kind, ThermalModel):
-        camera = fit_camera_of_type(reduced, kind)
+        camera = fit_with_type(reduced, kind)
     elif kind is not None:
         camera = fit_type(reduced, listed, T0, kind)
     else:

@@ -10,7 +10,7 @@ import pytest
 
 from tests.analysis.test_thermal_model import for_fit, reduced
 from tests.commands import answer, succeed
-from thermocald.analysis.thermal.camera_fit import fit_with_type, type_model, weight_of_type
+from thermocald.analysis.thermal.camera_fit import fit_with_type, type_model
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
@@ -96,12 +96,13 @@ def test_three_temperatures_predict_nearly_as_the_full_cycle_does():
         own = predicted_error(fit_thermal_model([reduced(cycle)], start, T0).model, other, 0.05)
         way = reduced(replace(at_three_temperatures(cycle, 50.0, 90), seed=2000 + seed))
         for name, series in (("way", way), ("rest", at_rest_only(cycle, 3000 + seed))):
-            model = fit_with_type([series], kind).model
+            fit = fit_with_type([series], kind)
+            model = fit.model
             error = predicted_error(model, other, 0.05)
             held[name].append(error.coverage)
             (lag,), (true,) = model.effects, cycle.model.effects
             pulls[name].append((lag.values["tau"] - true.values["tau"]) / lag.sds["tau"])
-            weight = weight_of_type(model, kind)["thermal_lag.tau"]
+            weight = fit.fitted["type"]["weights"]["thermal_lag.tau"]
             if name == "way":
                 assert error.rms_px <= 1.2 * own.rms_px
                 assert weight < 0.05

@@ -80,6 +80,11 @@ def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> Therma
 
     Non-linear parameters, which few temperatures may not show at all, have the type's as a prior
     within the adjustment; all others are shrunk afterwards. Raises DataError.
+
+    `fitted["type"]` holds weights {rate or effect's parameter: the fraction of it that is the
+    type's}. 1 where its recordings say nothing of the parameter, so that value and standard
+    deviation are the type's; near 0 where they say all. It is the variance of the parameter over
+    its variance among the cameras of the type.
     """
     require_type(kind)
     sd = {e.name: e.sds for e in kind.effects}
@@ -96,7 +101,11 @@ def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> Therma
         if f"{e.name}.{key}" not in priors
     ]
     fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors, kind.distortion)
-    return replace(fitted, model=shrunk_to_type(fitted.model, kind, priors))
+    model = shrunk_to_type(fitted.model, kind, priors)
+    names = [n for n in _names(kind) if not n.startswith("interior.") and kind.sd(n) > 0]
+    weights = {n: min(1.0, (model.sd(n) / kind.sd(n)) ** 2) for n in names}
+    about = {"name": kind.camera, "cameras": len(kind.fitted_on), "weights": weights}
+    return replace(fitted, model=model, fitted={**(fitted.fitted or {}), "type": about})
 
 
 def require_type(kind: ThermalModel) -> None:
@@ -159,17 +168,6 @@ def shrunk_to_type(
     )
 
 
-def weight_of_type(model: ThermalModel, kind: ThermalModel) -> dict[str, float]:
-    """{rate or effect's parameter: the fraction of it that is the type's}.
-
-    model: of `fit_with_type`. 1 where its recordings say nothing of the parameter, so that value
-    and standard deviation are the type's; near 0 where they say all. It is the variance of the
-    parameter over its variance among the cameras of the type.
-    """
-    names = [n for n in _names(kind) if not n.startswith("interior.") and kind.sd(n) > 0]
-    return {n: min(1.0, (model.sd(n) / kind.sd(n)) ** 2) for n in names}
-
-
 def _with_values(
     model: ThermalModel, names: tuple[str, ...], values: Array, covariance: Array, kind: str
 ) -> ThermalModel:
@@ -209,14 +207,6 @@ def fit_camera(
         )
         held.append(predicted_error(others.model, left_out, fitted["series"][k].thermometer_sd))
     return replace(camera, fitted={**fitted, "prediction_test": held})
-
-
-def fit_camera_of_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> ThermalCamera:
-    """Fit one camera that was measured at few temperatures, helped by its type's model."""
-    camera = fit_with_type(series, kind)
-    weights = weight_of_type(camera.model, kind)
-    about = {"name": kind.camera, "cameras": len(kind.fitted_on), "weights": weights}
-    return replace(camera, fitted={**(camera.fitted or {}), "type": about})
 
 
 def fit_type(

@@ -25,7 +25,7 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.analysis.thermal.control_points import ControlPoints
-from thermocald.analysis.thermal.predictor import Predictor
+from thermocald.analysis.thermal.predictor import GAP_S, Predictor
 from thermocald.errors import ConfigurationError, DataError, ImageError
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
@@ -198,12 +198,13 @@ class GaugeCalibrator:
             names = next(iter(epoch.temperatures), "the reference thermometer")
             bad = failed("no_temperature", f"no reading of {names} so far", measured)
             return CalibratedEpoch(epoch, bad, {})
+        beyond = now.camera.extrapolated
         extra = {
-            "reading_age_s": now.age_s, "unknown_past_px": now.unknown_px, "outside_K": now.beyond,
+            "reading_age_s": now.age_s, "unknown_past_px": now.unknown_px, "outside_K": beyond,
         }  # fmt: skip
         limits = self.thermal.validity
-        outside = "" if limits is None or not now.beyond else (
-            f"{now.camera.temperature:.1f} °C is {now.beyond:.1f} K outside the {limits.low:g} to "
+        outside = "" if limits is None or not beyond else (
+            f"{now.camera.temperature:.1f} °C is {beyond:.1f} K outside the {limits.low:g} to "
             f"{limits.high:g} °C that the model was fitted on"
         )  # fmt: skip
         if now.far:
@@ -214,7 +215,7 @@ class GaugeCalibrator:
             extra["event"] = 1.0
         if outside:
             result = replace(result, status="outside_range", reason=f"{outside}: sds are widened")
-        elif not now.has_reading:
+        elif now.age_s > GAP_S:
             old = f"the last reading is {now.age_s:.0f} s old: the covariance grows"
             result = replace(result, status="no_temperature", reason=old)
         return CalibratedEpoch(epoch, result, extra)

@@ -76,45 +76,6 @@ def derivatives(
     return np.stack(found, axis=2) if found else np.zeros((len(history.times), 22, 0))
 
 
-def reading_operators(history: History, model: ThermalModel) -> list[tuple[Array, str, csr_array]]:
-    """Return how reading errors reach the parameters: weights (22,), channel, operator (E, R)."""
-    found: list[tuple[Array, str, csr_array]] = []
-    rates = _weights(model)
-    if np.any(rates):
-        operator = drive_matrix(history, model.drives)
-        assert operator is not None
-        found.append((rates, history.reference, operator))
-    for effect in model.effects:
-        kind = catalogue.get(effect.name)
-        nonlinear, coefficients = kind.split(effect.values)
-        if kind.is_drive or kind.seen_in == "noise" or not any(coefficients.values()):
-            continue
-        S = kind.sensitivity(history, **nonlinear)
-        if S.nnz:
-            channel = kind.channel(history, **nonlinear)
-            found.append((_weights(model, effect.name, coefficients), channel, S))
-    return found
-
-
-def unresolved(
-    history: History, model: ThermalModel, rate_jump: Array
-) -> list[tuple[Array, Array]]:
-    """Return what the readings' times leave open: weights (22,) and standard deviations (E,)."""
-    found = []
-    for effect in model.effects:
-        kind = catalogue.get(effect.name)
-        nonlinear, coefficients = kind.split(effect.values)
-        if kind.kind == "image":
-            continue
-        left = kind.unresolved(history, rate_jump, **nonlinear)
-        weights = _weights(model)
-        if not kind.is_drive:
-            weights = _weights(model, effect.name, coefficients)
-        if np.any(left) and np.any(weights):
-            found.append((weights, left))
-    return found
-
-
 def _weights(
     model: ThermalModel, name: str = "", coefficients: Mapping[str, float] | None = None
 ) -> Array:
@@ -329,10 +290,35 @@ def _variance(A: Array, covariance: Array) -> Array:
 
 
 def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: float) -> Array:
-    """Covariance (E, 22, 22) of an epoch's parameters, relative to the series' mean."""
+    """Covariance (E, 22, 22) of an epoch's parameters, relative to the series' mean.
+
+    It comes from the readings' errors, carried through each effect's operator, and from what their
+    times leave open.
+    """
     history = series.readings_history
+    jump = series.thermometers[history.reference].slope_jump(history.times)
+    rates = _weights(model)
+    operators: list[tuple[Array, str, csr_array]] = []
+    unresolved = []
+    if np.any(rates):
+        operator = drive_matrix(history, model.drives)
+        assert operator is not None
+        operators.append((rates, history.reference, operator))
+    for effect in model.effects:
+        kind = catalogue.get(effect.name)
+        if kind.seen_in == "noise":
+            continue
+        nonlinear, coefficients = kind.split(effect.values)
+        weights = rates if kind.is_drive else _weights(model, effect.name, coefficients)
+        if not kind.is_drive and any(coefficients.values()):
+            S = kind.sensitivity(history, **nonlinear)
+            if S.nnz:
+                operators.append((weights, kind.channel(history, **nonlinear), S))
+        if kind.kind != "image":
+            left = kind.unresolved(history, jump, **nonlinear)
+            if np.any(left) and np.any(weights):
+                unresolved.append((weights, left))
     covariance = np.zeros((len(history.times), 22, 22))
-    operators = reading_operators(history, model)
     means = [np.asarray(S.mean(axis=0)).ravel() for _, _, S in operators]
     for (c, a, S), mean_s in zip(operators, means, strict=True):
         for (d, b, R), mean_r in zip(operators, means, strict=True):
@@ -341,8 +327,7 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
             shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
             shared = shared - S @ mean_r - R @ mean_s + mean_s @ mean_r
             covariance += thermometer_sd**2 * shared[:, None, None] * np.outer(c, d)
-    jump = series.thermometers[history.reference].slope_jump(history.times)
-    for c, left in unresolved(history, model, jump):
+    for c, left in unresolved:
         covariance += left[:, None, None] ** 2 * np.outer(c, c)
     return covariance
 

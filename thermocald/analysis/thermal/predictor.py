@@ -29,7 +29,7 @@ _LONG_S = 30 * 86400.0  # after so long at one temperature everything has settle
 _DAY_S = 6 * 3600.0  # temperatures farther apart in time have little in common
 _USUAL_RANGE_K = 20.0  # of a model that does not say on what it was fitted
 _CHANGED_S = 60.0  # in which a camera came from elsewhere to where it is
-_GAP_S = 120.0  # between readings a straight line will do
+GAP_S = 120.0  # between readings a straight line will do
 _BACK_S = 10.0  # a clock that is set back by less makes a reading late, not unknown
 _REMEMBERED = 4000  # readings
 
@@ -40,8 +40,8 @@ class PredictedCamera:
 
     age_s: of its last reading; temperature_sd: K, of its temperature, with what a reading's age and
     the limits of the fit add; unknown (10,): what the unknown past adds, one standard deviation,
-    and unknown_px, the largest of it in the image; beyond: K outside the temperatures of the fit,
-    `far` if nothing should be predicted there.
+    and unknown_px, the largest of it in the image; far: whether it is so far outside the
+    temperatures of the fit that nothing should be predicted.
     """
 
     camera: Camera
@@ -49,13 +49,7 @@ class PredictedCamera:
     temperature_sd: float
     unknown: Array
     unknown_px: float
-    beyond: float
     far: bool
-
-    @property
-    def has_reading(self) -> bool:
-        """Return whether the temperature of its time is known."""
-        return self.age_s <= _GAP_S
 
 
 class Predictor:
@@ -91,7 +85,7 @@ class Predictor:
             self._begin_again()
         if self._pair is None:
             self._begin(time, row)
-        elif time - self._recent[-1][0] > _GAP_S:
+        elif time - self._recent[-1][0] > GAP_S:
             self._cross_gap(time, row)
         self._recent.append((time, row))
         assert self._pair is not None
@@ -111,7 +105,7 @@ class Predictor:
         T, unknown = camera.temperature, other.values - self._now[0].values
         rates = self.thermal.model.rate_vector
         covariance = camera.covariance + np.outer(unknown, unknown)
-        drifted = math.hypot(self.thermal.reading_sd, self._change(age) if age > _GAP_S else 0.0)
+        drifted = math.hypot(self.thermal.reading_sd, self._change(age) if age > GAP_S else 0.0)
         covariance = covariance + drifted**2 * np.outer(rates, rates)
         beyond, far = 0.0, False
         if (validity := self.thermal.validity) is not None:
@@ -121,7 +115,7 @@ class Predictor:
         now = Camera(model.sensor, T, camera.values, covariance, beyond, model.camera)
         shift = self._largest_px(camera.values, unknown)
         spread = math.hypot(drifted, beyond)
-        return PredictedCamera(now, age, spread, unknown, shift, beyond, far)
+        return PredictedCamera(now, age, spread, unknown, shift, far)
 
     def settled(self) -> Camera:
         """Return the camera of a temperature that nothing is known of, with its covariance."""

@@ -23,7 +23,7 @@ from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import BASE, Candidate, Term
 from thermocald.thermal.noise import calibrate_thermometers, weight_slow_noise
 from thermocald.thermal.reduce import reduce_together
-from thermocald.thermal.scan import Scanner, examine
+from thermocald.thermal.scan import Scanner, examine_all
 
 TEN = (
     "tanh", "sign_rate_square", "integral_above", "abs_rate", "two_lags", "product", "switch",
@@ -41,7 +41,7 @@ def examined(kind: str, seed: int):
     ready = [weight_slow_noise(e) for e in calibrate_thermometers(reduced(kind, seed))]
     fitter = HypothesisFitter(ready)
     base = Search(fitter).base()
-    adequacy = tuple(examine(fitter, base.fit, s) for s in range(2))
+    adequacy = examine_all(fitter, base.fit)
     return SimpleNamespace(fitter=fitter, base=base, base_adequacy=adequacy)
 
 
@@ -52,19 +52,20 @@ def above():
 
 def test_an_integral_above_a_threshold_is_told_with_its_constant(above):
     found = propose(above, BASE)
-    (term,) = found.terms
+    (term,) = found.best.terms
     assert term.effect == "integral(above(temperature, k))"
     assert dict(term.nonlinear)["k"] == pytest.approx(26.48, abs=0.2)
     assert min(found.closed) > 0.95
     assert found.surrogates.p < 0.01
-    assert all(examine(found.fitter, found.best.fit, s).adequate for s in range(2))
+    assert all(a.adequate for a in examine_all(found.best.fitter, found.best.fit))
 
 
 @pytest.mark.slow
 def test_a_recorded_humidity_is_a_quantity_too():
     found = propose(examined("lag_of_humidity", 31), BASE)
-    assert found.terms[0].effect == 'lag(column("humidity"), tau)'
-    assert dict(found.terms[0].nonlinear)["tau"] == pytest.approx(120.0, abs=2.0)
+    (term,) = found.best.terms
+    assert term.effect == 'lag(column("humidity"), tau)'
+    assert dict(term.nonlinear)["tau"] == pytest.approx(120.0, abs=2.0)
 
 
 @pytest.mark.parametrize("kind", ["smooth", pytest.param("random_walk", marks=pytest.mark.slow)])

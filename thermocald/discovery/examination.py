@@ -63,7 +63,7 @@ _GUIDES = 3
 class Examination:
     """What the search found.
 
-    fitter: the series as examined, displaced targets out and noise weighted; base, best: solutions;
+    base, best: solutions, in the series as examined: displaced targets out and noise weighted;
     ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per
     series; cross_validation: gains (blocks,) of its effects on blocks of time left out; surrogates:
     each of its effects against surrogates; mount: its movement, where it moves; knocks: of the
@@ -71,7 +71,6 @@ class Examination:
     field_movements: boards and targets that moved, per series.
     """
 
-    fitter: HypothesisFitter
     base: Solution
     best: Solution
     ranking: tuple[Solution, ...]
@@ -88,6 +87,11 @@ class Examination:
     as_slips: tuple[bool, ...] = ()
     original: tuple[ReducedSeries, ...] = ()
     field_movements: tuple[tuple[FieldMovement, ...], ...] = ()
+
+    @property
+    def fitter(self) -> HypothesisFitter:
+        """The series as examined."""
+        return self.best.fitter
 
     @property
     def image_places(self) -> list[str]:
@@ -210,7 +214,7 @@ def _search_standing(
         seen += grown
         if complete:
             equal = [s for s in frontier if s.score < best.score + criteria.BAND]
-            grown = [s for s in grown if _is_worth_it(fitter, base, best, equal, s)]
+            grown = [s for s in grown if _is_worth_it(base, best, equal, s)]
         if not grown:
             break
         champion = min(grown, key=lambda s: s.score)
@@ -243,7 +247,7 @@ def _search_standing(
         # where single targets wander much, one series alone carries no name
         complete = complete and fitter.series[0].correlation <= criteria.WANDERING
     return Examination(
-        fitter, base, best, tuple(ranking), _list_rivals(best, seen), base_adequacy, adequacy,
+        base, best, tuple(ranking), _list_rivals(best, seen), base_adequacy, adequacy,
         complete, tuple(blocks), surrogates=tests,
     )  # fmt: skip
 
@@ -285,11 +289,7 @@ def _compare_ties(
 
 
 def _is_worth_it(
-    fitter: HypothesisFitter,
-    base: Solution,
-    best: Solution,
-    equal: Sequence[Solution],
-    champion: Solution,
+    base: Solution, best: Solution, equal: Sequence[Solution], champion: Solution
 ) -> bool:
     """Decide whether effects take the place of `best`, which explains all, or of one `equal` to it.
 
@@ -298,21 +298,22 @@ def _is_worth_it(
     """
     fewer = [s for s in equal if set(s.names) <= set(champion.names)]
     if not fewer:
-        more = _measure_px(fitter, best, champion) >= criteria.CURVATURE_PX
+        more = _measure_px(best, champion) >= criteria.CURVATURE_PX
         return (
             more
             and champion.score < best.score - criteria.BAND
             and champion.fit.chi2 < best.fit.chi2
         )
-    least = max(criteria.FURTHER_PX, criteria.FURTHER_SHARE * _measure_px(fitter, base, best))
-    return all(_measure_px(fitter, s, champion) >= least for s in fewer)
+    least = max(criteria.FURTHER_PX, criteria.FURTHER_SHARE * _measure_px(base, best))
+    return all(_measure_px(s, champion) >= least for s in fewer)
 
 
-def _measure_px(fitter: HypothesisFitter, without: Solution, with_it: Solution) -> float:
+def _measure_px(without: Solution, with_it: Solution) -> float:
     """Return the RMS px that one more effect explains."""
     gain = max(without.score - with_it.score, 0.0)
-    coordinates = 2.0 * sum(float(e.n.sum()) for e in fitter.series)
-    weights = np.concatenate([e.weights[..., 0].ravel() for e in fitter.series])
+    series = without.fitter.series
+    coordinates = 2.0 * sum(float(e.n.sum()) for e in series)
+    weights = np.concatenate([e.weights[..., 0].ravel() for e in series])
     return float(np.sqrt(gain / coordinates / np.mean(weights[weights > 0])))
 
 
@@ -349,17 +350,17 @@ def _examine_beside_mount(
     )
     shaken = add_tremble(fitter, fitter.fit(()), WAVES)
     beside, ranking, seen, like = search_beside_mount(HypothesisFitter(shaken), say, given)
-    fitter = beside.fitter
-    base, whole, knocks = split_knocks(fitter, beside.solution, len(given))
-    if beside.mount.smoothness(fitter, whole.fit) > criteria.SMOOTH:
+    fitter, mount = beside.fitter, beside.mount
+    base, whole, knocks = split_knocks(beside, len(given))
+    if mount is None or mount.smoothness(fitter, whole.fit) > criteria.SMOOTH:
         return None
     search = Search(fitter, say, like)
     best, blocks, tests = _keep_named(search, base, whole, jobs)
     if any(t.kind.is_event and t not in best.terms for t in whole.terms):
         # steps that cannot be named are still there
-        base, whole, knocks = split_knocks(fitter, whole, len(given), slips=True)
+        base, whole, knocks = split_knocks(whole, len(given), slips=True)
         best, blocks, tests = _keep_named(search, base, whole, jobs)
-    if not is_convincing(fitter, base, best):
+    if not is_convincing(base, best):
         best, blocks, tests = base, [], ()
     tried = iter(beside.as_slips)
     as_slips = tuple(t.parameters != EOP_NAMES or next(tried) for t in knocks)
@@ -374,8 +375,8 @@ def _examine_beside_mount(
         if close and sorted(names) != sorted(own) and s.names not in [r.names for r in rivals]:
             rivals.append(s)
     return Examination(
-        fitter, base, best, tuple(ranking), tuple(rivals), examine_all(fitter, base.fit),
-        examine_all(fitter, best.fit), True, tuple(blocks), surrogates=tests, mount=beside.mount,
+        base, best, tuple(ranking), tuple(rivals), examine_all(fitter, base.fit),
+        examine_all(fitter, best.fit), True, tuple(blocks), surrogates=tests, mount=mount,
         knocks=knocks, as_slips=as_slips,
     )  # fmt: skip
 

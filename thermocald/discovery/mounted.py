@@ -8,7 +8,7 @@ found, kept alongside the base model, and reported with time and size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from thermocald.discovery import criteria
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Fit, Term
+    from thermocald.thermal.hypothesis import Term
 
 _WIDTH = 4  # solutions of a level whose movement is estimated
 _LEVELS = 5
@@ -40,32 +40,11 @@ _TURNS = 5
 _SETTLED = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Beside:
-    """A solution and the movement of the mount with it, in a fitter that has it.
-
-    as_slips: whether a slip inside the camera explains each knock of the mount as well, in order.
-    """
-
-    solution: Solution
-    fitter: HypothesisFitter
-    mount: Mount
-    as_slips: tuple[bool, ...] = ()
-
-    @property
-    def score(self) -> float:
-        return self.solution.score
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        return self.solution.terms
-
-
 def search_beside_mount(
     fitter: HypothesisFitter,
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]] = (),
-) -> tuple[Beside, list[Solution], list[Solution], Search]:
+) -> tuple[Solution, list[Solution], list[Solution], Search]:
     """Add effects and knocks, one by one, while the penalised likelihood improves.
 
     Returns the best, single effects by score, every solution that was looked at, each with its
@@ -76,26 +55,26 @@ def search_beside_mount(
     W = find_combinations(fitter.series)
     guess = guess_mount_motion(fitter, start.fit, W)
     say("movement of the mount")
-    trials = [_fit_beside(fitter, start, Mount(W, guess, corner), 4) for corner in _CORNERS]
+    trials = [_fit_beside(start, Mount(W, guess, corner), 4) for corner in _CORNERS]
     plain = best = min(trials, key=lambda t: t.score)
     ranking, seen = list[Solution](), list[Solution]()
     for level in range(_LEVELS):
-        say(f"alongside the mount: {', '.join(best.solution.names) or 'the base'}")
+        say(f"alongside the mount: {', '.join(best.names) or 'the base'}")
         search = Search(best.fitter, like=first)
-        grown: list[Beside] = []
+        grown: list[Solution] = []
         # a scan is right to some percent, and a further effect has to be worth much
         further = any(not t.kind.is_event for t in best.terms[len(start.terms) :])
         least = _PROMISE * _least_further(plain, best) if further else 0.0
-        for solution in _add_delays(search, search.expand(best.solution, 6, least)[:_WIDTH]):
+        for solution in _add_delays(search, search.expand(best, 6, least)[:_WIDTH]):
             trial = _profile(best, solution)
             grown.append(_try_knock(best, trial) or trial)
         if not grown:
             break
         if level == 0:
-            ranking = sorted((g.solution for g in grown), key=lambda s: s.score)
+            ranking = sorted(grown, key=lambda s: s.score)
             # a movement estimated to its end takes up drifts too: a scan would find nothing in it
             plain = best = _settle(plain, ranking[0].score)
-        seen += [g.solution for g in grown]
+        seen += grown
         allowed = [g for g in grown if _is_allowed(g, best, plain, len(start.terms))]
         if not allowed:
             break
@@ -115,21 +94,21 @@ def _add_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
     return solutions
 
 
-def _fit_beside(fitter: HypothesisFitter, solution: Solution, mount: Mount, turns: int) -> Beside:
+def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:
     own, fit, mount = estimate_mount_motion(
-        fitter, solution.terms, mount, solution.fit.coefficients, turns
+        solution.fitter, solution.terms, mount, solution.fit.coefficients, turns
     )
-    return Beside(Solution(fit, solution.penalties), own, mount)
+    return Solution(fit, solution.penalties, own, mount)
 
 
-def _settle(found: Beside, best: float) -> Beside:
+def _settle(found: Solution, best: float) -> Solution:
     """Estimate the movement again from what it leaves over, while it may come below another score:
     a direction that the first estimate has at zero stays there.
     """
     for _ in range(_TURNS):
         if found.score < best:
             break
-        more = _profile(found, found.solution)
+        more = _profile(found, found)
         if more.score > found.score:
             break
         change, found = found.score - more.score, more
@@ -138,34 +117,37 @@ def _settle(found: Beside, best: float) -> Beside:
     return found
 
 
-def _profile(best: Beside, solution: Solution) -> Beside:
-    """Fit a solution with the movement that it leaves; its non-linear parameters refined in it."""
+def _profile(best: Solution, solution: Solution) -> Solution:
+    """Fit a solution with the movement that it leaves; its non-linear parameters refined in it.
+
+    best: what it was found beside, in the same fitter, with its movement.
+    """
+    assert best.mount is not None
     guess = guess_mount_motion(best.fitter, solution.fit, best.mount.combinations)
     # a share of the movement before: what starts at zero stays there
     mount = replace(best.mount, covariance=guess + _REST * best.mount.covariance)
-    found = _fit_beside(best.fitter, solution, mount, 5)
-    fit = found.fitter.refine(found.solution.fit, max_iterations=3)
-    return replace(found, solution=Solution(fit, solution.penalties), as_slips=best.as_slips)
+    found = _fit_beside(solution, mount, 5)
+    fit = found.fitter.refine(found.fit, max_iterations=3)
+    return replace(found, fit=fit, as_slips=best.as_slips)
 
 
-def _try_knock(best: Beside, trial: Beside) -> Beside | None:
+def _try_knock(best: Solution, trial: Solution) -> Solution | None:
     """Explain the same event as a knock of the mount, where that does as well; else None."""
     term = trial.terms[-1]
     if not term.kind.is_event:
         return None
     terms = (*trial.terms[:-1], replace(term, parameters=EOP_NAMES))
     more = len(EOP_NAMES) / max(len(term.parameters), 1)
-    penalties = (*trial.solution.penalties[:-1], trial.solution.penalties[-1] * more)
-    fit = best.fitter.fit(terms)
-    knock = _profile(best, Solution(fit, penalties))
-    worse = knock.solution.fit.objective - trial.solution.fit.objective
+    penalties = (*trial.penalties[:-1], trial.penalties[-1] * more)
+    knock = _profile(best, Solution(best.fitter.fit(terms), penalties, best.fitter))
+    worse = knock.fit.objective - trial.fit.objective
     if worse < criteria.SLIP_NOT_KNOCK:
         alike = worse > -criteria.SLIP_NOT_KNOCK
         return replace(knock, as_slips=(*best.as_slips, alike))
     return None
 
 
-def _is_allowed(grown: Beside, best: Beside, plain: Beside, given: int) -> bool:
+def _is_allowed(grown: Solution, best: Solution, plain: Solution, given: int) -> bool:
     """Decide whether a solution improves enough on the one before."""
     gain = best.score - grown.score
     own = [t for t in grown.terms[given:] if not t.kind.is_event]
@@ -177,15 +159,15 @@ def _is_allowed(grown: Beside, best: Beside, plain: Beside, given: int) -> bool:
     return gain > _least_further(plain, best)
 
 
-def _least_further(plain: Beside, best: Beside) -> float:
+def _least_further(plain: Solution, best: Solution) -> float:
     """Return what an effect after the first has to gain."""
     return max(criteria.MOUNT_FURTHER, criteria.MOUNT_SHARE * (plain.score - best.score))
 
 
 def split_knocks(
-    fitter: HypothesisFitter, solution: Solution, given: int, slips: bool = False
+    solution: Solution, given: int, slips: bool = False
 ) -> tuple[Solution, Solution, tuple[Term, ...]]:
-    """Fit the base model with the knocks, and all of it, in one fitter; also return the knocks.
+    """Fit the base model with the knocks, and all of it, in its fitter; also return the knocks.
 
     given: how many terms the model has already; slips: take steps inside the camera for nuisances
     as knocks are.
@@ -196,15 +178,16 @@ def split_knocks(
     effects = [x for x in rest if x not in knocks]
 
     def fitted(parts: list[tuple[Term, float]]) -> Solution:
-        fit: Fit = fitter.refine(fitter.fit([t for t, _ in parts]), max_iterations=3)
-        return Solution(fit, tuple(p for _, p in parts))
+        fitter = solution.fitter
+        fit = fitter.refine(fitter.fit([t for t, _ in parts]), max_iterations=3)
+        return replace(solution, fit=fit, penalties=tuple(p for _, p in parts))
 
     base = fitted(first + knocks)
     whole = fitted(first + knocks + effects) if effects else base
     return base, whole, tuple(t for t, _ in knocks)
 
 
-def is_convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> bool:
+def is_convincing(base: Solution, best: Solution) -> bool:
     """Test whether the effects of `best` are worth their penalties, and hold in both series.
 
     Constants from all series but one are held against that one, and from two each against the
@@ -212,6 +195,7 @@ def is_convincing(fitter: HypothesisFitter, base: Solution, best: Solution) -> b
     """
     if base.score <= best.score:
         return False
+    fitter = best.fitter
     every = range(len(fitter.series))
     if len(every) < 2 or all(t.is_separate for t in best.terms[len(base.terms) :]):
         return True

@@ -15,7 +15,6 @@ import numpy as np
 from thermocald.discovery import criteria
 from thermocald.discovery.formulas import FormulaSearch, condensed
 from thermocald.discovery.gap import image_chi2
-from thermocald.discovery.search import Solution
 from thermocald.discovery.validation import SurrogateTest
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.linalg import explained
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
 
     from thermocald.discovery.examination import Examination
     from thermocald.discovery.formulas import Found
+    from thermocald.discovery.search import Solution
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
@@ -44,22 +44,16 @@ _SEED = 16
 class Proposal:
     """What was found.
 
-    fitter: the series it was found on; base, best: solutions in it; closed: share of the misfit of
+    base, best: solutions in the series that it was found on; closed: share of the misfit of
     M2 that constants of M1 explain, and of M1 by constants of M2; surrogates: shares of
     surrogates; rivals: other formulas, as simple, and by how much they score worse.
     """
 
-    fitter: HypothesisFitter
     base: Solution
     best: Solution
     closed: tuple[float, float]
     surrogates: SurrogateTest
     rivals: tuple[tuple[Term, float], ...]
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """The formulas, without what the base model has already."""
-        return self.best.terms[len(self.base.terms) :]
 
 
 def propose(
@@ -74,7 +68,8 @@ def propose(
     if len(x.fitter.series) < 2:
         return None
     (progress or (lambda _: None))("beyond the catalogue")
-    fitter, base = _straighten(x)
+    base = _straighten(x)
+    fitter = base.fitter
     search = FormulaSearch(condensed(fitter, base.fit, moving), criteria.MARGIN)
     test = SurrogateTest(
         *search.surrogates(criteria.FORMULA_SURROGATES, np.random.default_rng(_SEED))
@@ -88,7 +83,7 @@ def propose(
         if turn:
             here = condensed(fitter, base.fit, moving, best.fit.weightings)
             search = FormulaSearch(here, criteria.MARGIN, search)
-        _try(fitter, base, moving, search.best(further=turn > 0), tried)
+        _try(base, moving, search.best(further=turn > 0), tried)
         best = min([base, *tried.values()], key=lambda s: s.score)
         if best.score > before.score - criteria.MARGIN or all(
             a.adequate for a in examine_all(fitter, best.fit)
@@ -96,8 +91,8 @@ def propose(
             break
     if best is base:
         return None
-    best = _choose_parameters(fitter, base, _simplify(fitter, base, best))
-    closed = _cross_check(fitter, base, best)
+    best = _choose_parameters(base, _simplify(base, best))
+    closed = _cross_check(base, best)
     if closed is None:
         return None
     by_m1, by_m2 = closed  # NaN: M2 does not determine them
@@ -113,10 +108,10 @@ def propose(
          if s.terms[-1].effect != best.terms[-1].effect and parse(s.terms[-1].effect).size <= size),
         key=lambda r: r[1],
     )  # fmt: skip
-    return Proposal(fitter, base, best, closed, test, tuple(rivals))
+    return Proposal(base, best, closed, test, tuple(rivals))
 
 
-def _straighten(x: Examination) -> tuple[HypothesisFitter, Solution]:
+def _straighten(x: Examination) -> Solution:
     """Take the curvature of the projection along everything that moves off the series, and fit the
     base model in them.
     """
@@ -125,11 +120,11 @@ def _straighten(x: Examination) -> tuple[HypothesisFitter, Solution]:
         bridge = a.trajectories.T @ a.amplitudes
         series.append(relinearise(x.fitter, x.base.fit, s, bridge) or e)
     fitter = HypothesisFitter(series)
-    return fitter, replace(x.base, fit=fitter.fit(x.base.terms, x.base.fit.coefficients))
+    fit = fitter.fit(x.base.terms, x.base.fit.coefficients)
+    return replace(x.base, fit=fit, fitter=fitter)
 
 
 def _try(
-    fitter: HypothesisFitter,
     base: Solution,
     parameters: Sequence[str],
     formulas: Sequence[Found],
@@ -141,11 +136,11 @@ def _try(
         structure, values = found.node.named()
         term = Term(structure.text(), tuple(parameters), tuple(values.items()))
         penalty = found.penalty + criteria.MARGIN * structure.size
-        fit = _fit(fitter, (*base.terms, term))
+        fit = _fit(base.fitter, (*base.terms, term))
         if fit is not None:
-            here[term.effect] = Solution(fit, (*base.penalties, penalty))
+            here[term.effect] = replace(base, fit=fit, penalties=(*base.penalties, penalty))
     for text, solution in sorted(here.items(), key=lambda h: h[1].score)[:_REFINED]:
-        better = _fit(fitter, solution.terms, refined=True)
+        better = _fit(base.fitter, solution.terms, refined=True)
         here[text] = solution if better is None else replace(solution, fit=better)
     for text, solution in here.items():
         if text not in tried or solution.score < tried[text].score:
@@ -172,8 +167,9 @@ def _leaves_nothing(fitter: HypothesisFitter, fit: Fit) -> bool:
     return all(a.significance < noise_criteria.SIGNIFICANT for a in examine_all(fitter, fit))
 
 
-def _simplify(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solution:
+def _simplify(base: Solution, best: Solution) -> Solution:
     """Leave out operators that it does as well without, one after the other."""
+    fitter = base.fitter
     nothing_left = _leaves_nothing(fitter, best.fit)
     while True:
         term = best.terms[-1]
@@ -186,7 +182,8 @@ def _simplify(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solut
             own = Term(structure.text(), term.parameters, tuple(values.items()))
             fit = _fit(fitter, (*base.terms, own), refined=True)
             if fit is not None:
-                solution = Solution(fit, (*base.penalties, best.penalties[-1] - criteria.MARGIN))
+                penalties = (*base.penalties, best.penalties[-1] - criteria.MARGIN)
+                solution = replace(base, fit=fit, penalties=penalties)
                 if solution.score < best.score or (nothing_left and _leaves_nothing(fitter, fit)):
                     found.append(solution)
         if not found:
@@ -194,9 +191,9 @@ def _simplify(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solut
         best = min(found, key=lambda s: s.score)
 
 
-def _choose_parameters(fitter: HypothesisFitter, base: Solution, best: Solution) -> Solution:
+def _choose_parameters(base: Solution, best: Solution) -> Solution:
     """Choose the parameters in which the formula is needed, one after the other."""
-    term = best.terms[-1]
+    term, fitter = best.terms[-1], base.fitter
     A, c = normals_of_term(fitter, base.fit, term, PARAMETER_NAMES, best.fit.weightings)
     n = float(np.log(sum(int((e.n > 0).sum()) for e in fitter.series)))
     chosen = [PARAMETER_NAMES.index(p) for p in term.parameters]
@@ -225,16 +222,14 @@ def _choose_parameters(fitter: HypothesisFitter, base: Solution, best: Solution)
     if fit is None:
         return best
     change = n * (len(names) - len(term.parameters))
-    return Solution(fit, (*best.penalties[:-1], best.penalties[-1] + change))
+    return replace(best, fit=fit, penalties=(*best.penalties[:-1], best.penalties[-1] + change))
 
 
-def _cross_check(
-    fitter: HypothesisFitter, base: Solution, best: Solution
-) -> tuple[float, float] | None:
+def _cross_check(base: Solution, best: Solution) -> tuple[float, float] | None:
     """Return the share of the misfit of M2 that constants of M1 alone explain, and the other way,
     NaN where M2 alone does not determine them; None where M1 does not.
     """
-    shares = []
+    shares, fitter = [], base.fitter
     for here, there in ((0, 1), (1, 0)):
         without = fitter.fit(base.terms, only=[here])
         whole = _fit(fitter, best.terms, [here], refined=True)

@@ -356,11 +356,8 @@ def _conclude_unexplained(
     fits = base, base
     proposal = propose(x, described.where["parameters"], progress)
     if proposal is not None:
-        fitter, best = proposal.fitter, proposal.best
-        x = replace(
-            x, fitter=fitter, base=proposal.base, best=best,
-            adequacy=examine_all(fitter, best.fit),
-        )  # fmt: skip
+        best, fitter = proposal.best, proposal.best.fitter
+        x = replace(x, base=proposal.base, best=best, adequacy=examine_all(fitter, best.fit))
         fits = fit_first(fitter, x.base.terms), fit_first(fitter, best.terms)
         added = (stages[-1].added, "unnamed")
         stages[-1:] = [measure_stage(x, a, f, known) for a, f in zip(added, fits, strict=True)]

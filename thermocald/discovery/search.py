@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.movement import Mount
     from thermocald.thermal.scan import Scan
     from thermocald.thermal.series import ReducedSeries
 
@@ -95,10 +96,19 @@ class Scanned:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A fitted hypothesis with its penalty; the smaller the score the better."""
+    """A fitted hypothesis with its penalties, and the fitter that it was fitted in; the smaller the
+    score the better.
+
+    mount: the movement beside it, which the fitter's series have, None where the mount stands
+    still; as_slips: whether a slip inside the camera explains each knock of the mount as well, in
+    order.
+    """
 
     fit: Fit
     penalties: tuple[float, ...]
+    fitter: HypothesisFitter
+    mount: Mount | None = None
+    as_slips: tuple[bool, ...] = ()
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -140,11 +150,12 @@ class Search:
     def base(self, given: Sequence[tuple[str, dict[str, Any]]] = ()) -> Solution:
         """Fit the base model, with the effects that a model has already."""
         if not given:
-            return Solution(self.fitter.fit(()), ())
+            return Solution(self.fitter.fit(()), (), self.fitter)
         terms = tuple(
             make_known_term(name, values, len(self.fitter.series)) for name, values in given
         )
-        return Solution(self.fitter.refine(self.fitter.fit(terms)), (0.0,) * len(terms))
+        fit = self.fitter.refine(self.fitter.fit(terms))
+        return Solution(fit, (0.0,) * len(terms), self.fitter)
 
     # -- scanning --------------------------------------------------------------------------
 
@@ -154,18 +165,21 @@ class Search:
 
     def promise(self, candidate: Candidate, found: Scan) -> Scanned:
         """Return what a scan of a candidate promises."""
-        if candidate.kind.is_event:
-            return self._event(candidate, found)
-        value = float(candidate.grid[found.best]) if len(candidate.grid) else None
-        term = candidate.term(value, len(self.fitter.series))
-        penalty = self._penalty(candidate, found.coefficients)
-        return Scanned(candidate, term, float(found.gains[found.best]), penalty)
-
-    def _event(self, candidate: Candidate, found: Scan) -> Scanned:
-        """Place an event in each series, at its own time, or in none."""
+        once = 2 * float(np.log(len(self.candidates))) + self.margin
+        count, each = found.coefficients, float(np.log(self.epochs))
+        if not candidate.kind.is_event:
+            key = (candidate.effect, candidate.parameters)
+            if key not in self._trials:
+                self._trials[key] = self.scanner.trials(candidate)
+            best = int(np.argmax(found.gains))
+            value = float(candidate.grid[best]) if len(candidate.grid) else None
+            penalty = (count + (value is not None)) * each + once
+            penalty += 2 * float(np.log(max(self._trials[key], 1.0)))
+            term = candidate.term(value, len(self.fitter.series))
+            return Scanned(candidate, term, float(found.gains[best]), penalty)
+        # an event comes in each series at its own time, or in none but the first
         fresh: list[tuple[tuple[str, float], ...] | None] = []
-        total, penalty = 0.0, 0.0
-        single = found.coefficients * np.log(self.epochs) + 2 * np.log(self.epochs)
+        total, penalty, single = 0.0, once, (count + 2) * each
         for s, gains in enumerate(found.events):
             best = int(np.argmax(gains))
             if gains[best] > single + self.margin or s == 0:
@@ -175,22 +189,7 @@ class Search:
             else:
                 fresh.append(None)
         term = replace(candidate.term(None, len(found.events)), fresh=tuple(fresh))
-        return Scanned(candidate, term, total, penalty + self._once())
-
-    def _once(self) -> float:
-        return 2 * float(np.log(len(self.candidates))) + self.margin
-
-    def _penalty(self, candidate: Candidate, count: int) -> float:
-        key = (candidate.effect, candidate.parameters)
-        if key not in self._trials:
-            self._trials[key] = self.scanner.trials(candidate)
-        searched = np.log(self.epochs) if len(candidate.grid) else 0.0
-        return float(
-            count * np.log(self.epochs)
-            + searched
-            + 2 * np.log(max(self._trials[key], 1.0))
-            + self._once()
-        )
+        return Scanned(candidate, term, total, penalty)
 
     # -- growing and shrinking ----------------------------------------------------------------
 
@@ -199,7 +198,7 @@ class Search:
         key = tuple(terms)
         if key not in self._refined:
             self._refined[key] = self.fitter.refine(self.fitter.fit(terms), max_iterations=5)
-        found = Solution(self._refined[key], tuple(penalties))
+        found = Solution(self._refined[key], tuple(penalties), self.fitter)
         same = _kinds(terms)
         if same not in self._known or found.score < self._known[same].score:
             self._known[same] = found
@@ -235,18 +234,34 @@ class Search:
         return self.refine((*solution.terms, promise.term), penalties)
 
     def _promises(self, solution: Solution, width: int, least: float = 0.0) -> list[Scanned]:
-        """Scan every candidate that a solution does not have; the most promising come first."""
+        """Scan every candidate that a solution does not have: the `width` most promising effects
+        first, each with the sets that promise as much as its best.
+
+        A scan is right to some percent, with a drive to half: what promises a tenth cannot win.
+        """
         if solution.fit not in self._scanned:
             self._scanned[solution.fit] = [
                 self.scan(c, solution) for c in self.candidates if c.effect not in solution.names
             ]
             solution.fit.forget()
-        promises = []
-        for found in self._scanned[solution.fit]:
-            enough = found.net > (0.0 if found.candidate.kind.is_event else least)
-            if np.isfinite(found.gain) and enough:
-                promises.append(found)
-        return _worth_fitting(promises, width)
+        enough = [
+            p
+            for p in self._scanned[solution.fit]
+            if np.isfinite(p.gain)
+            and p.net > (0.0 if p.candidate.kind.is_event else max(least, 0.0))
+        ]
+        ordered = sorted(enough, key=lambda p: -p.net)
+        out: list[Scanned] = []
+        best: dict[str, float] = {}
+        for p in ordered:
+            name = p.candidate.effect
+            if name in best:
+                if p.net > criteria.SET_SHARE * best[name]:
+                    out.append(p)
+            elif len(best) < width and (len(best) < 3 or p.net >= 0.1 * ordered[0].net):
+                best[name] = p.net
+                out.append(p)
+        return out
 
     def with_other_delay(self, solution: Solution) -> Solution | None:
         """Put another kind of delay of the temperature in place of a solution's own."""
@@ -291,41 +306,19 @@ class Search:
     def shrink(self, solution: Solution, kept: int = 0) -> Solution:
         """Drop every effect that is no longer worth its penalty; the first `kept` stay."""
         while len(solution.terms) > kept + 1:
-            fewer = [self._without(solution, i) for i in range(kept, len(solution.terms))]
+            fewer = []
+            for number in range(kept, len(solution.terms)):
+                terms = tuple(t for j, t in enumerate(solution.terms) if j != number)
+                penalties = [p for j, p in enumerate(solution.penalties) if j != number]
+                # as it was found before, where the rest was fitted already
+                fewer.append(self._known.get(_kinds(terms)) or self.refine(terms, penalties))
             best = min(fewer, key=lambda s: s.score)
             if best.score > solution.score:
                 break
             solution = best
         return solution
 
-    def _without(self, solution: Solution, number: int) -> Solution:
-        """Drop one effect; as it was found before, where the rest was fitted already."""
-        terms = tuple(t for j, t in enumerate(solution.terms) if j != number)
-        known = self._known.get(_kinds(terms))
-        penalties = [p for j, p in enumerate(solution.penalties) if j != number]
-        return known or self.refine(terms, penalties)
-
 
 def _kinds(terms: Sequence[Term]) -> frozenset[tuple[str, tuple[str, ...]]]:
     """Return what a hypothesis consists of, whatever its numbers."""
     return frozenset((t.effect, t.parameters) for t in terms)
-
-
-def _worth_fitting(promises: Sequence[Scanned], width: int) -> list[Scanned]:
-    """Choose the `width` most promising effects, each with the sets that promise as much as its
-    best.
-
-    A scan is right to some percent, with a drive to half: what promises a tenth cannot win.
-    """
-    ordered = sorted((p for p in promises if p.net > 0), key=lambda p: -p.net)
-    out: list[Scanned] = []
-    best: dict[str, float] = {}
-    for p in ordered:
-        name = p.candidate.effect
-        if name in best:
-            if p.net > criteria.SET_SHARE * best[name]:
-                out.append(p)
-        elif len(best) < width and (len(best) < 3 or p.net >= 0.1 * ordered[0].net):
-            best[name] = p.net
-            out.append(p)
-    return out

@@ -160,16 +160,16 @@ def describe_proposal(
     """
     number = len(found.best.terms) - 1
     term = found.best.terms[number]
-    estimates = estimate_term(fit, number, found.fitter.series[0])
+    estimates = estimate_term(fit, number, x.fitter.series[0])
     trade_off = None
-    tied = find_tied_constants(found.fitter, fit, number)
+    tied = find_tied_constants(x.fitter, fit, number)
     if tied and tied["exchanged"]:  # what the inverse says of them is of the others held
         estimates = {
             k: {**v, "sd": None} if k in tied["parameters"] or k.startswith("a_") else v
             for k, v in estimates.items()
         }
     else:
-        trade_off = find_trade_off(found.fitter, fit, number)
+        trade_off = find_trade_off(x.fitter, fit, number)
     sentence = catalogue.get(term.effect).sentence(estimates)
     evidence = {k: v for k, v in described.evidence.items() if k != "bridge"}
     by_m1, by_m2 = found.closed

@@ -1,10 +1,11 @@
-"""What came of one blind case."""
+"""What came of one case, blind or on real corners."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
-from tests.blind.case import Case
+from thermocald.discovery.result import Discovery
 
 
 @dataclass
@@ -13,7 +14,7 @@ class Outcome:
     gap_closed: share of M2's excess of reduced χ²; seconds: CPU.
     """
 
-    case: Case
+    case: Any
     found: tuple[str, ...]
     verdict: str
     listed: tuple[str, ...]
@@ -23,3 +24,22 @@ class Outcome:
     gap_closed: float | None = None
     seconds: float = 0.0
     misfit_px: float = 0.0
+
+
+def compare(
+    case: Any, discovery: Discovery, seconds: float, accepted: tuple[tuple[str, ...], ...] = ()
+) -> Outcome:
+    """Compare what was discovered with what is hidden; accepted: names that are right instead."""
+    found = tuple(sorted(e.effect for e in discovery.effects))
+    listed = tuple(a for e in discovery.effects for a in e.alternative_names)
+    hidden = tuple(sorted(case.effects))
+    right = found in (accepted or (hidden,))
+    right &= (discovery.verdict == "unexplained") is (found == ("unnamed",))
+    close = right
+    if not right and len(found) == len(hidden):
+        wrong = [h for h in hidden if h not in found]
+        close = all(any(w in a.split("+") for a in listed) for w in wrong)
+    return Outcome(
+        case, found, discovery.verdict, listed, right, close, {}, discovery.excess_closed(),
+        seconds, max(a.misfit_px for a in discovery.examination.adequacy),
+    )  # fmt: skip

@@ -24,7 +24,7 @@ import numpy as np
 from tests.blind.bridge import series_input
 from tests.blind.case import OUTSIDE, SINGLE, Case
 from tests.blind.generator import generate
-from tests.blind.outcome import Outcome
+from tests.blind.outcome import Outcome, compare
 from tests.blind.tables import row, write
 from thermocald.discovery.result import Discovery, discover_series
 from thermocald.thermal.reduce import reduce_series
@@ -53,25 +53,12 @@ def judge(case: Case) -> Outcome:
 
 def judge_discovery(case: Case, discovery: Discovery, truth: dict, seconds: float) -> Outcome:
     """Compare what was discovered with what is hidden."""
-    found = tuple(sorted(e.effect for e in discovery.effects))
-    listed = tuple(a for e in discovery.effects for a in e.alternative_names)
-    hidden = tuple(sorted(case.effects))
-    if hidden == (OUTSIDE,):
-        right = discovery.verdict == "unexplained" and found == ("unnamed",)
-        close = right
-    else:
-        right = found == hidden
-        close = right
-        if not right and len(found) == len(hidden):
-            wrong = [h for h in hidden if h not in found]
-            close = all(any(w in a.split("+") for a in listed) for w in wrong)
-    out = Outcome(
-        case, found, discovery.verdict, listed, right, close, seconds=seconds,
-        misfit_px=max(a.misfit_px for a in discovery.examination.adequacy),
-    )  # fmt: skip
-    if right and hidden and hidden != (OUTSIDE,):
+    outside = case.effects == (OUTSIDE,)
+    out = compare(case, discovery, seconds, (("unnamed",),) if outside else ())
+    if out.right and case.effects and not outside:
         out.pulls = dict(_pulls(discovery, truth))
-        out.gap_closed = discovery.excess_closed()
+    else:
+        out.gap_closed = None
     return out
 
 

@@ -4,10 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
 from thermocald.thermal.series import COLUMNS
+
+
+def of_images(e):
+    """The well-determined combinations (P, k), and the covariance of the images alone."""
+    size, U = np.linalg.eigh(e.N.mean(axis=0))
+    keep = U[:, size > 1e-3 * np.median(size)]
+    N = np.einsum("pi,epq,qj->eij", keep, e.N, keep)
+    return keep, block_diag(*np.linalg.inv(N))
+
+
+def products(S, C, V):
+    """Inner products of trajectories C (E, R) along V (k, R), their levels eliminated, under S."""
+    X = np.einsum("er,kr->ekr", C, V).reshape(-1, C.shape[1])
+    level = np.tile(np.eye(len(V)), (len(C), 1))
+    inverse = np.linalg.inv(S)
+    L = inverse @ level
+    return X.T @ (inverse - L @ np.linalg.solve(level.T @ L, L.T)) @ X
 
 
 @pytest.fixture
@@ -17,29 +35,20 @@ def dense(evidence_of):
     fitter = HypothesisFitter(evidence)
     fit = fitter.fit((Term("nonlinear_expansion"),))
     e = evidence[0]
-    E, _P = len(e.times), len(COLUMNS)
-    # the least determined combinations are left out so that N can be inverted
-    size, U = np.linalg.eigh(e.N.mean(axis=0))
-    keep = U[:, size > 1e-3 * np.median(size)]
-    N = np.einsum("pi,epq,qj->eij", keep, e.N, keep)
-    k = keep.shape[1]
-    S = np.zeros((E * k, E * k))
-    for i in range(E):
-        S[i * k : (i + 1) * k, i * k : (i + 1) * k] = np.linalg.inv(N[i])
-    J = np.zeros((E * k, len(e.state_sd("temperature"))))
+    keep, images = of_images(e)
+    J = np.zeros((len(images), len(e.state_sd("temperature"))))
     for block in fit.blocks:
         d = keep.T @ fit.direction(block)[0]
         operator = (
             fitter.drive((), 0)[1] if block.term < 0 else fitter.trajectories(fit.terms[0], 0)[1]
         )
-        for i in range(E):
-            J[i * k : (i + 1) * k] += np.outer(d, operator[i])
-    S += J @ np.diag(e.state_sd("temperature") ** 2) @ J.T
-    return e, fit, keep, S, J
+        J += np.einsum("k,er->ekr", d, operator).reshape(J.shape)
+    S = images + J @ np.diag(e.state_sd("temperature") ** 2) @ J.T
+    return e, fit, keep, S, images
 
 
 def test_inner_products_equal_the_dense_ones(dense):
-    e, fit, keep, S, J = dense
+    e, fit, keep, S, images = dense
     rng = np.random.default_rng(0)
     C = rng.normal(size=(len(e.times), 3))
     C -= C.mean(axis=0)
@@ -47,27 +56,19 @@ def test_inner_products_equal_the_dense_ones(dense):
 
     A = fit.weightings[0].reduce(C, V)[0]
 
-    X = np.einsum("er,kr->ekr", C, keep.T @ V).reshape(-1, 3)
-    level = np.tile(np.eye(keep.shape[1]), (len(e.times), 1))
-    inverse = np.linalg.inv(S)
-    L = inverse @ level
-    projected = inverse - L @ np.linalg.solve(level.T @ L, L.T)
-    expected = X.T @ projected @ X
+    expected = products(S, C, keep.T @ V)
     assert pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected).max()) == A
     # the thermometer's part of S is seen: image noise alone gives something else
-    images = np.linalg.inv(S - J @ np.diag(e.state_sd("temperature") ** 2) @ J.T)
-    L = images @ level
-    alone = X.T @ (images - L @ np.linalg.solve(level.T @ L, L.T)) @ X
+    alone = products(images, C, keep.T @ V)
     assert np.abs(alone - expected).max() > 0.02 * np.abs(expected).max()
 
 
 def test_determinant(dense):
-    e, fit, keep, S, _ = dense
-    k = keep.shape[1]
-    N = np.einsum("pi,epq,qj->eij", keep, e.N, keep)
-    images = -sum(np.linalg.slogdet(n)[1] for n in N)
-    expected = np.linalg.slogdet(S)[1] - images
-    assert expected > k  # readings are noisier than images: the determinants differ by much
+    _, fit, keep, S, images = dense
+    expected = np.linalg.slogdet(S)[1] - np.linalg.slogdet(images)[1]
+    assert (
+        expected > keep.shape[1]
+    )  # readings are noisier than images: the determinants differ by much
     assert fit.weightings[0].logdet == pytest.approx(expected, rel=1e-3)
 
 

@@ -10,6 +10,7 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import Case
 from tests.blind.generator import generate
+from tests.discovery.test_likelihood import of_images, products
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.random_effects import Movement, waves
 from thermocald.thermal.reduce import reduce_together
@@ -43,17 +44,11 @@ def test_targets_seen_in_one_epoch_say_nothing():
 def test_movement_is_the_dense_covariance(evidence_of):
     """Inner products with a movement equal those of the covariance matrix written out."""
     (e,), _ = evidence_of(seed=5, epochs=24, with_m2=False)
-    size, U = np.linalg.eigh(e.N.mean(axis=0))
-    keep = U[:, size > 1e-3 * np.median(size)]
+    keep, S = of_images(e)
     directions = keep[:, -2:]
     movement = Movement(directions, waves(e.times, 4), np.full((2, 4), 0.5))
     fit = HypothesisFitter([replace(e, movement=movement)]).fit(())
 
-    N = np.einsum("pi,epq,qj->eij", keep, e.N, keep)
-    E, k = len(N), keep.shape[1]
-    S = np.zeros((E * k, E * k))
-    for i in range(E):
-        S[i * k : (i + 1) * k, i * k : (i + 1) * k] = np.linalg.inv(N[i])
     J = [
         np.einsum("e,k->ek", column, keep.T @ d).ravel()
         for d, operator in movement.operators
@@ -64,13 +59,9 @@ def test_movement_is_the_dense_covariance(evidence_of):
     d = keep.T @ fit.direction(fit.blocks[0])[0]
     J += [np.einsum("e,k->ek", own[:, i], d).ravel() for i in range(own.shape[1])]
     S += np.transpose(J) @ np.array(J)
-    C = np.random.default_rng(1).normal(size=(E, 2))
+    C = np.random.default_rng(1).normal(size=(len(e.times), 2))
     C -= C.mean(axis=0)
-    X = np.einsum("er,kr->ekr", C, keep.T @ keep[:, :2]).reshape(-1, 2)
-    level = np.tile(np.eye(k), (E, 1))
-    inverse = np.linalg.inv(S)
-    L = inverse @ level
-    expected = X.T @ (inverse - L @ np.linalg.solve(level.T @ L, L.T)) @ X
+    expected = products(S, C, keep.T @ keep[:, :2])
 
     found = fit.weightings[0].reduce(C, keep[:, :2])[0]
 

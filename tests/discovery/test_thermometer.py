@@ -7,8 +7,7 @@ import pytest
 
 from thermocald.thermal.thermometer import (
     estimate_reading_noise,
-    find_curved_times,
-    find_latent_times,
+    find_times_between,
     smooth_channel,
     thermometers,
 )
@@ -48,9 +47,10 @@ def test_a_step_is_not_better_than_itself():
 
 def test_kinks_get_a_latent_instant(readings):
     t, y = readings
-    latent = find_latent_times(t, y, 0.0625)
+    latent, curved = find_times_between(t, y, 0.0625)
     assert np.min(np.abs(latent - 805)) < 12
     assert len(latent) < 15
+    assert not len(curved)  # frequent readings need no curve
 
 
 def test_course_is_closer_than_readings(readings):
@@ -100,7 +100,7 @@ def test_kinks_between_sparse_readings_are_found():
     """At 30 s every interval after a lamp bends more than its noise; the switches stand out."""
     rng = np.random.default_rng(2)
     t = 30.0 * np.arange(60)
-    latent = find_latent_times(t, trajectory(t) + rng.normal(0, 0.04, 60), None)
+    latent, _ = find_times_between(t, trajectory(t) + rng.normal(0, 0.04, 60), None)
     assert np.min(np.abs(latent - 200)) < 20
     assert np.min(np.abs(latent - 805)) < 20
     assert len(latent) < 8
@@ -141,8 +141,3 @@ def test_on_a_curve_nothing_is_unknown_but_the_readings():
     assert not weights[:, ~c.real].any()
     # as sharp as a reading, but for the ends, where there are two neighbours on one side
     assert np.linalg.norm(weights, axis=1).max() < 1.1
-
-
-def test_frequent_readings_need_no_curve(readings):
-    t, y = readings
-    assert not len(find_curved_times(t, y, 0.0625))

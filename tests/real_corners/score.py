@@ -14,12 +14,12 @@ import argparse
 import os
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+from tests.blind.outcome import Outcome, compare
 from tests.real_corners.generator import (
     CAMERAS,
     NINE,
@@ -40,20 +40,6 @@ GOALS = {"nine": 0.9, "others": 0.9, "none": 1.0}
 """Share of a part that is named exactly or listed; without an effect, of no name at all."""
 GAP_CLOSED = 0.8
 """Share of the excess on M2 that what was named right closes, down to the camera's own noise."""
-
-
-@dataclass
-class RealOutcome:
-    """found: names said; listed: alternatives not excluded; gap_closed: share on M2."""
-
-    case: RealCase
-    found: tuple[str, ...]
-    verdict: str
-    listed: tuple[str, ...]
-    right: bool
-    right_or_listed: bool
-    gap_closed: float | None
-    seconds: float
 
 
 def input_of(series: RealSeries, source: str) -> SeriesInput:
@@ -78,28 +64,15 @@ def discover_case(case: RealCase) -> tuple[Discovery, dict, float]:
     return found, truth, time.process_time() - begin
 
 
-def judge(case: RealCase) -> RealOutcome:
+def judge(case: RealCase) -> Outcome:
     """Run one case and judge it."""
     return judge_discovery(case, *discover_case(case))
 
 
-def judge_discovery(
-    case: RealCase, discovery: Discovery, truth: dict, seconds: float
-) -> RealOutcome:
+def judge_discovery(case: RealCase, discovery: Discovery, truth: dict, seconds: float) -> Outcome:
     """Compare what was discovered with what is hidden."""
-    found = tuple(sorted(e.effect for e in discovery.effects))
-    listed = tuple(a for e in discovery.effects for a in e.alternative_names)
-    hidden = tuple(sorted(case.effects))
-    right = found == hidden
-    if not hidden:  # what nobody recorded may be seen; it must not be named
-        right = found in ((), ("unnamed",))
-    close = right
-    if not right and len(found) == len(hidden):
-        wrong = [h for h in hidden if h not in found]
-        close = all(any(w in a.split("+") for a in listed) for w in wrong)
-    return RealOutcome(
-        case, found, discovery.verdict, listed, right, close, discovery.excess_closed(), seconds
-    )
+    # what nobody recorded may be seen; it must not be named
+    return compare(case, discovery, seconds, () if case.effects else ((), ("unnamed",)))
 
 
 def cases(part: str, seeds: Iterable[int], cameras: Iterable[str] = CAMERAS) -> Iterator[RealCase]:
@@ -114,7 +87,7 @@ def cases(part: str, seeds: Iterable[int], cameras: Iterable[str] = CAMERAS) -> 
                     yield RealCase(camera, (effect,), seed)
 
 
-def missed(part: str, done: list[RealOutcome]) -> list[str]:
+def missed(part: str, done: list[Outcome]) -> list[str]:
     """What a part does not reach of its goals, in words."""
     named = float(np.mean([o.right_or_listed for o in done]))
     out = []

@@ -59,11 +59,12 @@ def test_a_wander_of_the_mount_is_no_effect():
 
 
 def test_a_score_that_misses_its_goal_is_said():
-    from tests.real_corners.score import RealOutcome, missed
+    from tests.blind.outcome import Outcome
+    from tests.real_corners.score import missed
 
     case = RealCase("aviary-cam0", ("creep",), 500)
-    good = RealOutcome(case, ("creep",), "effects_found", (), True, True, 0.95, 1.0)
-    bad = RealOutcome(case, ("slip",), "effects_found", (), False, False, None, 1.0)
+    good = Outcome(case, ("creep",), "effects_found", (), True, True, {}, 0.95, 1.0)
+    bad = Outcome(case, ("slip",), "effects_found", (), False, False, {}, None, 1.0)
 
     assert missed("nine", [good] * 19 + [bad]) == []
     assert "80% named" in missed("nine", [good] * 4 + [bad])[0]

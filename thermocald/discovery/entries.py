@@ -28,6 +28,7 @@ from thermocald.physics import catalogue
 from thermocald.physics.effect import say_estimate
 from thermocald.physics.formula import known_together
 from thermocald.physics.model import ModelEffect, ThermalModel
+from thermocald.thermal import criteria as noise_criteria
 from thermocald.thermal.scan import normals_of_term
 from thermocald.thermal.series import COLUMNS, FIELD_SCALES
 
@@ -380,6 +381,6 @@ def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth, gap: Gap) -> E
         "next_best_gain": growth.other_gain,
     }
     statement = effect.sentence(estimates)
-    if not growth.excludes_other:
+    if growth.gain <= growth.other_gain + noise_criteria.CLEAR:
         statement += f"; it follows {growth.other} as well"
     return EffectFound(effect.name, statement, where, estimates, evidence, [], gap, gap)

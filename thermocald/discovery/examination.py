@@ -225,7 +225,10 @@ def _search_standing(
         complete = _is_adequate(examine_all(fitter, best.fit), base_adequacy)
         # what is adequate may still lack something too fast for the absolute test, and one effect
         # with many coefficients may stand for two others that have not been tried together yet
-        frontier = _choose_frontier(grown) if complete or level == 1 else [best]
+        frontier = [best]
+        if complete or level == 1:  # the best solutions, one per set of names
+            sets = {frozenset(s.names): s for s in sorted(grown, key=lambda s: -s.score)}
+            frontier = sorted(sets.values(), key=lambda s: s.score)[:_WIDTH]
     # larger combinations that were not accepted are no rivals
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > kept:
@@ -317,15 +320,6 @@ def _measure_px(without: Solution, with_it: Solution) -> float:
     return float(np.sqrt(gain / coordinates / np.mean(weights[weights > 0])))
 
 
-def _choose_frontier(grown: list[Solution]) -> list[Solution]:
-    """Choose the best solutions of a level, one per set of names."""
-    out: list[Solution] = []
-    for s in sorted(grown, key=lambda s: s.score):
-        if all(sorted(s.names) != sorted(o.names) for o in out):
-            out.append(s)
-    return out[:_WIDTH]
-
-
 def _is_adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
     """Test whether a solution leaves nothing, or next to nothing of what the base left."""
     return all(
@@ -384,10 +378,19 @@ def _examine_beside_mount(
 def _keep_named(
     search: Search, base: Solution, best: Solution, jobs: int
 ) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
-    """Drop the effects that blocks left out or surrogates speak against."""
+    """Drop the effects that do not predict blocks left out, or that surrogates speak against.
+
+    Returns also what the others gain on each block, and their surrogates.
+    """
     kept = len(base.terms)
-    best, blocks = _keep_confirmed(search, base, best)
     while len(best.terms) > kept:
+        blocks = measure_block_gains(search.fitter, best.fit, kept)
+        bad = [i for i, g in enumerate(blocks) if not is_confirmed(g)]
+        if bad:
+            worst = min(bad, key=lambda i: float(blocks[i].sum()))
+            search.progress(f"{best.names[kept + worst]} does not predict the blocks left out")
+            best = _drop_effect(search, base, best, kept + worst)
+            continue
         tests = []
         for i in range(kept, len(best.terms)):
             without = _drop_effect(search, base, best, i)
@@ -397,8 +400,8 @@ def _keep_named(
         if tests[worst].passed:
             return best, blocks, tuple(tests)
         search.progress(f"{best.names[kept + worst]} is not more than noise may give")
-        best, blocks = _keep_confirmed(search, base, _drop_effect(search, base, best, kept + worst))
-    return best, blocks, ()
+        best = _drop_effect(search, base, best, kept + worst)
+    return best, [], ()
 
 
 def _drop_effect(search: Search, base: Solution, best: Solution, number: int) -> Solution:
@@ -406,19 +409,3 @@ def _drop_effect(search: Search, base: Solution, best: Solution, number: int) ->
     terms = [t for i, t in enumerate(best.terms) if i != number]
     penalties = [p for i, p in enumerate(best.penalties) if i != number]
     return search.refine(terms, penalties) if len(terms) > len(base.terms) else base
-
-
-def _keep_confirmed(search: Search, base: Solution, best: Solution) -> tuple[Solution, list[Array]]:
-    """Drop the effects that do not predict blocks left out; also return what the others gain
-    on each block.
-    """
-    kept = len(base.terms)
-    while len(best.terms) > kept:
-        blocks = measure_block_gains(search.fitter, best.fit, kept)
-        bad = [i for i, g in enumerate(blocks) if not is_confirmed(g)]
-        if not bad:
-            return best, blocks
-        worst = kept + min(bad, key=lambda i: float(blocks[i].sum()))
-        search.progress(f"{best.names[worst]} does not predict the blocks left out")
-        best = _drop_effect(search, base, best, worst)
-    return best, []

@@ -85,12 +85,6 @@ class Condensed:
         out: Array = np.linalg.inv(np.linalg.cholesky(own)) @ Z
         return out
 
-    def beside(self, trajectory: Array) -> Condensed:
-        """Put a trajectory (rows,) into the model."""
-        Q = self.regressors(trajectory[:, None])[0].T
-        root = self.root - (self.root @ Q) @ Q.T
-        return replace(self, root=root, data=self.data - Q @ (Q.T @ self.data))
-
     @property
     def power(self) -> float:
         """χ² of everything that the base model leaves in these parameters."""
@@ -188,10 +182,6 @@ class Library:
         other.
         """
         return np.concatenate([e.values(node) for e in self.evaluators])
-
-    def stack(self, nodes: Sequence[Node]) -> Array:
-        """Return the trajectories (rows, G)."""
-        return np.stack([self.values(n) for n in nodes], axis=1)
 
     def span(self, node: Node) -> tuple[float, float]:
         """Return the range of a formula's values."""
@@ -334,11 +324,12 @@ _SIMPLER = 0.25  # log of what is left: one operator more has to leave a quarter
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A formula with its constants, the χ² it explains, and what the search for it costs."""
+    """A formula with its constants, the χ² it explains, what the search for it costs, its rank."""
 
     node: Node
     gain: float
     penalty: float
+    rank: float
 
 
 class FormulaSearch:
@@ -367,7 +358,7 @@ class FormulaSearch:
         G).
         """
         with np.errstate(all="ignore"):
-            stack = self.library.stack(nodes)
+            stack = np.stack([self.library.values(n) for n in nodes], axis=1)
             good = np.isfinite(stack).all(axis=0) & (np.ptp(stack, axis=0) > 0)
         return [n for n, ok in zip(nodes, good, strict=True) if ok], stack[:, good]
 
@@ -384,21 +375,18 @@ class FormulaSearch:
             self.tried += len(more)
             kept, stack = self._finite(more)
             tried = self._exact(kept, self.evidence.gains(stack), _WIDTH // 2)
-            found = sorted([*found, *tried], key=self._rank, reverse=True)
-            if self._rank(found[0]) <= self._rank(before):
+            found = sorted([*found, *tried], key=lambda f: f.rank, reverse=True)
+            if found[0].rank <= before.rank:
                 break
         return found
 
-    def _rank(self, found: Found) -> float:
+    def _rank(self, node: Node, gain: float) -> float:
         """Rank by what is left; a further operator has to leave a quarter less."""
-        return self._rank_gain(found.node, found.gain)
-
-    def _rank_gain(self, node: Node, gain: float) -> float:
         return -float(np.log(self._left(gain))) - _SIMPLER * node.size
 
     def _exact(self, nodes: Sequence[Node], gains: Array, width: int) -> list[Found]:
         """Fit the constants of the best structures."""
-        ranks = [-self._rank_gain(n, float(g)) for n, g in zip(nodes, gains, strict=True)]
+        ranks = [-self._rank(n, float(g)) for n, g in zip(nodes, gains, strict=True)]
         order = np.argsort(ranks)
         seen: dict[Node, Node] = {}
         for i in order:
@@ -408,7 +396,7 @@ class FormulaSearch:
             if len(seen) == width:
                 break
         out = [self._refine(node) for node in seen.values()]
-        return sorted(out, key=self._rank, reverse=True)
+        return sorted(out, key=lambda f: f.rank, reverse=True)
 
     def _refine(self, node: Node) -> Found:
         """Find the constants that explain most: Gauss-Newton, the coefficients eliminated."""
@@ -448,7 +436,9 @@ class FormulaSearch:
                     break
             if not improved:
                 steps = 0.25 * steps
-        return Found(at(x), gain, self._penalty(len(x)))
+        n = np.log(self.evidence.epochs)
+        penalty = (len(self.evidence.root) + len(x)) * n + 2 * np.log(max(self.tried, 1))
+        return Found(at(x), gain, float(penalty + self.margin), self._rank(at(x), gain))
 
     def _newton(self, trajectory: Array, slopes: Array) -> Array:
         """Return the step of the constants (n,), in the units of `slopes` (rows, n)."""
@@ -487,12 +477,6 @@ class FormulaSearch:
         """Return the χ² that is left beyond the noise, never quite none."""
         r = len(self.evidence.data)
         return max(self.evidence.power - gain - r, 0.0) + 0.1 * r
-
-    def _penalty(self, constants: int) -> float:
-        n = np.log(self.evidence.epochs)
-        return float(
-            (len(self.evidence.root) + constants) * n + 2 * np.log(max(self.tried, 1)) + self.margin
-        )
 
     def surrogates(self, count: int, rng: np.random.Generator) -> tuple[float, Array]:
         """Return the share of the misfit that the library explains at best, of data and

@@ -86,28 +86,6 @@ class Plan:
         return "\n".join(out)
 
 
-@dataclass(frozen=True, eq=False)
-class SetUp:
-    """One recording without any effect but the model's, and the simulation that it came from."""
-
-    source: SeriesInput
-    simulation: Simulation | None = None
-
-    @property
-    def given(self) -> list[tuple[str, dict[str, Any]]]:
-        """The effects that the model has already."""
-        return [] if self.simulation is None else terms_of(self.simulation.model)
-
-    def following(self, term: Term) -> SeriesInput | None:
-        """Return the recording of a camera that follows a drive; None where nothing simulates."""
-        if self.simulation is None:
-            return None
-        model = self.simulation.model
-        effect = ModelEffect(term.effect, dict(term.nonlinear))
-        changed = replace(model, effects=(*model.effects, effect))
-        return _record(replace(self.simulation, model=changed))
-
-
 def set_ups(
     source: SeriesInput | None,
     model: Path | None,
@@ -115,13 +93,14 @@ def set_ups(
     testfield: str | None,
     programme: Path | None,
     seeds: int,
-) -> list[SetUp]:
-    """Prepare recordings of the set-up with no effect but the model's, one per seed.
+) -> list[tuple[SeriesInput, Simulation | None]]:
+    """Prepare recordings of the set-up with no effect but the model's, one per seed, each with the
+    simulation that it came from.
 
     A measured series may stand for the set-up: then its own epochs and noise are used, once.
     """
     if source is not None:
-        return [SetUp(source)]
+        return [(source, None)]
     if preset is None and (model is None or programme is None):
         raise UsageError(
             "--plan needs a recording of the set-up, or --preset, or --model and --programme"
@@ -131,13 +110,13 @@ def set_ups(
 
     model = None if preset is not None else model
     field = load_field(testfield) if testfield is not None else None
-    out = []
+    out: list[tuple[SeriesInput, Simulation | None]] = []
     for seed in range(seeds):
         simulation = given_simulation(preset, model, None, field, programme, seed, "plan")
         if preset is not None:  # its camera counts, not how it drifts
             bare = simulation.model.without(*(e.name for e in simulation.model.effects))
             simulation = replace(simulation, model=bare)
-        out.append(SetUp(_record(simulation), simulation))
+        out.append((_record(simulation), simulation))
     return out
 
 
@@ -150,12 +129,17 @@ def _record(simulation: Simulation) -> SeriesInput:
         return series_input(read_recording(path))
 
 
-def plan_power(inputs: Sequence[SetUp], strength_px: float, advance: Callable[[], None]) -> Plan:
-    """Put every effect into every simulated recording and look for it."""
+def plan_power(
+    inputs: Sequence[tuple[SeriesInput, Simulation | None]],
+    strength_px: float,
+    advance: Callable[[], None],
+) -> Plan:
+    """Put every effect into every recording of `set_ups` and look for it."""
     found: dict[str, dict[str, int]] = {}
     rng = np.random.default_rng(0)
-    for set_up in inputs:
-        evidence = reduce_series(set_up.source)
+    for source, simulation in inputs:
+        given = [] if simulation is None else terms_of(simulation.model)
+        evidence = reduce_series(source)
         fitter = HypothesisFitter([evidence])
         done: set[str] = set()
         for candidate in list_candidates([evidence]):
@@ -163,10 +147,10 @@ def plan_power(inputs: Sequence[SetUp], strength_px: float, advance: Callable[[]
                 continue
             done.add(candidate.effect)
             if candidate.kind.is_drive:
-                changed = _put_drive(set_up, fitter, candidate, strength_px)
+                changed = _put_drive(simulation, fitter, candidate, strength_px)
             else:
                 changed = _put_effect(fitter, candidate, strength_px, rng)
-            said = _say(changed, set_up.given)
+            said = _say(changed, given)
             row = found.setdefault(candidate.effect, {})
             row[said] = row.get(said, 0) + 1
             advance()
@@ -203,7 +187,10 @@ def _put_effect(
 
 
 def _put_drive(
-    set_up: SetUp, fitter: HypothesisFitter, candidate: Candidate, strength_px: float
+    simulation: Simulation | None,
+    fitter: HypothesisFitter,
+    candidate: Candidate,
+    strength_px: float,
 ) -> ReducedSeries:
     """Let the camera follow a drive, at the value that leaves the strength.
 
@@ -220,8 +207,12 @@ def _put_drive(
         off = abs(float(np.log(max(_measure_left(fitter, moved), 1e-9) / strength_px)))
         trials.append((off, term, moved))
     _, term, moved = min(trials, key=lambda t: t[0])
-    source, e = set_up.following(term), fitter.series[0]
-    return e.with_values(e.values + moved) if source is None else reduce_series(source)
+    if simulation is None:
+        e = fitter.series[0]
+        return e.with_values(e.values + moved)
+    effect = ModelEffect(term.effect, dict(term.nonlinear))
+    model = replace(simulation.model, effects=(*simulation.model.effects, effect))
+    return reduce_series(_record(replace(simulation, model=model)))
 
 
 def _choose_place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> float | None:

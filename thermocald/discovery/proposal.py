@@ -238,14 +238,10 @@ def _cross_check(base: Solution, best: Solution) -> tuple[float, float] | None:
                 return None
             shares.append(float("nan"))
             continue
-        left, before = (_misfit_px(fitter, f, there) for f in (whole, without))
-        shares.append(1.0 - (left / max(before, 1e-9)) ** 2)
+        # mean squares px² beyond the noise of the free cameras
+        e = fitter.series[there]
+        noise = e.rank * float((e.n > 0).sum() - 1)
+        unit = e.sigma_px**2 * e.correlation / (2.0 * float(e.n.sum()))
+        left, before = (unit * max(image_chi2(e, f, there) - noise, 0.0) for f in (whole, without))
+        shares.append(1.0 - left / max(before, 1e-18))
     return shares[0], shares[1]
-
-
-def _misfit_px(fitter: HypothesisFitter, fit: Fit, series: int) -> float:
-    """Return the RMS px that constants leave in a series, beyond the noise of its free cameras."""
-    e = fitter.series[series]
-    chi2 = image_chi2(e, fit, series) - e.rank * float((e.n > 0).sum() - 1)
-    coordinates = 2.0 * float(e.n.sum())
-    return e.sigma_px * float(np.sqrt(max(chi2, 0.0) * e.correlation / coordinates))

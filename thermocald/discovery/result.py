@@ -442,6 +442,13 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
         unit = e.scale[COLUMNS.index(name)]
         rates[name] = float(fit.coefficients[block.start + j] / unit)
         rate_sds[f"rates.{name}"] = float(np.sqrt(fit.covariance[j, j]) / unit)
+    document = discovery.as_dict()
+    evidence: dict[str, Any] = {"verdict": discovery.verdict, "gap": document["gap"]}
+    for entry in document["effects"]:
+        kept = ("statement", "evidence", "alternatives")
+        evidence[entry["effect"]] = {key: entry[key] for key in kept}
+        if "bridge" in entry["evidence"]:
+            evidence["unnamed"]["note"] = "bridged by a smooth term in M1 alone; not transferable"
     T = e.history.temperature()
     weights = e.weights[..., :2] / e.source.per_row[:, None, None]
     return ThermalModel(
@@ -462,21 +469,7 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
         validity={e.history.reference: (float(T.min()), float(T.max()))},
         fitted_on=[{"recording": s.source.name, "epochs": int((s.n > 0).sum())}
                    for s in x.fitter.series[:1]],
-        evidence=_evidence(discovery),
+        evidence=evidence,
         name=old.name if old else e.source.camera,
         version=old.version + 1 if old else 1,
     )  # fmt: skip
-
-
-def _evidence(discovery: Discovery) -> dict[str, Any]:
-    document = discovery.as_dict()
-    out: dict[str, Any] = {"verdict": discovery.verdict, "gap": document["gap"]}
-    for entry in document["effects"]:
-        out[entry["effect"]] = {
-            "statement": entry["statement"],
-            "evidence": entry["evidence"],
-            "alternatives": entry["alternatives"],
-        }
-        if "bridge" in entry["evidence"]:
-            out["unnamed"]["note"] = "bridged by a smooth term in M1 alone; not transferable"
-    return out

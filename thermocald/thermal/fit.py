@@ -394,6 +394,8 @@ class HypothesisFitter:
     def refine(self, fit: Fit, max_iterations: int = 6, only: Sequence[int] | None = None) -> Fit:
         """Improve the non-linear parameters by Gauss-Newton; never makes the objective worse."""
         searched = self.searched(fit.terms)
+        # what is seen less often in each series is a wander
+        longest = max(float(e.times[-1]) for e in self.series) / _PERIODS
         if searched:
             for _ in range(max_iterations):
                 A, g, _ = self.normal_equations(fit, only)
@@ -407,7 +409,7 @@ class HypothesisFitter:
                         parameter = terms[i].kind.nonlinear[name]
                         value = parameter.bounded(old, old + float(d), slack=0.1)
                         if parameter.role == "period":
-                            value = min(value, max(old, self._longest_period()))
+                            value = min(value, max(old, longest))
                         terms[i] = terms[i].with_value(name, value)
                     if terms == tried:  # every parameter at its bound again
                         continue
@@ -421,10 +423,6 @@ class HypothesisFitter:
                     break
         A, _, searched = self.normal_equations(fit, only)
         return replace(fit, covariance=scaled_inverse(A, _RIDGE), searched=tuple(searched))
-
-    def _longest_period(self) -> float:
-        """Return the longest period: what is seen less often in each series is a wander."""
-        return max(float(e.times[-1]) for e in self.series) / _PERIODS
 
 
 def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:

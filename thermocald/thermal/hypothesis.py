@@ -292,7 +292,10 @@ def parse_effect(text: str) -> ModelEffect:
             names = kind.nonlinear[key].unit == "names"
             values[key] = tuple(value.split("+")) if names else value
         else:
-            values[key] = _number(text, key, value)
+            try:
+                values[key] = float(value)
+            except ValueError:
+                raise UsageError(f"--effect {text}: {key}={value} is not a number") from None
     for key, parameter in kind.nonlinear.items():
         if parameter.text and not values.get(key):
             example = "x33+y52" if parameter.unit == "names" else "board_temperature"
@@ -334,13 +337,6 @@ def check_names(listed: Iterable[ModelEffect], series: Iterable[ReducedSeries]) 
                         f"effect {effect.name}: the test field of {s.source.name} has no target "
                         f"{target!r}; {_nearest(target, s.source.field.index)}"
                     )
-
-
-def _number(text: str, key: str, value: str) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        raise UsageError(f"--effect {text}: {key}={value} is not a number") from None
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

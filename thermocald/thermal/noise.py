@@ -63,11 +63,6 @@ class NoiseGrowth:
     other: str
     noise: tuple[Array, ...]
 
-    @property
-    def excludes_other(self) -> bool:
-        """Whether the reference temperature explains it better than anything else."""
-        return self.gain > self.other_gain + criteria.CLEAR
-
 
 def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
     """Test whether the measuring noise follows the reference temperature; None where it does not.

@@ -53,7 +53,7 @@ from thermocald.thermal.thermometer import Thermometer, thermometers
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from thermocald.arrays import Array, Mask
     from thermocald.physics.model import Distortion
@@ -149,24 +149,16 @@ def _take_running_median(
     padded = np.pad(near, ((_HALF - before, _HALF - after), (0, 0), (0, 0)),
                     constant_values=np.nan)  # fmt: skip
     width, n = 2 * _HALF + 1, part.stop - part.start
-    stack = np.stack([padded[k : k + n] for k in range(width) if itself or k != _HALF])
-    width = len(stack)
-    stack.sort(axis=0)  # NaN go to the end
-    count = np.isfinite(stack).sum(axis=0)
-    low = np.maximum(count - 1, 0) // 2
-    high = np.minimum(count // 2, width - 1)
-    pick = np.take_along_axis
-    middle: Array = 0.5 * (pick(stack, low[None], 0)[0] + pick(stack, high[None], 0)[0])
-    return middle
+    return _take_median([padded[k : k + n] for k in range(width) if itself or k != _HALF], 0)
 
 
-def _take_medians(values: Array) -> Array:
-    """Return the median of each row (e, n), NaN ignored; NaN where there is nothing else."""
-    ordered = np.sort(values, axis=1)  # NaN go to the end
-    count = np.isfinite(ordered).sum(axis=1)
-    rows = np.arange(len(ordered))
-    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, ordered.shape[1] - 1)
-    return np.asarray(0.5 * (ordered[rows, low] + ordered[rows, high]))
+def _take_median(values: ArrayLike, axis: int) -> Array:
+    """Return the median along an axis, NaN ignored; NaN where there is nothing else."""
+    ordered = np.sort(values, axis=axis)  # NaN go to the end
+    count = np.isfinite(ordered).sum(axis=axis, keepdims=True)
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, ordered.shape[axis] - 1)
+    sides = (np.take_along_axis(ordered, at, axis) for at in (low, high))
+    return np.asarray(0.5 * sum(sides)).squeeze(axis)
 
 
 def find_spikes(misclosure: Array, seen: Mask) -> Mask:
@@ -180,8 +172,8 @@ def find_spikes(misclosure: Array, seen: Mask) -> Mask:
         # is usual would be nothing.
         d = misclosure[part] - _take_running_median(misclosure, part, itself=False)
         for k in range(2):
-            d[..., k] -= _take_medians(d[..., k])[:, None]  # the whole image may move
-        own[part] = MAD_TO_SD * _take_medians(np.abs(d).reshape(len(d), -1))
+            d[..., k] -= _take_median(d[..., k], 1)[:, None]  # the whole image may move
+        own[part] = MAD_TO_SD * _take_median(np.abs(d).reshape(len(d), -1), 1)
         size[part] = np.max(np.abs(np.nan_to_num(d)), axis=2)
     finite = own[np.isfinite(own)]
     level = float(np.median(finite)) if len(finite) else 0.0
@@ -201,7 +193,7 @@ def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
     for part in _parts(len(seen)):
         root = np.sqrt(weights[part, :, :2])
         kept = np.where(good[part, :, None], np.abs(np.nan_to_num(v[part])) * root, np.nan)
-        own[part] = MAD_TO_SD * _take_medians(kept.reshape(len(kept), -1))
+        own[part] = MAD_TO_SD * _take_median(kept.reshape(len(kept), -1), 1)
         normal.append(kept[np.isfinite(kept)])
         local = np.abs(np.nan_to_num(v[part] - _take_running_median(v, part, bad)))
         size[part] = np.max(local * root, axis=2)

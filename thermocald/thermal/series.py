@@ -29,7 +29,7 @@ from thermocald.physics.history import History
 from thermocald.physics.model import Distortion, distortion_along, follow_angle
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
     from scipy.sparse import csr_array
@@ -286,11 +286,6 @@ class ReducedSeries:
         weights = self.weights[..., :2]
         return float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
 
-    @property
-    def dof(self) -> float:
-        """Image coordinates that the free cameras do not use up."""
-        return float(np.sum(2 * self.n - self.N.shape[1]))
-
 
 def scaled_basis(iop: Array, scale: Array, distortion: Distortion) -> Array:
     """Return ∂ camera and field scales / ∂ columns (19, 19), both px-scaled, at an orientation."""
@@ -321,11 +316,11 @@ _DAYS = 30.0  # of a series whose long blocks are whole days: what a day repeats
 def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
     """Choose the first epochs (B,) of at most `rows` blocks."""
     E = len(evidence.times)
-    apart = _Scatter(evidence, _remove_rates(evidence))
-    every = _Scatter(evidence, evidence.values)
+    apart = _scatter(evidence, _remove_rates(evidence))
+    every = _scatter(evidence, evidence.values)
 
     def worth(start: int, stop: int) -> float:
-        return apart.within(start, stop) + _ALL_MOVEMENT * every.within(start, stop)
+        return apart(start, stop) + _ALL_MOVEMENT * every(start, stop)
 
     first = _cut_evenly(evidence.times, rows // 2)
     heap: list[tuple[float, int, int]] = []
@@ -337,7 +332,9 @@ def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
         if stop - start < 2:
             done.append(start)
             continue
-        middle = _halve(evidence.times, start, stop)
+        times = evidence.times[start:stop]  # halved in time; one epoch at least on either side
+        half = np.searchsorted(times, 0.5 * (times[0] + times[-1]))
+        middle = start + int(np.clip(half, 1, len(times) - 1))
         for part in ((start, middle), (middle, stop)):
             heapq.heappush(heap, (-worth(*part), *part))
     return np.array(sorted([*done, *(start for _, start, _ in heap)]), dtype=np.int64)
@@ -351,12 +348,6 @@ def _cut_evenly(times: Array, most: int) -> NDArray[np.int64]:
         length = np.ceil(length / _DAY_S) * _DAY_S
     number = np.floor((times - times[0]) / max(length, 1e-9))
     return np.flatnonzero(np.diff(number, prepend=-1.0) > 0)
-
-
-def _halve(times: Array, start: int, stop: int) -> int:
-    """Halve a block in time; at least one epoch on either side."""
-    half = 0.5 * (times[start] + times[stop - 1])
-    return int(np.clip(np.searchsorted(times[start:stop], half) + start, start + 1, stop - 1))
 
 
 def _remove_rates(evidence: ReducedSeries) -> Array:
@@ -374,35 +365,26 @@ def _remove_rates(evidence: ReducedSeries) -> Array:
     return left
 
 
-class _Scatter:
-    """χ² of cameras about the mean of any run of epochs, beyond their noise, from running sums."""
+def _scatter(evidence: ReducedSeries, values: Array) -> Callable[[int, int], float]:
+    """χ² of cameras about the mean of a run of epochs `start` to `stop`, less its expectation."""
 
-    def __init__(self, evidence: ReducedSeries, values: Array) -> None:
-        N = evidence.N
-        right = np.einsum("epq,eq->ep", N, values)
-        square = np.einsum("ep,ep->e", right, values)
-        self._N = _accumulate(N)
-        self._right = _accumulate(right)
-        self._square = _accumulate(square)
-        self._count = _accumulate((evidence.n > 0).astype(float))
-        self._free = evidence.rank
+    def running(each: Array) -> Array:  # (E + 1, …) sums of all before each epoch
+        out = np.zeros((len(each) + 1, *each.shape[1:]))
+        np.cumsum(each, axis=0, out=out[1:])
+        return out
 
-    def within(self, start: int, stop: int) -> float:
-        """Return χ² less its expectation for epochs `start` to `stop`."""
-        count = self._count[stop] - self._count[start]
+    right = np.einsum("epq,eq->ep", evidence.N, values)
+    square = np.einsum("ep,ep->e", right, values)
+    sums = [running(x) for x in (evidence.N, right, square, (evidence.n > 0).astype(float))]
+    rank = evidence.rank
+
+    def within(start: int, stop: int) -> float:
+        N, b, total, count = (x[stop] - x[start] for x in sums)
         if count < 2:
             return 0.0
-        N = self._N[stop] - self._N[start]
-        right = self._right[stop] - self._right[start]
-        total = self._square[stop] - self._square[start] - explained(N, right, 1e-9)
-        return float(total - self._free * (count - 1))
+        return float(total - explained(N, b, 1e-9) - rank * (count - 1))
 
-
-def _accumulate(values: Array) -> Array:
-    """Sum (E + 1, …) all before each epoch."""
-    out = np.zeros((len(values) + 1, *values.shape[1:]))
-    np.cumsum(values, axis=0, out=out[1:])
-    return out
+    return within
 
 
 def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:

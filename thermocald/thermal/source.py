@@ -338,7 +338,12 @@ def series_input(
     """
     source.head.require_calibrated(source.title)
     if source.has_observations and len(source) > limit_rows(len(source.testfield)):
-        return condensed(replace(_read_epochs(source), columns=_read_columns(source)), source)
+        every = source.columns
+        whole = _start_input(
+            source.head, source.testfield, source.title, every.numbers, every.frame_time,
+            every.temperature_time, every.temperatures,
+        )  # fmt: skip
+        return condensed(replace(whole, columns=_read_columns(source)), source)
     if not source.has_observations and say is not None:
         say(f"measuring the {len(source)} frames of {source.title}")
     epochs = measure_epochs(source, advance, jobs)
@@ -371,15 +376,6 @@ def _read_columns(source: Recording | StoredRecording) -> dict[str, NDArray[np.f
             continue  # text: a note
         out[name] = np.where(np.isfinite(values), values, np.nan)
     return out
-
-
-def _read_epochs(source: Recording | StoredRecording) -> SeriesInput:
-    """Read the epochs of a series without their image points."""
-    columns = source.columns
-    return _start_input(
-        source.head, source.testfield, source.title, columns.numbers,
-        columns.frame_time, columns.temperature_time, columns.temperatures,
-    )  # fmt: skip
 
 
 def _start_input(

@@ -84,8 +84,8 @@ class Thermometer:
         seen (E,) K/s: jumps of the slope that the images show; late s: of the readings they follow.
         The straight line between two readings misses an eighth of the jump times the interval.
         Where the readings show the jump themselves, the value in the middle of the interval is an
-        unknown of its own (`find_latent_times`); from the lines to it a kink anywhere differs by up
-        to 0.05 of that, half way between.
+        unknown of its own (`find_times_between`); from the lines to it a kink anywhere differs by
+        up to 0.05 of that, half way between.
         """
         t, size, sharp = self._jumps()
         i = np.clip(np.searchsorted(t, times - late, side="right") - 1, 0, len(t) - 2)
@@ -156,47 +156,37 @@ def _third_differences(t: Array, y: Array) -> Array:
     return out
 
 
-def find_latent_times(times: Array, readings: Array, resolution: float | None) -> Array:
-    """Find instants between two readings at which the temperature may leave the straight line.
+def find_times_between(
+    times: Array, readings: Array, resolution: float | None
+) -> tuple[Array, Array]:
+    """Find instants between two readings at which the temperature leaves the straight line.
 
-    Where a lamp was switched the trajectory bends within one interval, by up to a quarter of the
-    bend; a maximum that lies between two readings is seen by no reading.
-    """
-    valid = np.isfinite(readings)
-    t, y = times[valid], readings[valid]
-    bend, limit = _measure_bends(t, y, estimate_reading_noise(t, y, resolution))
-    size = np.abs(bend)
-    sharp = size > limit
-    if not len(sharp):
-        return np.zeros(0)
-    if sharp.mean() > _OFTEN_SHARP:  # it bends everywhere: a kink is where it bends most
-        padded = np.pad(size, 2)
-        # at a reading it bends in both intervals alike, and noise says in which more
-        sharp &= size >= _ALIKE * np.max([padded[k : k + len(size)] for k in range(5)], axis=0)
-        sharp &= size > _KINK * np.median(size[size > limit])
-    return 0.5 * (t[:-1] + t[1:])[sharp]
+    Returns latent ones: where a lamp was switched the trajectory bends within one interval, by up
+    to a quarter of the bend; a maximum that lies between two readings is seen by no reading.
 
-
-def find_curved_times(times: Array, readings: Array, resolution: float | None) -> Array:
-    """Find instants between two readings where the temperature follows its neighbours' curve.
-
-    A straight line lies below a warming that slows down, by a twelfth of h² T'' in the mean: little
-    in one interval, but it has one sign, and is a delay of h²/12τ in all. None where all lines
-    together miss less than a quarter of the noise of one reading; none beside a kink
-    (`find_latent_times`).
+    And others, where it follows its neighbours' curve: a straight line lies below a warming that
+    slows down, by a twelfth of h² T'' in the mean: little in one interval, but it has one sign, and
+    is a delay of h²/12τ in all. None where all lines together miss less than a quarter of the noise
+    of one reading; none beside a kink.
     """
     valid = np.isfinite(readings)
     t, y = times[valid], readings[valid]
     noise = estimate_reading_noise(t, y, resolution)
     bend, limit = _measure_bends(t, y, noise)
-    smooth = np.ones(len(bend), dtype=bool)
-    smooth[np.searchsorted(t, find_latent_times(times, readings, resolution)) - 1] = False
-    missed = max(float(np.sum(bend[smooth] ** 2 - (limit / 3.0) ** 2)), 0.0) if len(t) > 3 else 0.0
+    size = np.abs(bend)
+    sharp = size > limit
+    if sharp.any() and sharp.mean() > _OFTEN_SHARP:
+        # it bends everywhere: a kink is where it bends most
+        padded = np.pad(size, 2)
+        # at a reading it bends in both intervals alike, and noise says in which more
+        sharp &= size >= _ALIKE * np.max([padded[k : k + len(size)] for k in range(5)], axis=0)
+        sharp &= size > _KINK * np.median(size[size > limit])
+    latent = 0.5 * (t[:-1] + t[1:])[sharp]
+    missed = max(float(np.sum(bend[~sharp] ** 2 - (limit / 3.0) ** 2)), 0.0)
     if np.sqrt(missed) / 24.0 < _STRAIGHT * noise:
-        return np.zeros(0)
+        return latent, np.zeros(0)
     share = np.arange(1, _PARTS) / _PARTS
-    inside: Array = (t[:-1, None] + share * np.diff(t)[:, None])[smooth].ravel()
-    return inside
+    return latent, (t[:-1, None] + share * np.diff(t)[:, None])[~sharp].ravel()
 
 
 def _measure_bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
@@ -369,28 +359,26 @@ def thermometers(
 
     noises {column: (R,)} K: of readings that are means of many; between those nothing is latent.
     """
-    latent = {
-        name: find_latent_times(times, r, resolutions.get(name)) if noises is None else np.zeros(0)
+    between = {
+        name: (np.zeros(0), np.zeros(0))
+        if noises is not None
+        else find_times_between(times, r, resolutions.get(name))
         for name, r in readings.items()
     }
-    curved = {
-        name: find_curved_times(times, r, resolutions.get(name)) if noises is None else np.zeros(0)
-        for name, r in readings.items()
-    }
-    between = [*latent.values(), *curved.values()]
-    knots, first = np.unique(np.concatenate([times, *between]), return_index=True)
+    every = [instants for pair in between.values() for instants in pair]
+    knots, first = np.unique(np.concatenate([times, *every]), return_index=True)
     from_reading = first < len(times)
     channels = {}
     for name, r in readings.items():
         on_knots = np.full(len(knots), np.nan)
         on_knots[from_reading] = r[first[from_reading]]
-        own_latent, own_curved = np.isin(knots, latent[name]), np.isin(knots, curved[name])
+        latent, curved = (np.isin(knots, instants) for instants in between[name])
         known = None
         if noises is not None:
             known = np.full(len(knots), np.nan)
             known[from_reading] = noises[name][first[from_reading]]
-        own = from_reading & ~own_latent & ~own_curved
+        own = from_reading & ~latent & ~curved
         resolution = resolutions.get(name)
-        channel = smooth_channel(knots, on_knots, own, own_latent, own_curved, resolution, known)
+        channel = smooth_channel(knots, on_knots, own, latent, curved, resolution, known)
         channels[name] = extend(channel)
     return next(iter(channels.values())).times, channels

@@ -17,34 +17,35 @@ from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.series import in_blocks
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def source():
     return series_input(generate(Case(("creep",), 0.3, 4, with_m2=False))[0][0])
 
 
-def test_noise_is_found(source):
-    e = reduce_series(source)
+@pytest.fixture(scope="module")
+def e(source):
+    return reduce_series(source)
 
+
+def test_noise_is_found(e):
     assert np.sqrt(e.variance) * 0.04 == pytest.approx(0.04, rel=0.02)
     assert np.median(e.sigma0) == pytest.approx(1.0, abs=0.02)
 
 
-def test_gross_errors_are_taken_out(source):
-    e = reduce_series(source)
-
-    share = e.gross / source.grid.observed.sum()
+def test_gross_errors_are_taken_out(e):
+    share = e.gross / e.source.grid.observed.sum()
     assert 0.001 < share < 0.004  # 0.2 % were put in, some below what can be seen
     normal = e.residuals * np.sqrt(e.weights[..., :2])
     assert np.nanmax(np.abs(normal)) < 6.0
 
 
-def test_wrong_field_coordinates_do_not_matter(source):
+def test_wrong_field_coordinates_do_not_matter(source, e):
     """A constant error of each target's coordinates leaves the trajectories as they were."""
     rng = np.random.default_rng(0)
     moved = source.field.points + rng.normal(0, 0.1, source.field.points.shape)
     other = replace(source, field=replace(source.field, points=moved))
 
-    fits = [HypothesisFitter([reduce_series(x)]).fit((Term("creep"),)) for x in (source, other)]
+    fits = [HypothesisFitter([x]).fit((Term("creep"),)) for x in (e, reduce_series(other))]
 
     creep = [f.coefficients[3:] for f in fits]
     # 0.1 mm of 1 m turn the partial derivatives by 1e-4 and the linearisation by a little more
@@ -80,9 +81,7 @@ def test_weak_input_is_refused(source):
             reduce_series(weak)
 
 
-def test_blocks_keep_the_slow_courses(source):
-    e = reduce_series(source)
-
+def test_blocks_keep_the_slow_courses(e):
     short = in_blocks(e, rows=60)
 
     assert len(short.times) == 60

@@ -17,18 +17,27 @@ def lagging():
     return HypothesisFitter(trembling(("thermal_lag",), 0.0, 3))
 
 
-def fitted(fitter, first, second):
-    T = Node("", name=fitter.series[0].history.reference)
-    twice = Node("lag", (Node("lag", (T,), (first,)),), (second,))
-    structure, values = twice.named()
+T = Node("", name="temperature")
+
+
+def fitted(fitter, formula):
+    """A formula in c, x0, y0, with its constants as unknowns."""
+    structure, values = formula.named()
     fit = fitter.fit((Term(structure.text(), BASE, tuple(values.items())),))
     return fitter.refine(fit, max_iterations=0)
 
 
-def test_two_equal_lags_are_said_by_their_sum(lagging):
-    fit = fitted(lagging, 30.0, 30.0)
+def twice_lagging(fitter, first, second):
+    return fitted(fitter, Node("lag", (Node("lag", (T,), (first,)),), (second,)))
 
-    found = find_trade_off(lagging, fit, 0)
+
+def saturating(fitter, middle, width):
+    """A saturation of the temperature, centred somewhere."""
+    return fitted(fitter, Node("saturation", (T,), (middle, width)))
+
+
+def test_two_equal_lags_are_said_by_their_sum(lagging):
+    found = find_trade_off(lagging, twice_lagging(lagging, 30.0, 30.0), 0)
 
     document, sentence = found
     assert document["sum"] == pytest.approx(60.0)
@@ -37,7 +46,7 @@ def test_two_equal_lags_are_said_by_their_sum(lagging):
 
 
 def test_a_short_and_a_long_lag_are_separate(lagging):
-    assert find_trade_off(lagging, fitted(lagging, 20.0, 150.0), 0) is None
+    assert find_trade_off(lagging, twice_lagging(lagging, 20.0, 150.0), 0) is None
 
 
 def test_a_constant_that_is_not_determined_is_said_so():
@@ -47,15 +56,6 @@ def test_a_constant_that_is_not_determined_is_said_so():
 
     assert "about 1.2e+02" not in said
     assert "about 120 s" in said
-
-
-def saturating(fitter, middle, width):
-    """A saturation of the temperature, centred somewhere, with its constants as unknowns."""
-    T = Node("", name=fitter.series[0].history.reference)
-    structure, values = Node("saturation", (T,), (middle, width)).named()
-    return fitter.refine(
-        fitter.fit((Term(structure.text(), BASE, tuple(values.items())),)), max_iterations=0
-    )
 
 
 def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alone(lagging):
@@ -71,8 +71,6 @@ def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alon
 def test_what_is_known_of_it_is_slope_and_curvature(lagging, middle, width):
     """The curve is the same whichever of the formulas that explain the same is written."""
     found = find_tied_constants(lagging, saturating(lagging, middle, width), 0)
-    history = lagging.series[0].history
-    T = Node("", name=history.reference)
     square = Node("square", (Node("offset", (T,), (found["temperature"],)),))
     parabola = lagging.refine(lagging.fit((Term(square.text(), BASE),)), max_iterations=0)
 
@@ -86,5 +84,5 @@ def test_what_is_known_of_it_is_slope_and_curvature(lagging, middle, width):
 
 
 def test_a_saturation_within_the_recorded_range_is_known(lagging):
-    T = lagging.series[0].history.temperature()
-    assert find_tied_constants(lagging, saturating(lagging, float(T.mean()), 8.0), 0) is None
+    middle = float(lagging.series[0].history.temperature().mean())
+    assert find_tied_constants(lagging, saturating(lagging, middle, 8.0), 0) is None

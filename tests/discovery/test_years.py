@@ -56,19 +56,18 @@ def test_an_effect_hidden_in_one_afternoon_of_a_year():
 
 
 @pytest.mark.slow
-def test_an_effect_that_takes_a_year():
-    found = discover_series(year(outdoors, lambda at, T: T + 2.0 * at / (365 * DAY), 3))
-    assert [e.effect for e in found.effects] == ["creep"]
-    rate = found.effects[0].estimates["a_c"]
-    assert rate["value"] == pytest.approx(2.0 * 2e-4 / (365 * DAY), abs=4 * rate["sd"])
-
-
-@pytest.mark.slow
-def test_a_slip_is_found_on_its_day():
-    found = discover_series(year(outdoors, lambda at, T: T + 1.5 * (at > 123.6 * DAY), 3))
-    assert [e.effect for e in found.effects] == ["slip"]
-    time = found.effects[0].estimates["time"]
-    assert time["value"] == pytest.approx(123.6 * DAY, abs=3 * time["sd"])
+@pytest.mark.parametrize(
+    ("effect", "drives", "number", "true", "sds"),
+    [
+        ("creep", lambda at, T: T + 2.0 * at / (365 * DAY), "a_c", 2.0 * 2e-4 / (365 * DAY), 4),
+        ("slip", lambda at, T: T + 1.5 * (at > 123.6 * DAY), "time", 123.6 * DAY, 3),
+    ],
+)
+def test_what_takes_a_year_or_comes_on_one_day_is_named(effect, drives, number, true, sds):
+    found = discover_series(year(outdoors, drives, 3))
+    assert [e.effect for e in found.effects] == [effect]
+    said = found.effects[0].estimates[number]
+    assert said["value"] == pytest.approx(true, abs=sds * said["sd"])
 
 
 @pytest.mark.slow

@@ -35,8 +35,6 @@ NINE = (
 )  # fmt: skip
 OTHERS = ("slip", "cyclic_interference", "second_heat_source", "radial_distortion_drift",
           "decentering_drift", "test_field_expansion")  # fmt: skip
-DEVELOPMENT = range(100)
-SCORING = range(500, 1000)
 INTERVAL = 30.0
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

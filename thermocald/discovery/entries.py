@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from thermocald.discovery.examination import Examination
     from thermocald.discovery.gap import Gap
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Block, Fit, Term
+    from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.noise import NoiseGrowth
     from thermocald.thermal.series import ReducedSeries
 
@@ -56,7 +56,7 @@ def _make_estimate(value: float, sd: float, unit: str) -> Estimate:
 def estimate_term(fit: Fit, number: int, evidence: ReducedSeries) -> dict[str, Estimate]:
     """Return all parameters of one term: searched ones by name, coefficients as `a_<parameter>`."""
     term = fit.terms[number]
-    effect = catalogue.get(term.effect)
+    effect = term.kind
     units = effect.units()
     out: dict[str, Estimate] = {}
     K = len(fit.coefficients)
@@ -73,21 +73,15 @@ def estimate_term(fit: Fit, number: int, evidence: ReducedSeries) -> dict[str, E
             place = K + fit.searched.index((number, name))
             sd = float(np.sqrt(fit.covariance[place, place]))
         out[name] = _make_estimate(value, sd, units[name])
-    for block in fit.blocks:
-        if block.term == number and block.series in (None, 0):
-            out.update(_estimate_coefficients(fit, block, evidence, units))
-    return out
-
-
-def _estimate_coefficients(
-    fit: Fit, block: Block, evidence: ReducedSeries, units: dict[str, str]
-) -> dict[str, Estimate]:
+    own = [b for b in fit.blocks if b.term == number and b.series in (None, 0)]
+    if not own:  # a drive
+        return out
+    (block,) = own
     places = np.arange(block.start, block.stop)
     x = fit.coefficients[places].reshape(block.trajectories, -1)
     C = fit.covariance[np.ix_(places, places)]
     scale = np.array([evidence.scale[COLUMNS.index(p)] for p in block.parameters])
-    out: dict[str, Estimate] = {}
-    if fit.terms[block.term].kind.is_periodic:
+    if effect.is_periodic:
         u, s, v = np.linalg.svd(x, full_matrices=False)
         a, side = s[0] * v[0], u[:, 0]
         if side[0] < 0:

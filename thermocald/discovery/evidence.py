@@ -235,12 +235,17 @@ def _keep_whole_markers(
     return out
 
 
+def left_by_cameras(e: ReducedSeries, rows: NDArray[np.int64]) -> Array:
+    """Return what the free cameras leave (E, n, 2) px of targets, used for them or not."""
+    misclosure = e.source.grid.points[:, rows] - e.at.predicted[rows]
+    left: Array = misclosure - np.einsum("ek,tik->eti", e.values, e.columns[rows])
+    return left
+
+
 def _group_steps(cleaned: ReducedSeries, found: dict[int, tuple[int, float]]) -> list[Displaced]:
     """Measure the steps against the camera that the other targets give; one group per time."""
     rows = np.array(sorted(found))
-    A = cleaned.columns[rows]
-    misclosure = cleaned.source.grid.points[:, rows] - cleaned.at.predicted[rows]
-    v = misclosure - np.einsum("ek,tik->eti", cleaned.values, A)
+    v = left_by_cameras(cleaned, rows)
     w = cleaned.weights[..., 0]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
     v = np.where(np.abs(v - np.nanmedian(v, axis=0)).max(axis=2, keepdims=True) < 1e6, v, np.nan)

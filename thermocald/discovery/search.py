@@ -82,16 +82,12 @@ def _varies(evidence: ReducedSeries, channel: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Scanned:
-    """What a scan of one candidate promises: the best term, gain in χ², penalty."""
+    """What a scan of one candidate promises: the best term, gain in χ² less penalty, penalty."""
 
     candidate: Candidate
     term: Term
-    gain: float
+    net: float
     penalty: float
-
-    @property
-    def net(self) -> float:
-        return self.gain - self.penalty
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +145,10 @@ class Search:
 
     def base(self, given: Sequence[tuple[str, dict[str, Any]]] = ()) -> Solution:
         """Fit the base model, with the effects that a model has already."""
-        if not given:
-            return Solution(self.fitter.fit(()), (), self.fitter)
-        terms = tuple(
-            make_known_term(name, values, len(self.fitter.series)) for name, values in given
-        )
-        fit = self.fitter.refine(self.fitter.fit(terms))
+        count = len(self.fitter.series)
+        terms = [make_known_term(name, values, count) for name, values in given]
+        fit = self.fitter.fit(terms)
+        fit = self.fitter.refine(fit) if terms else fit
         return Solution(fit, (0.0,) * len(terms), self.fitter)
 
     # -- scanning --------------------------------------------------------------------------
@@ -176,7 +170,7 @@ class Search:
             penalty = (count + (value is not None)) * each + once
             penalty += 2 * float(np.log(max(self._trials[key], 1.0)))
             term = candidate.term(value, len(self.fitter.series))
-            return Scanned(candidate, term, float(found.gains[best]), penalty)
+            return Scanned(candidate, term, float(found.gains[best]) - penalty, penalty)
         # an event comes in each series at its own time, or in none but the first
         fresh: list[tuple[tuple[str, float], ...] | None] = []
         total, penalty, single = 0.0, once, (count + 2) * each
@@ -189,7 +183,7 @@ class Search:
             else:
                 fresh.append(None)
         term = replace(candidate.term(None, len(found.events)), fresh=tuple(fresh))
-        return Scanned(candidate, term, total, penalty)
+        return Scanned(candidate, term, total - penalty, penalty)
 
     # -- growing and shrinking ----------------------------------------------------------------
 
@@ -247,7 +241,7 @@ class Search:
         enough = [
             p
             for p in self._scanned[solution.fit]
-            if np.isfinite(p.gain)
+            if np.isfinite(p.net)
             and p.net > (0.0 if p.candidate.kind.is_event else max(least, 0.0))
         ]
         ordered = sorted(enough, key=lambda p: -p.net)

@@ -237,30 +237,29 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
     """
     if not any(term.is_drive for term in fit.terms):
         return None
-    d = fit.direction(fit.blocks[0])[0]
-    return [_sharpened(fitter, fit, s, d) for s in range(len(fitter.series))]
-
-
-def _sharpened(fitter: HypothesisFitter, fit: Fit, s: int, direction: Array) -> ReducedSeries:
-    e = fitter.series[s]
-    if e.blocks is not None:
-        return e
-    name = e.history.reference
-    old = e.thermometers[name]
-    precision = np.einsum("p,epq,q->e", direction, e.N, direction)
-    left = e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(s))
-    operator, sd = fitter.drive(fit.terms, s)[1], old.sd
-    # normal equations of the states and of one level
-    A = np.column_stack([operator, np.ones(len(operator))])
-    normal = A.T @ (precision[:, None] * A)
-    normal[:-1, :-1] += np.diag(1.0 / sd**2)
-    right = A.T @ (left @ direction)
-    right[:-1] += old.deviation / sd**2
-    state = scaled_solve(normal, right, 1e-12)[:-1]
-    trajectory = old.trajectory + old.mixing @ state
-    new = replace(old, trajectory=trajectory, deviation=old.deviation - state)
-    history = replace(e.history, readings={**e.history.readings, name: trajectory})
-    return replace(e, history=history, thermometers={**e.thermometers, name: new})
+    direction = fit.direction(fit.blocks[0])[0]
+    out = []
+    for s, e in enumerate(fitter.series):
+        if e.blocks is not None:
+            out.append(e)
+            continue
+        name = e.history.reference
+        old = e.thermometers[name]
+        precision = np.einsum("p,epq,q->e", direction, e.N, direction)
+        left = e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(s))
+        operator, sd = fitter.drive(fit.terms, s)[1], old.sd
+        # normal equations of the states and of one level
+        A = np.column_stack([operator, np.ones(len(operator))])
+        normal = A.T @ (precision[:, None] * A)
+        normal[:-1, :-1] += np.diag(1.0 / sd**2)
+        right = A.T @ (left @ direction)
+        right[:-1] += old.deviation / sd**2
+        state = scaled_solve(normal, right, 1e-12)[:-1]
+        trajectory = old.trajectory + old.mixing @ state
+        new = replace(old, trajectory=trajectory, deviation=old.deviation - state)
+        history = replace(e.history, readings={**e.history.readings, name: trajectory})
+        out.append(replace(e, history=history, thermometers={**e.thermometers, name: new}))
+    return out
 
 
 def _find_alike(series: ReducedSeries, ok: Mask) -> Mask:

@@ -75,15 +75,14 @@ class Scanner:
     def __init__(self, fitter: HypothesisFitter, like: Scanner | None = None) -> None:
         """like: a scanner of the same histories under other noise."""
         self.fitter = fitter
-        self._stacks: dict[tuple[int, int], Array] = like._stacks if like else {}
-        self._kept: list[Candidate] = like._kept if like else []  # keeps their identities alive
+        self._stacks: dict[tuple[Candidate, int], Array] = like._stacks if like else {}
 
     def stack(self, candidate: Candidate, series: int, fit: Fit) -> Array:
         """Return trajectories (G, E, m) of a candidate over its grid in one series."""
         fitter = self.fitter
         drives = [t for t in fit.terms if t.is_drive]
         chained = candidate.kind.is_drive and bool(drives)
-        key = (id(candidate), series)
+        key = (candidate, series)
         if key in self._stacks and not chained:
             return self._stacks[key]
         if candidate.kind.is_event:
@@ -100,7 +99,6 @@ class Scanner:
         stack -= stack.mean(axis=1, keepdims=True)
         if not chained:
             self._stacks[key] = stack
-            self._kept.append(candidate)
         return stack
 
     def scan(self, candidate: Candidate, fit: Fit) -> Scan:
@@ -126,7 +124,7 @@ class Scanner:
 
     def trials(self, candidate: Candidate) -> float:
         """Count the independent trajectories of the grid: its length in angles over 90°."""
-        stack = self._stacks.get((id(candidate), 0))
+        stack = self._stacks.get((candidate, 0))
         if stack is None or len(stack) < 2:
             return max(float(len(candidate.grid)), 1.0)
         s = stack[..., 0]

@@ -53,10 +53,15 @@ def test_kinks_get_a_latent_instant(readings):
     assert not len(curved)  # frequent readings need no curve
 
 
+def smoothed(t, y):
+    """As an instrument, of which nothing is known between two readings."""
+    none = np.zeros(len(t), bool)
+    return smooth_channel(t, y, ~none, none, none, 0.0625)
+
+
 def test_course_is_closer_than_readings(readings):
     t, y = readings
-    none = np.zeros(len(t), bool)
-    c = smooth_channel(t, y, np.ones(len(t), bool), none, none, 0.0625)
+    c = smoothed(t, y)
     assert np.std(c.trajectory - trajectory(t)) < 0.7 * np.std(y - trajectory(t))
     assert c.trajectory + c.deviation == pytest.approx(y)
 
@@ -65,8 +70,7 @@ def test_a_missing_reading_is_uncertain(readings):
     t, y = readings
     y = y.copy()
     y[50] = np.nan
-    none = np.zeros(len(t), bool)
-    c = smooth_channel(t, y, np.ones(len(t), bool), none, none, 0.0625)
+    c = smoothed(t, y)
     assert c.deviation[50] == 0.0
     assert c.sd[50] > 2 * c.sd[100]
 

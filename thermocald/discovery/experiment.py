@@ -112,25 +112,24 @@ _NOISE_PX = 0.01  # of an epoch: its image points, and a thermometer of 0.02 K
 _HYSTERESIS_K = 0.5
 _LEAST_S = 900.0
 _LEAST_K = 5.0  # of warming, for anything to be seen
-_KINDS: dict[str, tuple[tuple[float, float], ...]] = {
-    "one long hold": ((0.08, 0.0), (0.09, 1.0), (0.62, 1.0), (0.63, 0.0), (1.0, 0.0)),
+_KINDS: dict[str, tuple[tuple[float, float, float], ...]] = {
+    "one long hold": ((0.08, 0.09, 1.0), (0.62, 0.63, 0.0)),
     "two equal cycles": (
-        (0.06, 0.0), (0.07, 1.0), (0.3, 1.0), (0.31, 0.0), (0.53, 0.0), (0.54, 1.0), (0.77, 1.0),
-        (0.78, 0.0), (1.0, 0.0)),
+        (0.06, 0.07, 1.0), (0.3, 0.31, 0.0), (0.53, 0.54, 1.0), (0.77, 0.78, 0.0)),
     "a staircase up and down": (
-        (0.06, 0.0), (0.07, 0.35), (0.2, 0.35), (0.21, 0.7), (0.35, 0.7), (0.36, 1.0), (0.5, 1.0),
-        (0.51, 0.6), (0.68, 0.6), (0.69, 0.3), (0.84, 0.3), (0.85, 0.0), (1.0, 0.0)),
+        (0.06, 0.07, 0.35), (0.2, 0.21, 0.7), (0.35, 0.36, 1.0), (0.5, 0.51, 0.6),
+        (0.68, 0.69, 0.3), (0.84, 0.85, 0.0)),
     "once slowly, once fast": (
-        (0.05, 0.0), (0.5, 1.0), (0.51, 0.0), (0.72, 0.0), (0.73, 1.0), (0.85, 1.0), (0.86, 0.0),
-        (1.0, 0.0)),
+        (0.05, 0.5, 1.0), (0.5, 0.51, 0.0), (0.72, 0.73, 1.0), (0.85, 0.86, 0.0)),
     "three short pulses": (
-        (0.06, 0.0), (0.07, 1.0), (0.17, 1.0), (0.18, 0.0), (0.38, 0.0), (0.39, 1.0), (0.49, 1.0),
-        (0.5, 0.0), (0.7, 0.0), (0.71, 1.0), (0.81, 1.0), (0.82, 0.0), (1.0, 0.0)),
+        (0.06, 0.07, 1.0), (0.17, 0.18, 0.0), (0.38, 0.39, 1.0), (0.49, 0.5, 0.0),
+        (0.7, 0.71, 1.0), (0.81, 0.82, 0.0)),
     "a small loop, then a large one": (
-        (0.05, 0.0), (0.06, 0.5), (0.22, 0.5), (0.23, 0.0), (0.43, 0.0), (0.44, 1.0), (0.7, 1.0),
-        (0.71, 0.0), (1.0, 0.0)),
+        (0.05, 0.06, 0.5), (0.22, 0.23, 0.0), (0.43, 0.44, 1.0), (0.7, 0.71, 0.0)),
 }  # fmt: skip
-"""What is done: (share of the time, share of the highest warming) along straight lines."""
+"""What is done: from one share of the time to another, straight to a share of the highest warming,
+which then is held; 0 at first.
+"""
 
 
 @dataclass(frozen=True)
@@ -249,7 +248,8 @@ def _steps(
     name: str, limits: Limits, body: Body, duration: float, highest: float
 ) -> Iterator[tuple[float, float | None]]:
     """Yield the kind's profile as steps of a thermostat, none rising faster than the limit."""
-    shares, levels = np.array(((0.0, 0.0), *_KINDS[name])).T
+    changes = np.array(_KINDS[name])
+    shares, levels = changes[:, :2].ravel(), np.repeat([0.0, *changes[:, 2]], 2)[1:-1]
     at = np.arange(0.0, duration + _STEP_S, _STEP_S)
     wanted = np.interp(at, shares * duration, body.ambient + levels * (highest - body.ambient))
     held: list[float] = [float(body.ambient)]

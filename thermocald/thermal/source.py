@@ -15,7 +15,7 @@ Does not hold: what is faster than a row outside these windows is averaged over.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.store.recording.head import Head
-    from thermocald.store.recording.readings import Readings
     from thermocald.store.sources import StoredRecording
 
 _POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
@@ -288,26 +287,6 @@ def _roughness(values: Array) -> float:
     return float(np.sum(z**2) - noise)
 
 
-def measure_epochs(
-    source: Recording | StoredRecording,
-    advance: Callable[[int], None] | None = None,
-    jobs: int = 1,
-) -> list[Epoch]:
-    """List the epochs of a series with observations; frames are measured where they are not.
-
-    jobs: processes that measure, with the same bits for any number.
-    """
-    if not isinstance(source, Recording) or source.has_observations:
-        return list(source.epochs)
-    calibrator = Calibrator.of_recording(source)
-    epochs = []
-    for done in calibrated_epochs(calibrator, source.iter_epochs(), jobs):
-        epochs.append(done.epoch)
-        if advance is not None:
-            advance(1)
-    return epochs
-
-
 def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: str) -> SeriesInput:
     """Put some epochs into arrays; name: of their recording or store, for messages."""
     readings = {
@@ -333,8 +312,8 @@ def series_input(
 ) -> SeriesInput:
     """Read the arrays of a recording, or of a series in a store.
 
-    Frames are measured where they have not been, on `jobs` processes. A long series with
-    observations is condensed while it is read.
+    Frames are measured where they have not been, on `jobs` processes, with the same bits for any
+    number. A long series with observations is condensed while it is read.
     """
     source.head.require_calibrated(source.title)
     if source.has_observations and len(source) > limit_rows(len(source.testfield)):
@@ -344,26 +323,26 @@ def series_input(
             every.temperature_time, every.temperatures,
         )  # fmt: skip
         return condensed(replace(whole, columns=_read_columns(source)), source)
-    if not source.has_observations and say is not None:
-        say(f"measuring the {len(source)} frames of {source.title}")
-    epochs = measure_epochs(source, advance, jobs)
+    if isinstance(source, Recording) and not source.has_observations:
+        if say is not None:
+            say(f"measuring the {len(source)} frames of {source.title}")
+        epochs = []
+        for done in calibrated_epochs(Calibrator.of_recording(source), source.iter_epochs(), jobs):
+            epochs.append(done.epoch)
+            if advance is not None:
+                advance(1)
+    else:
+        epochs = list(source.epochs)
     found = epochs_input(source.head, source.testfield, epochs, source.title)
     log = source.columns.readings
-    if log is not None:
-        found = replace(found, **_cut_log(found, log))
+    if log is not None:  # of a log what matters: from one hour before the series, some a frame
+        begin, end = float(found.frame_times[0]), float(found.frame_times[-1])
+        step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
+        rows = np.flatnonzero((log.times >= begin - _MEMORY_S) & (log.times <= end + step))
+        rows = rows[:: max(1, len(rows) // (_READINGS_A_FRAME * len(found.frame_times)))]
+        channels = {name: values[rows] for name, values in log.channels.items()}
+        found = replace(found, reading_times=log.times[rows], readings=channels)
     return replace(found, columns=_read_columns(source))
-
-
-def _cut_log(source: SeriesInput, log: Readings) -> dict[str, Any]:
-    """Return the readings of a log that matter to a series: from one hour before it, some a
-    frame.
-    """
-    begin, end = float(source.frame_times[0]), float(source.frame_times[-1])
-    step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
-    rows = np.flatnonzero((log.times >= begin - _MEMORY_S) & (log.times <= end + step))
-    rows = rows[:: max(1, len(rows) // (_READINGS_A_FRAME * len(source.frame_times)))]
-    channels = {name: values[rows] for name, values in log.channels.items()}
-    return {"reading_times": log.times[rows], "readings": channels}
 
 
 def _read_columns(source: Recording | StoredRecording) -> dict[str, NDArray[np.float64]]:

@@ -43,10 +43,10 @@ from thermocald.photogrammetry.epoch.gauss_markov import (
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds, weaknesses
 from thermocald.photogrammetry.epoch.snooping import (
     TRUSTED_REDUNDANCY,
-    Rejections,
     fails_global_test,
     most_rejected,
     point_tests,
+    settle,
     snoop,
 )
 from thermocald.photogrammetry.field.testfield import plane_fit
@@ -206,10 +206,10 @@ def adjust(
     try:
         solution = solve(problem, start, use)
         tests = point_tests(solution, use)
-        rejections = Rejections(use)
+        history = np.zeros(n, dtype=np.int8)
         for _ in range(_ROUNDS):
             keep = snoop(tests, use, len(unknowns), s.snooping_alpha)
-            keep = rejections.settle(use, keep)
+            keep = settle(history, use, keep)
             if keep is use:
                 break
             use = keep

@@ -98,33 +98,25 @@ def point_tests(solution: Solution, use: Mask) -> Array:
     return test
 
 
-class Rejections:
-    """What data snooping has done so far: a point rejected for the second time stays out.
+def settle(history: NDArray[np.int8], use: Mask, keep: Mask) -> Mask:
+    """Which of those that a round would keep do stay, `use` itself where nothing changes.
 
-    A borderline point would otherwise come and go for ever.
+    history: of each point 1 if it was taken back, 2 if it was rejected again and stays out, as a
+    borderline point would otherwise come and go for ever; 0 at first. Changed in place.
     """
-
-    def __init__(self, used: Mask) -> None:
-        self._back = np.zeros(used.shape, dtype=bool)
-        self._barred = np.zeros(used.shape, dtype=bool)
-
-    def settle(self, use: Mask, keep: Mask, part: slice | NDArray[np.int64] = slice(None)) -> Mask:
-        """Which of those that a round would keep do stay, `use` itself where nothing changes.
-
-        part: the rows that the round looked at.
-        """
-        if keep is use or not np.count_nonzero(keep != use):
-            return use
-        keep = keep & ~self._barred[part]
-        self._barred[part] |= self._back[part] & use & ~keep
-        self._back[part] |= keep & ~use
-        return keep if np.count_nonzero(keep != use) else use
+    if keep is use or not np.count_nonzero(keep != use):
+        return use
+    keep = keep & (history < 2)
+    history[(history == 1) & use & ~keep] = 2
+    history[keep & ~use] = 1
+    return keep if np.count_nonzero(keep != use) else use
 
 
 def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     """Which observations stay: the worst are rejected, those that fit again come back.
 
-    test (n,) of `point_tests`; alpha: error probability of one test.
+    test (n,) of `point_tests`; alpha: error probability of one test. `series.snooping` has the same
+    rule for many epochs, whose arrays would cost a single one ten times as much.
     """
     if alpha <= 0:
         return use

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, Rejections
+from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
@@ -248,7 +248,7 @@ class SeriesEstimator:
     def _snoop_together(self, estimate: Estimate, offered: Mask) -> Estimate:
         """Data snooping where all epochs share unknowns: every round solves the series again."""
         variance, typical = 1.0, None
-        rejections = Rejections(estimate.system.use)
+        history = np.zeros(offered.shape, dtype=np.int8)
         for _ in range(_ROUNDS):
             use = estimate.system.use
             tests = point_tests(estimate.system, estimate.residuals)
@@ -260,7 +260,7 @@ class SeriesEstimator:
             keep = snoop_series(
                 tests, offered, use, self.s.carried, alpha, typical, self._noise_freedom
             )
-            keep = rejections.settle(use, keep)
+            keep = settle(history, use, keep)
             previous, variance = variance, self.variance(estimate)
             settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
             if settled and np.array_equal(keep, use):
@@ -273,7 +273,7 @@ class SeriesEstimator:
         values, residuals = estimate.values, estimate.residuals
         system = whole = replace(estimate.system, use=estimate.system.use.copy())
         use, rows = whole.use, np.arange(len(whole.use))
-        rejections = Rejections(use)
+        history = np.zeros(use.shape, dtype=np.int8)
         part: slice | Index = slice(None)  # without a copy
         typical = self.typical
         for _ in range(_ROUNDS):
@@ -284,7 +284,9 @@ class SeriesEstimator:
                 tests, offered[part], use[part], self.s.carried, self.s.snooping_alpha, typical,
                 self._noise_freedom,
             )  # fmt: skip
-            keep = rejections.settle(use[part], keep, part)
+            seen = history[part]
+            keep = settle(seen, use[part], keep)
+            history[part] = seen
             changed = (keep != use[part]).any(axis=1)
             part = rows = rows[changed]
             if len(rows) == 0:

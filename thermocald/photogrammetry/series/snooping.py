@@ -67,6 +67,17 @@ def _test_weights(
     return inverse
 
 
+def _variances(tests: Array, used: Mask) -> Array:
+    """Variance of unit weight (E,) from each epoch's median, which gross errors do not reach."""
+    n = used.sum(axis=1)
+    half = np.minimum(n // 2, tests.shape[1] - 1)
+    ordered = np.where(used, tests, np.inf)
+    ordered.sort(axis=1)
+    middle = ordered[np.arange(len(n)), half]
+    variance: Array = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
+    return variance
+
+
 def typical_variance(tests: Array, used: Mask) -> float:
     """Variance of unit weight that most epochs agree on; 1 where no residuals show it."""
     variances = _variances(tests, used)
@@ -87,44 +98,16 @@ def snoop_series(
     typical: variance of unit weight of the series, for epochs too poor to tell their own; freedom
     (T,): degrees of freedom with which each target's noise is known, None: it is as stated.
     """
-    keep = np.empty_like(used)
+    keep = offered.copy()
     for part in chunks(*used.shape):
-        keep[part] = _staying(
-            tests[part], offered[part], used[part], unknowns, alpha, typical, freedom
-        )
-    return keep
-
-
-def _variances(tests: Array, used: Mask) -> Array:
-    """Variance of unit weight (E,) from each epoch's median, which gross errors do not reach."""
-    n = used.sum(axis=1)
-    half = np.minimum(n // 2, tests.shape[1] - 1)
-    ordered = np.where(used, tests, np.inf)
-    ordered.sort(axis=1)
-    middle = ordered[np.arange(len(n)), half]
-    variance: Array = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
-    return variance
-
-
-def _staying(
-    tests: Array,
-    offered: Mask,
-    used: Mask,
-    unknowns: int,
-    alpha: float,
-    typical: float,
-    freedom: Array | None,
-) -> Mask:
-    n = used.sum(axis=1)
-    few = 2 * n - unknowns < TRUSTED_REDUNDANCY
-    variance = np.where(few, typical, _variances(tests, used))
-    uncertain = np.where(few, 0.0, 1.0 / np.maximum(n, 1))[:, None]
-    if freedom is not None:
-        uncertain = uncertain + 1.0 / freedom
-    limit = np.maximum(variance, 1e-12)[:, None] * limit_2d(alpha, uncertain)
-    worst = np.where(used, tests, 0.0).max(axis=1, initial=0.0)[:, None]
-    small = tests <= limit
-    near = np.where(few, 1.0, 0.5)[:, None]
-    suspicious = used & ~small & (tests >= near * worst)
-    keep: Mask = offered & (used | small) & ~suspicious
+        test, use = tests[part], used[part]
+        n = use.sum(axis=1)
+        few = 2 * n - unknowns < TRUSTED_REDUNDANCY
+        variance = np.where(few, typical, _variances(test, use))
+        uncertain = np.where(few, 0.0, 1.0 / np.maximum(n, 1))[:, None]
+        if freedom is not None:
+            uncertain = uncertain + 1.0 / freedom
+        fits = test <= np.maximum(variance, 1e-12)[:, None] * limit_2d(alpha, uncertain)
+        worst = np.where(use, test, 0.0).max(axis=1, initial=0.0)
+        keep[part] &= fits | (use & (test < (np.where(few, 1.0, 0.5) * worst)[:, None]))
     return keep

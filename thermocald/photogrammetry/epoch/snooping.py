@@ -26,11 +26,6 @@ _GLOBAL_TEST_NORMAL = 3.09  # quantile of the normal distribution: error probabi
 _AFTER_REJECTION_NORMAL = 1.28  # 10 %
 
 
-def chi2_2d(alpha: float) -> float:
-    """Quantile 1 - alpha of chi-square with two degrees of freedom, which has a closed form."""
-    return -2.0 * log(alpha) if alpha > 0 else float("inf")
-
-
 def limit_2d(alpha: float, uncertainty: Array) -> Array:
     """Limit of a point's test at error probability alpha where the noise was found, not known.
 

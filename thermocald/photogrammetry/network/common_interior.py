@@ -26,7 +26,6 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
-from thermocald.photogrammetry.epoch.snooping import chi2_2d
 from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.network.bundle import (
     BEHIND,
@@ -160,7 +159,8 @@ def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
     """Which image points stay; of the rays of one target only the worst goes at a time."""
     if alpha <= 0:
         return used
-    limit = chi2_2d(alpha) * max(float(np.median(tests[used])) / MEDIAN_CHI2, 1e-12)
+    # chi² with 2 degrees of freedom
+    limit = -2.0 * np.log(alpha) * max(float(np.median(tests[used])) / MEDIAN_CHI2, 1e-12)
     worst = np.zeros(1 + int(target.max(initial=0)))
     np.maximum.at(worst, target[used], tests[used])
     kept: Mask = (tests <= limit) | (used & (tests < worst[target]))

@@ -23,12 +23,18 @@ import numpy as np
 from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     IOP,
+    PRINCIPAL_POINT,
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
     free_columns,
 )
-from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY
+from thermocald.photogrammetry.epoch.geometry import weaknesses
+from thermocald.photogrammetry.epoch.snooping import (
+    TRUSTED_REDUNDANCY,
+    fails_global_test,
+    most_rejected,
+)
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
     by_perspective,
@@ -60,7 +66,6 @@ from thermocald.photogrammetry.series.result import (
     SeriesAdjustment,
     SeriesSettings,
     enough_targets,
-    judge,
 )
 from thermocald.photogrammetry.series.snooping import point_tests
 from thermocald.photogrammetry.series.system import State
@@ -251,28 +256,28 @@ def result(
     still = np.full(len(sigma0), np.nan)
     if s.exterior == "series":
         still = stillness(system, estimate.residuals) / np.where(redundancy > 0, unit, 1.0)
-    values = estimate.values.copy()
-    observed = series.grid.observed
-    status, reasons = judge(
-        series.sensor, series.testfield, series.grid, s, values, use, sound, relative,
-        unit / pooled, redundancy,
-    )  # fmt: skip
-    values[[word != "ok" for word in status]] = np.nan
-    return SeriesAdjustment(
-        s, values, relative, level, sigma0, redundancy, use, observed & ~use,
-        estimate.residuals, estimate.offsets if series.has_offsets else estimate.offsets * np.nan,
-        tuple(status), tuple(reasons), still,
-        np.sqrt(excess), np.sqrt(np.diag(trend + mount_trend)),
-        np.sqrt(pooled) * by_perspective(system), float(np.sqrt(series.field_variance)),
-        _outer_noise(series, estimate),
-        float(np.median(known)) if len(known := sigma0[sound & np.isfinite(sigma0)]) else 1.0,
-        of_held_affinity(
+    known = sigma0[sound & np.isfinite(sigma0)]
+    held_affinity = None
+    if affinity and sound.any():
+        held_affinity = of_held_affinity(
             series.sensor, series.testfield, system, estimate, estimate.residuals,
             series.field_variance,
-        )
-        if affinity and sound.any() else None,
-        movement, series.choice, slow, pairs,
-    )  # fmt: skip
+        )  # fmt: skip
+    return replace(
+        judged(series, estimate, relative, unit / pooled, sigma0, redundancy, still),
+        level_covariance=level,
+        excess_sd=np.sqrt(excess),
+        trend_sd=np.sqrt(np.diag(trend + mount_trend)),
+        perspective_sd=np.sqrt(pooled) * by_perspective(system),
+        field_ratio=float(np.sqrt(series.field_variance)),
+        outer_noise=_outer_noise(series, estimate),
+        noise_ratio=float(np.median(known)) if len(known) else 1.0,
+        affinity=held_affinity,
+        movement=movement,
+        choice=series.choice,
+        slow=slow,
+        pairs=pairs,
+    )
 
 
 def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, float]:
@@ -310,3 +315,92 @@ def epoch_variance(unit: Array, redundancy: Array, pooled: float) -> Array:
     few = redundancy < TRUSTED_REDUNDANCY
     own: Array = np.where(few, np.maximum(unit, pooled), unit)
     return np.where(redundancy > 0, own, pooled)
+
+
+_FEW = 0.6  # share of a series' targets below which an epoch's geometry is looked at by itself
+
+
+def judged(
+    series: SeriesEstimator,
+    estimate: Estimate,
+    covariance: Array,
+    unit: Array,
+    sigma0: Array,
+    redundancy: Array,
+    stillness: Array,
+) -> SeriesAdjustment:
+    """The epochs with their status and reason, and without what belongs to the series as a whole.
+
+    covariance (E, 16, 16); unit (E,): variance of unit weight over the series' own; sigma0,
+    redundancy, stillness (E,).
+    """
+    sensor, testfield, grid, s = series.sensor, series.testfield, series.grid, series.s
+    values, use = estimate.values.copy(), estimate.system.use
+    observed, bounds = grid.observed, s.bounds
+    offered, used = observed.sum(axis=1), use.sum(axis=1)
+    status, reasons = ["ok"] * len(use), [""] * len(use)
+
+    def say(rows: Mask, word: str, sentence: str) -> None:
+        for row in np.flatnonzero(rows):
+            if status[row] == "ok":
+                status[row] = word
+                reasons[row] = sentence.format(n=offered[row], bad=offered[row] - used[row])
+
+    few = 2 * offered - s.carried < TRUSTED_REDUNDANCY
+    most = np.where(few, most_rejected(s.max_rejected, 0), s.max_rejected)
+    say(offered == 0, "no_observations", "no target was measured")
+    say(
+        ~enough_targets(grid, s),
+        "too_few_targets",
+        f"{{n}} targets for {s.carried} unknowns of the epoch leave too little "
+        "redundancy: show more targets or hold parameters fixed",
+    )
+    say(
+        used < (1 - most) * offered,
+        "too_many_rejected",
+        "{bad} of {n} targets contradict the others: a moved test field, a wrong one, or a "
+        "blurred image",
+    )
+    say(~estimate.system.good, "weak_geometry", "these targets cannot carry the parameters")
+    say(
+        fails_global_test(unit, redundancy),
+        "global_test",
+        "the residuals are larger than the series' noise allows, and too few to tell which target "
+        "is wrong: show more targets",
+    )
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    c, pitch = values[:, 0], sensor.pixel_pitch
+    say(
+        np.sqrt(np.maximum(variance[:, 0], 0.0)) > bounds.relative_sd_c * c,
+        "weak_geometry",
+        f"the principal distance is known to worse than {bounds.relative_sd_c:.1%}",
+    )
+    say(
+        np.sqrt(variance[:, PRINCIPAL_POINT].max(axis=1).clip(0.0)) > bounds.sd_point_px * pitch,
+        "weak_geometry",
+        f"the principal point is known to worse than {bounds.sd_point_px:.0f} px",
+    )
+    # Geometry is that of the series' targets; only epochs that see few of them are looked at
+    # one by one.
+    ever = use.any(axis=0).sum()
+    few = (used < _FEW * ever) & (np.array(status) == "ok")
+    typical = int(np.argmax(used))
+    for row in {typical, *map(int, np.flatnonzero(few))}:
+        if status[row] != "ok":
+            continue
+        seen = use[row]
+        found = weaknesses(
+            sensor, testfield.points[seen], grid.points[row, seen], values[row], covariance[row],
+            s.free, bounds,
+        )  # fmt: skip
+        said = "; ".join(found).replace("{", "(").replace("}", ")")
+        if said and row == typical:
+            say(np.ones(len(use), dtype=bool), "weak_geometry", said)
+        elif said:
+            status[row], reasons[row] = "weak_geometry", said
+    values[[word != "ok" for word in status]] = np.nan
+    return SeriesAdjustment(
+        s, values, covariance, np.zeros((16, 16)), sigma0, redundancy, use, observed & ~use,
+        estimate.residuals, estimate.offsets if series.has_offsets else estimate.offsets * np.nan,
+        tuple(status), tuple(reasons), stillness,
+    )  # fmt: skip

@@ -29,7 +29,7 @@ import numpy as np
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
-from thermocald.photogrammetry.series.adjustment import adjusted, epoch_variance, result
+from thermocald.photogrammetry.series.adjustment import adjusted, epoch_variance, judged, result
 from thermocald.photogrammetry.series.covariances import (
     line_weights,
     of_correlated,
@@ -50,7 +50,6 @@ from thermocald.photogrammetry.series.result import (
     SeriesAdjustment,
     SeriesSettings,
     enough_targets,
-    judge,
 )
 from thermocald.photogrammetry.series.system import Design, SeriesSystem, State
 
@@ -285,39 +284,32 @@ class KnownSeries:
             N = normal_matrices(system.used(), system.design.at.A)
             score = stillness(replace(system, N=N), estimate.residuals)
             still = score / np.where(redundancy > 0, unit, 1.0)
-        status, reasons = judge(
-            held.sensor, held.testfield, grid, s, estimate.values, system.use, system.good,
-            covariance, unit / pooled, redundancy,
-        )  # fmt: skip
-        values = estimate.values.copy()
-        values[[word != "ok" for word in status]] = np.nan
-        return estimate, SeriesAdjustment(
-            s, values, covariance, np.zeros((16, 16)), sigma0, redundancy, system.use,
-            grid.observed & ~system.use, estimate.residuals, self.offsets, status, reasons, still,
-        )  # fmt: skip
+        relative_unit = unit / pooled
+        return estimate, judged(
+            held, estimate, covariance, relative_unit, sigma0, redundancy, still
+        )
 
     def _covariance(self, system: SeriesSystem, unit: Array) -> Array:
         """Return covariances (E, 16, 16) of epochs without what all epochs have in common.
 
         unit (E,): variance of unit weight that scales each.
         """
-        s, own, pooled = self.estimator.s, self.design.own, self.estimator.unit
-        mine, kinds = system.Q.copy(), _kinds_of(self.design, system)
-        for rows, _, G in kinds:
+        own, pooled = self.design.own, self.estimator.unit
+        swayed = self.movement.covariance * (self.estimator.s.exterior == "series")
+        mine, added = system.Q.copy(), np.zeros_like(system.Q)
+        for rows, one, G in _kinds_of(self.design, system):
             away = G - self.mean
             mine[rows] += away @ self.cofactors @ away.T
+            if self.pairs is not None:
+                mine[rows] += of_correlated(one, self.pairs, pooled)[0][np.ix_(own, own)]
+            if swayed.any():
+                added[rows] = G[:, :6] @ swayed @ G[:, :6].T
         # What priors contribute is known as well as they are, not as the epoch.
         bound = of_priors(system) if system.design.own_prior.any() else 0.0
         mine -= bound
-        if self.pairs is not None:
-            for rows, one, _ in kinds:
-                mine[rows] += of_correlated(one, self.pairs, pooled)[0][np.ix_(own, own)]
         mine *= unit[:, None, None]
         mine += pooled * bound
-        if s.exterior == "series" and self.movement.covariance.any():
-            for rows, _, G in kinds:
-                swayed = G[:, :6]
-                mine[rows] += swayed @ self.movement.covariance @ swayed.T
+        mine += added
         mine += np.diag(self.excess[own])
         mine[~system.good] = 0.0
         return among_all(mine, own)

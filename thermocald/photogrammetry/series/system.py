@@ -164,7 +164,7 @@ class SeriesSystem:
         """Form the normal equations and invert those of the epochs' own parameters."""
         own, A = design.own, design.at.A
         first, of = alike(weights, use)
-        w = _used(weights[first], use[first])
+        w = weights[first] * use[first][..., None]
         separate = design.width == 0
         N = normal_matrices(w, A[..., own] if separate else A)
         Q, good = cofactors((N if separate else N[:, own[:, None], own]) + design.own_prior)
@@ -182,7 +182,8 @@ class SeriesSystem:
 
     def used(self, rows: Index | Mask | slice = slice(None)) -> Array:
         """Weights (e, T, 3) of some epochs, 0 where a point takes no part."""
-        return _used(self.weights[rows], self.use[rows])
+        used: Array = self.weights[rows] * self.use[rows][..., None]
+        return used
 
     def common_normals(self, count: Array | None = None) -> Array:
         """Normal matrix of the common unknowns, the own parameters of all epochs reduced.
@@ -299,11 +300,6 @@ class SeriesSystem:
         pose, x, y = np.split(self.Q_common, [len(prior), len(prior) + len(wx)], axis=1)
         held = np.hstack([pose * prior, x * wx + y * wxy, x * wxy + y * wy])
         return float(np.trace(held)), float(np.einsum("ij,ji->", held, held))
-
-
-def _used(weights: Array, use: Mask) -> Array:
-    used: Array = weights * use[..., None]
-    return used
 
 
 def alike(weights: Array, use: Mask) -> tuple[Index, Index]:

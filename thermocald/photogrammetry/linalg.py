@@ -6,6 +6,7 @@ would cost the daemon 20 MB.
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 MAD_TO_SD = 1.4826
 """Median absolute deviation of a normal distribution to its standard deviation."""
+MEDIAN_CHI2 = 2.0 * math.log(2.0)
+"""The median of χ² with two degrees of freedom, those of an image point."""
 
 _SMALL = 32  # rows
 

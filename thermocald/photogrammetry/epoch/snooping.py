@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
@@ -21,7 +23,6 @@ TRUSTED_REDUNDANCY = 20
 """From here on the residuals themselves give the noise."""
 
 _MOST_OF_FEW = 0.15  # one of 7 to 13 targets, two of 14 and more
-_CHI2_MEDIAN = 2 * log(2)  # with two degrees of freedom
 _GLOBAL_TEST_NORMAL = 3.09  # quantile of the normal distribution: error probability 0.1 %
 _AFTER_REJECTION_NORMAL = 1.28  # 10 %
 
@@ -120,7 +121,7 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     # The median is a scale that the gross errors do not reach.
     ordered = used.copy()
     ordered.partition(n // 2)
-    variance = float(ordered[n // 2]) / _CHI2_MEDIAN
+    variance = float(ordered[n // 2]) / MEDIAN_CHI2
     few = 2 * n - unknowns < TRUSTED_REDUNDANCY
     if few:
         variance = 1.0  # one gross error reaches every residual: the stated sigmas are the scale

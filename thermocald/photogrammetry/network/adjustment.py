@@ -31,8 +31,8 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     Sensor,
 )
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2
 from thermocald.photogrammetry.network.bundle import (
-    MEDIAN_CHI2,
     Bundle,
     BundleAdjustment,
     ImageRays,

@@ -30,7 +30,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     partials,
     project,
 )
-from thermocald.photogrammetry.linalg import scaled_inverse, unit_diagonal
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2, scaled_inverse, unit_diagonal
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,8 +53,6 @@ _SEPARATE_NOTHING = (
 BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
 _CONTROLLED = 1e-3  # cofactor of a residual below which nothing else controls it
-MEDIAN_CHI2 = 1.386
-"""Of two degrees of freedom."""
 
 
 class KnownTargets(NamedTuple):

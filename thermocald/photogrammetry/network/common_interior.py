@@ -27,9 +27,9 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
 from thermocald.photogrammetry.field.testfield import plane_fit
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2
 from thermocald.photogrammetry.network.bundle import (
     BEHIND,
-    MEDIAN_CHI2,
     Bundle,
     BundleAdjustment,
     ImageRays,

@@ -13,6 +13,7 @@ import numpy as np
 
 from thermocald.photogrammetry.camera.camera_model import EOP, IOP, PARAMETER_NAMES, Sensor, project
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, settle
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2
 from thermocald.photogrammetry.series.mount import STILL, Movement
 from thermocald.photogrammetry.series.normals import (
     ObservationGrid,
@@ -152,7 +153,7 @@ class SeriesEstimator:
         if shown.sum() < _FEWEST_OFFSETS:
             return None
         squares = (wx * x * x + wy * y * y + 2.0 * wxy * x * y) / self.variance(estimate)
-        ratio = float(np.median(squares[shown] / told[shown])) / (2.0 * np.log(2.0))
+        ratio = float(np.median(squares[shown] / told[shown])) / MEDIAN_CHI2
         ratio *= self.field_variance
         chance = 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / (MEDIAN_WORTH * 2.0 * told[shown].sum()))
         return ratio if ratio > chance or self.field_variance > 1.0 else None

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY, limit_2d
+from thermocald.photogrammetry.linalg import MEDIAN_CHI2
 from thermocald.photogrammetry.series.normals import chunks, products
 from thermocald.photogrammetry.series.system import SeriesSystem, alike
 
@@ -74,7 +75,7 @@ def _variances(tests: Array, used: Mask) -> Array:
     ordered = np.where(used, tests, np.inf)
     ordered.sort(axis=1)
     middle = ordered[np.arange(len(n)), half]
-    variance: Array = np.where(n > 0, middle, 1.0) / (2 * np.log(2))
+    variance: Array = np.where(n > 0, middle, 1.0) / MEDIAN_CHI2
     return variance
 
 

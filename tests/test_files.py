@@ -72,6 +72,7 @@ def test_the_caller_chooses_the_error(tmp_path):
         read_yaml(tmp_path / "none.yaml", RecordingError)
 
 
+@pytest.mark.slow
 def test_a_file_that_is_written_in_place_meanwhile_is_read_whole(tmp_path):
     """As the status on a full disk; each document says at both ends which it is."""
     path, ended = tmp_path / "status.json", threading.Event()

@@ -197,6 +197,7 @@ HEADS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @AMOUNTS
 def test_any_other_meaning_of_a_recording(amount, recorded, tmp_path):
     """A column in another unit or with other values, in all rows or some: what is calibrated is

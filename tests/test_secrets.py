@@ -163,6 +163,7 @@ def test_a_secret_option_is_not_quoted_where_it_is_wrong(value):
         Options.read({"api_key": 3.0, "password_file": 5})
 
 
+@pytest.mark.slow
 def test_hostile_texts_take_no_time():
     parts = ["password='", "token=a ", "http://", "a:b", "%2F%40:", "a\\", "://@", "Bearer a", "y",
              "y."]  # fmt: skip

@@ -28,6 +28,7 @@ def error_over_sd(x, coloured, phi, draws, seed, thermometer=0.0):
     return float(np.sqrt(np.mean(np.square(off))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [WARM_UP, UP_AND_DOWN], ids=["warm-up", "up and down"])
 @pytest.mark.parametrize(
     ("coloured", "phi"), [(0.0, 0.0), (1.0, 0.5), (1.0, 0.9), (0.5, 0.8), (0.5, 0.97)]

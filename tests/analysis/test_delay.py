@@ -14,6 +14,7 @@ from thermocald.thermal.reduce import reduce_series
 DELAY = ModelEffect("time_offset", {"d": 0.0})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval", [10.0, 15.0])
 def test_the_noise_of_readings_between_the_frames(interval):
     """What is interpolated between two readings errs by less than one of them."""
@@ -39,6 +40,7 @@ def test_a_clock_that_is_wrong(late):
             assert abs(off) < 3.5 * f.model.sd(f"rates.{name}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval", mostly_slow([10.0, 15.0, 30.0, 60.0], 15.0))
 def test_a_clock_that_is_wrong_by_any_interval_of_the_readings(interval):
     """Between readings the temperature bends: a straight line would be a delay of h²/12τ."""

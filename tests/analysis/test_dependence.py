@@ -45,6 +45,7 @@ def test_correlation_matrix_is_numpys_and_silent_on_constants():
     assert matrix[0, 3] == pytest.approx(np.corrcoef(columns[0][keep], columns[3][keep])[0, 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thermometer_sd", [0.05, 1.5])
 def test_slope_is_unbiased_and_its_sd_true(thermometer_sd):
     """A thermometer with 1.5 K on a rise of 12 K: ordinary least squares is 20 % too flat."""

@@ -81,6 +81,7 @@ def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
     assert said >= 4  # 25 ± 10 in χ², 9 are asked for
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", [
     ModelEffect("thermal_lag", {"tau": 120.0}),
     ModelEffect("permanent_set", {"c": 2e-5, "x0": 6e-5, "y0": -4e-5}),

@@ -64,6 +64,7 @@ def series(
     return table_of_series(head, field, apart, grid, SeriesSettings(exterior="auto"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_no_target_is_accused_of_what_the_camera_did(seed):
     table = with_drifts(series(seed))
@@ -97,6 +98,7 @@ def test_a_level_that_few_targets_cannot_test_is_flagged(targets, few):
     assert any(said in line for line in table.lines()) is bool(few)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("epochs", [30, 80, 150])
 def test_a_warm_up_is_a_drift_however_long_the_series(epochs):
     """To a straight line the bend of 150 epochs was noise with a memory, and no drift."""
@@ -166,6 +168,7 @@ def test_what_is_stored_is_what_is_exported(tmp_path):
     assert (table.sd[:, 0] > 1e-4).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("coloured", "phi", "epochs"), [(1.0, 0.97, 150), (0.5, 0.97, 150), (1.0, 0.9, 30)]
 )

@@ -27,6 +27,7 @@ def noise(rng, coloured, phi, n=N):
     return np.sqrt(coloured) * slow + np.sqrt(1 - coloured) * white
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", mostly_slow([1.0, 3.0], 1.0))
 @pytest.mark.parametrize(("coloured", "phi"), NOISES)
 def test_at_most_one_in_twenty_driftless_series_drifts_or_exceeds_its_sds(coloured, phi, size):
@@ -51,6 +52,7 @@ def flicker(rng, exponent, n):
     return y / y.std()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "exponent_and_white", mostly_slow([(1.0, 0.0), (1.5, 0.0), (1.0, 0.7)], (1.0, 0.0))
 )
@@ -67,6 +69,7 @@ def test_flicker_noise_is_no_drift(exponent_and_white):
     assert np.mean(found) <= 0.035  # 99.9 % point of a share of 1 %
 
 
+@pytest.mark.slow
 def test_eight_driftless_parameters_are_corrected_for():
     rng = np.random.default_rng(6)
     any_found = []
@@ -76,6 +79,7 @@ def test_eight_driftless_parameters_are_corrected_for():
     assert np.mean(any_found) <= 0.13  # 99.9 % point of 100 draws
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("course", [WARM_UP, 1 - np.abs(2 * TIME_S / TIME_S[-1] - 1)])
 @pytest.mark.parametrize(("coloured", "phi"), [(0.0, 0.0), (1.0, 0.97), (0.5, 0.97), (0.2, 0.97)])
 def test_no_dependence_is_claimed_of_noise_with_a_memory(course, coloured, phi):
@@ -155,6 +159,7 @@ def test_a_daily_cycle_of_a_long_series_is_drift():
     assert result.p_value < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("phi", "missing"), [(0.97, 60), (0.9, 25)])
 def test_noise_forgets_in_a_gap(phi, missing):
     """150 epochs with a piece missing: both sides counted as neighbours, 46 % depended at 1 %."""

@@ -173,6 +173,7 @@ def test_a_gap_is_uncertain_for_as_long_as_it_is_felt():
     assert after[-1] < 1e-3 * after[0]
 
 
+@pytest.mark.slow
 def test_the_state_after_a_restart_is_honest():
     """Another past than the log's: errors of a camera with a lag, over their sds, 80 draws."""
     rng = np.random.default_rng(7)
@@ -260,6 +261,7 @@ def test_what_a_model_lacks_is_told_from_a_knock():
     assert all("a model that lacks an effect looks alike" in text for _, text in told)
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still_in_changing_heat_is_not_moved():
     """300 epochs of 3 gauges over 40 K, with a point hidden now and then: no movement."""
     for seed in range(3):
@@ -273,6 +275,7 @@ def test_a_camera_that_stands_still_in_changing_heat_is_not_moved():
         assert told == []
 
 
+@pytest.mark.slow
 def test_a_past_that_fades_is_no_movement():
     """Carried out of a warm room, with a lag of 600 s: twenty minutes of another camera."""
     for seed in range(5):

@@ -153,6 +153,7 @@ def test_a_camera_outside_the_family(outside, name):
             assert abs(f.model.rates[n] - first.model.rates[n]) < 3 * f.model.sd(f"rates.{n}"), n
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", OTHERS)
 def test_no_band_that_does_not_hold(outside, kind):
     """Effects from hardly visible to large: a band holds at least 90 %, or none is stated."""
@@ -274,6 +275,7 @@ def on_a_mount(s, px):
     return replace(source, grid=replace(source.grid, points=points))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("px", [0.3, 0.8])
 def test_a_mount_that_wanders_is_said_beside_a_missing_effect(px):
     """`discover` finds nothing but the mount there: `fit` claims no effect that is none."""

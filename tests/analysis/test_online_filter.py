@@ -67,6 +67,7 @@ def one_changed(parameter: int, size: float) -> np.ndarray:
     return size * np.eye(16)[parameter]
 
 
+@pytest.mark.slow
 def test_the_scatter_of_estimate_and_rates_is_what_its_covariance_says():
     deviations = []
     for seed in range(40):
@@ -152,6 +153,7 @@ def test_innovations_are_as_large_as_their_covariance_whatever_the_field(sigma_m
     assert 0.9 < np.mean(ratios) < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_mm", mostly_slow([0.01, 0.05], 0.05))
 def test_the_sds_of_the_estimate_hold_the_field_whatever_the_number_of_epochs(sigma_mm):
     deviations, sds = [], []

@@ -40,6 +40,7 @@ def coverage(noise, own, fleets):
     return inside / fleets
 
 
+@pytest.mark.slow
 def test_the_intervals_of_a_new_specimen_hold():
     found = coverage(0.1, 1.0, 120)
     assert found.mean() == pytest.approx(0.95, abs=0.03)
@@ -79,6 +80,7 @@ def test_shrinking_is_better_than_either_alone():
     assert np.mean(shrunk) < 0.65 * np.mean(kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fleets", [60, pytest.param(200, marks=pytest.mark.slow)])
 def test_odd_specimens_are_seen_and_others_are_not(fleets):
     rng = np.random.default_rng(7)

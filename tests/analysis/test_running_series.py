@@ -92,6 +92,7 @@ def replayed(sensor, field, epochs, exterior="auto", c=3.04):
     return table_of_series(head, field, apart, grid, settings)
 
 
+@pytest.mark.slow
 def test_a_series_of_which_no_epoch_is_good_goes_on():
     """Twelve targets that hardly show c: the common adjustment ended with an error before."""
     running, results, _, _ = take(Scene(0, per_side=2, hidden=0), 60)
@@ -220,6 +221,7 @@ def test_a_program_started_again_goes_on_where_it_was():
                                                columns[f"level_sd_{name}"])  # fmt: skip
 
 
+@pytest.mark.slow
 def test_gross_errors_in_most_epochs_are_found():
     scene = Scene(8, hidden=8)
     calibrator, running = begun(scene.sensor, scene.field)
@@ -263,6 +265,7 @@ def test_priors_and_what_is_held_are_kept():
         assert (result.values[3:10] == 0).all()
 
 
+@pytest.mark.slow
 def test_an_epoch_of_month_twelve_costs_what_one_of_the_first_days_does(monkeypatch):
     """What is adjusted together, and how often, once the epochs that are kept are all there."""
     monkeypatch.setattr(running_series, "_WINDOW", 30)
@@ -296,6 +299,7 @@ def real(shared):
     return read_recording(Path(shared) / "data" / "aviary-cam6")
 
 
+@pytest.mark.slow
 def test_a_real_camera_is_live_what_replay_finds(real):
     calibrator, running = begun(real.camera.sensor, real.testfield, 12.7)
     epochs = list(real.epochs)[:27]

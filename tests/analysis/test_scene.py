@@ -177,6 +177,7 @@ def drawn(rng: np.random.Generator, lacks: str, size: float, noise: float = 1.0)
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "most"), [(0.7, 4), (1.0, 4), (2.0, 35)])
 def test_false_alarms_are_as_rare_as_they_are_said_to_be(noise, most):
     """Of 1000 days at one in a thousand; of noise that is twice what is stated, three in a hundred.
@@ -222,6 +223,7 @@ def test_a_camera_that_was_moved_is_said_with_the_frame(tmp_path):
     assert course.as_dict()["movements"][0]["frame"] == "3.png"
 
 
+@pytest.mark.slow
 def test_a_model_that_lacks_an_effect_is_found_and_one_that_holds_is_not(tmp_path):
     held = series(tmp_path, 100, 0.0)
     assert held.seen.sum() == 7

@@ -27,6 +27,7 @@ def replayed(folder):
     return json.loads(succeed("replay", folder, "--json", "-").stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "targets"),
     [

@@ -47,6 +47,7 @@ def test_without_covariances_there_is_no_monte_carlo_but_a_reason(warm_up):
     assert "No epoch has a covariance matrix" in " ".join(camera.notes)
 
 
+@pytest.mark.slow
 def test_two_hundred_thousand_epochs_in_seconds(warm_up):
     """A sixteenth of a year; the year itself is in benchmarks/study.py."""
     import time

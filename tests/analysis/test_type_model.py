@@ -53,6 +53,7 @@ def pull(true, found):
     return (values_of(found) - true) / sd[rows]
 
 
+@pytest.mark.slow
 def test_few_temperatures_and_the_type_are_better_than_few_temperatures():
     rng = np.random.default_rng(8)
     pulls, own, shrunk = [], [], []

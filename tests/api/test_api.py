@@ -33,7 +33,11 @@ def examples():
     return found
 
 
-SLOW = {"thermocald.api.discover"}  # the command on the same series is tests/golden's
+# the commands on the same series are tests/golden's
+SLOW = {
+    f"thermocald.{n}"
+    for n in ("api.calibrate", "api.discover", "api.study", "series.Series.calibrate")
+}
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from tests.blind.score import judge, run
 from tests.blind.tables import summary
 
 
+@pytest.mark.slow
 def test_a_single_effect():
     assert judge(Case(("second_heat_source",), 0.1, 41)).right
 

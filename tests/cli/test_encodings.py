@@ -77,6 +77,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("environment", "name"), CASES)
 def test_no_command_breaks_on_what_a_terminal_cannot_show(tmp_path, environment, name):
     make_recording(tmp_path / "M1", 24)

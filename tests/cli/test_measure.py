@@ -126,6 +126,7 @@ def draws(tmp_path_factory):
     return np.array(errors), np.array(with_model), np.array(without)
 
 
+@pytest.mark.slow
 def test_standard_deviations_of_places_are_true(draws):
     errors, _, _ = draws
     rms = np.sqrt(np.mean(errors**2))

@@ -138,6 +138,7 @@ def test_on_a_read_only_file_system_it_says_so_and_leaves_the_rest_to_the_restar
     assert daemon.stop() == 0
 
 
+@pytest.mark.slow
 def test_a_full_disk_loses_frames_then_observations_but_no_result(daemon, devices, small_disk):
     disk = small_disk(60)
     daemon.store = disk / "thermocald.db"

@@ -85,6 +85,7 @@ def test_predicted_epochs_through_a_restart_are_not_taken_for_calibrations(
         assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_posed_epochs_are_those_of_the_rendered_camera_and_kept_frames_stand_there_corrected_too(
     daemon, devices, thermal_model, control_points
 ):

@@ -160,6 +160,7 @@ ROUTES = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounds", [6, pytest.param(100, marks=pytest.mark.slow)])
 def test_the_page_keeps_to_80_mb_however_often_it_is_asked(tmp_path, page_of, rounds):
     """Every route, by turns: 100 rounds are three months of somebody who looks once a day."""

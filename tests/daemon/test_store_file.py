@@ -451,6 +451,7 @@ def test_what_waits_for_a_card_that_does_not_come_back_is_reported_as_lost(card)
     assert set(numbers(path)) >= {1, 2, 3}
 
 
+@pytest.mark.slow
 def test_a_running_daemon_whose_card_is_unmounted_and_mounted_again(card, daemon, devices):
     folder = card("a")
     daemon.store = folder / "thermocald.db"

@@ -18,6 +18,7 @@ def short_blocks(monkeypatch):
     monkeypatch.setattr(examination, "in_blocks", lambda series: in_blocks(series, rows=60))
 
 
+@pytest.mark.slow
 def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     evidence, _ = evidence_of("nonlinear_expansion", px=0.2, seed=12, with_m2=False)
     found = discover_series(evidence)

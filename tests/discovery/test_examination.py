@@ -132,6 +132,7 @@ def test_document(evidence_of):
     assert "&lt;" not in page  # no object in place of its text
 
 
+@pytest.mark.slow
 def test_a_drift_of_a_few_targets_is_not_the_camera(evidence_of):
     evidence, truth = evidence_of("target_displacement", px=0.05, seed=26)
     found = discover_series(evidence)
@@ -150,6 +151,7 @@ def test_a_gross_error_near_the_end_is_no_target_that_moved(evidence_of):
         assert [g.rows.tolist() for g in groups] == [[30]] * moved
 
 
+@pytest.mark.slow
 def test_surrogates_tried_at_once_give_the_same_bits(evidence_of):
     evidence, _ = evidence_of("permanent_set", px=0.3, seed=22)
     search = Search(HypothesisFitter([in_blocks(e) for e in evidence]))

@@ -20,6 +20,7 @@ from thermocald.thermal.reduce import reduce_together
 slow = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "effects"),
     [
@@ -85,6 +86,7 @@ def few_tags(source, wandering, course):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["slip", "thermal_gradient"])
 def test_an_effect_is_named_where_corners_of_a_few_tags_wander(effect):
     """So few that three of them bend the cameras until none stands out."""
@@ -102,6 +104,7 @@ def test_an_effect_is_named_where_corners_of_a_few_tags_wander(effect):
     assert moved == [set(rows) for rows in WANDERING]
 
 
+@pytest.mark.slow
 def test_a_knock_that_may_be_a_slip_is_listed_as_both():
     """So many corners jump that none is left out, and the mount is taken for what moves."""
     series, _ = generate(Case(("slip",), 0.25, 901, epochs=60))

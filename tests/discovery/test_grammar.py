@@ -50,6 +50,7 @@ def above():
     return examined("integral_above", 41)
 
 
+@pytest.mark.slow
 def test_an_integral_above_a_threshold_is_told_with_its_constant(above):
     found = propose(above, BASE)
     (term,) = found.best.terms
@@ -68,6 +69,7 @@ def test_a_recorded_humidity_is_a_quantity_too():
     assert dict(term.nonlinear)["tau"] == pytest.approx(120.0, abs=2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["smooth", pytest.param("random_walk", marks=pytest.mark.slow)])
 def test_what_was_not_recorded_gets_no_formula(kind):
     assert propose(examined(kind, 33), BASE) is None

@@ -7,9 +7,8 @@ import pytest
 from thermocald.discovery.result import discover_series
 
 
-@pytest.mark.parametrize(
-    ("px", "separable"), [pytest.param(0.1, True, marks=pytest.mark.slow), (0.006, False)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("px", "separable"), [(0.1, True), (0.006, False)])
 def test_the_recording_decides_whether_shift_and_tilt_are_separable(evidence_of, px, separable):
     evidence, _ = evidence_of("creep", px=px, seed=1)
 

@@ -45,6 +45,7 @@ def test_a_tremble_is_found_along_its_own_directions(px, directions):
     assert (again is None) is not bool(directions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effects", "px", "expected"),
     [((), 0.0, False), (("thermal_lag",), 0.0, False), (("thermal_lag",), 0.01, True)],

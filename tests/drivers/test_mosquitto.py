@@ -129,6 +129,7 @@ def _emit_for(device, seconds):
 
 
 # paho leaves the socket of a refused handshake to the garbage collector, which says so
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_who_is_let_in_and_what_an_outage_does(broker, tmp_path):
     (tmp_path / "wrong").write_text("SECRET")

@@ -56,6 +56,7 @@ def test_what_fails_costs_itself(archive, tmp_path):
     assert len(files(tmp_path)) == 3
 
 
+@pytest.mark.slow
 def test_a_block_that_kills_its_process_costs_itself(archive, tmp_path):
     done = run_tasks(die, blocks_of(archive, tmp_path), jobs=2)
     assert sorted(o.error for o in done) == ["", "", "", "its process died twice"]

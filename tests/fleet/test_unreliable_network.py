@@ -87,6 +87,7 @@ def require_equal(server, folder, stations):
         assert waiting == 0
 
 
+@pytest.mark.slow
 def test_a_small_fleet_arrives_once(server, tmp_path):
     forwarded(server, tmp_path, 4, 2, 30, kills=1, cut_every_s=0.15)
     require_equal(server, tmp_path, 4)

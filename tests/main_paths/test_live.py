@@ -93,6 +93,7 @@ def test_real_cameras(shared, forker, tmp_path, camera):
     assert 0.6 < spread < 1.5, f"c scatters {spread:.2f} of the usual sd"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "epochs"),
     [("badly_surveyed", 40), *(pytest.param(k, 70, marks=pytest.mark.slow) for k in crooked.KINDS)],
@@ -110,6 +111,7 @@ def test_crooked_fields(forker, tmp_path, kind, epochs):
         assert 0.6 <= ratio <= 1.4, f"errors of {name} are {ratio:.2f} of their sd"
 
 
+@pytest.mark.slow
 def test_frames_of_crooked_planes(forker, tmp_path):
     """Rendered frames of a field whose planes are bent, surveyed to 2 µm."""
     recording, truth = tmp_path / "frames", crooked.write_frames(tmp_path / "frames", 14, seed=3)
@@ -163,6 +165,7 @@ def test_a_part_of_a_real_camera(shared, forker, tmp_path):
     agree(live, replayed)
 
 
+@pytest.mark.slow
 def test_epochs_too_weak_by_themselves(shared, forker, tmp_path):
     """14 targets leave y0 of an epoch unknown by 80 px; together the epochs carry it."""
     part = part_of(shared / "data" / "aviary-cam1", tmp_path / "part", 62, every=5)
@@ -173,6 +176,7 @@ def test_epochs_too_weak_by_themselves(shared, forker, tmp_path):
     assert len(good(live)) >= 38
 
 
+@pytest.mark.slow
 def test_names_of_targets_that_are_exchanged(shared, forker, tmp_path):
     """Live and replay leave both out, as if nobody had seen them; replay had no epoch at all."""
     real = part_of(shared / "data" / "aviary-cam2", tmp_path / "part", 61)
@@ -260,6 +264,7 @@ def restarted(forker: Forker, recording: Path, folder: Path, kill_at: int) -> np
     )
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_the_rest_is_the_same(forker, tmp_path):
     """The program goes on with the epochs of its store as if it had never been away."""
     crooked.write(tmp_path / "trembling", "trembling", seed=2, epochs=28)

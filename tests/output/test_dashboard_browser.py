@@ -92,7 +92,7 @@ def page_with(tmp_path):
         server.communicate()
 
 
-@pytest.mark.parametrize("cameras", [2, 12])
+@pytest.mark.parametrize("cameras", [2, pytest.param(12, marks=pytest.mark.slow)])
 def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     url, start = page_with(cameras)
     page = page_of(url)
@@ -135,6 +135,7 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     assert "out since 2020-09-13 12:26:40 UTC: no broker" in page.text_content("#devices")
 
 
+@pytest.mark.slow
 def test_on_paper_the_curves_keep_to_their_card(page_with, page_of):
     """And the page says whose they are."""
     url, start = page_with(2)

@@ -248,7 +248,7 @@ REPORTS = {
     "calibration-nothing": _not_calibrated,
     "fleet": _fleet,
 }
-_QUICK = ("field-check", "study", "epochs", "calibration", "fleet", "discovery-nothing")
+_QUICK = ("field-check", "study", "epochs", "calibration", "fleet")
 
 
 @pytest.fixture(scope="module")

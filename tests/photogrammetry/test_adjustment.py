@@ -202,6 +202,7 @@ def test_a_mirrored_pose_is_said():
     assert a.status == "ambiguous_pose"
 
 
+@pytest.mark.slow
 def test_one_gross_error_among_twelve_targets_is_found_or_the_epoch_has_no_result():
     """200 epochs: never `ok` with residuals that contradict the sigmas, and true sds where ok."""
     field, z, ok = scene.corner_field(), [], 0

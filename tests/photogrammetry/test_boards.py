@@ -50,6 +50,7 @@ STANDS = [(0.0, 0.0, 420.0), (150.0, -120.0, 380.0), (-250.0, 60.0, 300.0)]
 OBLIQUE = [(0.0, 0.0, 300.0), (-200.0, 50.0, 220.0), (-260.0, 90.0, 180.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stand", mostly_slow(STANDS, STANDS[2]))
 def test_all_corners_of_an_aprilgrid(april, stand, taken):
     found, errors, visible = seen(*april, stand, taken=taken)
@@ -81,6 +82,7 @@ def drawn_exactly(field, columns, rows, size, spacing):
     return scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stand", mostly_slow(OBLIQUE, OBLIQUE[2]))
 def test_standard_deviations_of_an_aprilgrid_are_true_however_obliquely_it_is_seen(stand):
     """384 coordinates of white noise: error over sd is 1 ± 0.036."""

@@ -48,6 +48,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+@pytest.mark.slow
 def test_rms_error_is_near_the_bound_and_sigmas_are_true(targets):
     over_bound, over_stated = _scatter(targets, 40, seed=11)
     # 1,600 errors: their RMS is known to 1.8 %.
@@ -79,6 +80,7 @@ def test_the_covariance_has_the_right_shape():
     assert scatter == pytest.approx(np.mean(stated, axis=0), abs=0.12 * scatter.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [
@@ -94,6 +96,7 @@ def test_sigmas_are_true_in_other_light(case):
     assert np.abs(over_stated.mean(axis=0)).max() < 4.5 / np.sqrt(60)  # no bias
 
 
+@pytest.mark.slow
 def test_a_code_ring_does_not_pull_its_centre():
     rings = single_targets(diameters=(12, 24), bits=14)
     _, over_stated = _scatter(rings, 60, seed=14, coded=True)

@@ -56,6 +56,7 @@ def _truth(exterior) -> np.ndarray:
     return SMALL_CAMERA.project(exterior, FIELD.points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "view", ["oblique", *(pytest.param(v, marks=pytest.mark.slow) for v in VIEWS if v != "oblique")]
 )
@@ -104,6 +105,7 @@ def test_a_marker_that_is_there_twice_is_dropped():
     assert missed[0]
 
 
+@pytest.mark.slow
 def test_a_large_frame_is_found_at_half_size_and_measured_at_full():
     from tests.photogrammetry.fields import PI_CAMERA
 

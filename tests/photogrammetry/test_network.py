@@ -26,6 +26,7 @@ def _survey(field, stations, sigma, seed, distances=None, **options):
     return network, field[[int(name[1:]) for name in network.names]], wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_nominal", [False, True], ids=["from nothing", "from nominal"])
 def test_bent_sheet_from_twelve_rolled_stations(with_nominal):
     field = cases.bent_sheet()

@@ -66,6 +66,7 @@ def _in_clutter(seeds: range) -> list:
     return [(s, ink, _codes(frame, ink)) for s, frame in frames for ink in (-1, 1)]
 
 
+@pytest.mark.slow
 def test_no_code_in_clutter():
     candidates = sum(len(find_circles(clutter(s), 1, -1)) for s in range(20))
     assert candidates > 200  # the clutter does look like circles

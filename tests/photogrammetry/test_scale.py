@@ -48,6 +48,7 @@ def aslant(sheet):
     return frame_from(sheet, "near and aslant")
 
 
+@pytest.mark.slow
 def test_a_tilted_sheet_is_found_whole_at_every_scale(sheet, aslant):
     frame, seen = aslant
     found = [found_at(frame, sheet[0], scale) for scale in (1.0, 0.9, 0.75, 0.5, 0.25)]

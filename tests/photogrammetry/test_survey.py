@@ -68,6 +68,7 @@ def sheet():
     return nominal, truth, photograph(truth, stations), measured_distance(truth, a, b, 0.02)
 
 
+@pytest.mark.slow
 def test_bent_sheet_with_its_nominal_field(sheet):
     """Among its photographs a black and a foreign one: they are named and do no harm."""
     nominal, truth, pictures, distance = sheet

@@ -55,6 +55,7 @@ def placed(rng: np.random.Generator, n: int = 6):
     return centres, field, Observations(np.arange(n), clicks, np.full((n, 2), CLICK))
 
 
+@pytest.mark.slow
 def test_centres_of_crosses_are_better_than_the_clicks_and_have_true_sds():
     ratio, errors, clicked = [], [], []
     for seed in range(12):

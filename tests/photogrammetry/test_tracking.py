@@ -66,6 +66,7 @@ def no_search(monkeypatch):
     monkeypatch.setattr(tracking, "measure", search)
 
 
+@pytest.mark.slow
 def test_windows_are_enough_and_sigmas_stay_true(tracker, clean, rng, no_search):
     z = []
     for _ in range(15):
@@ -79,6 +80,7 @@ def test_windows_are_enough_and_sigmas_stay_true(tracker, clean, rng, no_search)
     assert _rms(np.mean(z, axis=0)) < 1.35 / np.sqrt(15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("px", [0.12, 1.2])
 def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
     camera = _shifted(px)

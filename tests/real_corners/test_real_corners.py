@@ -29,6 +29,7 @@ def still(monkeypatch):
     monkeypatch.setattr(generator, "corners", quiet)
 
 
+@pytest.mark.slow
 def test_boards_that_come_and_go_do_not_pull_at_the_camera(still):
     from tests.real_corners.score import judge
 

@@ -111,6 +111,7 @@ def test_parameters_are_found_again(tmp_path, name):
     assert abs(fitted.fitted["sigma0"] - 1.0) < 0.03 or name == "defocus"
 
 
+@pytest.mark.slow
 def test_a_lag_is_found_again(tmp_path):
     """The quick one of the above."""
     true = ModelEffect("thermal_lag", {"tau": 84.0})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
+import pytest
 
 from thermocald.photogrammetry.camera.camera_model import (
     ExteriorOrientation,
@@ -78,6 +79,7 @@ def test_corners_agree_with_the_projected_truth():
     assert np.sqrt(np.mean(error**2)) < 0.01
 
 
+@pytest.mark.slow
 def test_corners_err_as_stated_wherever_in_a_pixel():
     """Blurred on the pixel grid, corners would err by 1.16 times their sds, in step with the phase.
 

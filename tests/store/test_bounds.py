@@ -18,6 +18,7 @@ from thermocald.store.recording.reader import RecordingWriter
 DAY = 8640
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("targets", [60, 500])
 def test_the_file_is_little_more_than_its_payload(tmp_path, targets):
     """Of a day's third; the empty tables are 0.1 MB on top of it."""

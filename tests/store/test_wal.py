@@ -101,6 +101,7 @@ def test_the_last_write_is_damaged_where_the_index_counts_it(store_path, head, f
         assert read_wal_tail(wal) == WalTail(unfinished=True)
 
 
+@pytest.mark.slow
 def test_a_store_that_is_being_written_is_not_damaged(store_path, head, field, make_epoch):
     wal = store_path.with_name(f"{store_path.name}-wal")
     with Store.open(store_path, "append", durable=False) as store:

@@ -97,7 +97,7 @@ def epochs_wait(daemon) -> bool:
     )
 
 
-@in_each(argvalues=mostly_slow(["disk", "card", "quota", "late quota"], "disk", "quota"))
+@in_each(argvalues=mostly_slow(["disk", "card", "quota", "late quota"], "disk"))
 def test_a_full_place_is_said_and_waited_for(daemon, place):
     daemon.start(**place.environment)
     daemon.more(4)

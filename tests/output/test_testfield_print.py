@@ -69,9 +69,9 @@ def centroid(image, centre, radius_px, light=False):
     ("paper", "options"),
     [
         ("A4", {}),
-        ("A3", {"bits": 14}),
-        ("250x330", {"dictionary": "DICT_APRILTAG_36h11"}),
-        ("A4", {"light": True}),
+        pytest.param("A3", {"bits": 14}, marks=pytest.mark.slow),
+        pytest.param("250x330", {"dictionary": "DICT_APRILTAG_36h11"}, marks=pytest.mark.slow),
+        pytest.param("A4", {"light": True}, marks=pytest.mark.slow),
     ],
     ids=["A4", "A3 14 bit", "odd size with markers", "light on dark"],
 )

@@ -67,6 +67,7 @@ def test_fifty_scales(sheet, stand, noise):
     assert seen >= 50
 
 
+@pytest.mark.slow
 def test_a_saturated_sheet_says_so(sheet, aslant):
     bright = np.clip(aslant[0].astype(float) * 1.6, 0, 255).astype(np.uint8)
     status = measure(bright, sheet[0]).status

@@ -227,7 +227,7 @@ def _search_standing(
         # with many coefficients may stand for two others that have not been tried together yet
         frontier = [best]
         if complete or level == 1:  # the best solutions, one per set of names
-            sets = {frozenset(s.names): s for s in sorted(grown, key=lambda s: -s.score)}
+            sets = {tuple(sorted(s.names)): s for s in sorted(grown, key=lambda s: -s.score)}
             frontier = sorted(sets.values(), key=lambda s: s.score)[:_WIDTH]
     # larger combinations that were not accepted are no rivals
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]

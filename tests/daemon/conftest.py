@@ -275,6 +275,11 @@ def preloaded(tmp_path_factory):
     forker.close()
 
 
+def tool(*command: object) -> subprocess.CompletedProcess[str]:
+    """A program of the system, which may fail."""
+    return subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path):
     """MB → the folder of a disk of that size; skips where nothing can be mounted."""
@@ -283,22 +288,15 @@ def small_disk(tmp_path: Path):
     def mount(size_mb: int) -> Path:
         folder = tmp_path / f"disk{len(mounted)}"
         folder.mkdir()
-        tool = shutil.which("mount")
-        options = ["-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", str(folder)]
-        done = tool and subprocess.run([tool, *options], capture_output=True, check=False)
-        if not done or done.returncode:
+        wanted = ("mount", "-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder)
+        if not shutil.which("mount") or tool(*wanted).returncode:
             pytest.skip("a small disk cannot be mounted here: needs root and tmpfs")
         mounted.append(folder)
         return folder
 
     yield mount
     for folder in mounted:
-        subprocess.run(["umount", "-l", str(folder)], check=False)
-
-
-def tool(*command: object) -> subprocess.CompletedProcess[str]:
-    """A program of the system, which may fail."""
-    return subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+        tool("umount", "-l", folder)
 
 
 @pytest.fixture
@@ -307,18 +305,18 @@ def loop_disk(tmp_path: Path):
     image, folder = tmp_path / "disk.img", tmp_path / "card"
 
     def mount(size_mb: int, *mkfs: str, options: str = "loop") -> tuple[Path, Path]:
-        folder.mkdir()
-        image.write_bytes(bytes(size_mb * 1_000_000))
         if os.geteuid() or not all(map(shutil.which, ("mkfs.ext4", "mount"))):
             pytest.skip("needs root, mount and mkfs.ext4")
+        folder.mkdir()
+        image.write_bytes(bytes(size_mb * 1_000_000))
         made = tool("mkfs.ext4", "-q", *mkfs, image).returncode
         if made or tool("mount", "-o", options, image, folder).returncode:
             pytest.skip("no file system can be mounted from a file here")
         return image, folder
 
     yield mount
-    while tool("umount", "-l", folder).returncode == 0:
-        pass
+    while folder.is_mount():
+        subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
 class Supervisor:

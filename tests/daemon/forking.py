@@ -100,7 +100,9 @@ def _work(script: str) -> NoReturn:
     try:
         exec(script or "import thermocald.cli; thermocald.cli.main()", {})
     except SystemExit as ended:
-        status = int(ended.code or 0)
+        if isinstance(ended.code, str):  # is said, as the interpreter's own end does
+            print(ended.code, file=sys.stderr)
+        status = 1 if isinstance(ended.code, str) else int(ended.code or 0)
     except BaseException:
         traceback.print_exc()
         status = 1

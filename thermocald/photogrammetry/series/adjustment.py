@@ -190,6 +190,8 @@ def adjusted(
         bound = np.diag((A**2).sum(axis=1).mean(axis=0)) / _LOOSE_PX**2
         loose = replace(series, s=replace(s, exterior="mount"), bound=bound)
         loose, estimate = loose.adjusted(first, use)
+        if not estimate.settled:
+            return loose, estimate
         use = estimate.system.use
         series = choose(loose, s.exterior, int(estimate.system.good.sum()), estimate)
         if series.s.exterior != "series" and np.isfinite(estimate.values).all():
@@ -361,7 +363,7 @@ def judged(
         "{bad} of {n} targets contradict the others: a moved test field, a wrong one, or a "
         "blurred image",
     )
-    say(~estimate.system.good, "weak_geometry", "these targets cannot carry the parameters")
+    say(~estimate.solved, "weak_geometry", "these targets cannot carry the parameters")
     say(
         fails_global_test(unit, redundancy),
         "global_test",

@@ -28,7 +28,13 @@ from thermocald.photogrammetry.series.snooping import (
     snoop_series,
     typical_variance,
 )
-from thermocald.photogrammetry.series.system import Design, SeriesSystem, State, offset_weights
+from thermocald.photogrammetry.series.system import (
+    Design,
+    SeriesSystem,
+    State,
+    Step,
+    offset_weights,
+)
 from thermocald.photogrammetry.series.target_noise import (
     FEW_EPOCHS,
     MEDIAN_WORTH,
@@ -49,6 +55,7 @@ _ENOUGH_FOR_NOISE = 4  # epochs that show the noise of single targets
 _GUESSED = 10.0  # degrees of freedom with which stated noise tells that of a single target
 _MANY = 10.0  # observations for each common unknown: their priors hardly matter any more
 _ITERATIONS = 15
+_HALVINGS = 6  # of a step at most
 _SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
 _SMALLER = 1e-4  # of one block among many: the result must not depend on the blocks
 _NEAR = 10.0  # standard deviations: by what the residuals follow a step by the partials
@@ -70,6 +77,16 @@ class Estimate(State):
     residuals: Array
     system: SeriesSystem
     converged: Mask
+
+    @property
+    def solved(self) -> Mask:
+        """Which epochs (E,) carry their parameters and converged."""
+        return self.converged & self.system.good
+
+    @property
+    def settled(self) -> bool:
+        """Whether most epochs that take part are solved."""
+        return bool(2 * self.solved.sum() >= self.system.use.any(axis=1).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +125,7 @@ class SeriesEstimator:
         """
         series, s, offered = self, self.s, use
         estimate = series.solve(start, use, self.unit)
-        found = (estimate.converged & estimate.system.good) | ~use.any(axis=1)
+        found = estimate.solved | ~use.any(axis=1)
         if not found.all():
             # Gross errors among few targets: such an epoch must not spoil what all share.
             few = 2 * found.sum() < len(found)
@@ -126,10 +143,12 @@ class SeriesEstimator:
                 variance = series.estimate_field_variance(estimate)
                 if variance is None or abs(variance / series.field_variance - 1.0) < _SAME_FIELD:
                     break
-                series = replace(series, field_variance=variance)
+                wider = replace(series, field_variance=variance)
                 use = estimate.system.use
-                estimate = series.solve(estimate, use, series.variance(estimate))
-                estimate = series.snoop(estimate, offered)
+                again = wider.solve(estimate, use, wider.variance(estimate))
+                if not again.settled:
+                    break  # a field that is known no better does not carry the parameters
+                series, estimate = wider, wider.snoop(again, offered)
         return series, estimate
 
     def estimate_field_variance(self, estimate: Estimate) -> float | None:
@@ -178,24 +197,34 @@ class SeriesEstimator:
         """Gauss-Newton with one linearisation at the series' mean, renewed while that moves.
 
         variance: of unit weight, by which the offsets' prior is weighted against image points.
+        Where most epochs of a series do not converge, its geometry is so weak that whole steps
+        lead too far, and shorter ones are tried.
         """
-        values, offsets, pose = start.values, start.offsets, start.pose
-        system = self._linearised(values, use, variance)
+        whole = self._iterated(start, use, variance)
+        if not whole.system.design.width or whole.settled:
+            return whole
+        shorter = self._iterated(start, use, variance, _HALVINGS)
+        return max(shorter, whole, key=lambda estimate: estimate.solved.sum())
+
+    def _iterated(self, start: State, use: Mask, variance: float, halvings: int = 0) -> Estimate:
+        """`solve` with every step halved until it helps, so often at most."""
+        state = start
+        system = self._linearised(state.values, use, variance)
         own, common = system.design.own, system.design.common
-        residuals = self._residuals(values, offsets, planes(2, *use.shape))
-        for _ in range(_ITERATIONS):
-            step = system.step(residuals, State(values, offsets, pose))
+        residuals = self._residuals(state, planes(2, *use.shape))
+        for _ in range(_ITERATIONS * (1 + halvings)):
+            step = system.step(residuals, state)
             sizes = step.sizes
-            values = values.copy()
-            values[:, own] += step.d_own
-            values[:, common] += step.d_common
-            if len(common):
-                pose = pose + step.d_common
-            offsets = offsets + step.d_offsets
+            if halvings and step.size >= _SMALL:
+                shorter = self._shortened(system, state, step, halvings)
+                if shorter is None:
+                    break
+                step = shorter
+            state = system.design.moved(state, step)
             if step.size < (_SMALL if self.held is None else _SMALLER):
                 system.move(residuals, step)
                 break
-            residuals = self._residuals(values, offsets, residuals)
+            residuals = self._residuals(state, residuals)
             moved = np.zeros(16)
             moved[common] = step.d_common
             if system.good.any():
@@ -205,8 +234,20 @@ class SeriesEstimator:
                 sizes = np.full(len(use), np.inf)
                 break
             if far > _RELINEARISE_PX:
-                system = self._linearised(values, use, variance)
-        return Estimate(values, offsets, pose, residuals, system, sizes < _NEAR)
+                system = self._linearised(state.values, use, variance)
+        return Estimate(state.values, state.offsets, state.pose, residuals, system, sizes < _NEAR)
+
+    def _shortened(
+        self, system: SeriesSystem, state: State, step: Step, halvings: int
+    ) -> Step | None:
+        """The step, halved until the next one is shorter; None where it never is."""
+        for _ in range(halvings):
+            there = system.design.moved(state, step)
+            left = self._residuals(there, planes(2, *system.use.shape))
+            if system.step(left, there).size < step.size:
+                return step
+            step = step.halved()
+        return None
 
     def snoop(self, estimate: Estimate, offered: Mask) -> Estimate:
         """The estimate without gross errors; offered (E, T): points that may come back."""
@@ -247,7 +288,10 @@ class SeriesEstimator:
         return max((n - own) / max(n, 1), 0.05)
 
     def _snoop_together(self, estimate: Estimate, offered: Mask) -> Estimate:
-        """Data snooping where all epochs share unknowns: every round solves the series again."""
+        """Data snooping where all epochs share unknowns: every round solves the series again.
+
+        An estimate that has not settled tells no gross errors: the last one that has is kept.
+        """
         variance, typical = 1.0, None
         history = np.zeros(offered.shape, dtype=np.int8)
         for _ in range(_ROUNDS):
@@ -266,12 +310,16 @@ class SeriesEstimator:
             settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
             if settled and np.array_equal(keep, use):
                 break
-            estimate = self.solve(estimate, keep, variance)
+            again = self.solve(estimate, keep, variance)
+            if estimate.settled and not again.settled:
+                break
+            estimate = again
         return estimate
 
     def _snoop_apart(self, estimate: Estimate, offered: Mask) -> Estimate:
         """Data snooping where epochs share nothing: only those that changed are solved again."""
         values, residuals = estimate.values, estimate.residuals
+        converged = estimate.converged.copy()
         system = whole = replace(estimate.system, use=estimate.system.use.copy())
         use, rows = whole.use, np.arange(len(whole.use))
         history = np.zeros(use.shape, dtype=np.int8)
@@ -294,25 +342,29 @@ class SeriesEstimator:
                 break
             system = SeriesSystem.formed(whole.design, self.grid.weights[rows], keep[changed])
             some = replace(self, grid=ObservationGrid(self.grid.points[rows], system.weights))
-            values[rows], residuals[rows] = some._without(
+            values[rows], residuals[rows], converged[rows] = some._without(
                 system, values[rows], residuals[rows], estimate
             )
             use[rows], whole.Q[rows], whole.good[rows] = system.use, system.Q, system.good
             whole.alike = None
-        return replace(estimate, values=values, residuals=residuals, system=whole)
+        return replace(
+            estimate, values=values, residuals=residuals, system=whole, converged=converged
+        )
 
     def _without(
         self, system: SeriesSystem, values: Array, left: Array, known: State
-    ) -> tuple[Array, Array]:
-        """Values (E, 16) and residuals (E, T, 2) of epochs of which points were taken out."""
+    ) -> tuple[Array, Array, Mask]:
+        """Values (E, 16) and residuals (E, T, 2) of epochs of which points were taken out, and
+        which converged (E,).
+        """
         for _ in range(_ITERATIONS):
             step = system.step(left, replace(known, values=values))
             values[:, system.design.own] += step.d_own
             if step.size < (_NEAR if self.held is None else _SMALLER):
                 system.move(left, step)
                 break
-            left = self._residuals(values, known.offsets, left)
-        return values, left
+            left = self._residuals(State(values, known.offsets, known.pose), left)
+        return values, left, step.sizes < _NEAR
 
     def _linearised(self, values: Array, use: Mask, variance: float) -> SeriesSystem:
         at = self.held
@@ -344,8 +396,9 @@ class SeriesEstimator:
             if offsets else np.empty((0, 3)),
         )  # fmt: skip
 
-    def _residuals(self, values: Array, offsets: Array, out: Array) -> Array:
-        """Measured minus predicted (E, T, 2) px at each epoch's own values (E, 16), into `out`."""
+    def _residuals(self, state: State, out: Array) -> Array:
+        """Measured minus predicted (E, T, 2) px at each epoch's own values, into `out`."""
+        values = state.values
         if (values == values[:1]).all():
             first = project(self.sensor, values[0, IOP], values[0, EOP], self.testfield.points)
             np.subtract(self.grid.points, first, out=out)
@@ -354,8 +407,8 @@ class SeriesEstimator:
                 iop, eop = values[part, IOP], values[part, EOP]
                 predicted = project(self.sensor, iop, eop, self.testfield.points)
                 np.subtract(self.grid.points[part], predicted, out=out[part])
-        if offsets.any():
-            out -= offsets
+        if state.offsets.any():
+            out -= state.offsets
         return out
 
     def sums(self, estimate: Estimate) -> tuple[Array, Array]:

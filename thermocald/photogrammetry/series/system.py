@@ -74,6 +74,14 @@ class Design:
         (wx, wy, wxy), (x, y) = self.offset_prior.T, offsets[: len(self.offset_prior)].T
         return np.concatenate([pull, -wx * x - wxy * y, -wxy * x - wy * y])
 
+    def moved(self, state: State, step: Step) -> State:
+        """The state after a step."""
+        values = state.values.copy()
+        values[:, self.own] += step.d_own
+        values[:, self.common] += step.d_common
+        pose = state.pose + step.d_common if len(self.common) else state.pose
+        return State(values, state.offsets + step.d_offsets, pose)
+
     def gradient(self, weights: Array, residuals: Array) -> Array:
         """Gradient (width,) of the common unknowns: weights (E, T, 3), residuals (E, T, 2) px."""
         b = right_hand_sides(weights, residuals, self.at.A[..., self.common])
@@ -136,6 +144,11 @@ class Step:
     d_offsets: Array
     size: float
     sizes: Array
+
+    def halved(self) -> Step:
+        """Half of it; as far from the solution as before."""
+        own, common, offsets = self.d_own / 2, self.d_common / 2, self.d_offsets / 2
+        return Step(own, common, offsets, self.size, self.sizes)
 
 
 @dataclass(eq=False)

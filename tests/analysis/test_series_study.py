@@ -34,8 +34,8 @@ def test_a_warm_up_is_found_where_it_was_put_and_only_there(warm_up):
     assert abs(change.change - expected) < 4 * change.sd_change
     channel = found.channels[0]
     assert min(abs(channel.dependences[n].r) for n in ("c", "x0", "y0")) > 0.99
-    assert max(channel.p_holm[n] for n in ("c", "x0", "y0")) < 1e-6
-    assert min(channel.p_holm[n] for n in ("A1", "A2", "B1", "B2", "sigma0")) > 0.01
+    assert max(channel.dependences[n].p_holm for n in ("c", "x0", "y0")) < 1e-6
+    assert min(channel.dependences[n].p_holm for n in ("A1", "A2", "B1", "B2", "sigma0")) > 0.01
     assert found.significance["x0"].success_ratio == 1.0
     assert found.significance["x0"].drift.p_value <= 0.001
     assert found.significance["B2"].drift.p_value > 0.01

@@ -199,10 +199,24 @@ class RunningSeries:
         s = self._asked
         return len(s.free) > 0 and (s.exterior != "per_epoch" or s.target_offsets)
 
-    def remember(self, calibrated: CalibratedEpoch, seen: Observations, reported: Array) -> None:
-        """Take an epoch in that was reported (16,) before the program was started again."""
-        self._keep(calibrated, seen)
-        self._kept[-1].reported = reported
+    def remember(
+        self, calibrated: CalibratedEpoch, seen: Observations, reported: Array | None = None
+    ) -> None:
+        """Take an epoch in that was reported (16,) before the program was started again, or that
+        will be.
+        """
+        epoch = calibrated.epoch
+        self.epochs += 1
+        self._kept.append(
+            _Kept(
+                ObservationGrid.from_observations(self._field, [seen]),
+                epoch.number,
+                epoch.frame_time,
+                next(iter(epoch.temperatures.values()), np.nan),
+                calibrated.adjustment.values,
+                reported,
+            )
+        )
 
     def refine(
         self, calibrated: CalibratedEpoch, seen: Observations, *, hurried: bool = False
@@ -225,7 +239,7 @@ class RunningSeries:
             self._restart(calibrated.epoch.number)
             columns["series_restarted"] = 1.0
         self._away = 0
-        self._keep(calibrated, seen)
+        self.remember(calibrated, seen)
         own, whole = self._adjusted()
         columns |= self._columns(whole)
         if not weak:  # what is weak contradicts nothing
@@ -299,19 +313,6 @@ class RunningSeries:
                 columns[f"sd_series_{name}"] = float(sd[k])
                 columns[f"level_sd_{name}"] = float(level[k])
         return columns
-
-    def _keep(self, calibrated: CalibratedEpoch, seen: Observations) -> None:
-        epoch = calibrated.epoch
-        self.epochs += 1
-        self._kept.append(
-            _Kept(
-                ObservationGrid.from_observations(self._field, [seen]),
-                epoch.number,
-                epoch.frame_time,
-                next(iter(epoch.temperatures.values()), np.nan),
-                calibrated.adjustment.values,
-            )
-        )
 
     def _restart(self, number: int) -> None:
         self.reset()

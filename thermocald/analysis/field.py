@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
 
 _USED = [PARAMETER_NAMES.index(name) for name in (*DEFAULT_FREE, *EOP_NAMES)]
+_COLUMNS, _ROWS = ("left", "centre left", "centre right", "right"), ("upper", "middle", "lower")
 CELLS = (4, 3)
 """The image is divided into so many columns and rows to see whether it is filled."""
 MIN_SIZE_PX = 8.0
@@ -225,6 +226,17 @@ def check_field(
         )
     points, sigmas = field.points[rows], field.sigmas[rows]
     image = camera.project(station, points)
+    # the reasons for which `adjust` would give an image of these points no result
+    A, _ = _partials(camera, station, points)
+    covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
+    # what nothing determines gets a variance that is large, and correlations that are 1
+    covariance[np.ix_(_USED, _USED)] = scaled_inverse(
+        _normal_matrix(A, np.eye(2) * sigma_px**2), 1e-13
+    )
+    values = np.concatenate([camera.interior.as_array(), station.as_array()])
+    weak = weaknesses(
+        camera.sensor, points, image, values, covariance, DEFAULT_FREE, GeometryBounds()
+    )
     depth = -((points - station.centre) @ station.rotation)[:, 2]
     _, axes, _ = plane_fit(points)
     w, h = camera.sensor.width, camera.sensor.height
@@ -246,22 +258,7 @@ def check_field(
         distance=float(depth.mean()),
         flatness=float(np.ptp(points @ axes[2])) / float(depth.mean()),
         precision=precision(camera, station, points, sigmas, sigma_px),
-        weak=tuple(_weak(camera, station, points, image, sigma_px)),
-    )
-
-
-def _weak(
-    camera: CameraModel, station: ExteriorOrientation, points: Array, image: Array, sigma_px: float
-) -> list[str]:
-    """The reasons for which `adjust` would give an image of these points no result."""
-    A, _ = _partials(camera, station, points)
-    N = _normal_matrix(A, np.eye(2) * sigma_px**2)
-    covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
-    # what nothing determines gets a variance that is large, and correlations that are 1
-    covariance[np.ix_(_USED, _USED)] = scaled_inverse(N, 1e-13)
-    values = np.concatenate([camera.interior.as_array(), station.as_array()])
-    return weaknesses(
-        camera.sensor, points, image, values, covariance, DEFAULT_FREE, GeometryBounds()
+        weak=tuple(weak),
     )
 
 
@@ -403,9 +400,11 @@ def advise(check: FieldCheck) -> list[str]:
     )
     empty = np.argwhere(check.cells == 0)[:, ::-1]
     if len(empty):
+        words = [f"{_ROWS[r]} {_COLUMNS[c]}" for c, r in empty]
+        where = ", ".join(words[:4]) + (f" and {len(words) - 4} more" if len(words) > 4 else "")
         propose(
             _beside(check, empty, points),
-            f"{len(empty)} targets in the empty parts of the image ({_where(empty)})",
+            f"{len(empty)} targets in the empty parts of the image ({where})",
         )
     if len(points) < _FEW:
         propose(points, f"twice as many targets ({len(points)} are visible)")
@@ -468,11 +467,3 @@ def _beside(check: FieldCheck, parts: NDArray[np.int64], points: Array) -> Array
     sensible = (reach > 0.4) & (reach < 2.5)
     result: Array = check.station.centre + rays * np.where(sensible, reach, 1.0)[:, None]
     return result
-
-
-def _where(empty: NDArray[np.int64]) -> str:
-    """Parts of the image in words."""
-    rows = ("upper", "middle", "lower")
-    columns = ("left", "centre left", "centre right", "right")
-    words = [f"{rows[r]} {columns[c]}" for c, r in empty]
-    return ", ".join(words[:4]) + (f" and {len(words) - 4} more" if len(words) > 4 else "")

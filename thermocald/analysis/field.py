@@ -94,8 +94,51 @@ class FieldCheck:
 
     @cached_property
     def advice(self) -> list[str]:
-        """What would be better, as sentences, the most helpful first."""
-        return advise(self)
+        """Sentences on what would be better, the most helpful first; none if nothing would help by
+        a seventh.
+
+        That a field is one plane comes before all else: more targets in front of it are no print.
+        """
+        points, sigmas = self.field.points[self.visible], self.field.sigmas[self.visible]
+        typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
+        now, pitch = self.precision["epoch"], self.camera.sensor.pixel_pitch
+        proposals: list[tuple[float, str]] = []
+
+        def propose(added: Array, what: str) -> None:
+            both = np.concatenate([points, added])
+            spread = np.concatenate([sigmas, np.repeat(typical, len(added), axis=0)])
+            then = precision(self.camera, self.station, both, spread, self.sigma_px)["epoch"]
+            with np.errstate(invalid="ignore"):  # what is not determined now is worth everything
+                gain = np.where(np.isfinite(now), then / now, 0.0)[:3]
+            gain = np.where(np.isfinite(then[:3]), gain, 1.0)
+            best = int(np.argmin(gain))
+            if gain[best] < _WORTH and np.all(np.isfinite(then[:3])):
+                before = (
+                    f"{now[best] / pitch:.2g} px" if np.isfinite(now[best]) else "not determined"
+                )
+                name = parameter_label(DEFAULT_FREE[best])
+                change = f"sd({name}) of one image {before} → {then[best] / pitch:.2g} px"
+                proposals.append((float(gain[best]), f"{what}: {change}"))
+
+        near = self.distance * (1 - _RAISED)
+        propose(
+            _along(self, np.array([(c, r) for r in range(2) for c in range(4)]), (4, 2), near),
+            f"8 targets standing {self.distance * _RAISED:.0f} mm in front of the field, spread "
+            "over the image",
+        )
+        empty = np.argwhere(self.cells == 0)[:, ::-1]
+        if len(empty):
+            words = [f"{_ROWS[r]} {_COLUMNS[c]}" for c, r in empty]
+            where = ", ".join(words[:4]) + (f" and {len(words) - 4} more" if len(words) > 4 else "")
+            propose(
+                _beside(self, empty, points),
+                f"{len(empty)} targets in the empty parts of the image ({where})",
+            )
+        if len(points) < _FEW:
+            propose(points, f"twice as many targets ({len(points)} are visible)")
+        sentences = [text for _, text in sorted(proposals)]
+        plane = [_ONE_PLANE] if self.flatness < _FLAT else []
+        return [*plane, *sentences, *_remarks(self)]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the document that `testfield check` writes with `--json`."""
@@ -366,51 +409,6 @@ def assess_field(
         if look_at is not None or roll:
             station = station_at(station.centre, target, np.radians(roll))
     return check_field(camera, field, station, sigma_px)
-
-
-def advise(check: FieldCheck) -> list[str]:
-    """Return sentences, the most helpful first; none if nothing would help by a seventh.
-
-    That a field is one plane comes before all else: more targets in front of it are no print.
-    """
-    points, sigmas = check.field.points[check.visible], check.field.sigmas[check.visible]
-    typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
-    now, pitch = check.precision["epoch"], check.camera.sensor.pixel_pitch
-    proposals: list[tuple[float, str]] = []
-
-    def propose(added: Array, what: str) -> None:
-        both = np.concatenate([points, added])
-        spread = np.concatenate([sigmas, np.repeat(typical, len(added), axis=0)])
-        then = precision(check.camera, check.station, both, spread, check.sigma_px)["epoch"]
-        with np.errstate(invalid="ignore"):  # what is not determined now is worth everything
-            gain = np.where(np.isfinite(now), then / now, 0.0)[:3]
-        gain = np.where(np.isfinite(then[:3]), gain, 1.0)
-        best = int(np.argmin(gain))
-        if gain[best] < _WORTH and np.all(np.isfinite(then[:3])):
-            before = f"{now[best] / pitch:.2g} px" if np.isfinite(now[best]) else "not determined"
-            name = parameter_label(DEFAULT_FREE[best])
-            change = f"sd({name}) of one image {before} → {then[best] / pitch:.2g} px"
-            proposals.append((float(gain[best]), f"{what}: {change}"))
-
-    near = check.distance * (1 - _RAISED)
-    propose(
-        _along(check, np.array([(c, r) for r in range(2) for c in range(4)]), (4, 2), near),
-        f"8 targets standing {check.distance * _RAISED:.0f} mm in front of the field, spread over "
-        "the image",
-    )
-    empty = np.argwhere(check.cells == 0)[:, ::-1]
-    if len(empty):
-        words = [f"{_ROWS[r]} {_COLUMNS[c]}" for c, r in empty]
-        where = ", ".join(words[:4]) + (f" and {len(words) - 4} more" if len(words) > 4 else "")
-        propose(
-            _beside(check, empty, points),
-            f"{len(empty)} targets in the empty parts of the image ({where})",
-        )
-    if len(points) < _FEW:
-        propose(points, f"twice as many targets ({len(points)} are visible)")
-    sentences = [text for _, text in sorted(proposals)]
-    plane = [_ONE_PLANE] if check.flatness < _FLAT else []
-    return [*plane, *sentences, *_remarks(check)]
 
 
 def _remarks(check: FieldCheck) -> list[str]:

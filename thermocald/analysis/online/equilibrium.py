@@ -198,11 +198,8 @@ class EquilibriumWatch:
 def _straight(times: Array, values: Array, sds: Array) -> bool:
     """Whether a parabola finds no curvature, of any of the columns (n, k), beyond 2 sd."""
     t = (times - times.mean()) / max(float(np.ptp(times)), 1e-9)
-    design = np.stack([np.ones_like(t), t, t * t], axis=1)
-    for column, sd in zip(values.T, sds.T, strict=True):
-        A = design / sd[:, None]
-        cofactor = np.linalg.inv(A.T @ A)
-        curvature = float((cofactor @ A.T @ (column / sd))[2])
-        if abs(curvature) > _CURVED_SD * np.sqrt(cofactor[2, 2]):
-            return False
-    return True
+    A = np.stack([np.ones_like(t), t, t * t], axis=1) / sds.T[..., None]
+    transposed = np.swapaxes(A, 1, 2)
+    cofactors = np.linalg.inv(transposed @ A)
+    curvatures = (cofactors @ transposed @ (values / sds).T[..., None])[:, 2, 0]
+    return bool(np.all(np.abs(curvatures) <= _CURVED_SD * np.sqrt(cofactors[:, 2, 2])))

@@ -206,6 +206,26 @@ def test_a_camera_that_is_carried_elsewhere_begins_another_series():
     assert "begun again after epoch" in running.report()["orientation"]
 
 
+def test_a_series_that_contradicts_five_epochs_begins_again_and_they_keep_their_results():
+    """Ended with an IndexError at the fifth: the epochs that were kept had been forgotten."""
+    scene = Scene(5)
+    running, _, _, _ = take(scene, 24)
+    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
+    adjusted, restarted = running._adjusted, []
+
+    def contradicted():
+        own, whole = adjusted()
+        return own, replace(whole, status="global_test")
+
+    running._adjusted = contradicted
+    for k in range(24, 30):
+        epoch, _ = scene.epoch(k)
+        result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
+        assert result.ok
+        restarted.append("series_restarted" in columns)
+    assert restarted == [False] * 4 + [True, False]
+
+
 def test_a_program_started_again_goes_on_where_it_was():
     scene = Scene(7)
     _, results, alone, _ = take(scene, 32)

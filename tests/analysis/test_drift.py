@@ -9,20 +9,14 @@ import numpy as np
 import pytest
 from scipy import signal
 
-import thermocald as tc
-from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.drift import courses, with_drifts
 from thermocald.analysis.series.epochs import Epochs
-from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.physics.testfields import corner_field, demonstration_model
-from thermocald.store.database.store import Store
-from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.series import EpochResult
 
 SIGMA = 0.05
 
@@ -133,33 +127,6 @@ def test_a_group_is_left_out_once_for_all_parameters(monkeypatch):
     found = courses(replace(table, without=without))
     assert sum(c.drifts for c in found) > 1
     assert len(asked) == len(set(asked)) > 0
-
-
-def test_what_is_stored_is_what_is_exported(tmp_path):
-    """A store's export is the numbers in it, as in the dashboard's CSV; not adjusted again."""
-    field = corner_field("plain", per_side=4, pitch_mm=150.0)
-    model, rng = demonstration_model(field), np.random.default_rng(3)
-    camera = CameraSpec("cam", model.sensor, 3.04, None)
-    head = Head("r", "M1", 10.0, camera, {"temperature": Channel("degC", 0.06)})
-    calibrator = Calibrator(model.sensor, field, nominal_c=3.04)
-    points = project(
-        model.sensor, model.interior.as_array(), model.exterior.as_array(), field.points
-    )
-    path = tmp_path / "a.db"
-    with Store.open(path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        for k in range(1, 6):
-            measured = Observations(
-                np.arange(len(field)), points + rng.normal(0, 0.05, points.shape),
-                np.full((len(field), 2), 0.05),
-            )  # fmt: skip
-            epoch = Epoch(k, 10.0 * k, 10.0 * k, {"temperature": 20.0}, observations=measured)
-            store.append(series, epoch, EpochResult.from_adjustment(calibrator.adjust(measured)))
-        columns = store.series_columns(series, ["c", "sd_c"])
-    table = tc.open(path).calibrate(exterior="stored")
-    np.testing.assert_array_equal(table.values[:, 0], columns["c"])
-    np.testing.assert_array_equal(table.sd[:, 0], columns["sd_c"])
-    assert (table.sd[:, 0] > 1e-4).all()
 
 
 @pytest.mark.slow

@@ -340,16 +340,15 @@ def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraS
     """A camera of which no file says anything, its image size that of most photographs; without
     its pitch a pixel counts as 1 µm.
     """
-    first: ImageError | None = None
+    errors: list[ImageError] = []
     sizes: Counter[tuple[int, ...]] = Counter()
     for path in images:
         try:
             sizes[decode_grey(path).shape] += 1
         except ImageError as error:
-            first = first or error
+            errors.append(error)
     if not sizes:
-        assert first is not None
-        raise first
+        raise errors[0]
     height, width = sizes.most_common(1)[0][0]
     pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
     return CameraSpec("camera", Sensor(width, height, pitch))

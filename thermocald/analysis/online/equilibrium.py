@@ -36,8 +36,8 @@ class Equilibrium:
     """drift, sd_drift: px/min of (c, x0, y0) together; ready_in, sd_ready_in: s, NaN if unknown."""
 
     state: State
-    drift: float
-    sd_drift: float
+    drift: float = float("nan")
+    sd_drift: float = float("nan")
     ready_in: float = float("nan")
     sd_ready_in: float = float("nan")
 
@@ -155,16 +155,15 @@ class EquilibriumWatch:
         All of the past is seen from the same exterior orientation: what was known of it at each
         epoch improves with time, and would look like drift.
         """
-        nothing = Equilibrium("unknown", float("nan"), float("nan"))
         if len(self._past) < _FEWEST:
-            return nothing
+            return Equilibrium("unknown")
         times = np.array([total / count for _, count, total, _ in self._past])
         sums = np.array([one for *_, one in self._past])
         values = (sums[..., 1] + sums[..., 2:] @ exterior) / sums[..., 0]
         sds = 1.0 / np.sqrt(sums[..., 0])
         good = np.isfinite(values).all(axis=0) & np.isfinite(sds).all(axis=0)
         if not good.any():
-            return nothing
+            return Equilibrium("unknown")
         values, sds = values[:, good], sds[:, good]
         # from the longest past that straight lines describe, else from the window
         pasts = [times >= times[-1] - windows * _WINDOW_S for windows in (4.0, 2.0, 1.0)]

@@ -71,7 +71,7 @@ class OnlineObserver:
         self._tell = tell
         self._rejected: Counter[int] = Counter()
         self._reported: set[int] = set()
-        self._equilibrium = Equilibrium("unknown", float("nan"), float("nan"))
+        self._equilibrium = Equilibrium("unknown")
 
     def observe(
         self, calibrated: CalibratedEpoch, adjusted: Adjustment | None = None,

@@ -322,17 +322,15 @@ def _visible(
     reach = np.where(round_[:, None] & good[:, None], maps.half_extent, 0.0)
     half = np.array([camera.sensor.width, camera.sensor.height]) / 2
     inside = np.all(np.abs(image - camera.sensor.centre) + reach < half, axis=1)
-    hidden = {}
-    for i, name in enumerate(field.names):
-        if not np.isfinite(image[i]).all():
-            hidden[name] = "behind the camera"
-        elif not inside[i]:
-            hidden[name] = "outside of the image"
-        elif round_[i] and cosine[i] < MAX_TILT_COSINE:
-            hidden[name] = "seen edge-on"
-        elif round_[i] and minor[i] < MIN_SIZE_PX:
-            hidden[name] = f"smaller than {MIN_SIZE_PX:g} px"
-    rows = np.array([i for i, name in enumerate(field.names) if name not in hidden], dtype=int)
+    reasons = {
+        "behind the camera": ~np.isfinite(image).all(axis=1),
+        "outside of the image": ~inside,
+        "seen edge-on": round_ & (cosine < MAX_TILT_COSINE),
+        f"smaller than {MIN_SIZE_PX:g} px": round_ & (minor < MIN_SIZE_PX),
+    }
+    found = np.select([*reasons.values()], [*reasons], "")
+    hidden = {name: str(why) for name, why in zip(field.names, found, strict=True) if why}
+    rows = np.flatnonzero(found == "")
     return rows, hidden, minor[rows][round_[rows]]
 
 

@@ -201,9 +201,7 @@ class RunningSeries:
     def remember(
         self, calibrated: CalibratedEpoch, seen: Observations, reported: Array | None = None
     ) -> None:
-        """Take an epoch in that was reported (16,) before the program was started again, or that
-        will be.
-        """
+        """Take an epoch in; reported (16,): of one from before the program was started again."""
         epoch = calibrated.epoch
         self.epochs += 1
         self._kept.append(

@@ -1,4 +1,4 @@
-"""A day adjusted, studied and fitted in blocks: the numbers of one block that holds all of it."""
+"""A day studied and fitted in blocks: the numbers of one block that holds all of it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 
 import thermocald as tc
-from benchmarks.adjustment import EXTERIOR, INTERIOR
+from benchmarks.adjustment import INTERIOR
 from benchmarks.long_recording import write_long_recording
 from tests.blocks import InBlocks
 from thermocald.analysis.series import adjusted, recorded
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
-from thermocald.photogrammetry.series.long_series import adjust_long_series
 from thermocald.photogrammetry.series.normals import gathered
-from thermocald.photogrammetry.series.result import SeriesSettings
 from thermocald.series import Series
 from thermocald.store.recording.reader import Recording, open_recording
 from thermocald.thermal.reduce import reduce_series
@@ -47,23 +45,6 @@ def day(tmp_path_factory):
     write_long_recording(path, DAY, 21)
     recording = open_recording(path)
     return Day(recording, gathered(recording, [slice(0, DAY)]))
-
-
-@pytest.mark.slow
-def test_the_series(day):
-    r = day.recording
-    one, many = (
-        adjust_long_series(
-            r.camera.sensor, r.testfield, day.blocks(size), INTERIOR, EXTERIOR, SeriesSettings(),
-            together=TOGETHER,
-        )
-        for size in (DAY, 500)
-    )  # fmt: skip
-    apart = np.abs(many.rows.values - one.rows.values)[:, :10]
-    assert np.nanmax(apart[:, :3]) < SAME * INTERIOR.c
-    assert np.nanmax(apart / one.rows.sd[:, :10]) < 1e-5
-    assert many.rows.status == one.rows.status
-    np.testing.assert_allclose(many.level_sd, one.level_sd, rtol=1e-6, atol=1e-15)
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.field import (
-    advise,
     check_field,
     precision,
     station_at,
@@ -111,7 +110,7 @@ def test_a_plane_field_never_tells_all_in_one_image_and_needs_depth(aside_deg):
     check = check_field(CAMERA, field, station_at(place, centre, 0.3))
     assert np.isinf(check.precision["epoch"][0])
     assert np.isfinite(check.precision["series"][:3]).all()
-    first, second = advise(check)[:2]
+    first, second = check.advice[:2]
     assert "one plane" in first
     assert "in front of the field" in second
     assert "not determined" in second
@@ -122,7 +121,7 @@ def test_proposed_targets_bring_what_is_said():
     field = corner_field()
     station = usual_station(CAMERA, field)
     check = check_field(CAMERA, field, station)
-    (note,) = [n for n in advise(check) if "in front of the field" in n]
+    (note,) = [n for n in check.advice if "in front of the field" in n]
     which = ("c", "x₀", "y₀").index(note.split("sd(")[1].split(")")[0])
     promised = float(note.split("→ ")[1].split(" px")[0])
     u, v = np.meshgrid((np.arange(4) + 0.5) / 4 * 3280 - 0.5, (np.arange(2) + 0.5) / 2 * 2464 - 0.5)
@@ -139,19 +138,19 @@ def test_empty_parts_and_unsurveyed_print_are_named():
     field = _printed("A3", sheets=3)
     check = check_field(CAMERA, field, usual_station(CAMERA, field))
     assert (check.cells == 0).sum() > 0
-    assert any("empty parts of the image" in note for note in advise(check))
-    assert any("testfield survey" in note for note in advise(check))
+    assert any("empty parts of the image" in note for note in check.advice)
+    assert any("testfield survey" in note for note in check.advice)
     surveyed = TestField.build(
         field.names, field.points, 0.002, field.diameters, field.kinds, field.codes
     )
     again = check_field(CAMERA, surveyed, usual_station(CAMERA, surveyed))
-    assert not any("testfield survey" in note for note in advise(again))
+    assert not any("testfield survey" in note for note in again.advice)
 
 
 def test_small_targets_are_told_to_be_larger():
     field = corner_field(size_mm=6.0)
     check = check_field(CAMERA, field, usual_station(CAMERA, field))
-    assert any("come nearer or print larger" in note for note in advise(check))
+    assert any("come nearer or print larger" in note for note in check.advice)
 
 
 def test_roll_turns_the_image_and_not_the_axis():

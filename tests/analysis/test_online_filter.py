@@ -12,48 +12,33 @@ from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter, chi2_quantile
 from thermocald.analysis.online.observer import OnlineObserver, given_exterior
 from thermocald.epoch import Epoch
-from thermocald.photogrammetry.camera.camera_model import (
-    ExteriorOrientation,
-    InteriorOrientation,
-    project,
-)
-from thermocald.photogrammetry.epoch.adjustment import adjust, failed
-from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.physics.testfields import corner_field, demonstration_model
+from thermocald.photogrammetry.epoch.adjustment import failed
+from thermocald.photogrammetry.field.testfield import TestField
 
 RATES = np.array([2.0e-4, -4.5e-4, -3.0e-4])
 
 
-class Surveyed:
-    """A camera before a field whose coordinates err as its sigmas state: series of epochs."""
+class Surveyed(Scene):
+    """Series of epochs before a field whose coordinates err as its sigmas state."""
 
     def __init__(self, sigma_mm: float, seed: int, missing: float = 0.0) -> None:
-        plain = corner_field("plain", per_side=4, pitch_mm=150.0)
-        self.model = demonstration_model(plain)
-        self.rng = np.random.default_rng([seed, round(1e3 * sigma_mm)])
-        self.field = TestField.build(plain.names, plain.points, sigma_mm)
-        self.true_points = plain.points + sigma_mm * self.rng.standard_normal(plain.points.shape)
-        self.iop, self.eop = self.model.interior.as_array(), self.model.exterior.as_array()
+        super().__init__(np.random.default_rng([seed, round(1e3 * sigma_mm)]), sigma_mm)
         self.missing = missing
 
     def epoch(self, rise: float = 0.0, change=0.0):
         values = np.concatenate([self.iop, self.eop]) + change
         values[:3] += RATES * rise
-        points = project(self.model.sensor, values[:10], values[10:], self.true_points)
-        points = points + self.rng.normal(0, 0.04, points.shape)
-        rows = np.flatnonzero(self.rng.random(len(points)) >= self.missing)
-        seen = Observations(rows, points[rows], np.full((len(rows), 2), 0.04))
-        result = adjust(
-            self.model.sensor, self.field, seen, InteriorOrientation.from_array(self.iop),
-            ExteriorOrientation.from_array(self.eop),
-        )  # fmt: skip
+        seen = self.observe(values[:10], values[10:])
+        if self.missing:
+            seen = seen.select(self.rng.random(len(seen)) >= self.missing)
+        result = self.adjust(seen)
         assert result.ok
         return seen, result
 
     def filter(self):
         """The filter, and a function that gives it an epoch."""
-        errors = FieldErrors(self.model.sensor, self.field)
-        found = OnlineFilter(self.model.sensor, errors.variances)
+        errors = FieldErrors(self.sensor, self.field)
+        found = OnlineFilter(self.sensor, errors.variances)
 
         def take(rise: float = 0.0, change=0.0):
             seen, result = self.epoch(rise, change)
@@ -133,7 +118,7 @@ def test_chi2_quantiles():
 
 def test_an_epoch_without_a_result_changes_nothing():
     camera = Surveyed(0.0, 4)
-    observer = OnlineObserver(camera.model.sensor, camera.field, lambda *_: None)
+    observer = OnlineObserver(camera.sensor, camera.field, lambda *_: None)
     epoch = Epoch(1, 0.0, 0.0, {"temperature": 25.0}, None, camera.epoch()[0])
     assert observer.observe(CalibratedEpoch(epoch, failed("bad_frame", ""), {})) == {}
     assert observer.filter.epochs == 0
@@ -168,7 +153,7 @@ def test_the_sds_of_the_estimate_hold_the_field_whatever_the_number_of_epochs(si
     rms = np.sqrt(np.mean(np.square(deviations), axis=0))
     # 200 draws: a ratio scatters by 5 %.
     assert np.all((rms > 0.9) & (rms < 1.1)), rms
-    pitch = camera.model.sensor.pixel_pitch
+    pitch = camera.sensor.pixel_pitch
     assert np.all(np.mean(sds, axis=0)[1:] / pitch > 0.4)  # px, where 0.1 used to be stated
 
 
@@ -179,7 +164,7 @@ def test_a_knock_of_a_tenth_of_a_pixel_is_noticed(sigma_mm):
         camera = Surveyed(sigma_mm, seed)
         _, take = camera.filter()
         assert all(take().change == "" for _ in range(20))
-        change = one_changed(11, 0.1 * camera.model.sensor.pixel_pitch / camera.iop[0])  # phi, rad
+        change = one_changed(11, 0.1 * camera.sensor.pixel_pitch / camera.iop[0])  # phi, rad
         noticed += any(take(change=change).change not in ("", "outlier") for _ in range(4))
     assert noticed >= 18
 
@@ -188,7 +173,7 @@ def test_a_knock_of_a_tenth_of_a_pixel_is_noticed(sigma_mm):
 def test_a_steady_camera_is_ready_in_time_before_a_field_that_errs(sigma_mm):
     camera = Surveyed(sigma_mm, 1)
     events, states = [], []
-    observer = OnlineObserver(camera.model.sensor, camera.field, lambda *a: events.append(a))
+    observer = OnlineObserver(camera.sensor, camera.field, lambda *a: events.append(a))
     for k in range(80):
         seen, result = camera.epoch()
         epoch = Epoch(k, 10.0 * k, 10.0 * k, {"temperature": 25.0}, None, seen)
@@ -205,7 +190,7 @@ def test_the_noise_is_measured_apart_from_the_field():
     for sigma_mm, stated in ((0.05, 0.001), (0.0, 0.05)):
         camera = Surveyed(sigma_mm, 3)
         camera.field = TestField.build(camera.field.names, camera.field.points, stated)
-        errors = FieldErrors(camera.model.sensor, camera.field)
+        errors = FieldErrors(camera.sensor, camera.field)
         for _ in range(30):
             seen, result = camera.epoch()
             errors.split(result, seen)

@@ -41,13 +41,7 @@ def coverage(noise, own, fleets):
 
 
 @pytest.mark.slow
-def test_the_intervals_of_a_new_specimen_hold():
-    found = coverage(0.1, 1.0, 120)
-    assert found.mean() == pytest.approx(0.95, abs=0.03)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("noise", "own"), [(0.05, 1.0), (0.3, 0.3), (0.1, 3.0)])
+@pytest.mark.parametrize(("noise", "own"), [(0.05, 1.0), (0.3, 0.3), (0.1, 3.0), (0.1, 1.0)])
 def test_the_intervals_hold_over_a_thousand_fleets(noise, own):
     found = coverage(noise, own, 1000)
     assert found[:4].mean() == pytest.approx(0.95, abs=0.01)
@@ -81,11 +75,10 @@ def test_shrinking_is_better_than_either_alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fleets", [60, pytest.param(200, marks=pytest.mark.slow)])
-def test_odd_specimens_are_seen_and_others_are_not(fleets):
+def test_odd_specimens_are_seen_and_others_are_not():
     rng = np.random.default_rng(7)
     false, seen = [], []
-    for _ in range(fleets):
+    for _ in range(200):
         _, found, C = fleet(rng, 10, 0.1)
         false.append(odd_specimens(found, C) < 0.01)
         found[3, 1] += 10 * SD[1]

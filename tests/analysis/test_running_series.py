@@ -45,8 +45,8 @@ class Scene:
         )
         self.sway = np.zeros(3)
 
-    def epoch(self, k: int) -> tuple[Epoch, np.ndarray]:
-        """The epoch and its true values (16,)."""
+    def epoch(self, k: int, exterior=None) -> tuple[Epoch, np.ndarray]:
+        """The epoch, also from elsewhere, and its true values (16,)."""
         rng, warm = self.rng, 1 - np.exp(-k / 25)
         now = np.concatenate([self.model.interior.as_array(), self.model.exterior.as_array()])
         now[:3] += np.array([2e-3, -4.5e-3, -3e-3]) * warm
@@ -54,9 +54,12 @@ class Scene:
         now[10:13] += self.sway + rng.normal(0, self.tremble, 3)
         if self.knock is not None and k >= self.knock:
             now[10] += 5e-4
+        if exterior is not None:
+            now[10:] = exterior
         points = project(self.sensor, now[:10], now[10:], self.plain.points)
         points += rng.normal(0, NOISE, points.shape)
         rows = np.sort(rng.permutation(len(self.plain))[: len(self.plain) - self.hidden])
+        rows = rows[self.sensor.contains(points[rows])]
         seen = Observations(rows, points[rows], np.full((len(rows), 2), NOISE))
         time = 1e9 + 10.0 * k
         return Epoch(k + 1, time, time, {"t": 20.0 + 10 * warm}, None, seen), now
@@ -190,20 +193,33 @@ def test_a_camera_that_is_carried_elsewhere_begins_another_series():
     away[[1, 3]] += 0.2, 250.0
     restarted = []
     for k in range(24, 44):
-        epoch, now = scene.epoch(k)
-        now[10:] = away
-        points = project(scene.sensor, now[:10], away, scene.plain.points)
-        points += scene.rng.normal(0, NOISE, points.shape)
-        inside = ((points > 0) & (points < (scene.sensor.width, scene.sensor.height))).all(axis=1)
-        rows = np.flatnonzero(inside)
-        seen = Observations(rows, points[rows], np.full((len(rows), 2), NOISE))
-        calibrated = calibrator.calibrate(replace(epoch, observations=seen))
-        result, columns = running.refine(calibrated, seen)
+        epoch, now = scene.epoch(k, away)
+        result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
         assert result.ok
         assert abs(result.values[0] - now[0]) < 0.02
         restarted.append("series_restarted" in columns)
     assert restarted == [False, True] + [False] * 18
     assert "begun again after epoch" in running.report()["orientation"]
+
+
+def test_a_series_that_contradicts_five_epochs_begins_again_and_they_keep_their_results():
+    """Ended with an IndexError at the fifth: the epochs that were kept had been forgotten."""
+    scene = Scene(5)
+    running, _, _, _ = take(scene, 24)
+    calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
+    adjusted, restarted = running._adjusted, []
+
+    def contradicted():
+        own, whole = adjusted()
+        return own, replace(whole, status="global_test")
+
+    running._adjusted = contradicted
+    for k in range(24, 30):
+        epoch, _ = scene.epoch(k)
+        result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
+        assert result.ok
+        restarted.append("series_restarted" in columns)
+    assert restarted == [False] * 4 + [True, False]
 
 
 def test_a_program_started_again_goes_on_where_it_was():

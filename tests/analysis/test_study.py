@@ -1,12 +1,118 @@
-"""The study of a camera: series together, drawn from, and propagated."""
+"""Series and cameras studied: what is found, and what is said in words where nothing can be."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from thermocald.analysis.study.series_study import StudySettings
-from thermocald.analysis.study.study import study
+from tests.analysis.conftest import NEXUS
+from thermocald.analysis.camera.undistortion import image_grid
+from thermocald.analysis.study.measured import Thermometer
+from thermocald.analysis.study.montecarlo import correlations_over_time, trajectories
+from thermocald.analysis.study.series_study import (
+    StudySettings,
+    circle_of_confusion,
+    depth_of_field,
+    deviation,
+    image_displacement,
+    study_series,
+)
+from thermocald.analysis.study.study import study, study_camera
+from thermocald.output.study.summary import answer_sentences
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
+
+SETTINGS = StudySettings(sets=2000)
+CLUSTERS = (15.0, 50.0, 100.0)
+
+
+def test_a_warm_up_is_found_where_it_was_put_and_only_there(warm_up):
+    found = study_series(warm_up()(), SETTINGS)
+    change = found.deviations["x0"]
+    expected = 0.0194 * (1 - np.exp(-1490 / 300))
+    assert abs(change.change - expected) < 4 * change.sd_change
+    channel = found.channels[0]
+    assert min(abs(channel.dependences[n].r) for n in ("c", "x0", "y0")) > 0.99
+    assert max(channel.dependences[n].p_holm for n in ("c", "x0", "y0")) < 1e-6
+    assert min(channel.dependences[n].p_holm for n in ("A1", "A2", "B1", "B2", "sigma0")) > 0.01
+    assert found.significance["x0"].success_ratio == 1.0
+    assert found.significance["x0"].drift.p_value <= 0.001
+    assert found.significance["B2"].drift.p_value > 0.01
+    slope = channel.dependences["x0"]
+    assert abs(slope.slope - 0.0194 / 12) < 4 * slope.sd_slope
+
+
+def test_parameters_held_fixed_are_named_and_absent(warm_up):
+    found = study_series(warm_up()(), SETTINGS)
+    assert "A3, C1, C2 were held fixed" in " ".join(found.notes)
+    for part in (found.deviations, found.significance, found.channels[0].dependences):
+        assert not {"A3", "C1", "C2"} & set(part)
+
+
+def test_a_single_epoch_says_so_and_computes_nothing(warm_up):
+    result = study([warm_up(epochs=1)()], SETTINGS).cameras[0]
+    one = result.series[0]
+    assert "a single epoch: nothing can be said about change" in " ".join(one.notes)
+    assert "The F-test needs 31 consecutive epochs; the series has 1" in " ".join(one.notes)
+    assert not one.deviations
+    assert not one.significance
+    assert result.montecarlo is None
+    assert "No Monte-Carlo" in " ".join(result.notes)
+
+
+@pytest.mark.parametrize(
+    ("temperature", "words"),
+    [
+        (np.full(150, 25.0), "stayed at 25.00 °C"),
+        (25 + 0.05 * np.random.default_rng(1).standard_normal(150), "which its noise of 0.050 K"),
+        (np.full(150, np.nan), "has too few readings (0)"),
+    ],
+    ids=["constant", "noise only", "never read"],
+)
+def test_a_temperature_that_says_nothing(warm_up, temperature, words):
+    series = warm_up()(thermometers=(Thermometer("temperature", temperature, 0.05),))
+    found = study_series(series, SETTINGS)
+    assert words in " ".join(found.notes)
+    assert not found.channels[0].dependences
+    column = found.columns.index("temperature")
+    if words.startswith(("stayed", "was")):
+        assert np.isnan(found.matrix[column]).all()
+
+
+def test_gaps_are_said_and_not_tested_across(warm_up):
+    series, rows = warm_up()(), np.r_[0:60, 100:150]
+    names = ("number", "time_s", "values", "sds", "sigma0", "redundancy", "correlations")
+    kept = {name: getattr(series, name)[rows] for name in names}
+    t = series.thermometers[0]
+    kept["thermometers"] = (replace(t, values=t.values[rows]),)
+    series = replace(series, **kept)
+    found = study_series(series, SETTINGS)
+    assert "1 gap, the longest of 410 s at an interval of 10 s" in " ".join(found.notes)
+    assert found.significance["c"].tests == 30 + 20
+
+
+def test_missing_temperatures_leave_out_their_epochs_only(warm_up):
+    series = warm_up()()
+    values = series.thermometers[0].values.copy()
+    values[40:50] = np.nan
+    found = study_series(
+        replace(series, thermometers=(Thermometer("temperature", values, 0.05),)), SETTINGS
+    )
+    assert found.channels[0].dependences["x0"].n == 140
+    assert abs(found.channels[0].dependences["x0"].r) > 0.99
+
+
+def test_lost_epochs_are_counted_by_reason(warm_up):
+    found = study_series(warm_up()(without_result={"too few targets": 7}), SETTINGS)
+    assert "7 of 157 epochs have no result (7 × too few targets)." in found.notes
+
+
+def test_a_parameter_that_never_changed_is_no_dependence(warm_up):
+    series = warm_up()()
+    series.values[:, 3] = series.values[0, 3]
+    found = study_series(series, SETTINGS)
+    assert "A1" not in found.channels[0].dependences
+    assert found.deviations["A1"].change == 0
 
 
 def test_labels_make_cameras_and_series_are_pooled(warm_up):
@@ -32,12 +138,15 @@ def test_series_of_one_name_are_told_apart_by_where_they_are(warm_up):
 
 def test_first_order_agrees_where_errors_are_small(warm_up):
     camera = study([warm_up()()], StudySettings(sets=50_000)).cameras[0]
-    np.testing.assert_allclose(camera.first_order.mean, camera.montecarlo.mean, rtol=0.02)
-    np.testing.assert_allclose(camera.first_order.fractions, camera.montecarlo.fractions, atol=0.01)
+    first, drawn = camera.first_order, camera.montecarlo
+    np.testing.assert_allclose(first.mean, drawn.mean, rtol=0.02)
+    np.testing.assert_allclose(first.fractions, drawn.fractions, atol=0.01)
     # Maxima of 50,000 draws scatter by some per cent.
-    np.testing.assert_allclose(
-        camera.first_order.expected_largest, camera.montecarlo.largest, rtol=0.2
-    )
+    np.testing.assert_allclose(first.expected_largest, drawn.largest, rtol=0.2)
+    # A variance is known to 0.6 %, a mean to 0.0045 of the standard deviation.
+    variance = first.covariance[:, 0, 0]
+    np.testing.assert_allclose(drawn.covariance[:, 0, 0], variance, rtol=0.03)
+    assert np.linalg.norm(drawn.mean_error, axis=1).max() < 0.02 * np.sqrt(variance[0])
 
 
 def test_without_covariances_there_is_no_monte_carlo_but_a_reason(warm_up):
@@ -50,10 +159,129 @@ def test_without_covariances_there_is_no_monte_carlo_but_a_reason(warm_up):
 @pytest.mark.slow
 def test_two_hundred_thousand_epochs_in_seconds(warm_up):
     """A sixteenth of a year; the year itself is in benchmarks/study.py."""
-    import time
-
     series = warm_up(epochs=200_000)(correlations=np.tile(np.eye(10), (5000, 1, 1)))
     begin = time.process_time()  # other jobs may share the machine
     result = study([series], StudySettings())
     assert time.process_time() - begin < 12
     assert result.cameras[0].series[0].significance["x0"].tests == 200_000 - 30
+
+
+def test_a_shift_of_the_principal_point_moves_all_points_alike(warm_up):
+    """x0 alone, no distortion to speak of: D Δx0 / c at every image point."""
+    series = warm_up(drift={"x0": 0.0194}, sds=np.full(10, 1e-12))()
+    first, mean, last = trajectories([series], 10_000.0, 3, CLUSTERS)
+    away = np.abs(series.values[:, 1] - series.values[0, 1]) * 10_000.0 / series.values[0, 0]
+    assert first.reference == "first"
+    assert first.mean == pytest.approx(away.mean(), rel=0.03)
+    assert first.mean_largest == pytest.approx(away.max(), rel=0.03)
+    assert first.fractions[0] == pytest.approx(np.mean(away < 15.0), abs=0.02)
+    assert mean.mean < first.mean
+    assert mean.mean_largest < first.mean_largest
+    assert first.fractions.sum() == pytest.approx(1.0)
+    # A warm-up leaves its start quickly and stays near its end.
+    assert first.fractions[0] < last.fractions[0]
+
+
+def test_correlations_over_time_are_about_each_series_mean(warm_up):
+    made = warm_up(drift={"x0": 0.02, "y0": -0.02})
+    r = correlations_over_time([made("M1"), made("M2")])
+    assert r[1, 2] == pytest.approx(-1.0, abs=1e-3)
+    assert np.isnan(r[IOP_NAMES.index("A3"), 1])  # held
+    # Two series at different levels: what lies between them is no correlation.
+    still = warm_up(drift={})
+    one, other = still("M1"), still("M2")
+    other.values[:, 1:3] += 1.0
+    assert abs(correlations_over_time([one, other])[1, 2]) < 0.3
+
+
+def test_the_summary_says_what_the_draws_are_and_what_the_camera_did(warm_up):
+    camera = study_camera("nexus", [warm_up()()], StudySettings(sets=500))
+    text = " ".join(answer_sentences(camera))
+    assert "drawn from independent normal distributions about the series' mean" in text
+    assert "along its own path" in text
+    assert "x₀ and y₀ −0.999" in text or "x₀ and y₀ −1" in text
+
+
+def test_a_camera_that_heats_and_cools_is_told_by_its_range(warm_up):
+    """The change from first to last is nothing; the text must not say that nothing changed."""
+    make = warm_up()
+    warm = make()
+    up_and_down = np.concatenate([np.arange(75), np.arange(75)[::-1]])
+    thermometer = warm.thermometers[0]
+    cycle = make(
+        values=warm.values[up_and_down],
+        thermometers=(type(thermometer)("temperature", thermometer.values[up_and_down], 0.05),),
+    )
+    camera = study_camera("rpi", [cycle], StudySettings(sets=500))
+    change = camera.series[0].deviations
+    assert change["c"].range > 0.006
+    text = answer_sentences(camera)[1]
+    assert "did not change" not in text
+    assert "the principal distance grew by up to" in text
+    assert "ended where it started" in text
+    assert "temperature rose by up to 1" in text
+
+
+def test_last_minus_first_with_its_sd_passes_over_missing_epochs():
+    values = np.array([np.nan, 1.0, 5.0, 2.5, np.nan])
+    found = deviation(values, np.array([9.0, 0.3, 9.0, 0.4, 9.0]))
+    assert found is not None
+    assert (found.first, found.last, found.change) == (1.0, 2.5, 1.5)
+    assert found.sd_change == pytest.approx(0.5)
+    assert found.largest == 4.0
+    # one value is none
+    assert deviation(np.array([np.nan, 1.0]), np.ones(2)) is None
+
+
+def test_a_moved_principal_point_moves_every_image_point_by_as_much():
+    first = np.array([3.97, 0.01, -0.02, 5e-3, -4e-4, 0, 1e-4, -1e-4, 0, 0])
+    later = first.copy()
+    later[1:3] += np.array([10.0, 5.0]) * 0.0014
+    moved = image_displacement(NEXUS, first, later, image_grid(NEXUS))
+    np.testing.assert_allclose(moved, np.tile([10.0, -5.0], (9, 1)), atol=1e-6)
+
+
+def test_a_longer_principal_distance_moves_points_outwards_in_proportion():
+    first = np.array([3.97, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
+    later = first.copy()
+    later[0] *= 1.002
+    points = image_grid(NEXUS)
+    moved = image_displacement(NEXUS, first, later, points)
+    np.testing.assert_allclose(moved, 0.002 * (points - NEXUS.centre), atol=1e-9)
+
+
+def blur(f, f_number, focus, distance):
+    """Diameter of the blur circle, by the thin lens: image distances of both objects."""
+    image, other = (f * s / (s - f) for s in (focus, distance))
+    return f / f_number * abs(other - image) / other
+
+
+def test_limits_have_the_blur_circle_that_was_allowed():
+    near, far = depth_of_field(3.97, 1000.0, 2.4, 0.0029)
+    assert blur(3.97, 2.4, 1000.0, near) == pytest.approx(0.0029, rel=1e-9)
+    assert blur(3.97, 2.4, 1000.0, far) == pytest.approx(0.0029, rel=1e-9)
+
+
+def test_beyond_the_hyperfocal_distance_everything_far_is_sharp():
+    assert np.isinf(depth_of_field(3.04, 3000.0, 2.0, 0.003)[1])
+
+
+@pytest.mark.parametrize(
+    ("sensor", "c", "f_number", "drift", "quoted"),
+    [
+        (NEXUS, 3.97, 2.4, 0.007, 5),
+        (NEXUS, 3.97, 2.4, 0.003, 3),
+        (Sensor(4032, 3024, 0.0014), 4.2, 1.7, 0.007, 3),
+        (Sensor(4032, 3024, 0.0014), 4.2, 1.7, 0.003, 2),
+    ],
+)
+def test_changes_of_the_reference(sensor, c, f_number, drift, quoted):
+    """Quoted in whole mm at 1 m, without f-number and circle of confusion: within 1 mm."""
+    confusion = circle_of_confusion(sensor)
+    before, after = (depth_of_field(v, 1000.0, f_number, confusion) for v in (c, c + drift))
+    assert np.ptp(before) - np.ptp(after) == pytest.approx(quoted, abs=1.0)
+
+
+def test_a_focus_inside_the_lens_is_refused():
+    with pytest.raises(ValueError, match="no depth of field"):
+        depth_of_field(3.97, 3.0, 2.0, 0.003)

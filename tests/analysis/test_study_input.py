@@ -64,6 +64,7 @@ def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
             if epoch.number == 6:
                 result = EpochResult("too_few_targets", "3 targets")
             store.append(stored, epoch, result)
+        columns = store.series_columns(stored, ["c", "sd_c"])
     series = tc.open(tmp_path / "s.db").measured(exterior="per_epoch")
     assert series.label == "nexus5-warm"
     assert series.number.tolist() == [1, 2, 3, 4, 7, 8, 9, 10]
@@ -72,6 +73,11 @@ def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
     assert series.free == IOP_NAMES[:8]
     assert len(series.correlations) == 8
     assert series.redundancy.tolist() == [200] * 8
+    # a store's export is the numbers in it; not adjusted again
+    table = tc.open(tmp_path / "s.db").calibrate(exterior="stored")
+    np.testing.assert_array_equal(table.values[:, 0], columns["c"])
+    np.testing.assert_array_equal(table.sd[:, 0], columns["sd_c"])
+    assert (table.sd[table.ok, 0] == 1e-4).all()
 
 
 def test_a_store_without_any_result_is_one_error(recording, tmp_path):

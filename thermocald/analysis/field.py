@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
 
 _USED = [PARAMETER_NAMES.index(name) for name in (*DEFAULT_FREE, *EOP_NAMES)]
+_COLUMNS, _ROWS = ("left", "centre left", "centre right", "right"), ("upper", "middle", "lower")
 CELLS = (4, 3)
 """The image is divided into so many columns and rows to see whether it is filled."""
 MIN_SIZE_PX = 8.0
@@ -93,8 +94,51 @@ class FieldCheck:
 
     @cached_property
     def advice(self) -> list[str]:
-        """What would be better, as sentences, the most helpful first."""
-        return advise(self)
+        """Sentences on what would be better, the most helpful first; none if nothing would help by
+        a seventh.
+
+        That a field is one plane comes before all else: more targets in front of it are no print.
+        """
+        points, sigmas = self.field.points[self.visible], self.field.sigmas[self.visible]
+        typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
+        now, pitch = self.precision["epoch"], self.camera.sensor.pixel_pitch
+        proposals: list[tuple[float, str]] = []
+
+        def propose(added: Array, what: str) -> None:
+            both = np.concatenate([points, added])
+            spread = np.concatenate([sigmas, np.repeat(typical, len(added), axis=0)])
+            then = precision(self.camera, self.station, both, spread, self.sigma_px)["epoch"]
+            with np.errstate(invalid="ignore"):  # what is not determined now is worth everything
+                gain = np.where(np.isfinite(now), then / now, 0.0)[:3]
+            gain = np.where(np.isfinite(then[:3]), gain, 1.0)
+            best = int(np.argmin(gain))
+            if gain[best] < _WORTH and np.all(np.isfinite(then[:3])):
+                before = (
+                    f"{now[best] / pitch:.2g} px" if np.isfinite(now[best]) else "not determined"
+                )
+                name = parameter_label(DEFAULT_FREE[best])
+                change = f"sd({name}) of one image {before} → {then[best] / pitch:.2g} px"
+                proposals.append((float(gain[best]), f"{what}: {change}"))
+
+        near = self.distance * (1 - _RAISED)
+        propose(
+            _along(self, np.array([(c, r) for r in range(2) for c in range(4)]), (4, 2), near),
+            f"8 targets standing {self.distance * _RAISED:.0f} mm in front of the field, spread "
+            "over the image",
+        )
+        empty = np.argwhere(self.cells == 0)[:, ::-1]
+        if len(empty):
+            words = [f"{_ROWS[r]} {_COLUMNS[c]}" for c, r in empty]
+            where = ", ".join(words[:4]) + (f" and {len(words) - 4} more" if len(words) > 4 else "")
+            propose(
+                _beside(self, empty, points),
+                f"{len(empty)} targets in the empty parts of the image ({where})",
+            )
+        if len(points) < _FEW:
+            propose(points, f"twice as many targets ({len(points)} are visible)")
+        sentences = [text for _, text in sorted(proposals)]
+        plane = [_ONE_PLANE] if self.flatness < _FLAT else []
+        return [*plane, *sentences, *_remarks(self)]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the document that `testfield check` writes with `--json`."""
@@ -225,6 +269,17 @@ def check_field(
         )
     points, sigmas = field.points[rows], field.sigmas[rows]
     image = camera.project(station, points)
+    # the reasons for which `adjust` would give an image of these points no result
+    A, _ = _partials(camera, station, points)
+    covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
+    # what nothing determines gets a variance that is large, and correlations that are 1
+    covariance[np.ix_(_USED, _USED)] = scaled_inverse(
+        _normal_matrix(A, np.eye(2) * sigma_px**2), 1e-13
+    )
+    values = np.concatenate([camera.interior.as_array(), station.as_array()])
+    weak = weaknesses(
+        camera.sensor, points, image, values, covariance, DEFAULT_FREE, GeometryBounds()
+    )
     depth = -((points - station.centre) @ station.rotation)[:, 2]
     _, axes, _ = plane_fit(points)
     w, h = camera.sensor.width, camera.sensor.height
@@ -246,22 +301,7 @@ def check_field(
         distance=float(depth.mean()),
         flatness=float(np.ptp(points @ axes[2])) / float(depth.mean()),
         precision=precision(camera, station, points, sigmas, sigma_px),
-        weak=tuple(_weak(camera, station, points, image, sigma_px)),
-    )
-
-
-def _weak(
-    camera: CameraModel, station: ExteriorOrientation, points: Array, image: Array, sigma_px: float
-) -> list[str]:
-    """The reasons for which `adjust` would give an image of these points no result."""
-    A, _ = _partials(camera, station, points)
-    N = _normal_matrix(A, np.eye(2) * sigma_px**2)
-    covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
-    # what nothing determines gets a variance that is large, and correlations that are 1
-    covariance[np.ix_(_USED, _USED)] = scaled_inverse(N, 1e-13)
-    values = np.concatenate([camera.interior.as_array(), station.as_array()])
-    return weaknesses(
-        camera.sensor, points, image, values, covariance, DEFAULT_FREE, GeometryBounds()
+        weak=tuple(weak),
     )
 
 
@@ -282,17 +322,15 @@ def _visible(
     reach = np.where(round_[:, None] & good[:, None], maps.half_extent, 0.0)
     half = np.array([camera.sensor.width, camera.sensor.height]) / 2
     inside = np.all(np.abs(image - camera.sensor.centre) + reach < half, axis=1)
-    hidden = {}
-    for i, name in enumerate(field.names):
-        if not np.isfinite(image[i]).all():
-            hidden[name] = "behind the camera"
-        elif not inside[i]:
-            hidden[name] = "outside of the image"
-        elif round_[i] and cosine[i] < MAX_TILT_COSINE:
-            hidden[name] = "seen edge-on"
-        elif round_[i] and minor[i] < MIN_SIZE_PX:
-            hidden[name] = f"smaller than {MIN_SIZE_PX:g} px"
-    rows = np.array([i for i, name in enumerate(field.names) if name not in hidden], dtype=int)
+    reasons = {
+        "behind the camera": ~np.isfinite(image).all(axis=1),
+        "outside of the image": ~inside,
+        "seen edge-on": round_ & (cosine < MAX_TILT_COSINE),
+        f"smaller than {MIN_SIZE_PX:g} px": round_ & (minor < MIN_SIZE_PX),
+    }
+    found = np.select([*reasons.values()], [*reasons], "")
+    hidden = {name: str(why) for name, why in zip(field.names, found, strict=True) if why}
+    rows = np.flatnonzero(found == "")
     return rows, hidden, minor[rows][round_[rows]]
 
 
@@ -371,49 +409,6 @@ def assess_field(
     return check_field(camera, field, station, sigma_px)
 
 
-def advise(check: FieldCheck) -> list[str]:
-    """Return sentences, the most helpful first; none if nothing would help by a seventh.
-
-    That a field is one plane comes before all else: more targets in front of it are no print.
-    """
-    points, sigmas = check.field.points[check.visible], check.field.sigmas[check.visible]
-    typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
-    now, pitch = check.precision["epoch"], check.camera.sensor.pixel_pitch
-    proposals: list[tuple[float, str]] = []
-
-    def propose(added: Array, what: str) -> None:
-        both = np.concatenate([points, added])
-        spread = np.concatenate([sigmas, np.repeat(typical, len(added), axis=0)])
-        then = precision(check.camera, check.station, both, spread, check.sigma_px)["epoch"]
-        with np.errstate(invalid="ignore"):  # what is not determined now is worth everything
-            gain = np.where(np.isfinite(now), then / now, 0.0)[:3]
-        gain = np.where(np.isfinite(then[:3]), gain, 1.0)
-        best = int(np.argmin(gain))
-        if gain[best] < _WORTH and np.all(np.isfinite(then[:3])):
-            before = f"{now[best] / pitch:.2g} px" if np.isfinite(now[best]) else "not determined"
-            name = parameter_label(DEFAULT_FREE[best])
-            change = f"sd({name}) of one image {before} → {then[best] / pitch:.2g} px"
-            proposals.append((float(gain[best]), f"{what}: {change}"))
-
-    near = check.distance * (1 - _RAISED)
-    propose(
-        _along(check, np.array([(c, r) for r in range(2) for c in range(4)]), (4, 2), near),
-        f"8 targets standing {check.distance * _RAISED:.0f} mm in front of the field, spread over "
-        "the image",
-    )
-    empty = np.argwhere(check.cells == 0)[:, ::-1]
-    if len(empty):
-        propose(
-            _beside(check, empty, points),
-            f"{len(empty)} targets in the empty parts of the image ({_where(empty)})",
-        )
-    if len(points) < _FEW:
-        propose(points, f"twice as many targets ({len(points)} are visible)")
-    sentences = [text for _, text in sorted(proposals)]
-    plane = [_ONE_PLANE] if check.flatness < _FLAT else []
-    return [*plane, *sentences, *_remarks(check)]
-
-
 def _remarks(check: FieldCheck) -> list[str]:
     """What is wrong with the targets themselves."""
     notes = []
@@ -468,11 +463,3 @@ def _beside(check: FieldCheck, parts: NDArray[np.int64], points: Array) -> Array
     sensible = (reach > 0.4) & (reach < 2.5)
     result: Array = check.station.centre + rays * np.where(sensible, reach, 1.0)[:, None]
     return result
-
-
-def _where(empty: NDArray[np.int64]) -> str:
-    """Parts of the image in words."""
-    rows = ("upper", "middle", "lower")
-    columns = ("left", "centre left", "centre right", "right")
-    words = [f"{rows[r]} {columns[c]}" for c, r in empty]
-    return ", ".join(words[:4]) + (f" and {len(words) - 4} more" if len(words) > 4 else "")

@@ -300,7 +300,7 @@ class CameraDifference(Result):
     @cached_property
     def shifts(self) -> Array:
         """By how much each direction of the grid is seen elsewhere, (n, 2) px."""
-        return self._seen(self.second, self._directions) - self._grid
+        return self._moved(self._directions)
 
     @property
     def rms_px(self) -> float:
@@ -314,8 +314,7 @@ class CameraDifference(Result):
         from scipy.spatial.transform import Rotation
 
         def left(angles: Array) -> Array:
-            turned = Rotation.from_rotvec(angles).apply(self._directions)
-            return (self._seen(self.second, turned) - self._grid).ravel()
+            return self._moved(Rotation.from_rotvec(angles).apply(self._directions)).ravel()
 
         best = least_squares(left, np.zeros(3), x_scale=1e-4, xtol=1e-14, ftol=1e-14)
         return np.asarray(best.fun).reshape(-1, 2)
@@ -323,7 +322,8 @@ class CameraDifference(Result):
     def as_dict(self) -> dict[str, Any]:
         """The result as `--json` has it."""
         a, b = self.first.interior.as_array(), self.second.interior.as_array()
-        sds = self._sds()
+        known = [np.diag(c) for c in self.covariances if c is not None]
+        sds = np.sqrt(known[0] + known[1]) if self.has_sd else None
         rows = []
         for k, name in enumerate(IOP_NAMES):
             row = {"name": name, "unit": PARAMETER_UNITS[name], "first": a[k], "second": b[k],
@@ -397,13 +397,10 @@ class CameraDifference(Result):
     def _directions(self) -> Array:
         return directions(self.first.sensor, self.first.interior.as_array(), self._grid)
 
-    @staticmethod
-    def _seen(camera: CameraModel, seen: Array) -> Array:
-        return project(camera.sensor, camera.interior.as_array(), np.zeros(6), seen)
-
-    def _sds(self) -> Array | None:
-        a, b = self.covariances
-        return None if a is None or b is None else np.sqrt(np.diag(a) + np.diag(b))
+    def _moved(self, seen: Array) -> Array:
+        """Where the second camera sees directions (n, 3), from where the first sees the grid's."""
+        values = self.second.interior.as_array()
+        return project(self.second.sensor, values, np.zeros(6), seen) - self._grid
 
     def _image_sds(self, worst: int) -> tuple[float, float]:
         """Standard deviations px of the largest shift's length, and of the RMS."""

@@ -33,11 +33,11 @@ from thermocald.result import with_sds
 from thermocald.store.logger.photographs import find_copies, moment_taken
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"})
@@ -187,156 +187,130 @@ def calibrate_observations(
     settings: AdjustmentSettings,
 ) -> Photographs:
     """Calibrate image points; failures: {position: (status, reason)} known beforehand."""
+    sensor, failures = camera.sensor, dict(failures)
     seen = {k: o for k, o in enumerate(measured) if o is not None}
-    given = _Given(names, seen, dict(failures), testfield, camera, settings)
+    usable = {k: o for k, o in seen.items() if k not in failures}
+    rows: list[int] = []
+    together: CommonInterior | None = None
     reason = "no photograph shows enough targets"
     if not settings.free:
         reason = "the interior orientation is held (--free none)"
-    elif given.usable:
+    elif usable:
         try:
-            rows, together = given.adjust_together(given.first_camera())
-            if poor := given.poor_ones(rows, together):
-                given.failures.update(poor)
-                rows, together = given.adjust_together(together.interior)
+            start = _first_camera(max(usable.values(), key=len), testfield, camera, settings)
+            rows, together = _adjust_together(usable, testfield, sensor, start, settings)
+            residuals = dict(zip(rows, together.residuals, strict=True))
+            poor = {} if together.reasons else _poor_ones(residuals, usable)
+            if poor:
+                failures |= poor
+                usable = {k: o for k, o in usable.items() if k not in poor}
+                start = together.interior
+                rows, together = _adjust_together(usable, testfield, sensor, start, settings)
+            reason = "; ".join(together.reasons)
         except GeometryError as error:
             reason = str(error)
-        else:
-            reason = "; ".join(together.reasons)
-            if not reason:
-                return given.estimated(rows, together)
-    return given.held(reason)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Given:
-    """Image points of photographs, by their position, and why others have none."""
-
-    names: Sequence[str]
-    seen: dict[int, Observations]
-    failures: dict[int, tuple[str, str]]
-    testfield: TestField
-    camera: CameraSpec
-    settings: AdjustmentSettings
-
-    @property
-    def usable(self) -> dict[int, Observations]:
-        """The photographs that nothing speaks against."""
-        return {k: o for k, o in self.seen.items() if k not in self.failures}
-
-    def first_camera(self) -> InteriorOrientation:
-        """Return the camera of the photograph with most targets, to start from."""
-        o, camera = max(self.usable.values(), key=len), self.camera
-        nominal = camera.principal_distance
-        first = cold_start(
-            camera.sensor, self.testfield, o, self.settings, nominal, camera.interior
-        )
-        start = first.interior or camera.interior
-        if start is None:
-            points = self.testfield.points[o.targets]
-            start = approximate_orientation(camera.sensor, points, o.points, nominal)[0]
-        if not first.ok and camera.interior is None:
-            # Distortion from a weak photograph would only mislead the others.
-            start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
-        return start
-
-    def adjust_together(self, interior: InteriorOrientation) -> tuple[list[int], CommonInterior]:
-        """Adjust the photographs whose targets a pose explains; return which, and the result."""
-        rows, poses, chosen, fitting = [], [], [], []
-        for k, o in self.usable.items():
-            with suppress(GeometryError):
-                points = self.testfield.points[o.targets]
-                _, pose, fits = approximate_orientation(
-                    self.camera.sensor, points, o.points, interior=interior
-                )
-                rows.append(k)
-                poses.append(pose)
-                chosen.append(o)
-                fitting.append(fits)
-        if not chosen:
-            raise GeometryError("no pose explains the targets of any photograph")
-        return rows, adjust_common_interior(
-            self.camera.sensor, self.testfield, chosen, interior, poses, self.settings, fitting
-        )
-
-    def poor_ones(
-        self, rows: Sequence[int], together: CommonInterior
-    ) -> dict[int, tuple[str, str]]:
-        """Return {position: (status, reason)} of photographs whose residuals are too large."""
-        residuals = dict(zip(rows, together.residuals, strict=True))
-        size = {
-            k: float(np.sqrt(np.median(np.sum((r / self.seen[k].sigmas) ** 2, axis=1))))
-            for k, r in residuals.items()
-            if len(r) >= _ENOUGH_TARGETS
-        }
-        if together.reasons or len(size) < _FEWEST_TO_COMPARE:
-            return {}
-        usual = max(float(np.median(list(size.values()))), 1.0)
-        poor = {}
-        for k, own in size.items():
-            if own / usual > _POOR:
-                why = (
-                    f"residuals of {np.sqrt(np.mean(residuals[k] ** 2)):.2f} px, {own / usual:.0f} "
-                    "times those of the other photographs: moved while exposed, or a board that "
-                    "was bent; left out"
-                )
-                poor[k] = ("large_residuals", why)
-        return poor
-
-    def estimated(self, rows: Sequence[int], together: CommonInterior) -> Photographs:
-        """Return the camera that the photographs have in common."""
-        results = []
-        for k in range(len(self.names)):
-            if k in self.failures or k not in rows:
-                why = self.failures.get(k, ("no_orientation", "no pose explains its targets"))
-                results.append(self._failed(k, *why))
-                continue
-            i = rows.index(k)
-            sd = np.sqrt(np.diag(together.exterior_covariances[i]))
-            adjusted = together.used[i], together.residuals[i], together.exteriors[i], sd
-            results.append(self._posed(k, *adjusted))
-        return Photographs(
-            "ok", "", together.interior, True, together.covariance, together.sigma0,
-            together.redundancy, tuple(results),
-        )  # fmt: skip
-
-    def held(self, reason: str) -> Photographs:
-        """Return poses with the camera as it was given, and why it was not estimated."""
-        results, camera = [], self.camera
-        for k in range(len(self.names)):
-            if k in self.failures:
-                results.append(self._failed(k, *self.failures[k]))
-            elif camera.interior is None:
+    poses: dict[int, tuple[Mask, Array, ExteriorOrientation | None, Array]] = {}
+    if together is None or reason:
+        # the camera is held as it was given
+        status, interior, estimated = "held", camera.interior, False
+        if settings.free:
+            status = "weak_geometry"
+        covariance, sigma0, redundancy = np.zeros((16, 16)), float("nan"), 0
+        for k in seen.keys() - failures.keys():
+            if interior is None:
                 why = f"without an interior orientation there is no pose: {reason}"
-                results.append(self._failed(k, "weak_geometry", why))
-            else:
-                pose = pose_only(
-                    camera.sensor, self.testfield, self.seen[k], camera.interior, self.settings
-                )
-                if not pose.ok:
-                    results.append(self._failed(k, pose.status, pose.reason))
-                    continue
+                failures[k] = ("weak_geometry", why)
+                continue
+            pose = pose_only(sensor, testfield, seen[k], interior, settings)
+            if pose.ok:
                 used = ~np.isin(pose.targets, pose.rejected)
-                results.append(self._posed(k, used, pose.residuals, pose.exterior, pose.sd[10:]))
-        status = "weak_geometry" if self.settings.free else "held"
-        return Photographs(
-            status, reason, camera.interior, False, np.zeros((16, 16)), float("nan"), 0,
-            tuple(results),
-        )  # fmt: skip
-
-    def _failed(self, k: int, status: str, reason: str) -> PhotographResult:
-        n = len(self.seen[k]) if k in self.seen else 0
-        return PhotographResult(self.names[k], status, reason, n)
-
-    def _posed(
-        self, k: int, used: NDArray[np.bool_], residuals: Array,
-        exterior: ExteriorOrientation | None, sd: Array,
-    ) -> PhotographResult:  # fmt: skip
-        o = self.seen[k]
-        rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
-        rejected = tuple(self.testfield.names[t] for t in o.targets[~used])
-        return PhotographResult(
-            self.names[k], "ok", "", len(o), rejected, rms, exterior, sd, o.points, residuals, used
+                poses[k] = used, pose.residuals, pose.exterior, pose.sd[10:]
+            else:
+                failures[k] = (pose.status, pose.reason)
+    else:
+        status, interior, estimated = "ok", together.interior, True
+        covariance, sigma0 = together.covariance, together.sigma0
+        redundancy = together.redundancy
+        sds = np.sqrt(np.diagonal(together.exterior_covariances, axis1=1, axis2=2))
+        found = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
+        poses = dict(zip(rows, found, strict=True))
+    results = []
+    for k, name in enumerate(names):
+        n = len(seen[k]) if k in seen else 0
+        if k not in poses:
+            word, why = failures.get(k, ("no_orientation", "no pose explains its targets"))
+            results.append(PhotographResult(name, word, why, n))
+            continue
+        o, (used, rest, exterior, sd) = seen[k], poses[k]
+        rms = float(np.sqrt(np.mean(rest[used] ** 2)))
+        rejected = tuple(testfield.names[t] for t in o.targets[~used])
+        results.append(
+            PhotographResult(name, "ok", "", n, rejected, rms, exterior, sd, o.points, rest, used)
         )
+    return Photographs(
+        status, reason, interior, estimated, covariance, sigma0, redundancy, tuple(results)
+    )
+
+
+def _first_camera(
+    o: Observations, testfield: TestField, camera: CameraSpec, settings: AdjustmentSettings
+) -> InteriorOrientation:
+    """Return the camera that one photograph gives, to start from."""
+    nominal = camera.principal_distance
+    first = cold_start(camera.sensor, testfield, o, settings, nominal, camera.interior)
+    start = first.interior or camera.interior
+    if start is None:
+        points = testfield.points[o.targets]
+        start = approximate_orientation(camera.sensor, points, o.points, nominal)[0]
+    if not first.ok and camera.interior is None:
+        # Distortion from a weak photograph would only mislead the others.
+        start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
+    return start
+
+
+def _adjust_together(
+    usable: Mapping[int, Observations], testfield: TestField, sensor: Sensor,
+    interior: InteriorOrientation, settings: AdjustmentSettings,
+) -> tuple[list[int], CommonInterior]:  # fmt: skip
+    """Adjust the photographs whose targets a pose explains; return which, and the result."""
+    rows, poses, fitting = [], [], []
+    for k, o in usable.items():
+        with suppress(GeometryError):
+            points = testfield.points[o.targets]
+            _, pose, fits = approximate_orientation(sensor, points, o.points, interior=interior)
+            rows.append(k)
+            poses.append(pose)
+            fitting.append(fits)
+    if not rows:
+        raise GeometryError("no pose explains the targets of any photograph")
+    chosen = [usable[k] for k in rows]
+    return rows, adjust_common_interior(
+        sensor, testfield, chosen, interior, poses, settings, fitting
+    )
+
+
+def _poor_ones(
+    residuals: Mapping[int, Array], seen: Mapping[int, Observations]
+) -> dict[int, tuple[str, str]]:
+    """Return {position: (status, reason)} of photographs whose residuals (n, 2) are too large."""
+    size = {
+        k: float(np.sqrt(np.median(np.sum((r / seen[k].sigmas) ** 2, axis=1))))
+        for k, r in residuals.items()
+        if len(r) >= _ENOUGH_TARGETS
+    }
+    if len(size) < _FEWEST_TO_COMPARE:
+        return {}
+    usual = max(float(np.median(list(size.values()))), 1.0)
+    poor = {}
+    for k, own in size.items():
+        if own / usual > _POOR:
+            why = (
+                f"residuals of {np.sqrt(np.mean(residuals[k] ** 2)):.2f} px, {own / usual:.0f} "
+                "times those of the other photographs: moved while exposed, or a board that was "
+                "bent; left out"
+            )
+            poor[k] = ("large_residuals", why)
+    return poor
 
 
 def images_of(given: Sequence[Path]) -> list[Path]:
@@ -366,16 +340,15 @@ def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraS
     """A camera of which no file says anything, its image size that of most photographs; without
     its pitch a pixel counts as 1 µm.
     """
-    first: ImageError | None = None
+    errors: list[ImageError] = []
     sizes: Counter[tuple[int, ...]] = Counter()
     for path in images:
         try:
             sizes[decode_grey(path).shape] += 1
         except ImageError as error:
-            first = first or error
+            errors.append(error)
     if not sizes:
-        assert first is not None
-        raise first
+        raise errors[0]
     height, width = sizes.most_common(1)[0][0]
     pitch = _ASSUMED_PITCH if pixel_pitch is None else pixel_pitch
     return CameraSpec("camera", Sensor(width, height, pitch))

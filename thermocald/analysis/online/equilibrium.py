@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 if TYPE_CHECKING:
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array
 
 State = Literal["unknown", "drifting", "ready"]
 
@@ -36,8 +36,8 @@ class Equilibrium:
     """drift, sd_drift: px/min of (c, x0, y0) together; ready_in, sd_ready_in: s, NaN if unknown."""
 
     state: State
-    drift: float
-    sd_drift: float
+    drift: float = float("nan")
+    sd_drift: float = float("nan")
     ready_in: float = float("nan")
     sd_ready_in: float = float("nan")
 
@@ -92,8 +92,18 @@ def fit_approach(
     span = float(times[-1] - times[0])
     step = span / (len(times) - 1)
     taus = np.geomspace(2.0 * step, 10.0 * span, _TAUS)
+    w = 1.0 / sds**2
+    mean = float(w @ values / w.sum())
     for narrowing in range(_NARROWINGS):
-        chi2, ready, variance = _profile(times - times[0], values, 1.0 / sds**2, taus, bound)
+        # chi-square, time to steady s and its variance for every tau, a and b at their best
+        E = np.exp(-(times - times[0]) / taus[:, None])
+        D = E - (E @ w / w.sum())[:, None]
+        see = D**2 @ w
+        b = D @ (w * (values - mean)) / see
+        chi2 = ((values - mean - D * b[:, None]) ** 2) @ w
+        with np.errstate(divide="ignore"):
+            ready = np.maximum(0.0, taus * np.log(np.abs(b) * E[:, -1] / taus / bound))
+        variance = (taus / (np.sqrt(see) * np.maximum(np.abs(b), 1e-300))) ** 2
         factor = max(1.0, float(chi2.min()) / max(len(times) - 3, 1))
         weight = np.exp(-0.5 * (chi2 - chi2.min()) / factor)
         if narrowing == 0 and weight[-1] > 0.25:
@@ -106,22 +116,6 @@ def fit_approach(
     ready_in = float(weight @ ready)
     sd = float(np.sqrt(weight @ ((ready - ready_in) ** 2 + factor * variance)))
     return ready_in, sd, factor
-
-
-def _profile(
-    t: Array, values: Array, w: Array, taus: Array, bound: float
-) -> tuple[Array, Array, Array]:
-    """Chi-square, time to steady s and its variance for every tau, a and b at their best."""
-    E = np.exp(-t / taus[:, None])
-    D = E - (E @ w / w.sum())[:, None]
-    mean = float(w @ values / w.sum())
-    see = D**2 @ w
-    b = D @ (w * (values - mean)) / see
-    chi2 = ((values - mean - D * b[:, None]) ** 2) @ w
-    with np.errstate(divide="ignore"):
-        ready = np.maximum(0.0, taus * np.log(np.abs(b) * E[:, -1] / taus / bound))
-    variance = (taus / (np.sqrt(see) * np.maximum(np.abs(b), 1e-300))) ** 2
-    return chi2, ready, variance
 
 
 class EquilibriumWatch:
@@ -161,22 +155,22 @@ class EquilibriumWatch:
         All of the past is seen from the same exterior orientation: what was known of it at each
         epoch improves with time, and would look like drift.
         """
-        nothing = Equilibrium("unknown", float("nan"), float("nan"))
         if len(self._past) < _FEWEST:
-            return nothing
+            return Equilibrium("unknown")
         times = np.array([total / count for _, count, total, _ in self._past])
         sums = np.array([one for *_, one in self._past])
         values = (sums[..., 1] + sums[..., 2:] @ exterior) / sums[..., 0]
         sds = 1.0 / np.sqrt(sums[..., 0])
         good = np.isfinite(values).all(axis=0) & np.isfinite(sds).all(axis=0)
         if not good.any():
-            return nothing
+            return Equilibrium("unknown")
         values, sds = values[:, good], sds[:, good]
         # from the longest past that straight lines describe, else from the window
-        for multiple in (4.0, 2.0, 1.0):
-            recent = _last(times, multiple)
+        pasts = [times >= times[-1] - windows * _WINDOW_S for windows in (4.0, 2.0, 1.0)]
+        for past in pasts:
+            recent = past.copy()
             recent[-_FEWEST:] = True
-            if multiple == 1.0 or _straight(times[recent], values[recent], sds[recent]):
+            if past is pasts[-1] or _straight(times[recent], values[recent], sds[recent]):
                 break
         rate, sd_rate = slope(times[recent], values[recent], sds[recent])
         size = float(np.linalg.norm(rate))
@@ -188,11 +182,10 @@ class EquilibriumWatch:
             return Equilibrium("unknown", speed, sd_speed)
         along, sd_along = values @ direction, np.sqrt((sds**2) @ direction**2)
         # from the longest past that one exponential describes: heating may just have begun
-        for multiple in (4.0, 2.0, 1.0):
-            recent = _last(times, multiple)
-            if recent.sum() < _FEWEST:
+        for past in pasts:
+            if past.sum() < _FEWEST:
                 break
-            found = fit_approach(times[recent], along[recent], sd_along[recent], _STEADY / 60.0)
+            found = fit_approach(times[past], along[past], sd_along[past], _STEADY / 60.0)
             if found is None:
                 break
             ready_in, sd_ready_in, misfit = found
@@ -201,18 +194,11 @@ class EquilibriumWatch:
         return Equilibrium("drifting", speed, sd_speed)
 
 
-def _last(times: Array, windows: float) -> Mask:
-    return np.asarray(times >= times[-1] - windows * _WINDOW_S)
-
-
 def _straight(times: Array, values: Array, sds: Array) -> bool:
     """Whether a parabola finds no curvature, of any of the columns (n, k), beyond 2 sd."""
     t = (times - times.mean()) / max(float(np.ptp(times)), 1e-9)
-    design = np.stack([np.ones_like(t), t, t * t], axis=1)
-    for column, sd in zip(values.T, sds.T, strict=True):
-        A = design / sd[:, None]
-        cofactor = np.linalg.inv(A.T @ A)
-        curvature = float((cofactor @ A.T @ (column / sd))[2])
-        if abs(curvature) > _CURVED_SD * np.sqrt(cofactor[2, 2]):
-            return False
-    return True
+    A = np.stack([np.ones_like(t), t, t * t], axis=1) / sds.T[..., None]
+    transposed = np.swapaxes(A, 1, 2)
+    cofactors = np.linalg.inv(transposed @ A)
+    curvatures = (cofactors @ transposed @ (values / sds).T[..., None])[:, 2, 0]
+    return bool(np.all(np.abs(curvatures) <= _CURVED_SD * np.sqrt(cofactors[:, 2, 2])))

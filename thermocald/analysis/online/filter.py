@@ -271,11 +271,52 @@ class OnlineFilter:
         wander = _WANDER_PX * self.sensor.pixel_pitch
         self._P[warm, warm] += (wander / self._scale[warm]) ** 2
         self._P[:n, :n] += self._rate_moment() * (step * _LAG) ** 2
-        innovation = self._take_in(adjustment, errors)
-        if not self._surprised and tremble is not None:
+        z = (adjustment.values - self._held)[self._free] / self._scale[:n]
+        R, K = self._scaled(errors)
+        R += self._rate_moment() * self._rise_variance
+        H = self._H()
+        v = z - H @ self._x
+        common = K * self._common
+
+        def covariances() -> tuple[Array, Array]:
+            """Of the innovation (n, n), and of the state with it (n + 3, n)."""
+            cross = self._P @ H.T + self._C @ K.T
+            S: Array = H @ cross + K @ self._C.T @ H.T + common @ K.T + R
+            return 0.5 * (S + S.T), cross
+
+        S, cross = covariances()
+        chi2 = float(v @ np.linalg.solve(S, v))
+        bound = chi2_quantile(1.0 - _ALPHA, n)
+        if len(self._history) >= _FEWEST:
+            # A mount in the wind sways by more than the normal distribution has: what it did in a
+            # tenth of the epochs is nothing to report.
+            bound = max(bound, _BEYOND * float(np.quantile(self._history, _USUAL)))
+        self._history.append(chi2)
+        change: Change = ""
+        if chi2 > bound:
+            self._surprised += 1
+            if self._surprised < 2:
+                return Innovation(chi2, bound, n, "outlier")
+            change = self._name(adjustment, v, S)
+            # what the change has made untrue is forgotten
+            block = _BLOCKS.get(change, tuple(range(16)))
+            rows = np.flatnonzero(np.isin(self._free, block))
+            self._P[rows, rows] += _FAR**2
+            S, cross = covariances()
+        self._surprised = 0
+        gain: Array = np.asarray(np.linalg.solve(S, cross.T).T, dtype=np.float64)
+        self._x = self._x + gain @ v
+        # Joseph's form, which stays positive where a change has opened the state
+        left = np.eye(len(self._x)) - gain @ H
+        mixed = left @ self._C @ (gain @ K).T
+        P = left @ self._P @ left.T - mixed - mixed.T + gain @ (common @ K.T + R) @ gain.T
+        self._P = 0.5 * (P + P.T)
+        self._C = left @ self._C - gain @ common
+        self.epochs += 1
+        if tremble is not None:
             # a knock is not judged by a movement that it is part of
             self._tremble = tremble
-        return innovation
+        return Innovation(chi2, bound, n, change)
 
     @property
     def rates(self) -> Array:
@@ -349,52 +390,6 @@ class OnlineFilter:
         moment = np.outer(self._x[n:], self._x[n:]) + self._P[n:, n:]
         result: Array = self._by_rate @ moment @ self._by_rate.T
         return result
-
-    def _take_in(self, adjustment: Adjustment, errors: tuple[Array, Array]) -> Innovation:
-        n = len(self._free)
-        z = (adjustment.values - self._held)[self._free] / self._scale[:n]
-        R, K = self._scaled(errors)
-        R += self._rate_moment() * self._rise_variance
-        H = self._H()
-        v = z - H @ self._x
-        common = K * self._common
-
-        def covariances() -> tuple[Array, Array]:
-            """Of the innovation (n, n), and of the state with it (n + 3, n)."""
-            cross = self._P @ H.T + self._C @ K.T
-            S: Array = H @ cross + K @ self._C.T @ H.T + common @ K.T + R
-            return 0.5 * (S + S.T), cross
-
-        S, cross = covariances()
-        chi2 = float(v @ np.linalg.solve(S, v))
-        bound = chi2_quantile(1.0 - _ALPHA, n)
-        if len(self._history) >= _FEWEST:
-            # A mount in the wind sways by more than the normal distribution has: what it did in a
-            # tenth of the epochs is nothing to report.
-            bound = max(bound, _BEYOND * float(np.quantile(self._history, _USUAL)))
-        self._history.append(chi2)
-        change: Change = ""
-        if chi2 > bound:
-            self._surprised += 1
-            if self._surprised < 2:
-                return Innovation(chi2, bound, n, "outlier")
-            change = self._name(adjustment, v, S)
-            # what the change has made untrue is forgotten
-            block = _BLOCKS.get(change, tuple(range(16)))
-            rows = np.flatnonzero(np.isin(self._free, block))
-            self._P[rows, rows] += _FAR**2
-            S, cross = covariances()
-        self._surprised = 0
-        gain: Array = np.asarray(np.linalg.solve(S, cross.T).T, dtype=np.float64)
-        self._x = self._x + gain @ v
-        # Joseph's form, which stays positive where a change has opened the state
-        left = np.eye(len(self._x)) - gain @ H
-        mixed = left @ self._C @ (gain @ K).T
-        P = left @ self._P @ left.T - mixed - mixed.T + gain @ (common @ K.T + R) @ gain.T
-        self._P = 0.5 * (P + P.T)
-        self._C = left @ self._C - gain @ common
-        self.epochs += 1
-        return Innovation(chi2, bound, n, change)
 
     def _name(self, adjustment: Adjustment, v: Array, S: Array) -> Change:
         """Which parameters, freed alone, explain the innovation."""

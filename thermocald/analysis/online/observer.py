@@ -11,6 +11,7 @@ import numpy as np
 from thermocald.analysis.online.equilibrium import Equilibrium, EquilibriumWatch
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
+from thermocald.result import with_sds
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -70,7 +71,7 @@ class OnlineObserver:
         self._tell = tell
         self._rejected: Counter[int] = Counter()
         self._reported: set[int] = set()
-        self._equilibrium = Equilibrium("unknown", float("nan"), float("nan"))
+        self._equilibrium = Equilibrium("unknown")
 
     def observe(
         self, calibrated: CalibratedEpoch, adjusted: Adjustment | None = None,
@@ -127,12 +128,10 @@ class OnlineObserver:
             values = self.filter.values()
             sd = np.sqrt(np.diag(self.filter.covariance()))
             rates, sd_rates = self.filter.rates, np.sqrt(np.diag(self.filter.rates_covariance))
-            for k, name in enumerate(PARAMETER_NAMES):
-                if sd[k] > 0:
-                    report[name], report[f"sd_{name}"] = float(values[k]), float(sd[k])
-            for k, name in enumerate(PARAMETER_NAMES[_IOP]):
-                report[f"d{name}_dT"] = float(rates[k])
-                report[f"sd_d{name}_dT"] = float(sd_rates[k])
+            free = np.flatnonzero(sd > 0)
+            report |= with_sds([PARAMETER_NAMES[k] for k in free], values[free], sd[free])
+            names = [f"d{name}_dT" for name in PARAMETER_NAMES[_IOP]]
+            report |= with_sds(names, rates, sd_rates)
         return report
 
     def _watch_targets(self, calibrated: CalibratedEpoch, adjusted: Adjustment) -> None:

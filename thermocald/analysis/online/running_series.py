@@ -157,13 +157,12 @@ class RunningSeries:
         self._asked = replace(SeriesSettings.of(settings, exterior), target_offsets=offsets)
         size = min(_WINDOW, max(_WINDOW_POINTS // max(len(testfield), 1), _FEWEST))
         self._kept: deque[_Kept] = deque(maxlen=size)
-        self._restarted = 0
         self._hurried = False
         self.reset()
 
-    def reset(self) -> None:
-        """Forget all: the epochs to come are another series."""
-        self.epochs = 0
+    def reset(self, after: int = 0) -> None:
+        """Forget all: the epochs to come are another series; after: which epoch says so."""
+        self.epochs, self._restarted = 0, after
         self._look_at = [0, 0]
         self._period, self._offsets = 0.0, False
         self._kept.clear()
@@ -199,10 +198,22 @@ class RunningSeries:
         s = self._asked
         return len(s.free) > 0 and (s.exterior != "per_epoch" or s.target_offsets)
 
-    def remember(self, calibrated: CalibratedEpoch, seen: Observations, reported: Array) -> None:
-        """Take an epoch in that was reported (16,) before the program was started again."""
-        self._keep(calibrated, seen)
-        self._kept[-1].reported = reported
+    def remember(
+        self, calibrated: CalibratedEpoch, seen: Observations, reported: Array | None = None
+    ) -> None:
+        """Take an epoch in; reported (16,): of one from before the program was started again."""
+        epoch = calibrated.epoch
+        self.epochs += 1
+        self._kept.append(
+            _Kept(
+                ObservationGrid.from_observations(self._field, [seen]),
+                epoch.number,
+                epoch.frame_time,
+                next(iter(epoch.temperatures.values()), np.nan),
+                calibrated.adjustment.values,
+                reported,
+            )
+        )
 
     def refine(
         self, calibrated: CalibratedEpoch, seen: Observations, *, hurried: bool = False
@@ -222,18 +233,16 @@ class RunningSeries:
             self._away += 1
             if self._away < _STAYS:
                 return alone, columns
-            self._restart(calibrated.epoch.number)
+            self.reset(calibrated.epoch.number)
             columns["series_restarted"] = 1.0
         self._away = 0
-        self._keep(calibrated, seen)
+        self.remember(calibrated, seen)
         own, whole = self._adjusted()
         columns |= self._columns(whole)
         if not weak:  # what is weak contradicts nothing
             against = any(e is not None and e.status in _AGAINST for e in (own, whole))
             self._doubts = self._doubts + 1 if against else 0
-            if self._doubts >= _DOUBTED:
-                self._restart(self._kept[-1].number)
-                columns["series_restarted"] = 1.0
+        refined = alone
         if own is not None and own.status == "ok":
             values = own.values - self._level
             self._kept[-1].reported = values
@@ -242,10 +251,10 @@ class RunningSeries:
             values, level = whole.values, np.diag(self._series.sample.level_sd**2)
             own = replace(whole, covariance=whole.covariance + level)
         else:
-            return alone, columns
-        wrong = self._wrong & self._kept[-1].grid.observed[0]
-        return (
-            replace(
+            own = None
+        if own is not None:
+            wrong = self._wrong & self._kept[-1].grid.observed[0]
+            refined = replace(
                 alone,
                 status="ok",
                 reason="",
@@ -256,9 +265,11 @@ class RunningSeries:
                 redundancy=own.redundancy,
                 residuals=own.residuals[alone.targets],
                 rejected=tuple(np.flatnonzero(own.rejected | wrong).tolist()),
-            ),
-            columns,
-        )
+            )
+        if self._doubts >= _DOUBTED:
+            self.reset(calibrated.epoch.number)
+            columns["series_restarted"] = 1.0
+        return refined, columns
 
     def report(self) -> dict[str, Any]:
         """For status and page: how the camera's orientation is taken, and on how many epochs."""
@@ -300,23 +311,6 @@ class RunningSeries:
                 columns[f"level_sd_{name}"] = float(level[k])
         return columns
 
-    def _keep(self, calibrated: CalibratedEpoch, seen: Observations) -> None:
-        epoch = calibrated.epoch
-        self.epochs += 1
-        self._kept.append(
-            _Kept(
-                ObservationGrid.from_observations(self._field, [seen]),
-                epoch.number,
-                epoch.frame_time,
-                next(iter(epoch.temperatures.values()), np.nan),
-                calibrated.adjustment.values,
-            )
-        )
-
-    def _restart(self, number: int) -> None:
-        self.reset()
-        self._restarted = number
-
     def _elsewhere(self, alone: Adjustment) -> bool:
         """Whether the camera sees its targets elsewhere than in the last epoch: it was turned, by
         far more than a knock that the movements of a mount take up.
@@ -334,33 +328,29 @@ class RunningSeries:
         """The last epoch's own result, None where epochs share nothing that changes it, and that
         in the series.
         """
-        newest = self._without_wrong(self._kept[-1].grid)
+        whole, newest = None, self._without_wrong(self._kept[-1].grid)
         more = (newest.observed[0] & ~self._shown).any()  # targets that none of the others showed
         if self._series is not None and not more and self.epochs < self._look_at[1]:
             whole = self._series.further(newest, len(self._kept))
-            if whole.status not in _AGAINST:
-                return self._further(newest, whole), whole
-        row = self._look()
-        assert self._series is not None
-        whole = self._series.epoch(row)
-        if not self._offsets:
-            return None, whole
-        if self._each is None and (last := self._own_looks()[0]) < self.epochs:
-            self._each = self._look_at_each(last)  # the program was started again
-        due = self._each is None or self.epochs >= self._look_at[0]
-        if not due and whole.status not in _AGAINST:
-            return self._further(self._without_wrong(self._kept[-1].grid), whole), whole
-        self._each = self._look_at_each()
-        own = self._each.epoch(row)
-        return replace(own, rejected=own.rejected | self._gross()[row]), whole
-
-    def _further(self, grid: ObservationGrid, whole: _Epoch) -> _Epoch | None:
-        """The own result of an epoch that its series does not contradict."""
+        if whole is None or whole.status in _AGAINST:
+            row = self._look()
+            assert self._series is not None
+            whole = self._series.epoch(row)
+            if not self._offsets:
+                return None, whole
+            if self._each is None and (last := self._own_looks()[0]) < self.epochs:
+                self._each = self._look_at_each(last)  # the program was started again
+            due = self._each is None or self.epochs >= self._look_at[0]
+            if due or whole.status in _AGAINST:
+                self._each = self._look_at_each()
+                own = self._each.epoch(row)
+                return replace(own, rejected=own.rejected | self._gross()[row]), whole
         if self._each is None:
-            return None
+            return None, whole
         gross = whole.rejected & (self._binds and whole.status == "ok")
-        own = self._each.further(grid.reject(gross[None]), len(self._kept))
-        return replace(own, rejected=own.rejected | gross)
+        newest = self._without_wrong(self._kept[-1].grid).reject(gross[None])
+        own = self._each.further(newest, len(self._kept))
+        return replace(own, rejected=own.rejected | gross), whole
 
     def _gross(self) -> Mask:
         """Image points (E, T) of the kept epochs that their series contradicts.

@@ -128,11 +128,9 @@ def table_of_series(
     apart = replace(apart, head=head)
     settings = replace(settings, drift_period=drift_period(apart.frame_time, apart.temperature))
     in_blocks = len(source) > together_at_most(len(testfield))
-    if in_blocks:
-        found = _in_blocks(testfield, apart, start, source, settings, jobs, advance)
-    else:
-        grid = gathered(source, [slice(0, len(source))])
-        found = _as_one(testfield, apart, start, grid, settings)
+    if not in_blocks:
+        source = grid = gathered(source, [slice(0, len(source))])
+    found = _adjusted(testfield, apart, start, source, settings, in_blocks, jobs, advance)
     assert found.adjustment is not None
     c_px = start[0] / head.camera.sensor.pixel_pitch
     wrong = np.flatnonzero(find_misplaced(found.adjustment.offsets, c_px))
@@ -146,67 +144,49 @@ def table_of_series(
     )  # fmt: skip
     if not moved:
         return found
-    return replace(_as_one(testfield, apart, start, still, settings), field_movements=moved)
+    return replace(_adjusted(testfield, apart, start, still, settings), field_movements=moved)
 
 
-def _as_one(
-    testfield: TestField, apart: Epochs, start: Array, grid: ObservationGrid,
-    settings: SeriesSettings,
-) -> Epochs:  # fmt: skip
-    """Return the table of one adjustment of all epochs."""
-    assert apart.head is not None
-    result = adjust_series(
-        apart.head.camera.sensor, testfield, grid, InteriorOrientation.from_array(start[IOP]),
-        ExteriorOrientation.from_array(start[EOP]), settings,
-    )  # fmt: skip
-
-    def without(rows: NDArray[np.int64], quick: bool) -> Epochs:
-        rough = replace(settings, exterior=result.exterior)
-        mask = np.zeros(result.observed.shape, dtype=bool)
-        if quick:
-            mask = ~result.observed
-            rough = replace(rough, snooping_alpha=0.0, target_noise=False)
-        mask[:, rows] = True
-        return _as_one(testfield, apart, start, grid.reject(mask), rough)
-
-    return replace(_table(apart, testfield, result, result), without=without)
-
-
-def _in_blocks(
+def _adjusted(
     testfield: TestField, apart: Epochs, start: Array, source: ObservationBlocks,
-    settings: SeriesSettings, jobs: int, advance: Callable[[int], None] | None = None,
+    settings: SeriesSettings, in_blocks: bool = False, jobs: int = 1,
+    advance: Callable[[int], None] | None = None,
 ) -> Epochs:  # fmt: skip
-    """Return the table of a long series."""
+    """Return the table of one adjustment of all epochs, which are one grid, or of a long series."""
     assert apart.head is not None
-    found = adjust_long_series(
-        apart.head.camera.sensor, testfield, source, InteriorOrientation.from_array(start[IOP]),
-        ExteriorOrientation.from_array(start[EOP]), settings, jobs=jobs, advance=advance,
+    sensor, whole_series = apart.head.camera.sensor, [slice(0, len(source))]
+    camera = (
+        InteriorOrientation.from_array(start[IOP]), ExteriorOrientation.from_array(start[EOP])
     )  # fmt: skip
-    sample, sampled = found.sample, found.sampled
+    whole: SeriesAdjustment | LongAdjustment
+    if in_blocks:
+        whole = adjust_long_series(
+            sensor, testfield, source, *camera, settings, jobs=jobs, advance=advance
+        )
+        # the epochs that are known in full
+        sample, sampled = whole.sample, whole.sampled
+    else:
+        grid = gathered(source, whole_series)
+        whole = sample = adjust_series(sensor, testfield, grid, *camera, settings)
+        sampled = None
 
     def without(targets: NDArray[np.int64], quick: bool) -> Epochs:
-        rough = replace(settings, exterior=sample.exterior)
-        fewer = WithoutTargets(source, targets)
+        rough, fewer = replace(settings, exterior=sample.exterior), WithoutTargets(source, targets)
         if not quick:
-            return _in_blocks(testfield, apart, start, fewer, rough, jobs)
+            return _adjusted(testfield, apart, start, fewer, rough, in_blocks, jobs)
         rough = replace(rough, snooping_alpha=0.0, target_noise=False)
-        grid = gathered(fewer, spread_windows(len(source), len(sampled)))
-        some = replace(
-            apart.part(slice(0, 0)),
-            **{n: getattr(apart, n)[sampled] for n in _AS_READ},
-            status=tuple(apart.status[i] for i in sampled),
-            reasons=tuple(apart.reasons[i] for i in sampled),
-        )
-        return _as_one(testfield, some, start, grid.reject(~sample.observed), rough)
+        windows, some = whole_series, apart
+        if sampled is not None:
+            windows = list(spread_windows(len(source), len(sampled)))
+            some = replace(
+                apart.part(slice(0, 0)),
+                **{n: getattr(apart, n)[sampled] for n in _AS_READ},
+                status=tuple(apart.status[i] for i in sampled),
+                reasons=tuple(apart.reasons[i] for i in sampled),
+            )
+        kept = gathered(fewer, windows).reject(~sample.observed)
+        return _adjusted(testfield, some, start, kept, rough)
 
-    return replace(_table(apart, testfield, found, sample), without=without, sampled=sampled)
-
-
-def _table(
-    apart: Epochs, testfield: TestField, whole: SeriesAdjustment | LongAdjustment,
-    sample: SeriesAdjustment,
-) -> Epochs:  # fmt: skip
-    """Return the table of adjusted epochs; sample: those that are known in full."""
     rows, groups = whole.rows, {}
     # what the epoch itself said of a frame without a result says more than "no observations"
     for row in np.flatnonzero(~apart.ok).tolist():
@@ -225,4 +205,6 @@ def _table(
         groups=groups,
         trend_sd=whole.trend_sd,
         perspective_sd=sample.perspective_sd,
+        without=without,
+        sampled=sampled,
     )

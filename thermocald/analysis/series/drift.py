@@ -46,19 +46,36 @@ def _thinned(*columns: Array) -> list[Array]:
 def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     """Straight lines through the parameters that were estimated, p corrected for their number
     (Holm).
+
+    The p-value of no drift is that of `drift_test`, as in a study. Targets hidden at the end and
+    not at the beginning tilt the line by their coordinate errors: that part of the change's sd all
+    epochs share, and what it explains of the slow course is no drift.
     """
+    from scipy.stats import norm
+
     found, ok = [], table.ok
-    t = table.frame_time[ok]
+    time = table.frame_time[ok]
     for name in names:
         column = IOP_NAMES.index(name)
-        y, sd = table.values[ok, column], table.sd[ok, column]
-        if len(y) < _FEWEST or not np.isfinite(sd).all() or np.ptp(t) == 0:
+        values, sds = table.values[ok, column], table.sd[ok, column]
+        if len(values) < _FEWEST or not np.isfinite(sds).all() or np.ptp(time) == 0:
             continue
+        t, y, sd = _thinned(time, values, sds)  # means err less than that, by one factor: p stays
+        x = t - t.mean()
+        slope = float(x @ y / (x @ x))
+        noise = slope_noise(y, x, slope, times=t)
+        test = drift_test(y, sd, np.ones(len(y)), times=t)
+        p = 1.0 if test is None else test.p_value
+        span, tilt_sd = float(np.ptp(time)), float(table.trend_sd[column])
+        if tilt_sd > 0:
+            slow = float(np.ptp(np.polynomial.Polynomial.fit(t, y, 3)(t)))
+            p = max(p, float(2 * norm.sf(slow / tilt_sd)))
         line = Course(
-            name, float(y.mean()), float(y.std(ddof=1)), float(np.sqrt(np.mean(sd**2))),
-            *_line(t, y, sd, float(table.trend_sd[column])), drifts=False,
-            last_minus_first=float(y[-1] - y[0]),
-            sd_last_minus_first=float(np.hypot(sd[-1], sd[0])),
+            name, float(values.mean()), float(values.std(ddof=1)),
+            float(np.sqrt(np.mean(sds**2))), slope * span,
+            float(np.hypot(noise.sd * span, tilt_sd)), min(1.0, p), drifts=False,
+            last_minus_first=float(values[-1] - values[0]),
+            sd_last_minus_first=float(np.hypot(sds[-1], sds[0])),
             sd_by_perspective=float(np.sqrt(2.0) * table.perspective_sd[column]),
         )  # fmt: skip
         found.append(line)
@@ -70,8 +87,16 @@ def courses(table: Epochs) -> list[Course]:
     """How c, x0 and y0 changed over a series; those that were held are left out."""
     ok = table.ok
     lines = _lines(table, IOP_NAMES[PRINCIPAL])
-    columns = [table.values[ok, IOP_NAMES.index(name)] for name in lines]
-    warm = _with_temperature(table.frame_time[ok], table.temperature[ok], columns)
+    have = np.flatnonzero(ok)[np.isfinite(table.temperature[ok])]
+    temperature, time = table.temperature[have], table.frame_time[have]
+    if len(have) >= _FEWEST and np.ptp(temperature) >= _LEAST_WARMING_K:
+        for name, line in lines.items():
+            values = table.values[have, IOP_NAMES.index(name)]
+            t, y, times = _thinned(temperature, values, time)
+            t = t - t.mean()
+            slope = float(y @ t / (t @ t))
+            sd, p = slope_noise(y, t, slope).sd, slope_p_value(y, t, times)
+            lines[name] = replace(line, per_kelvin=slope, sd_per_kelvin=sd, p_temperature=p)
 
     @cache
     def without(group: str) -> dict[str, Course]:
@@ -80,29 +105,12 @@ def courses(table: Epochs) -> list[Course]:
         return _lines(left, tuple(lines)) if left.ok.sum() >= _FEWEST else {}
 
     result = []
-    for line, (slope, sd_slope, p_warm) in zip(lines.values(), warm, strict=True):
+    p_warm = holm([line.p_temperature for line in lines.values()])
+    for line, p in zip(lines.values(), p_warm, strict=True):
         rests_on = _single_support(table, line, without) if line.drifts else None
-        line = replace(line, per_kelvin=slope, sd_per_kelvin=sd_slope, p_temperature=p_warm)
-        result.append(replace(line, drifts=line.drifts and not rests_on, rests_on=rests_on))
+        drifts = line.drifts and not rests_on
+        result.append(replace(line, drifts=drifts, rests_on=rests_on, p_temperature=p))
     return result
-
-
-def _with_temperature(
-    time: Array, temperature: Array, columns: list[Array]
-) -> list[tuple[float, float, float]]:
-    """Slope per kelvin, its sd and corrected p-value of each column (n,); NaN without one."""
-    have = np.isfinite(temperature)
-    unknown = [(float("nan"),) * 3] * len(columns)
-    if have.sum() < _FEWEST or np.ptp(temperature[have]) < _LEAST_WARMING_K:
-        return unknown
-    slopes, sds, ps = [], [], []
-    for column in columns:
-        t, y, times = _thinned(temperature[have], column[have], time[have])
-        t = t - t.mean()
-        slopes.append(float(y @ t / (t @ t)))
-        sds.append(slope_noise(y, t, slopes[-1]).sd)
-        ps.append(slope_p_value(y, t, times))
-    return list(zip(slopes, sds, holm(ps), strict=True)) if columns else []
 
 
 def with_drifts(table: Epochs) -> Epochs:
@@ -140,25 +148,3 @@ def _single_support(
         if without is not None and not without.drifts and abs(without.change) < least:
             best, least = first, abs(without.change)
     return best
-
-
-def _line(t: Array, y: Array, sds: Array, tilt_sd: float) -> tuple[float, float, float]:
-    """Change of a straight line over the series, its sd, and the p-value of no drift.
-
-    The p-value is that of `drift_test`, as in a study. tilt_sd: the part of the change's sd that
-    all epochs share: targets hidden at the end and not at the beginning tilt the line by their
-    coordinate errors. What they explain of the slow course is no drift.
-    """
-    from scipy.stats import norm
-
-    span = float(np.ptp(t))
-    t, y, sds = _thinned(t, y, sds)  # means err less than that, by one factor: p stays
-    x = t - t.mean()
-    slope = float(x @ y / (x @ x))
-    noise = slope_noise(y, x, slope, times=t)
-    found = drift_test(y, sds, np.ones(len(y)), times=t)
-    p = found.p_value if found is not None else 1.0
-    if tilt_sd > 0:
-        slow = float(np.ptp(np.polynomial.Polynomial.fit(t, y, 3)(t)))
-        p = max(p, float(2 * norm.sf(slow / tilt_sd)))
-    return slope * span, float(np.hypot(noise.sd * span, tilt_sd)), min(1.0, p)

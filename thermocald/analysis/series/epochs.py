@@ -186,19 +186,19 @@ class Epochs(Result):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `thermocald replay --json` writes, without the names of files."""
-        ok = self.ok
+        ok, adjustment = self.ok, self.adjustment
         level = dict(zip(PARAMETER_NAMES, self.level_sd.tolist(), strict=True))
         document: dict[str, Any] = {
             "format": "thermocald-replay/1",
             "exterior": self.exterior,
-            "exterior_choice": None if self.adjustment is None else self.adjustment.choice,
+            "exterior_choice": None,
             "epochs": len(self),
             "ok": int(ok.sum()),
             "sigma0": float(np.median(self.sigma0[ok])) if ok.any() else None,
-            "noise_ratio": None if self.adjustment is None else self.adjustment.noise_ratio,
-            "field_ratio": None if self.adjustment is None else self.adjustment.field_ratio,
-            "outer_noise": _outer_noise(self.adjustment),
-            "held_affinity": _held_affinity(self.adjustment),
+            "noise_ratio": None,
+            "field_ratio": None,
+            "outer_noise": None,
+            "held_affinity": None,
             "rejected": int(self.n_rejected.sum()),
             "left_out": list(self.left_out),
             "field_movements": [
@@ -210,12 +210,33 @@ class Epochs(Result):
                 for i in np.flatnonzero(~ok).tolist()
             ],
         }
-        if few := _few_targets(self.adjustment):
-            document["level_tested_by_targets"] = few
+        if adjustment is not None:
+            value, sd = adjustment.outer_noise
+            uneven = abs(value - 1.0) > max(3.0 * sd, _UNEVEN - 1.0)
+            document |= {
+                "exterior_choice": adjustment.choice,
+                "noise_ratio": adjustment.noise_ratio,
+                "field_ratio": adjustment.field_ratio,
+                "outer_noise": {"value": value, "sd": sd} if uneven else None,
+                "held_affinity": _held_affinity(adjustment),
+            }
+            seen = int(adjustment.observed.any(axis=0).sum())
+            free = len(adjustment.settings.free) + 6  # and the exterior orientation
+            if np.isfinite(adjustment.offsets).any() and 2 * seen - free < _TESTS_A_FIELD:
+                document["level_tested_by_targets"] = seen
         if hang := self._hang_on_c():
             document["changes_hang_on_c"] = hang
-        if self.adjustment is not None and self.exterior == "series":
-            document["stood_still"] = _stood_still(self.stillness)
+        if adjustment is not None and self.exterior == "series":
+            from scipy.stats import chi2
+
+            # whether single epochs had another exterior orientation
+            values = self.stillness[np.isfinite(self.stillness)]
+            bound = float(chi2.ppf(1 - 0.01 / max(len(values), 1), 6))
+            document["stood_still"] = {
+                "epochs_that_moved": int((values > bound).sum()),
+                "largest_chi2": float(values.max(initial=0.0)),
+                "bound": bound,
+            }
         converted: dict[str, Any] = jsonable(document)
         return converted
 
@@ -241,10 +262,18 @@ class Epochs(Result):
         count = document["rejected"]
         rejected = f"{count} rejected observation{'' if count == 1 else 's'}"
         out = [f"{calibrated}, exterior orientation {stands}, {rejected}"]
-        if document["sigma0"] is not None:
+        if (sigma0 := document["sigma0"]) is not None:
+            cause = ""
+            if sigma0 > 1.0 + MATERIAL:
+                cause = f"; {CAUSES_OF_SIGMA0}"
+                if self.adjustment is not None and np.isfinite(self.adjustment.offsets).any():
+                    cause = (
+                        "; it changes from epoch to epoch: noise of the image points, not the test "
+                        "field"
+                    )
             out.append(
-                f"sigma0 {document['sigma0']:.2f}: image points scatter that many times as much as "
-                f"their stated standard deviations say{self._cause_of_noise()}"
+                f"sigma0 {sigma0:.2f}: image points scatter that many times as much as "
+                f"their stated standard deviations say{cause}"
             )
         if (ratio := document["field_ratio"] or 1.0) > 1.0:
             out.append(
@@ -319,14 +348,6 @@ class Epochs(Result):
         changes |= {f"{c.name}/K": (c.per_kelvin, c.sd_per_kelvin) for c in self.drifts}
         sds = carried_by_c(share, changes)
         return {"c_known_to": share, "sds": max(sds.values())} if sds else None
-
-    def _cause_of_noise(self) -> str:
-        """Return what a sigma0 beyond 1 can be, "" where it is not."""
-        if not np.median(self.sigma0[self.ok]) > 1.0 + MATERIAL:
-            return ""
-        if self.adjustment is None or not np.isfinite(self.adjustment.offsets).any():
-            return f"; {CAUSES_OF_SIGMA0}"
-        return "; it changes from epoch to epoch: noise of the image points, not the test field"
 
     def plot(self, against: str = "time") -> Figure:
         """Draw how c, x0 and y0 changed since the first epoch, µm, with 95 % of each epoch.
@@ -446,30 +467,13 @@ def unit_of(column: str) -> str:
     return others.get(column) or PARAMETER_UNITS.get(column.removeprefix("sd_"), "")
 
 
-def _outer_noise(adjustment: SeriesAdjustment | None) -> dict[str, float] | None:
-    """Return the outermost targets' noise over that in the middle, None where that is chance."""
-    value, sd = (1.0, 0.0) if adjustment is None else adjustment.outer_noise
-    if not abs(value - 1.0) > max(3.0 * sd, _UNEVEN - 1.0):
-        return None
-    return {"value": value, "sd": sd}
-
-
-def _few_targets(adjustment: SeriesAdjustment | None) -> int | None:
-    """Return how many targets a level rests on that are too few to show a bad field."""
-    if adjustment is None or not np.isfinite(adjustment.offsets).any():
-        return None
-    seen = int(adjustment.observed.any(axis=0).sum())
-    free = len(adjustment.settings.free) + 6  # and the exterior orientation
-    return seen if 2 * seen - free < _TESTS_A_FIELD else None
-
-
-def _held_affinity(adjustment: SeriesAdjustment | None) -> dict[str, Any] | None:
+def _held_affinity(adjustment: SeriesAdjustment) -> dict[str, Any] | None:
     """Return the parameter whose level a held affinity moves by most sds; None below one.
 
     It is the affinity that the targets show, with its difference and sd, or else `AFFINITY`.
     """
-    held = None if adjustment is None else adjustment.affinity
-    if adjustment is None or held is None or not held.names:
+    held = adjustment.affinity
+    if held is None or not held.names:
         return None
     size = np.abs(held.differences)
     shown = (size > _SHOWN_SDS * held.sds) & (size > AFFINITY)
@@ -495,19 +499,6 @@ def _imported(module: str) -> Any:
     except ImportError:
         missing = f"{module} is not installed: pip install 'thermocald[tables]'"
         raise DriverMissing(missing) from None
-
-
-def _stood_still(stillness: Array) -> dict[str, Any]:
-    """Whether single epochs had another exterior orientation (chi-square, 6 degrees of freedom)."""
-    from scipy.stats import chi2
-
-    values = stillness[np.isfinite(stillness)]
-    limit = float(chi2.ppf(1 - 0.01 / max(len(values), 1), 6))
-    return {
-        "epochs_that_moved": int((values > limit).sum()),
-        "largest_chi2": float(values.max(initial=0.0)),
-        "bound": limit,
-    }
 
 
 def calibrate_epochs(

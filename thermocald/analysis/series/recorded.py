@@ -64,7 +64,12 @@ def recorded_table(
     head, targets = recording.head, recording.testfield
     if recording.has_observations and len(recording) > together_at_most(len(targets)):
         start = _start(recording, recording.observations, calibrator)
-        apart = _not_calibrated(recording)
+        columns, E = recording.columns, len(recording)
+        nothing, none = np.broadcast_to(np.nan, (E, 16)), np.broadcast_to(np.int64(0), (E,))
+        apart = Epochs(  # nobody has calibrated them one by one
+            columns.numbers, columns.frame_time, _temperature(recording), nothing, nothing,
+            nothing[:, 0], none, none, ("ok",) * E, ("",) * E, "per_epoch",
+        )  # fmt: skip
         table = table_of_series(head, targets, apart, recording, adjusted, start, jobs, advance)
         return table, recording.observations
     apart, observations = calibrate_epochs(
@@ -114,16 +119,6 @@ def misplaced_doubts(recording: Recording, rows: Index, values: Array) -> list[s
             at[seen.targets] = seen.points - expected[seen.targets]
     c_px = float(np.median(values[:, 0])) / sensor.pixel_pitch
     return target_doubts(targets.names, median_known(found), c_px)
-
-
-def _not_calibrated(recording: Recording) -> Epochs:
-    """The table of a recording's epochs that nobody has calibrated one by one."""
-    columns, E = recording.columns, len(recording)
-    nothing, none = np.broadcast_to(np.nan, (E, 16)), np.broadcast_to(np.int64(0), (E,))
-    return Epochs(
-        columns.numbers, columns.frame_time, _temperature(recording), nothing, nothing,
-        nothing[:, 0], none, none, ("ok",) * E, ("",) * E, "per_epoch",
-    )  # fmt: skip
 
 
 def _temperature(source: Recording | StoredRecording) -> Array:

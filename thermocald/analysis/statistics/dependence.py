@@ -123,17 +123,12 @@ def slope_noise(
     rr = at.sums(r * r)
     phi, coloured, tau, prior = _models(max(_LONGEST, float(n)))
     spectrum = at.spectra(mixtures(phi, coloured))
-
-    weight = 1.0 / spectrum
-    information = np.maximum(weight @ uu, np.finfo(float).tiny)
-    off = weight @ ur / information
-    degrees = len(r) - 1
-    residual = np.maximum(weight @ rr - off**2 * information, np.finfo(float).tiny)
-    deviance = degrees * np.log(residual) + np.log(spectrum) @ at.count + np.log(information)
+    product, information, left, deviance = _regressed(at, spectrum, uu, ur, rr)
     plausible = prior * np.exp(-0.5 * (deviance - deviance.min()))
     plausible /= plausible.sum()
-    freedom = max(degrees - 2, 1)
-    variance = float(plausible @ (residual / freedom / information + off**2))
+    freedom = max(len(r) - 3, 1)
+    off = product / information
+    variance = float(plausible @ (left / freedom / information + off**2))
     # Geometric: models that a short series cannot exclude would rule an arithmetic mean.
     inflation = np.exp(plausible @ np.log(spectrum @ uu / uu.sum()))
     return SlopeNoise(
@@ -142,6 +137,24 @@ def slope_noise(
         float(plausible @ (phi * coloured)),
         bool(plausible[tau > _LONG_MEMORY * n].sum() > 0.5),
     )
+
+
+def _regressed(
+    at: Frequencies, spectrum: Array, uu: Array, ur: Array, rr: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Regress r on u by generalised least squares under each model of the noise (g,).
+
+    spectrum (g, m): the models'; uu, ur, rr (m,): sums of squares and products of the coefficients
+    of u and r. Returns the weighted product with r, the information on the slope, which is their
+    ratio, the squares that the line leaves, and -2 log restricted likelihood.
+    """
+    weight = 1.0 / spectrum
+    information = np.maximum(weight @ uu, np.finfo(float).tiny)
+    product = weight @ ur
+    left = np.maximum(weight @ rr - product**2 / information, np.finfo(float).tiny)
+    degrees = float(at.count.sum()) - 1.0
+    deviance = degrees * np.log(left) + np.log(spectrum) @ at.count + np.log(information)
+    return product, information, left, deviance
 
 
 _ITERATIONS = 100
@@ -195,7 +208,8 @@ class Dependence:
     noise; n_effective: independent values that the epochs are worth; sd_slope holds thermometer
     noise, the adjustments' sds, scatter beyond both and autocorrelation; misfit: scatter over what
     the two noises explain; too_short: the noise remembers so much of the series that sd_slope is an
-    order of magnitude only.
+    order of magnitude only; p_naive_holm, p_holm: p_naive, p_value corrected for the number of
+    parameters, NaN where there is one.
     """
 
     JSON: ClassVar = {
@@ -211,7 +225,9 @@ class Dependence:
     slope: float
     sd_slope: float
     misfit: float
-    too_short: bool = False
+    too_short: bool
+    p_naive_holm: float = float("nan")
+    p_holm: float = float("nan")
 
 
 def slope_p_value(values: Array, temperature: Array, times: Array | None = None) -> float:
@@ -224,13 +240,10 @@ def slope_p_value(values: Array, temperature: Array, times: Array | None = None)
 
     at = Frequencies.of(len(values), times)
     v, u = at.coefficients(values), at.coefficients(temperature)
-    vv, uv, uu = at.sums(v * v), at.sums(u * v), at.sums(u * u)
-    spectrum = at.spectra(MODELS)
-    weight = 1.0 / spectrum
-    information, product = weight @ uu, weight @ uv
-    left = np.maximum(weight @ vv - product**2 / information, np.finfo(float).tiny)
+    product, information, left, deviance = _regressed(
+        at, at.spectra(MODELS), at.sums(u * u), at.sums(u * v), at.sums(v * v)
+    )
     degrees = len(v) - 1
-    deviance = degrees * np.log(left) + np.log(spectrum) @ at.count + np.log(information)
     p = 2 * t.sf(np.abs(product) / np.sqrt(information * left / degrees), degrees)
     return largest_p_value(np.asarray(p), deviance)
 

@@ -244,7 +244,8 @@ class DriftTest:
     p_value: of no drift, that is of noise of any size and memory; p_excess: of no variation beyond
     the stated sds, whatever the memory; variance_ratio: variance of the series over its mean
     squared sd; noise_ratio, sd_noise_ratio: scatter between neighbouring epochs over the stated
-    sds; epochs: how many were used.
+    sds; epochs: how many were used; p_holm, p_excess_holm: the p-values corrected for the number of
+    parameters, NaN where there is one.
     """
 
     JSON: ClassVar = {"p_value": "p"}
@@ -255,6 +256,8 @@ class DriftTest:
     noise_ratio: float
     sd_noise_ratio: float
     epochs: int
+    p_holm: float = float("nan")
+    p_excess_holm: float = float("nan")
 
 
 def drift_test(

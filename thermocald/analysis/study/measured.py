@@ -174,10 +174,17 @@ def measured_series(
         some = np.flatnonzero(ok[of] & adjustment.ok)
         some = some[spread_rows(len(some), _MOST_MATRICES)]
         covariances = adjustment.covariance[some][:, :10, :10]
-    time_s = table.frame_time[ok]
+    time_s, thermometers = table.frame_time[ok], []
+    for name, channel in source.head.channels.items():
+        read, readings = source.columns.readings_of(name)
+        noise = thermometer_sd
+        if noise is None:
+            noise = estimate_reading_noise(read, readings, channel.resolution)
+        at_frames = interpolate_readings(time_s, read, readings)
+        thermometers.append(Thermometer(name, at_frames, noise))
     return MeasuredSeries(
         label, source.head.series, source.head.camera.name, source.head.camera.sensor, source.title,
-        table.number[ok], time_s - time_s[0], _thermometers(source, time_s, thermometer_sd),
+        table.number[ok], time_s - time_s[0], tuple(thermometers),
         table.values[ok, :10], table.sd[ok, :10], table.sigma0[ok], redundancy[: len(ok)][ok],
         correlations_of(covariances), exterior, without_result,
         _clip(source, ok, observations), float(time_s[0]),
@@ -200,19 +207,6 @@ def _assessed(table: Epochs) -> tuple[NDArray[np.bool_], dict[str, int]]:
     if missing := int(np.count_nonzero(ok & ~whole)):
         counted["no standard deviation"] = missing
     return whole, counted
-
-
-def _thermometers(
-    source: Recording | StoredRecording, times: Array, sd: float | None
-) -> tuple[Thermometer, ...]:
-    """Return every channel at some times (E,) s UTC, its noise as given or from the readings."""
-    found = []
-    for name, channel in source.head.channels.items():
-        read, readings = source.columns.readings_of(name)
-        values = interpolate_readings(times, read, readings)
-        noise = estimate_reading_noise(read, readings, channel.resolution) if sd is None else sd
-        found.append(Thermometer(name, values, noise))
-    return tuple(found)
 
 
 def _clip(

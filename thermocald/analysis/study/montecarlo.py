@@ -329,12 +329,16 @@ def trajectories(
     GeometryError where a reference has no ray for an image point.
     """
     found = []
-    for reference in REFERENCES:
-        distances = [
-            _distances(one, reference, distance_mm, size) for one in series if len(one) > 1
-        ]
-        if not distances:
-            return ()
+    series = [one for one in series if len(one) > 1]
+    for reference in REFERENCES if series else ():
+        distances = []
+        for one in series:
+            rows = spread_rows(len(one), _MOST_EPOCHS)
+            fixed = {"first": one.values[0], "mean": one.mean, "last": one.values[-1]}[reference]
+            points = image_grid(one.sensor, size)
+            errors = plane_errors(one.sensor, fixed, one.values[rows], points, distance_mm)
+            away = np.linalg.norm(errors, axis=-1)
+            distances.append(away[np.isfinite(away).all(axis=1)])
         every = np.concatenate(distances)
         below = [float(np.mean(every < limit)) for limit in clusters_mm]
         found.append(
@@ -347,16 +351,6 @@ def trajectories(
             )
         )
     return tuple(found)
-
-
-def _distances(one: MeasuredSeries, reference: str, distance_mm: float, size: int) -> Array:
-    """Distances (e, k) mm on the plane of image points (k,) at epochs (e,)."""
-    rows = spread_rows(len(one), _MOST_EPOCHS)
-    fixed = {"first": one.values[0], "mean": one.mean, "last": one.values[-1]}[reference]
-    points = image_grid(one.sensor, size)
-    errors = plane_errors(one.sensor, fixed, one.values[rows], points, distance_mm)
-    distances = np.linalg.norm(errors, axis=-1)
-    return np.asarray(distances[np.isfinite(distances).all(axis=1)])
 
 
 def correlations_over_time(series: Sequence[MeasuredSeries]) -> Array:

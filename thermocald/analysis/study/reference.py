@@ -25,7 +25,6 @@ from thermocald.store.recording.reader import open_recording
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from thermocald.analysis.study.montecarlo import MonteCarlo
     from thermocald.analysis.study.series_study import StudySettings
     from thermocald.analysis.study.study import CameraStudy
 
@@ -143,81 +142,56 @@ def reference_studies(
 
 def compare(camera: CameraStudy) -> list[Comparison]:
     """Hold what the study found against what the reference says of this preset."""
-    quoted, mc = QUOTED[camera.label], camera.montecarlo
+    quoted, mc, series = QUOTED[camera.label], camera.montecarlo, camera.series
     if mc is None:
         return []
-    rows = [*_changes(camera, quoted), *_correlations(camera, quoted)]
-    for name in ("c", "x0", "y0"):
-        ratio = float(np.mean([s.significance[name].success_ratio for s in camera.series]))
-        rows.append((f"F-test of {name}, success ratio", "", "near 1", ratio, 0.9, np.inf))
-    rows += _object_space(quoted, mc)
-    return [Comparison(camera.label, *row) for row in rows]
-
-
-def _about(quantity: str, unit: str, quote: float | None, ours: float, bound: float) -> list[_Row]:
-    """Compare a quoted number, with how much ours may differ; nothing where it is not quoted."""
-    if quote is None:
-        return []
-    return [(quantity, unit, f"{quote:g}", float(ours), quote - bound, quote + bound)]
-
-
-def _changes(camera: CameraStudy, quoted: Quoted) -> list[_Row]:
-    """Compare what moved, how far, and where to."""
-    deviations = [study.deviations for study in camera.series]
-    pitch = camera.series[0].series.sensor.pixel_pitch
-    moved = [np.hypot(d["x0"].change, d["y0"].change) / pitch for d in deviations]
-    px = float(np.mean(moved))
-    rows = _about("principal point, last − first", "px", quoted.moved_px, px, 0.5)
+    # what moved, how far, and where to
+    changes = [one.deviations for one in series]
+    pitch = series[0].series.sensor.pixel_pitch
+    px = np.mean([np.hypot(d["x0"].change, d["y0"].change) / pitch for d in changes])
     # where the principal point stands at its farthest, degrees from right towards up
     steps = []
-    for study in camera.series:
-        path = study.series.values[:, 1:3] - study.series.values[0, 1:3]
+    for one in series:
+        path = one.series.values[:, 1:3] - one.series.values[0, 1:3]
         steps.append(path[int(np.argmax(np.linalg.norm(path, axis=1)))])
     right, up = np.mean(steps, axis=0)
     where = float(np.degrees(np.arctan2(up, right)))
-    rows.append(
-        ("principal point, direction", "°", quoted.direction, where, *_DIRECTIONS[quoted.direction])
-    )
-    change = float(np.mean([d["c"].change for d in deviations]))
-    rows += _about("principal distance, last − first", "mm", quoted.c_mm, change, 0.0005)
-    focus = [abs(s.focus.change) for s in camera.series if s.focus is not None]
+    c = np.mean([d["c"].change for d in changes])
+    rows = [
+        *_about("principal point, last − first", "px", quoted.moved_px, px, 0.5),
+        ("principal point, direction", "°", quoted.direction, where,
+         *_DIRECTIONS[quoted.direction]),
+        *_about("principal distance, last − first", "mm", quoted.c_mm, c, 0.0005),
+    ]  # fmt: skip
+    focus = [abs(one.focus.change) for one in series if one.focus is not None]
     if focus:
-        depth = float(np.mean(focus))
+        depth = np.mean(focus)
         rows += _about("depth of field at 1 m, change", "mm", quoted.focus_mm, depth, 1.0)
-    ratio = max(float(s.series.sigma0.max() / s.series.sigma0[0]) for s in camera.series)
-    return rows + _about("σ₀ at its highest over the first", "", quoted.sigma0_ratio, ratio, 0.35)
-
-
-def _correlations(camera: CameraStudy, quoted: Quoted) -> list[_Row]:
-    """Compare correlations with the temperature, and of x0 with y0."""
-    with_temperature = [
-        {name: abs(d.r) for name, d in s.channels[0].dependences.items()} for s in camera.series
+    ratio = max(one.series.sigma0.max() / one.series.sigma0[0] for one in series)
+    rows += _about("σ₀ at its highest over the first", "", quoted.sigma0_ratio, ratio, 0.35)
+    # correlations with the temperature, and of x0 with y0
+    absolute = [
+        {name: abs(d.r) for name, d in one.channels[0].dependences.items()} for one in series
     ]
-
-    def mean_of_largest(*names: str) -> float:
-        return float(np.mean([max(r[name] for name in names) for r in with_temperature]))
-
-    rows: list[_Row] = []
     for name in ("c", "x0", "y0"):
-        least = min(r[name] for r in with_temperature)
+        least = min(r[name] for r in absolute)
         rows.append((f"|r| of {name} with the temperature", "", "nearly 1", least, _CLOSE, np.inf))
     if quoted.B_follows is not None:
-        largest = mean_of_largest("B1", "B2")
+        largest = float(np.mean([max(r["B1"], r["B2"]) for r in absolute]))
         quantity = "largest |r| of B1, B2 with the temperature"
         rows.append((quantity, "", "strong", largest, _STRONG, np.inf))
     text, low, high = ("high", _STRONG, 1.0) if quoted.sigma0_follows else ("not high", 0.0, _WEAK)
-    sigma0 = mean_of_largest("sigma0")
+    sigma0 = float(np.mean([r["sigma0"] for r in absolute]))
     rows.append(("|r| of σ₀ with the temperature", "", text, sigma0, low, high))
     if quoted.opposed is not None:
         r = float(camera.over_time[1, 2])
         rows.append(("r of x0 with y0 over time", "", "near −1", r, -1.0, -_CLOSE))
-    return rows
-
-
-def _object_space(quoted: Quoted, mc: MonteCarlo) -> list[_Row]:
-    """Compare all classes of Table 7 of which the text speaks, means and maxima."""
+    for name in ("c", "x0", "y0"):
+        share = float(np.mean([one.significance[name].success_ratio for one in series]))
+        rows.append((f"F-test of {name}, success ratio", "", "near 1", share, 0.9, np.inf))
+    # all classes of Table 7 of which the text speaks, means and maxima
     percent = (100 * mc.fractions).tolist()
-    rows = _about("errors below 1.5 cm at 10 m", "%", quoted.below, percent[0], 3.0)
+    rows += _about("errors below 1.5 cm at 10 m", "%", quoted.below, percent[0], 3.0)
     if quoted.far == "likely":
         rows.append(("errors of 5 to 10 cm", "%", "likely", percent[2], _LIKELY, np.inf))
     elif quoted.far == "unlikely":
@@ -225,6 +199,15 @@ def _object_space(quoted: Quoted, mc: MonteCarlo) -> list[_Row]:
         rows.append(("errors above 5 cm", "%", "unlikely", beyond, -np.inf, _UNLIKELY))
     rows.append(("errors above 10 cm", "%", "hardly ever", percent[3], -np.inf, _UNLIKELY))
     rows += _about("mean error at 10 m", "cm", quoted.mean_cm, mc.overall_mean / 10, 0.1)
-    bound = 0.15 * quoted.maxima_cm
-    largest = mc.mean_largest / 10
-    return rows + _about("mean of the maximum errors", "cm", quoted.maxima_cm, largest, bound)
+    largest, bound = mc.mean_largest / 10, 0.15 * quoted.maxima_cm
+    rows += _about("mean of the maximum errors", "cm", quoted.maxima_cm, largest, bound)
+    return [Comparison(camera.label, *row) for row in rows]
+
+
+def _about(
+    quantity: str, unit: str, quote: float | None, ours: np.floating | float, bound: float
+) -> list[_Row]:
+    """Compare a quoted number, with how much ours may differ; nothing where it is not quoted."""
+    if quote is None:
+        return []
+    return [(quantity, unit, f"{quote:g}", float(ours), quote - bound, quote + bound)]

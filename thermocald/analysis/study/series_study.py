@@ -14,8 +14,8 @@ of confusion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from thermocald.analysis.statistics.noise_models import DriftTest, drift_test
 from thermocald.errors import GeometryError
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, project
-from thermocald.result import document_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -161,14 +160,10 @@ class Significance:
 
     success_ratio over `tests` epochs, `left_out` had no window; degrees of freedom of the
     variance and (median) of the mean squared sd; critical: median; course (k, 2): time s, ratio of
-    the variances, thinned for drawing; drift: None where there is none; p_holm, p_excess_holm: its
-    p-values corrected for the number of parameters.
+    the variances, thinned for drawing; drift: None where there is none.
     """
 
-    JSON: ClassVar = {
-        "critical": "critical_ratio", "course": "", "drift": "", "p_holm": "", "p_excess_holm": "",
-        "drift_test": "drift_test",
-    }  # fmt: skip
+    JSON: ClassVar = {"critical": "critical_ratio", "course": "", "drift": "drift_test"}
 
     success_ratio: float
     tests: int
@@ -179,30 +174,16 @@ class Significance:
     median_ratio: float
     course: Array
     drift: DriftTest | None
-    p_holm: float
-    p_excess_holm: float
-
-    @property
-    def drift_test(self) -> dict[str, Any] | None:
-        """The test for the whole series with its corrected p-values, as a document has it."""
-        if self.drift is None:
-            return None
-        p_holm = {"p_holm": self.p_holm, "p_excess_holm": self.p_excess_holm}
-        return document_of(self.drift) | p_holm
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelStudy:
-    """One thermometer: the dependence of every free parameter and of sigma0 on it.
-
-    p_holm: the p-values, autocorrelation counted, corrected for the number of parameters; empty
-    with `reason` where the temperature says nothing.
+    """One thermometer: the dependence of every free parameter and of sigma0 on it, none with a
+    `reason` where the temperature says nothing.
     """
 
     thermometer: Thermometer
     dependences: Mapping[str, Dependence]
-    p_holm: Mapping[str, float]
-    p_naive_holm: Mapping[str, float]
     reason: str = ""
 
 
@@ -249,7 +230,11 @@ class SeriesStudy:
 def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy:
     """Study one series; never raises for data, but says what they do not allow."""
     notes = _circumstances(series)
-    deviations = _deviations(series)
+    every = {name: deviation(*series.column(name)) for name in series.free}
+    every["sigma0"] = deviation(series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy))
+    for t in series.thermometers:
+        every[t.name] = deviation(t.values, np.full(len(series), t.sd))
+    deviations = {name: d for name, d in every.items() if d is not None}
     significance = _significance(series, settings, notes)
     channels = tuple(_channel(series, t) for t in series.thermometers)
     notes += [c.reason for c in channels if c.reason]
@@ -323,14 +308,6 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
     return notes
 
 
-def _deviations(series: MeasuredSeries) -> dict[str, Deviation]:
-    found = {name: deviation(*series.column(name)) for name in series.free}
-    found["sigma0"] = deviation(series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy))
-    for t in series.thermometers:
-        found[t.name] = deviation(t.values, np.full(len(series), t.sd))
-    return {name: d for name, d in found.items() if d is not None}
-
-
 def _significance(
     series: MeasuredSeries, settings: StudySettings, notes: list[str]
 ) -> dict[str, Significance]:
@@ -346,8 +323,10 @@ def _significance(
         for name in series.free
     }
     tested = {name: drift for name, drift in drifts.items() if drift is not None}
-    p_holm = dict(zip(tested, holm([d.p_value for d in tested.values()]), strict=True))
-    p_excess = dict(zip(tested, holm([d.p_excess for d in tested.values()]), strict=True))
+    p_holm = holm([drift.p_value for drift in tested.values()])
+    p_excess = holm([drift.p_excess for drift in tested.values()])
+    for (name, drift), p, excess in zip(list(tested.items()), p_holm, p_excess, strict=True):
+        tested[name] = replace(drift, p_holm=p, p_excess_holm=excess)
     result = {}
     for name in series.free:
         values, sds = series.column(name)
@@ -359,7 +338,7 @@ def _significance(
             float(np.mean(ratio > critical)), len(ratio), len(values) - len(ratio),
             settings.window - 1, float(np.median(degrees_sd)), float(np.median(critical)),
             float(np.median(ratio)), np.column_stack([series.time_s[index[some]], ratio[some]]),
-            drifts[name], p_holm.get(name, float("nan")), p_excess.get(name, float("nan")),
+            tested.get(name),
         )  # fmt: skip
     return result
 
@@ -382,7 +361,7 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
             "no dependence on it can be computed."
         )
     if reason:
-        return ChannelStudy(thermometer, {}, {}, {}, reason)
+        return ChannelStudy(thermometer, {}, reason)
     found = {}
     for column in (*series.free, "sigma0"):
         if column == "sigma0":
@@ -391,12 +370,11 @@ def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
             values, sds = series.column(column)
         if np.ptp(values[have]) > 0:
             found[column] = dependence(values[have], sds[have], t, sd, series.time_s[have])
-    return ChannelStudy(
-        thermometer,
-        found,
-        dict(zip(found, holm([d.p_value for d in found.values()]), strict=True)),
-        dict(zip(found, holm([d.p_naive for d in found.values()]), strict=True)),
-    )
+    p_naive = holm([d.p_naive for d in found.values()])
+    p_holm = holm([d.p_value for d in found.values()])
+    for (column, d), naive, p in zip(list(found.items()), p_naive, p_holm, strict=True):
+        found[column] = replace(d, p_naive_holm=naive, p_holm=p)
+    return ChannelStudy(thermometer, found)
 
 
 def _focus(

@@ -131,10 +131,16 @@ def study_camera(
             "correlations."
         )
     else:
+        sensor, correlation = series[0].sensor, correlations.median
         try:
-            montecarlo, first_order = _object_space(
-                series[0], iop, sds, correlations.median, settings, progress
-            )
+            montecarlo = simulate_errors(sensor, iop, sds, correlation, settings, progress)
+            root = draw_root(sds, correlation)
+            jacobian = plane_jacobian(sensor, iop, montecarlo.image_points, settings.distance_mm)
+            covariance = jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
+            axes = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
+            below = np.mean(shares_within(axes, settings.clusters_mm), axis=0)
+            shares = np.diff(below, prepend=0.0, append=1.0)
+            first_order = FirstOrder(covariance, *mean_and_largest(axes, settings.sets), shares)
         except GeometryError as error:
             notes.append(f"No Monte-Carlo: {error}.")
     if montecarlo is not None and montecarlo.folded:
@@ -151,21 +157,3 @@ def study_camera(
         label, studies, iop, sds, correlations, montecarlo, first_order,
         correlations_over_time(series), paths, tuple(notes),
     )  # fmt: skip
-
-
-def _object_space(
-    one: MeasuredSeries,
-    iop: Array,
-    sds: Array,
-    correlation: Array,
-    s: StudySettings,
-    progress: Callable[[int], None] | None,
-) -> tuple[MonteCarlo, FirstOrder]:
-    montecarlo = simulate_errors(one.sensor, iop, sds, correlation, s, progress)
-    root = draw_root(sds, correlation)
-    jacobian = plane_jacobian(one.sensor, iop, montecarlo.image_points, s.distance_mm)
-    covariance = jacobian @ (root.T @ root) @ np.swapaxes(jacobian, 1, 2)
-    axes = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
-    below = np.mean(shares_within(axes, s.clusters_mm), axis=0)
-    shares = np.diff(below, prepend=0.0, append=1.0)
-    return montecarlo, FirstOrder(covariance, *mean_and_largest(axes, s.sets), shares)

@@ -106,7 +106,7 @@ def rates(study: SeriesStudy, distance_mm: float) -> str:
     found = [
         (name, rate_in_px_and_mm(study, name, d.slope, distance_mm), d)
         for name, d in channel.dependences.items()
-        if name in ("c", "x0", "y0") and channel.p_holm[name] < _SIGNIFICANT
+        if name in ("c", "x0", "y0") and d.p_holm < _SIGNIFICANT
     ]
     if not found:
         return ""
@@ -253,7 +253,8 @@ def _dependence(study: SeriesStudy) -> str:
     if channel is None:
         return ""
     close = [parameter_label(n) for n, d in channel.dependences.items() if abs(d.r) >= _CLOSE]
-    significant = [parameter_label(n) for n, p in channel.p_holm.items() if p < _SIGNIFICANT]
+    found = channel.dependences.items()
+    significant = [parameter_label(n) for n, d in found if d.p_holm < _SIGNIFICANT]
     name = parameter_label(channel.thermometer.name)
     if not significant:
         return f"{study.series.name}: no parameter depends significantly on {name}."
@@ -321,11 +322,7 @@ def _series(study: SeriesStudy, distance_mm: float) -> dict[str, Any]:
 def _channel(study: SeriesStudy, channel: ChannelStudy, distance_mm: float) -> dict[str, Any]:
     parameters = {}
     for name, d in channel.dependences.items():
-        parameters[name] = {
-            **document_of(d),
-            "p_naive_holm": channel.p_naive_holm[name],
-            "p_holm": channel.p_holm[name],
-        }
+        parameters[name] = document_of(d)
         if name in ("c", "x0", "y0"):
             px, mm = rate_in_px_and_mm(study, name, d.slope, distance_mm)
             sd_px, sd_mm = rate_in_px_and_mm(study, name, d.sd_slope, distance_mm)

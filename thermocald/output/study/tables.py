@@ -145,8 +145,8 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table:
             "limit": lambda r: f"{r[2].critical:.3f}",
             "degrees of freedom": lambda r: f"{r[2].degrees_variance}; {r[2].degrees_sd:.0f}",
             "epochs tested (left out)": lambda r: f"{r[2].tests} ({r[2].left_out})",
-            "p, no drift": lambda r: p_text(r[2].p_holm) if r[3] else "–",
-            "p, within sds": lambda r: p_text(r[2].p_excess_holm) if r[3] else "–",
+            "p, no drift": lambda r: p_text(r[3].p_holm) if r[3] else "–",
+            "p, within sds": lambda r: p_text(r[3].p_excess_holm) if r[3] else "–",
             "noise / stated": lambda r: (
                 with_sd(r[3].noise_ratio, r[3].sd_noise_ratio) if r[3] else "–"
             ),
@@ -188,8 +188,8 @@ def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
             "r": lambda r: coefficient(r[1].r),
             "n": lambda r: f"{r[1].n}",
             "n effective": lambda r: f"{r[1].n_effective:.0f}",
-            "p naive": lambda r: p_text(channel.p_naive_holm[r[0]]),
-            "p": lambda r: p_text(channel.p_holm[r[0]]),
+            "p naive": lambda r: p_text(r[1].p_naive_holm),
+            "p": lambda r: p_text(r[1].p_holm),
             "slope ± sd": lambda r: slope(r[0], r[1].slope, r[1].sd_slope),
             "px/K": lambda r: _in_pixels(study, r[0], r[1].slope, r[1].sd_slope),
             "scatter / noise": lambda r: f"{r[1].misfit:.1f}",

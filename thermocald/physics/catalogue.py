@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import ConfigurationError
 from thermocald.physics.effect import Effect
-from thermocald.physics.formula import formula_effect, is_formula
+from thermocald.physics.formula import OfFormula, is_formula
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -55,7 +55,7 @@ def get(name: str) -> Effect:
     ConfigurationError where there is none, or where it is not one.
     """
     if is_formula(name):
-        return formula_effect(name)
+        return OfFormula(name)
     if name not in names():
         near = get_close_matches(name, names(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"known are: {', '.join(names())}"

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import ast
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -369,11 +369,23 @@ class Evaluator:
         return node.kind.value(*(self._shifted(n, jump) for n in node.inputs), *node.constants)
 
 
-class _OfFormula(Effect):
-    """Adds a × formula. The formula is data: a tree of known operators over recorded quantities."""
+class OfFormula(Effect):
+    """Adds a × formula. The formula is data: a tree of known operators over recorded quantities.
+
+    Raises ConfigurationError where its text cannot be read.
+    """
 
     usual = ("c", "x0", "y0")
-    node: ClassVar[Node]
+
+    def __init__(self, text: str) -> None:
+        self.name, self.node = text, parse(text)
+        self.noun = f"an influence that follows {self.node.words({})}"
+        self.nonlinear = {
+            name: _make_parameter(owner.unit_of(constant), constant.positive)
+            for name, constant, owner in self.node.free()
+        }
+        per = unit_text(self.node.unit())
+        self.linear = coefficient_units(per if per.isalnum() else f"({per})")
 
     def channel(self, history: History, **_: Any) -> str:
         channels = self.node.channels()
@@ -417,26 +429,6 @@ def _say_constant(estimate: Values, parameter: Parameter) -> str:
     return say_estimate(estimate)
 
 
-def formula_effect(text: str) -> Effect:
-    """Make an effect of a formula. ConfigurationError where its text cannot be read."""
-    tree = parse(text)
-    per = unit_text(tree.unit())
-
-    class OfFormula(_OfFormula):
-        name = text
-        noun = f"an influence that follows {tree.words({})}"
-        node = tree
-        nonlinear: ClassVar[Mapping[str, Parameter]] = {
-            constant_name: _make_parameter(owner.unit_of(constant), constant.positive)
-            for constant_name, constant, owner in tree.free()
-        }
-        linear: ClassVar[Mapping[str, str]] = coefficient_units(
-            per if per.isalnum() else f"({per})"
-        )
-
-    return OfFormula()
-
-
 def known_together(
     text: str,
     values: Mapping[str, float],
@@ -468,7 +460,7 @@ def known_together(
     low, mean, high = temperatures
     T = np.linspace(low, high, _ON_THE_CURVE)
     parabola = np.linalg.pinv(np.vander(T - mean, 3, increasing=True))[1:] * [[1.0], [2.0]]
-    effect, constants = formula_effect(text), dict(zip(names, x[:L].tolist(), strict=False))
+    effect, constants = OfFormula(text), dict(zip(names, x[:L].tolist(), strict=False))
 
     def shape(**changed: float) -> Array | None:
         f = parse(text).bound({**constants, **changed}).steady(T)

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.physics.device import CameraDevice, Programme
-    from thermocald.physics.model import Prediction, ThermalModel
+    from thermocald.physics.effect import Prediction
+    from thermocald.physics.model import ThermalModel
 
 _CHUNK = 64  # epochs at a time
 _MARGIN_PX = 5.0  # a target nearer to the image's edge is not measured

@@ -81,10 +81,9 @@ class Prediction:
 Role = Literal["", "period", "phase", "event", "delay", "time_constant", "threshold", "width"]
 
 # Units of IOP and EOP as the files write them (CONVENTIONS §2).
-PARAMETER_UNITS: dict[str, str] = {
-    "c": "mm", "x0": "mm", "y0": "mm", "A1": "mm-2", "A2": "mm-4", "A3": "mm-6",
-    "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1",
-    "omega": "rad", "phi": "rad", "kappa": "rad", "X0": "mm", "Y0": "mm", "Z0": "mm",
+PARAMETER_UNITS = dict.fromkeys(PARAMETER_NAMES, "mm") | {
+    "A1": "mm-2", "A2": "mm-4", "A3": "mm-6", "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1",
+    "omega": "rad", "phi": "rad", "kappa": "rad",
 }  # fmt: skip
 
 # Experiments that separate two effects; each effect states how it responds to some of them.

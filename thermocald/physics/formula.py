@@ -94,10 +94,6 @@ class Node:
         """List the temperature channels that it reads, in order."""
         return tuple(dict.fromkeys(n.name for n in self.walk() if n.is_leaf and not n.operator))
 
-    def columns(self) -> tuple[str, ...]:
-        """List the other recorded columns that it reads, in order."""
-        return tuple(dict.fromkeys(n.name for n in self.walk() if n.operator == _COLUMN))
-
     def free(self) -> Iterator[tuple[str, Constant, Node]]:
         """Yield the constants that are names: (name, what it is, the node that it belongs to)."""
         for node in self.walk():
@@ -329,7 +325,7 @@ class Evaluator:
                     f"there is no recorded column {node.name!r}, which the formula reads; there "
                     f"are: {', '.join(self.history.columns) or 'none'}"
                 )
-            return self.history.column(node.name, at)
+            return np.interp(at, *self.history.columns[node.name])
         return self.history.polygon(node.name).at(at)
 
     def sensitivity(self, node: Node, channel: str, at_knots: bool = False) -> csr_array:
@@ -380,10 +376,13 @@ class OfFormula(Effect):
     def __init__(self, text: str) -> None:
         self.name, self.node = text, parse(text)
         self.noun = f"an influence that follows {self.node.words({})}"
-        self.nonlinear = {
-            name: _make_parameter(owner.unit_of(constant), constant.positive)
-            for name, constant, owner in self.node.free()
-        }
+        self.nonlinear = {}
+        for name, constant, owner in self.node.free():
+            unit, above_0 = owner.unit_of(constant), constant.positive
+            start, low = {"degC": 30.0, "s": 60.0}.get(unit, 1.0), 1e-9 if above_0 else -1e9
+            self.nonlinear[name] = Parameter(
+                unit, low, 1e9, start, log=above_0, sized=unit != _OFFSET_C
+            )
         per = unit_text(self.node.unit())
         self.linear = coefficient_units(per if per.isalnum() else f"({per})")
 
@@ -520,8 +519,3 @@ def say_together(known: Mapping[str, Any]) -> str:
 def is_formula(name: str) -> bool:
     """Return whether an effect's name is a formula's text: it calls an operator."""
     return "(" in name
-
-
-def _make_parameter(unit: str, positive: bool) -> Parameter:
-    start = {"degC": 30.0, "s": 60.0}.get(unit, 1.0)
-    return Parameter(unit, 1e-9 if positive else -1e9, 1e9, start, positive, sized=unit != "degC")

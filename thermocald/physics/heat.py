@@ -284,18 +284,14 @@ class HeatNetwork:
 
     def _matrices(self) -> tuple[Array, Array, Array]:
         """Return capacities (n,), conductances (n, n) and those to the boundaries (n, m)."""
-        row = {name: i for i, name in enumerate(self.bodies)}
-        column = {name: i for i, name in enumerate(self.boundaries)}
-        K, B = np.zeros((len(row), len(row))), np.zeros((len(row), len(column)))
+        names, n = [*self.bodies, *self.boundaries], len(self.bodies)
+        G = np.zeros((len(names), len(names)))
         for link in self.links:
-            for here, there in ((link.first, link.second), (link.second, link.first)):
-                if here in row:
-                    K[row[here], row[here]] += link.conductance
-                    if there in row:
-                        K[row[here], row[there]] -= link.conductance
-                    else:
-                        B[row[here], column[there]] += link.conductance
-        return np.array([self.capacities[n] for n in self.bodies]), K, B
+            i, j = names.index(link.first), names.index(link.second)
+            for here, there in ((i, j), (j, i)):
+                G[here, here] += link.conductance
+                G[here, there] -= link.conductance
+        return np.array([*self.capacities.values()]), G[:n, :n], -G[:n, n:]
 
     def solve(
         self,

@@ -107,12 +107,6 @@ class History:
         """Return the temperature (E,) °C of a channel at the frames' times."""
         return self.polygon(channel).at(self.times)
 
-    def column(self, name: str, at: ArrayLike) -> Array:
-        """Return another recorded column at some times (...,), held beyond its ends."""
-        times, values = self.columns[name]
-        result: Array = np.interp(np.asarray(at, dtype=float), times, values)
-        return result
-
     def temperature_matrix(self, channel: str | None = None) -> csr_array:
         """Return ∂ temperature / ∂ readings (E, R)."""
         p = self.polygon(channel)

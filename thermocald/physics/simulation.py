@@ -212,11 +212,16 @@ class Simulation:
 
         advance: called with the number of epochs done. Raises RecordingError if `path` exists.
         """
-        frames = self.frames() if with_frames else None
+        import simplejpeg
+
+        frames = self.frames()
         with RecordingWriter(path, self.head, self.field) as writer:
             for epoch in self.epochs(observed=not with_frames):
-                image = next(frames) if frames is not None else None
-                writer.append(epoch, None if image is None else _jpeg(image))
+                jpeg = None
+                if with_frames:
+                    image = np.ascontiguousarray(next(frames)[:, :, None])
+                    jpeg = simplejpeg.encode_jpeg(image, quality=95, colorspace="GRAY")
+                writer.append(epoch, jpeg)
                 advance(1)
 
     def as_dict(self) -> dict[str, Any]:
@@ -262,12 +267,3 @@ class Simulation:
                 f"{drift['c_mm'] * 1000:.1f} µm"
             )
         ]
-
-
-def _jpeg(image: NDArray[np.uint8]) -> bytes:
-    import simplejpeg
-
-    data: bytes = simplejpeg.encode_jpeg(
-        np.ascontiguousarray(image[:, :, None]), quality=95, colorspace="GRAY"
-    )
-    return data

@@ -54,19 +54,6 @@ EOP_COLUMNS = np.arange(EOP.start, EOP.stop)
 """The exterior orientation as an index array."""
 EOP_COLUMNS.flags.writeable = False
 
-UNITS = {
-    **dict.fromkeys(("c", "x0", "y0", "X0", "Y0", "Z0"), "mm"),
-    "A1": "mm⁻²",
-    "A2": "mm⁻⁴",
-    "A3": "mm⁻⁶",
-    "B1": "mm⁻¹",
-    "B2": "mm⁻¹",
-    "C1": "1",
-    "C2": "1",
-    **dict.fromkeys(("omega", "phi", "kappa"), "rad"),
-}
-"""Unit of each parameter."""
-
 
 def free_columns(names: tuple[str, ...]) -> list[int]:
     """Positions of the named interior parameters, in the order of `PARAMETER_NAMES`."""

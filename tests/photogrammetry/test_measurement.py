@@ -19,8 +19,9 @@ from tests.photogrammetry.fields import (
     station,
 )
 from thermocald.errors import TestFieldError
+from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.frame.measurement import Prior, measure
+from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets.outline import local_maps
 
 FIELD, NORMALS = small_field()
@@ -97,7 +98,7 @@ def test_unusual_frames_are_measured_all_the_same(frame, name, change):
     ],
 )
 def test_useless_frames_have_a_status_and_a_reason(frame, word, change):
-    found = measure(change(frame), FIELD, Prior(SMALL_SENSOR))
+    found = measure(change(frame), FIELD, CameraSpec("", SMALL_SENSOR))
     assert found.status.word == word
     assert len(found.status.reason) > 15
     assert len(found.observations) == 0
@@ -127,25 +128,11 @@ def test_plain_circles_alone_cannot_be_told_apart(frame):
     assert "coded" in found.status.reason
 
 
-def test_plain_circles_are_measured_where_the_camera_is_known(frame):
-    plain = TestField.build(FIELD.names, FIELD.points, 0.01, FIELD.diameters)
-    found = measure(frame, plain, Prior(SMALL_SENSOR, SMALL_CAMERA.interior, STATION))
-    assert found.status.ok
-    assert np.abs(_z(found.observations, _truth())).max() < 5
-
-
-def test_a_prior_that_is_wrong_does_no_harm(frame):
-    elsewhere = station(900.0, roll=0.2)
-    found = measure(frame, FIELD, Prior(SMALL_SENSOR, SMALL_CAMERA.interior, elsewhere))
-    assert found.status.ok
-    assert np.abs(_z(found.observations, _truth())).max() < 5
-
-
 def test_a_camera_that_has_drifted_from_its_calibration_is_measured_whole(frame):
     """Thirty px of the principal point and 1 % of c: a day in the sun."""
     i = SMALL_CAMERA.interior
     earlier = i.with_values(c=i.c * 0.99, x0=i.x0 + 30 * SMALL_SENSOR.pixel_pitch)
-    found = measure(frame, FIELD, Prior(SMALL_SENSOR, earlier))
+    found = measure(frame, FIELD, CameraSpec("", SMALL_SENSOR, interior=earlier))
     assert len(found.observations) == len(measure(frame, FIELD).observations)
     assert np.abs(_z(found.observations, _truth())).max() < 5
 
@@ -245,7 +232,7 @@ def test_what_a_person_would_call_visible_is_found(capsys):
     z = []
     for seed in range(40):
         case = _random_case(seed)
-        measured = measure(case["frame"], case["field"], Prior(SMALL_SENSOR))
+        measured = measure(case["frame"], case["field"], CameraSpec("", SMALL_SENSOR))
         seen = np.isin(np.arange(len(case["field"])), measured.observations.targets)
         visible += int(case["visible"].sum())
         found += int((seen & case["visible"]).sum())

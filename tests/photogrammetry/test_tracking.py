@@ -7,9 +7,8 @@ import pytest
 
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
-from thermocald.photogrammetry.camera.camera_model import CameraModel
+from thermocald.photogrammetry.camera.camera_model import CameraModel, CameraSpec
 from thermocald.photogrammetry.frame import tracking
-from thermocald.photogrammetry.frame.measurement import Prior
 from thermocald.photogrammetry.frame.tracking import Tracker
 
 FIELD, NORMALS = small_field()
@@ -40,7 +39,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def tracker(clean, rng) -> Tracker:
     """A tracker that has seen the first frame."""
-    tracker = Tracker(FIELD, Prior(SMALL_SENSOR))
+    tracker = Tracker(FIELD, CameraSpec("", SMALL_SENSOR))
     first = tracker.measure(noisy(clean, rng))
     assert first.status.ok
     assert first.searched

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from thermocald.photogrammetry.camera.camera_model import (
+    CameraSpec,
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
@@ -179,13 +180,13 @@ def test_portable_arithmetic_is_right():
 
 def test_a_coded_field_is_measured_from_nothing():
     """Drawn the way it is read: found by ring codes, measured with the true centres' sigmas."""
-    from thermocald.photogrammetry.frame.measurement import Prior, measure
+    from thermocald.photogrammetry.frame.measurement import measure
 
     field = demonstration_field("circles")
     model = demonstration_model(field)
     iop, eop = model.interior.as_array(), model.exterior.as_array()
     image = Scene(SENSOR, field).render(iop, eop, seed=3)
-    found = measure(image, field, Prior(SENSOR, principal_distance=3.04))
+    found = measure(image, field, CameraSpec("", SENSOR, 3.04))
     assert found.status.ok, found.status
     seen = found.observations
     assert len(seen) >= 140

@@ -109,15 +109,10 @@ def drive_matrix(history: History, drives: Drives, at_readings: bool = False) ->
     drive.
     """
     chain: csr_array | None = None
-    for name, values in drives if at_readings else drives[:-1]:
-        here = history.at(history.reading_times)
+    for number, (name, values) in enumerate(drives, start=1):
+        here = driven_history(history, drives[: number - 1])
+        if at_readings or number < len(drives):
+            here = here.at(history.reading_times)
         own = get(name).sensitivity(here, **values)
         chain = own if chain is None else own @ chain
-        history = history.with_reference(get(name).drive(here, **values))
-    if at_readings:
-        return chain
-    if not drives:
-        return history.temperature_matrix()
-    name, values = drives[-1]
-    last = get(name).sensitivity(history, **values)
-    return last if chain is None else last @ chain
+    return chain if drives or at_readings else history.temperature_matrix()

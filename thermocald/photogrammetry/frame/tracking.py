@@ -24,12 +24,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 import numpy as np
 
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.frame.measurement import (
-    Measurement,
-    Prior,
-    measure,
-    predict_circles,
-)
+from thermocald.photogrammetry.frame.measurement import Measurement, measure, predict_circles
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import CircleFit, blurred_disc, fit_circles
 from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
@@ -43,6 +38,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image, Single
+    from thermocald.photogrammetry.camera.camera_model import CameraSpec
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,9 +137,8 @@ _Circles: TypeAlias = "tuple[NDArray[np.int64], GradientWeights, NDArray[np.bool
 class Tracker:
     """Measures the frames of one camera and one test field, one after the other."""
 
-    def __init__(self, testfield: TestField, prior: Prior | None = None) -> None:
-        self._testfield = testfield
-        self._prior = prior or Prior()
+    def __init__(self, testfield: TestField, camera: CameraSpec) -> None:
+        self._testfield, self._camera = testfield, camera
         self.reset()
 
     def reset(self) -> None:
@@ -175,7 +170,7 @@ class Tracker:
         )
 
     def _search(self, image: NDArray[Any], why: str) -> Measurement:
-        found = measure(image, self._testfield, self._prior)
+        found = measure(image, self._testfield, self._camera)
         # A frame that shows nothing says nothing about where the targets are: keep what is known.
         if found.status.ok:
             self._shape, self._dtype, self._seen = image.shape, image.dtype, len(found.observations)

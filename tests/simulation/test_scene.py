@@ -169,7 +169,7 @@ def test_portable_arithmetic_is_right():
         np.testing.assert_allclose(k, expected / expected.sum(), rtol=1e-11)
     field = corner_field("plain", 3, 200.0)
     iop = np.array([3.04, 0.01, -0.02, -0.004, 5e-4, 1e-5, 1e-4, -2e-4, 3e-4, -2e-4])
-    eop = corner_view(field, 1200.0, roll_deg=13.0).as_array()
+    eop = corner_view(field, 1200.0).with_values(kappa=0.4).as_array()
     np.testing.assert_allclose(
         portable.project(SENSOR, iop, eop, field.points),
         project(SENSOR, iop, eop, field.points),

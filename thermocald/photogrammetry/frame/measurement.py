@@ -104,8 +104,7 @@ class Measurement:
     """What a frame gave: observations (none where the status is not ok), {row: reason} for targets
     of the field that are in view and not measured, the approximate orientation (None where the
     targets did not carry one), and where the marker corners are. Where targets are tracked,
-    `searched` says why the whole frame was searched, empty where only windows were read, and
-    renewed how many targets got new weights.
+    `searched` says why the whole frame was searched, empty where only windows were read.
     """
 
     observations: Observations
@@ -114,7 +113,6 @@ class Measurement:
     orientation: Orientation | None = None
     markers: Corners | None = None
     searched: str = ""
-    renewed: int = 0
 
 
 def measure(

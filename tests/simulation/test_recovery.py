@@ -15,7 +15,7 @@ import pytest
 
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.physics import catalogue
-from thermocald.physics.device import CameraDevice, Programme, default_heat
+from thermocald.physics.device import CameraDevice, Programme
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.simulation import Simulation
@@ -71,8 +71,7 @@ def record(tmp_path, effect, seed=8):
     """
     field = demonstration_field("plain")
     model = demonstration_model(field).with_effect(effect)
-    network, thermometers = default_heat()
-    device = CameraDevice("rpi", model.sensor, network, thermometers)
+    device = CameraDevice("rpi", model.sensor)
     lamp = Course.steps([0, 100, 600, 1000, 1400, 1e4], [0.0, 12.0, 0.0, 15.0, 0.0])
     board = Course.polygon([0, 300, 650, 1100, 1500, 1e4], [0.5, 3.0, 0.8, 4.0, 1.0, 1.0])
     programme = Programme(

@@ -174,7 +174,7 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
     names, matrix = _read_covariance(top)
     return ThermalModel(
         camera=camera.text("name", "camera"),
-        sensor=read_sensor(camera),
+        sensor=Sensor.read(camera),
         T0=top.number("reference_temperature", "degC", low=-273.15),
         interior=InteriorOrientation.from_mapping({"c": 0.0, **interior}),
         rates=rates,
@@ -191,14 +191,6 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
         name=top.text("name", ""),
         version=top.whole("version", "1") if "version" in document else 1,
     )
-
-
-def read_sensor(camera: QuantityReader) -> Sensor:
-    """Read width and height in px and the pixel pitch in mm."""
-    pitch = camera.number("pixel_pitch", "mm", above=0.0)
-    if pitch > 0.1:
-        raise camera.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
-    return Sensor(camera.whole("width", "px"), camera.whole("height", "px"), pitch)
 
 
 def _read_covariance(

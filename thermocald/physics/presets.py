@@ -29,10 +29,8 @@ from thermocald.errors import ConfigurationError, UsageError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.physics import catalogue
 from thermocald.physics.device import (
-    USUAL_THERMOMETERS,
     CameraDevice,
     Programme,
-    default_heat,
     read_camera_device,
     read_programme,
 )
@@ -145,9 +143,7 @@ def _device(preset: Preset) -> CameraDevice:
             Link("housing", "ambient", loss),
         ),
     )
-    return CameraDevice(
-        preset.camera, preset.sensor, network, USUAL_THERMOMETERS, distance=preset.distance_mm
-    )
+    return CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
 
 
 def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
@@ -254,11 +250,8 @@ def given_simulation(
             "(--camera and --testfield as well, where the usual ones do not fit)"
         )
     thermal = read_model(model)
-    if camera is not None:
-        device = read_camera_device(camera)
-    else:
-        network, thermometers = default_heat()
-        device = CameraDevice(thermal.camera, thermal.sensor, network, thermometers)
+    usual = CameraDevice(thermal.camera, thermal.sensor)
+    device = usual if camera is None else read_camera_device(camera)
     chosen = load_field("circles") if field is None else field
     return Simulation(thermal, device, chosen, read_programme(programme), seed)
 

@@ -292,24 +292,12 @@ class Scene:
             mine = place[member] >= 0
             steps = coverage_steps(a[mine], b[mine], sign[mine], place[member[mine]], windows)
             stack = average(fill(average(steps.astype(np.float32), kernel, 0)), kernel, 1)
-            for k in range(len(windows.members)):
-                self._paste(canvas, gain, stack, depth, windows, k)
-
-    def _paste(
-        self,
-        canvas: NDArray[np.int16],
-        gain: NDArray[np.float32],
-        stack: NDArray[np.float32],
-        depth: np.float32,
-        windows: Windows,
-        k: int,
-    ) -> None:
-        """Take the ink of one window off the canvas."""
-        row, left, top = windows.row[k], windows.left[k], windows.top[k]
-        y0, y1 = max(0, top), min(self.sensor.height, top + windows.height[k])
-        x0, x1 = max(0, left), min(self.sensor.width, left + windows.width)
-        if y0 >= y1 or x0 >= x1:
-            return
-        ink = stack[row + y0 - top : row + y1 - top, x0 - left : x1 - left]
-        taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
-        canvas[y0:y1, x0:x1] -= taken + taken
+            for row, left, top, height in zip(
+                windows.row, windows.left, windows.top, windows.height, strict=True
+            ):
+                y0, y1 = max(0, top), min(self.sensor.height, top + height)
+                x0, x1 = max(0, left), min(self.sensor.width, left + windows.width)
+                if y0 < y1 and x0 < x1:  # the ink is taken off the canvas
+                    ink = stack[row + y0 - top : row + y1 - top, x0 - left : x1 - left]
+                    taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
+                    canvas[y0:y1, x0:x1] -= taken + taken

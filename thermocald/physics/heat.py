@@ -27,7 +27,7 @@ Thermometers as instruments: what one says is not the temperature of what it is 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
@@ -315,7 +315,13 @@ class HeatNetwork:
         last = float(t.max(initial=0.0))
         grid = np.unique(np.concatenate([[0.0], t, *inner]))
         grid = grid[(grid >= 0.0) & (grid <= last)]
-        begin, end = (self._drive(grid, B, powers, temperatures, s) for s in ("right", "left"))
+        begin, end = np.zeros((2, len(capacity), len(grid)))  # heat flow W into each body
+        sides: tuple[tuple[Array, Literal["right", "left"]], ...] = (begin, "right"), (end, "left")
+        for q, side in sides:
+            for j, name in enumerate(self.boundaries):
+                q += B[:, j : j + 1] * temperatures[name].at(grid, side)
+            for name, course in powers.items():
+                q[self.bodies.index(name)] += course.at(grid, side)
         root = np.sqrt(capacity)
         rate, modes = np.linalg.eigh(K / np.outer(root, root))
         into = (modes / root[:, None]).T
@@ -332,22 +338,6 @@ class HeatNetwork:
         for name in self.boundaries:
             result[name] = temperatures[name].at(t)
         return result
-
-    def _drive(
-        self,
-        grid: Array,
-        B: Array,
-        powers: Mapping[str, Course],
-        temperatures: Mapping[str, Course],
-        side: Any,
-    ) -> Array:
-        """Return the heat flow (n, g) W into each body, on one side of the instants."""
-        q = np.zeros((len(self.bodies), len(grid)))
-        for j, name in enumerate(self.boundaries):
-            q += B[:, j : j + 1] * temperatures[name].at(grid, side)
-        for name, course in powers.items():
-            q[self.bodies.index(name)] += course.at(grid, side)
-        return q
 
 
 def _solve_mode(grid: Array, rate: float, begin: Array, end: Array, start: float) -> Array:

@@ -145,7 +145,7 @@ class _Frame:
     def measure(self) -> Measurement:
         """Measure markers and squares, then the circles."""
         if turned := corners_turned_deg(self._markers, self._field):
-            return self._result("other_field", _TURNED.format(turned))
+            return self._another_field(_TURNED.format(turned))
         corners = measure_corners(self._image, self._markers, self._missed)
         if "chess_corner" in self._field.kinds:
             corners = corners.joined(find_chessboards(self._image, self._field, self._missed))
@@ -202,10 +202,9 @@ class _Frame:
         try:
             orientation = self._orient(pairs, np.concatenate([corners.points, maps.centre]))
         except GeometryError as error:
-            return self._result(
-                "other_field",
+            return self._another_field(
                 f"{len(pairs)} codes of the test field are seen, but not where it has them "
-                f"({error})",
+                f"({error})"
             )
         measured, missed, orientation = self._circles(orientation, corners)
         self._missed.update(missed)
@@ -282,19 +281,12 @@ class _Frame:
                 )
         elif n < _FEWEST:
             word, why = "too_few", f"only {n} targets are found in the frame"
-        return self._result(word, why, observations, orientation)
+        status = FrameStatus(word, why)
+        return Measurement(observations, status, self._missed, orientation, self._markers)
 
-    def _result(
-        self,
-        word: Word,
-        reason: str,
-        observations: Observations | None = None,
-        orientation: Orientation | None = None,
-    ) -> Measurement:
-        return Measurement(
-            observations or Observations.none(), FrameStatus(word, reason), self._missed,
-            orientation, self._markers,
-        )  # fmt: skip
+    def _another_field(self, why: str) -> Measurement:
+        status = FrameStatus("other_field", why)
+        return Measurement(Observations.none(), status, self._missed, None, self._markers)
 
 
 def _why_nothing(missed: dict[int, str]) -> str:

@@ -48,7 +48,7 @@ class Prediction:
     effects add where the model has no exterior orientation); scale (E, 3): factors of the object
     coordinates; noise_factor, blur_factor (E,); displacements: of some targets, their rows (k,) of
     the test field, vector (3,) mm, and when (E,); drive (E,) °C: the temperature behind the linear
-    terms.
+    terms; field: where it is known what stands before the camera.
     """
 
     iop: Array
@@ -58,12 +58,14 @@ class Prediction:
     blur_factor: Array
     drive: Array
     displacements: list[tuple[NDArray[np.int64], Array, NDArray[np.bool_]]]
+    field: TestField | None
 
     @classmethod
-    def none(cls, epochs: int) -> Prediction:
+    def none(cls, epochs: int, field: TestField | None = None) -> Prediction:
         """Return a prediction without any influence."""
         one, (iop, eop) = np.ones, (np.zeros((epochs, n)) for n in (10, 6))
-        return cls(iop, eop, one((epochs, 3)), one(epochs), one(epochs), np.zeros(epochs), [])
+        factors = one((epochs, 3)), one(epochs), one(epochs)
+        return cls(iop, eop, *factors, np.zeros(epochs), [], field)
 
     @property
     def moves_points(self) -> bool:
@@ -322,13 +324,7 @@ class Effect:
         searched = {k: values[k] for k in self.nonlinear if k in values}
         return searched, {k: float(values[k]) for k in self.linear if k in values}
 
-    def influence(
-        self,
-        history: History,
-        values: Values,
-        found: Prediction,
-        field: TestField | None = None,  # noqa: ARG002
-    ) -> None:
+    def influence(self, history: History, values: Values, found: Prediction) -> None:
         """Add what it changes at the history's times; a drive changes nothing by itself."""
         searched, coefficients = self.split(values)
         if self.kind == "signal" and any(coefficients.values()):

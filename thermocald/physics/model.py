@@ -175,9 +175,9 @@ class ThermalModel:
         field lacks a target that an effect names.
         """
         history = replace(history, T0=self.T0)
-        found = Prediction.none(len(history.times))
+        found = Prediction.none(len(history.times), test_field)
         for effect in self.effects:
-            catalogue.get(effect.name).influence(history, effect.values, found, test_field)
+            catalogue.get(effect.name).influence(history, effect.values, found)
         found.drive = self.drive(history)
         linear = self.interior.as_array() + (found.drive - self.T0)[:, None] * self.rate_vector
         found.iop = self.carried(linear + found.iop)

@@ -11,7 +11,6 @@ from thermocald.physics.effect import Proportional, Steady, coefficient_units
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.effect import Prediction, Values
     from thermocald.physics.history import History
 
@@ -95,13 +94,7 @@ class Defocus(Proportional):
         "cycle": "makes noise come and go with the temperature",
     }
 
-    def influence(
-        self,
-        history: History,
-        values: Values,
-        found: Prediction,
-        field: TestField | None = None,  # noqa: ARG002
-    ) -> None:
+    def influence(self, history: History, values: Values, found: Prediction) -> None:
         factor = np.maximum(1.0 + values["factor"] * self.signal(history)[:, 0], 0.1)
         found.noise_factor *= factor
         found.blur_factor *= factor

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.effect import Estimates, Prediction, Values
 
 
@@ -270,13 +269,7 @@ class TestFieldExpansion(Proportional):
     columns: Mapping[str, str] = {"X": "scale_X", "Y": "scale_Y", "Z": "scale_Z"}
     behaviour: Mapping[str, str] = {**Proportional.behaviour, "shade": "stops"}
 
-    def influence(
-        self,
-        history: History,
-        values: Values,
-        found: Prediction,
-        field: TestField | None = None,  # noqa: ARG002
-    ) -> None:
+    def influence(self, history: History, values: Values, found: Prediction) -> None:
         rates = np.array([float(values.get(axis, 0.0)) for axis in self.linear])
         found.scale *= 1.0 + self.signal(history) * rates
 
@@ -302,16 +295,8 @@ class TargetDisplacement(OfTime):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, time: float = 600.0, **_: Any) -> Array:
-        return (history.times >= time).astype(float)[:, None]
-
-    def influence(
-        self,
-        history: History,
-        values: Values,
-        found: Prediction,
-        field: TestField | None = None,
-    ) -> None:
+    def influence(self, history: History, values: Values, found: Prediction) -> None:
+        field = found.field
         if field is None:
             return
         targets = values["targets"]

@@ -285,7 +285,7 @@ class Effect:
         """Return the same for every further column that it reads, {channel: (E, R)}."""
         return {}
 
-    def unresolved(self, history: History, rate_jump: Array | None = None, **_: Any) -> Array:  # noqa: ARG002
+    def unresolved(self, history: History, rate_jump: Array, **_: Any) -> Array:  # noqa: ARG002
         """Return the sd (E,) of drive or first signal that the times of the readings leave.
 
         What happens between two readings, or after the last, no reading tells; their noise is not

@@ -403,9 +403,7 @@ class OfFormula(Effect):
         found = {n: evaluator.sensitivity(node, n) for n in self.node.channels() if n != first}
         return {name: matrix for name, matrix in found.items() if matrix.nnz}
 
-    def unresolved(self, history: History, rate_jump: Array | None = None, **given: Any) -> Array:
-        if rate_jump is None:
-            return np.zeros(len(history.times))
+    def unresolved(self, history: History, rate_jump: Array, **given: Any) -> Array:
         return Evaluator(history).rate_jumps(self.node.bound(given), rate_jump)
 
     def sentence(self, estimates: Estimates) -> str:

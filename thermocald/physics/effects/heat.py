@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.physics.effect import (
     Effect,
     OfTime,
@@ -79,13 +78,7 @@ class TimeOffset(Effect):
     def drive(self, history: History, d: float = 0.0, **_: Any) -> Array:
         return history.polygon().at(history.times - d)
 
-    def unresolved(
-        self,
-        history: History,
-        rate_jump: Array | None = None,  # noqa: ARG002
-        d: float = 0.0,
-        **_: Any,
-    ) -> Array:
+    def unresolved(self, history: History, rate_jump: Array, d: float = 0.0, **_: Any) -> Array:  # noqa: ARG002
         """Return what is not known after the last reading, where the thermometer is ahead.
 
         As much as the temperature usually changes over the time that is missing.
@@ -102,9 +95,6 @@ class TimeOffset(Effect):
     def sensitivity(self, history: History, d: float = 0.0, **_: Any) -> csr_array:
         p = history.polygon()
         return interpolation_matrix(p.times, history.times - d) @ p.matrix
-
-
-_NOISE_JUMPS = 3.0  # standard deviations that a jump of the rate must be beyond noise
 
 
 class ThermalGradient(Operated):
@@ -130,18 +120,9 @@ class ThermalGradient(Operated):
         "idle": "does nothing",
     }
 
-    def unresolved(self, history: History, rate_jump: Array | None = None, **_: Any) -> Array:
+    def unresolved(self, history: History, rate_jump: Array, **_: Any) -> Array:  # noqa: ARG002
         """Return by how much the rate jumps where a lamp is switched between two readings."""
-        if rate_jump is not None:
-            return rate_jump
-        p = history.polygon()
-        if len(p.times) < 5:
-            return np.zeros(len(history.times))
-        jumps = np.abs(np.diff(np.diff(p.values) / np.diff(p.times)))
-        noise = mad_sd(jumps)
-        excess = np.sqrt(np.maximum(jumps**2 - (_NOISE_JUMPS * noise) ** 2, 0.0))
-        at_knots = np.concatenate([excess[:1], excess, excess[-1:]]) / 2.0
-        return np.interp(history.times, p.times, at_knots)
+        return rate_jump
 
 
 class SelfHeating(OfTime):

@@ -428,6 +428,7 @@ class Operated(Effect):
 class OfTime(Effect):
     """An effect that knows the time alone: the thermometer's error does not reach it."""
 
+    usual: tuple[str, ...] = IOP_NAMES[:3]
     of_now = True
     steady_signal = Steady()
 
@@ -441,6 +442,7 @@ class Proportional(Effect):
     """An effect whose signal is a power of T - T₀, at once; T is that of its `channel`."""
 
     power: int = 1
+    usual: tuple[str, ...] = IOP_NAMES[:3]
     of_now = True
     steady_signal = Steady((0.0, 1.0, 0.0))
     behaviour: Mapping[str, str] = {

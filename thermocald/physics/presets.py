@@ -26,7 +26,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError, UsageError
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    RASPBERRY_PI_V2,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.physics import catalogue
 from thermocald.physics.device import (
     CameraDevice,
@@ -38,7 +42,7 @@ from thermocald.physics.heat import Course, HeatNetwork, Link
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.physics.model_file import read_model
 from thermocald.physics.simulation import Simulation
-from thermocald.physics.testfields import corner_field, corner_view, load_field
+from thermocald.physics.testfields import RPI_INTERIOR, corner_field, corner_view, load_field
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -88,10 +92,6 @@ _S8 = Sensor(4032, 3024, 0.0014)
 _S8_INTERIOR = InteriorOrientation(
     c=4.2, x0=-0.017, y0=0.042, A1=0.0062, A2=-3.6e-4, B1=-0.7e-4, B2=1.1e-4
 )
-_RPI = Sensor(3280, 2464, 0.00112)
-_RPI_INTERIOR = InteriorOrientation(
-    c=3.04, x0=0.012, y0=-0.018, A1=-0.0040, A2=5.0e-4, B1=1.0e-4, B2=-2.0e-4
-)
 
 PRESETS: Mapping[str, Preset] = {
     p.name: p
@@ -122,7 +122,7 @@ PRESETS: Mapping[str, Preset] = {
         ),
         Preset(
             "rpi-v2.1-heating", "Raspberry Pi camera v2.1, heated by a lamp, then left to cool",
-            "rpi-v2.1", _RPI, _RPI_INTERIOR, 2.0, 900.0,
+            "rpi-v2.1", RASPBERRY_PI_V2.sensor, RPI_INTERIOR, 2.0, 900.0,
             drift_px=10.5, direction_deg=-150.0, drift_c_mm=0.005, begin_degc=25.0, end_degc=52.0,
             noise_ratio=3.5, set_share=0.06, lamp=True, distortion_drift=(2e-5, -2e-5, -2e-5),
         ),

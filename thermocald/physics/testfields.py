@@ -19,15 +19,19 @@ import numpy as np
 
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import (
+    RASPBERRY_PI_V2,
     ExteriorOrientation,
     InteriorOrientation,
-    Sensor,
 )
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.physics.model import ThermalModel
 from thermocald.store.recording.reader import read_testfield
 
+RPI_INTERIOR = InteriorOrientation(
+    c=3.04, x0=0.012, y0=-0.018, A1=-0.0040, A2=5.0e-4, B1=1.0e-4, B2=-2.0e-4
+)
+"""Of a Raspberry Pi camera v2.1; the distortion is of usual size."""
 # In-plane directions (right, down) of a viewer in front of each plane.
 _PLANES = {
     "x": (np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])),
@@ -116,11 +120,9 @@ def demonstration_model(field: TestField) -> ThermalModel:
     """Return a camera 1.3 m before a corner field: half a pixel of drift per kelvin, T₀ = 25 °C."""
     return ThermalModel(
         camera="rpi-v2.1",
-        sensor=Sensor(3280, 2464, 0.00112),
+        sensor=RASPBERRY_PI_V2.sensor,
         T0=25.0,
-        interior=InteriorOrientation(
-            c=3.04, x0=0.012, y0=-0.018, A1=-0.004, A2=0.0005, B1=1e-4, B2=-2e-4
-        ),
+        interior=RPI_INTERIOR,
         rates={"c": 2.0e-4, "x0": -4.5e-4, "y0": -3.0e-4},
         exterior=corner_view(field, 1300.0),
         name="demonstration",

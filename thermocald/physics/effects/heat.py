@@ -139,7 +139,6 @@ class SelfHeating(OfTime):
         "tau": Parameter("s", 10.0, 10000.0, 300.0, log=True, role="time_constant")
     }
     linear: Mapping[str, str] = coefficient_units("1")
-    usual = ("c", "x0", "y0")
     steady_signal = Steady((1.0, 0.0, 0.0))
     behaviour: Mapping[str, str] = {
         "idle": "rises and settles although the thermometer stands",
@@ -160,7 +159,6 @@ class SecondHeatSource(Proportional):
     says = "{channel} heats the camera too"
     nonlinear: Mapping[str, Parameter] = {"channel": Parameter("name", 0.0, 0.0, 0.0, text=True)}
     linear: Mapping[str, str] = coefficient_units("K")
-    usual = ("c", "x0", "y0")
     behaviour: Mapping[str, str] = dict.fromkeys(
         ("load", "idle", "hold"), "follows the other thermometer"
     )

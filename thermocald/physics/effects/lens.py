@@ -26,7 +26,6 @@ class NonlinearExpansion(Proportional):
     noun = "a quadratic expansion"
     power = 2
     linear: Mapping[str, str] = coefficient_units("K2")
-    usual = ("c", "x0", "y0")
     steady_signal = Steady((0.0, 0.0, 1.0))
     behaviour: Mapping[str, str] = {
         "hold": "does not move while the temperature stands",

@@ -130,7 +130,6 @@ class Creep(OfTime):
     name = "creep"
     noun = "creep"
     linear: Mapping[str, str] = coefficient_units("s")
-    usual = ("c", "x0", "y0")
     moves_mount = True
     behaviour: Mapping[str, str] = {
         "idle": "goes on at the same rate and never settles",
@@ -154,7 +153,6 @@ class Slip(OfTime):
     says = "a part slipped at {time} after the start"
     nonlinear: Mapping[str, Parameter] = {"time": Parameter("s", 0.0, 1e9, 600.0, role="event")}
     linear: Mapping[str, str] = coefficient_units("1")
-    usual = ("c", "x0", "y0")
     fresh = ("time",)
     moves_mount = True
     behaviour: Mapping[str, str] = {
@@ -237,7 +235,6 @@ class CyclicInterference(OfTime):
         "phase": Parameter("rad", -np.pi, np.pi, 0.0, role="phase"),
     }
     linear: Mapping[str, str] = coefficient_units("1")
-    usual = ("c", "x0", "y0")
     fresh = ("phase",)
     moves_mount = True
     behaviour: Mapping[str, str] = {

@@ -99,22 +99,16 @@ def _mirrored(number: int, bits: int = 14) -> int:
     return ring_code.smallest_rotation(int(format(number, f"0{bits}b")[::-1], 2), bits)
 
 
-def _in_clutter(seeds: range) -> list:
-    frames = ((s, clutter(s)) for s in seeds)
-    return [(s, ink, _codes(frame, ink)) for s, frame in frames for ink in (-1, 1)]
-
-
-@pytest.mark.slow
-def test_no_code_in_clutter():
-    candidates = sum(len(find_circles(clutter(s), 1, -1)) for s in range(20))
-    assert candidates > 200  # the clutter does look like circles
-    assert [f for f in _in_clutter(range(20)) if f[2]] == []
-
-
 @pytest.mark.slow
 def test_no_code_in_a_thousand_frames_of_clutter():
-    # Not the seeds that the thresholds were found with, which are those below 12,000.
-    assert [f for f in _in_clutter(range(20_000, 21_000)) if f[2]] == []
+    """Not the seeds that the thresholds were found with, which are those below 12,000."""
+    candidates, found = 0, []
+    for seed in range(20_000, 21_000):
+        frame = clutter(seed)
+        candidates += len(find_circles(frame, 1, -1))
+        found += [(seed, ink) for ink in (-1, 1) if _codes(frame, ink)]
+    assert candidates > 10_000  # the clutter does look like circles
+    assert found == []
 
 
 def test_no_code_in_photographs(shared):

@@ -43,7 +43,7 @@ def eigen_solution(t, T0, forcing):
 
 
 def test_two_bodies_step():
-    T = two_bodies().solve(TIMES, {"a": 22.0, "b": 80.0}, {"b": Course.constant(2.0)}, AIR)
+    T = two_bodies().solve(TIMES, [22.0, 80.0], {"b": Course.constant(2.0)}, AIR)
     expected = 22 + eigen_solution(TIMES, np.array([0.0, 58.0]), np.array([0.0, 2.0 / 20]))
     np.testing.assert_allclose(np.stack([T["a"], T["b"]], axis=1), expected, rtol=0, atol=1e-9)
 
@@ -73,7 +73,7 @@ def test_halving_the_step_changes_nothing():
 def test_energy_is_conserved():
     """Two bodies alone in the world: what goes in stays in."""
     network = HeatNetwork({"a": 30.0, "b": 7.0}, (Link("a", "b", 0.2),))
-    T = network.solve(TIMES, {"a": 20.0, "b": 60.0}, {"b": Course.constant(0.3)}, {})
+    T = network.solve(TIMES, [20.0, 60.0], {"b": Course.constant(0.3)}, {})
     energy = 30.0 * T["a"] + 7.0 * T["b"]
     np.testing.assert_allclose(energy - 0.3 * TIMES, 30 * 20 + 7 * 60, rtol=1e-12)
 

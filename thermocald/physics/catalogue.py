@@ -11,6 +11,7 @@ this one chain, forward and as the matrix that carries the readings' errors thro
 
 from __future__ import annotations
 
+from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import entry_points
@@ -89,8 +90,8 @@ def seen_in(place: str) -> Effect:
 def driven_history(history: History, drives: Drives) -> History:
     """Send the readings of a history's reference through drives [(effect, values)]."""
     for name, values in drives:
-        at_readings = history.at(history.reading_times)
-        history = history.with_reference(get(name).drive(at_readings, **values))
+        driven = get(name).drive(history.at(history.reading_times), **values)
+        history = replace(history, readings={**history.readings, history.reference: driven})
     return history
 
 

@@ -83,7 +83,7 @@ class Programme:
     reading_offset: float = 0.0
     reading_spread: float = 1.0
     begin: float = 1_600_000_000.0
-    initial: float | Mapping[str, float] | None = None
+    initial: float | None = None
 
     @property
     def duration(self) -> float:

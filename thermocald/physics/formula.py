@@ -351,18 +351,13 @@ class Evaluator:
             total = total + diags_array(slope) @ matrix
         return csr_array(total)
 
-    def rate_jumps(self, node: Node, jump: Array) -> Array:
-        """Return by how much (E,) values change where rates at the frames are off by `jump` K/s."""
-        if not any(n.operator == "rate" and n.inputs[0].is_leaf for n in node.walk()):
-            return np.zeros(len(self.history.times))
-        return np.abs(self._shifted(node, jump) - self.values(node))
-
-    def _shifted(self, node: Node, jump: Array) -> Array:
+    def shifted(self, node: Node, jump: Array) -> Array:
+        """Return the values (E,) where rates of readings are off by `jump` (E,), per s."""
         if node.operator == "rate" and node.inputs[0].is_leaf:
             return self.values(node) + jump
         if node.is_leaf or node.kind.remembers:
             return self.values(node)
-        return node.kind.value(*(self._shifted(n, jump) for n in node.inputs), *node.constants)
+        return node.kind.value(*(self.shifted(n, jump) for n in node.inputs), *node.constants)
 
 
 class OfFormula(Effect):
@@ -404,7 +399,8 @@ class OfFormula(Effect):
         return {name: matrix for name, matrix in found.items() if matrix.nnz}
 
     def unresolved(self, history: History, rate_jump: Array, **given: Any) -> Array:
-        return Evaluator(history).rate_jumps(self.node.bound(given), rate_jump)
+        evaluator, node = Evaluator(history), self.node.bound(given)
+        return np.abs(evaluator.shifted(node, rate_jump) - evaluator.values(node))
 
     def sentence(self, estimates: Estimates) -> str:
         said = {

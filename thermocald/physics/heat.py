@@ -76,11 +76,6 @@ class Course:
         v = np.asarray(values, dtype=float)
         return cls(np.asarray(times, dtype=float), v, v.copy())
 
-    @property
-    def span(self) -> tuple[float, float]:
-        """Where it begins and ends, s."""
-        return float(self.times[0]), float(self.times[-1])
-
     def at(self, times: ArrayLike, side: Literal["left", "right"] = "right") -> Array:
         """Return the value right after each time, or right before it (side: left), if it jumps."""
         t = np.asarray(times, dtype=float)
@@ -104,7 +99,7 @@ def read_course(
         course = _read_log(reader.inner(key), unit, folder)
     else:
         return Course.constant(reader.number(key, unit))
-    begin, end = course.span
+    begin, end = course.times[[0, -1]]
     if begin > 0 or end < duration:
         raise reader.fail(
             key, f"covers {begin:g} to {end:g} s; the programme lasts from 0 to {duration:g} s"
@@ -286,15 +281,15 @@ class HeatNetwork:
     def solve(
         self,
         times: ArrayLike,
-        initial: Mapping[str, float] | float,
+        initial: ArrayLike,
         powers: Mapping[str, Course],
         temperatures: Mapping[str, Course],
     ) -> dict[str, Array]:
         """Return temperatures °C of all bodies and boundaries at times (E,) s, ascending, from 0
         on.
 
-        initial: °C at time 0, per body or for all; powers: W into bodies; temperatures: °C of the
-        boundaries.
+        initial: °C at time 0, of each body or of all; powers: W into bodies; temperatures: °C of
+        the boundaries.
         """
         t = np.asarray(times, dtype=float)
         capacity, K, B = self._matrices()
@@ -307,10 +302,6 @@ class HeatNetwork:
                     f"a source heats {name!r}, which is not a body; bodies are "
                     f"{', '.join(self.bodies)}"
                 )
-        start = np.array(
-            [initial if isinstance(initial, int | float) else initial[n] for n in self.bodies],
-            dtype=float,
-        )
         inner = [c.times for c in (*powers.values(), *temperatures.values())]
         last = float(t.max(initial=0.0))
         grid = np.unique(np.concatenate([[0.0], t, *inner]))
@@ -328,7 +319,7 @@ class HeatNetwork:
         z = np.stack(
             [
                 _solve_mode(grid, max(float(rate[k]), 0.0), into[k] @ begin, into[k] @ end,
-                      float(modes[:, k] @ (root * start)))
+                      float(modes[:, k] @ (root * initial)))
                 for k in range(len(rate))
             ]
         )  # fmt: skip

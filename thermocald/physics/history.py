@@ -79,11 +79,6 @@ class History:
         """Ask for other times."""
         return replace(self, times=np.asarray(times, dtype=float))
 
-    def with_reference(self, readings: ArrayLike) -> Self:
-        """Replace the readings (R,) °C of the reference channel."""
-        changed = {**self.readings, self.reference: np.asarray(readings, dtype=float)}
-        return replace(self, readings=changed)
-
     @cached_property
     def _polygons(self) -> dict[str, Polygon]:
         return {}

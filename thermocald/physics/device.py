@@ -49,7 +49,6 @@ from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.physics.heat import (
     Course,
     HeatNetwork,
-    Link,
     SimulatedThermometer,
     read_course,
     read_network,
@@ -155,12 +154,12 @@ class Measuring:
 USUAL_NETWORK = HeatNetwork(
     {"sensor": 1.0, "lens": 1.5, "board": 40.0, "housing": 60.0, "test_field": 2000.0},
     (
-        Link("sensor", "lens", 0.05),
-        Link("sensor", "board", 0.05),
-        Link("lens", "housing", 0.02),
-        Link("board", "housing", 0.25),
-        Link("housing", "ambient", 0.4),
-        Link("test_field", "ambient", 5.0),
+        ("sensor", "lens", 0.05),
+        ("sensor", "board", 0.05),
+        ("lens", "housing", 0.02),
+        ("board", "housing", 0.25),
+        ("housing", "ambient", 0.4),
+        ("test_field", "ambient", 5.0),
     ),
 )
 """A camera module on a board in a housing before a test field: of the order of a Raspberry Pi in a

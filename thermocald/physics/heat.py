@@ -230,31 +230,23 @@ def read_thermometer(reader: QuantityReader) -> SimulatedThermometer:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Link:
-    """A conductance W/K between two bodies, or a body and a boundary."""
-
-    first: str
-    second: str
-    conductance: float
-
-
 @dataclass(frozen=True)
 class HeatNetwork:
-    """Bodies {name: capacity J/K} and the links between them; other names in links are boundaries.
+    """Bodies {name: capacity J/K} and the links between two each: names and a conductance W/K.
 
-    Capacities and conductances are above 0. Raises ConfigurationError where a link has no body.
+    Other names in links are boundaries; capacities and conductances are above 0. Raises
+    ConfigurationError where a link has no body.
     """
 
     capacities: Mapping[str, float]
-    links: tuple[Link, ...]
+    links: tuple[tuple[str, str, float], ...]
 
     def __post_init__(self) -> None:
         if not self.capacities:
             raise ConfigurationError("a heat network needs at least one body")
-        for link in self.links:
-            if link.first not in self.capacities and link.second not in self.capacities:
-                raise ConfigurationError(f"neither {link.first!r} nor {link.second!r} is a body")
+        for first, second, _ in self.links:
+            if first not in self.capacities and second not in self.capacities:
+                raise ConfigurationError(f"neither {first!r} nor {second!r} is a body")
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -264,18 +256,18 @@ class HeatNetwork:
     @property
     def boundaries(self) -> tuple[str, ...]:
         """Names of what has a given temperature."""
-        names = dict.fromkeys(n for link in self.links for n in (link.first, link.second))
+        names = dict.fromkeys(n for link in self.links for n in link[:2])
         return tuple(n for n in names if n not in self.capacities)
 
     def _matrices(self) -> tuple[Array, Array, Array]:
         """Return capacities (n,), conductances (n, n) and those to the boundaries (n, m)."""
         names, n = [*self.bodies, *self.boundaries], len(self.bodies)
         G = np.zeros((len(names), len(names)))
-        for link in self.links:
-            i, j = names.index(link.first), names.index(link.second)
+        for first, second, conductance in self.links:
+            i, j = names.index(first), names.index(second)
             for here, there in ((i, j), (j, i)):
-                G[here, here] += link.conductance
-                G[here, there] -= link.conductance
+                G[here, here] += conductance
+                G[here, there] -= conductance
         return np.array([*self.capacities.values()]), G[:n, :n], -G[:n, n:]
 
     def solve(
@@ -361,5 +353,5 @@ def read_network(reader: QuantityReader) -> HeatNetwork:
         ends = link.mapping.get("between")
         if not isinstance(ends, list) or len(ends) != 2:
             raise link.fail("between", "must be [one, other]")
-        links.append(Link(str(ends[0]), str(ends[1]), link.number("conductance", "W/K", above=0.0)))
+        links.append((str(ends[0]), str(ends[1]), link.number("conductance", "W/K", above=0.0)))
     return HeatNetwork(capacities, tuple(links))

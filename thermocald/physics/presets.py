@@ -38,7 +38,7 @@ from thermocald.physics.device import (
     read_camera_device,
     read_programme,
 )
-from thermocald.physics.heat import Course, HeatNetwork, Link
+from thermocald.physics.heat import Course, HeatNetwork
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.physics.model_file import read_model
 from thermocald.physics.simulation import Simulation
@@ -137,17 +137,17 @@ def _device(preset: Preset) -> CameraDevice:
     network = HeatNetwork(
         {"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4},
         (
-            Link("board", "housing", 6.0),
-            Link("lens", "housing", 0.4),
-            Link("sensor", "lens", 0.2),
-            Link("housing", "ambient", loss),
+            ("board", "housing", 6.0),
+            ("lens", "housing", 0.4),
+            ("sensor", "lens", 0.2),
+            ("housing", "ambient", loss),
         ),
     )
     return CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
 
 
 def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
-    (loss,) = (k.conductance for k in device.network.links if k.second == "ambient")
+    (loss,) = (g for _, second, g in device.network.links if second == "ambient")
     duration = (_EPOCHS - 1) * _INTERVAL_S
     ambient = preset.begin_degc if preset.lamp else 23.0
     power = loss * (preset.end_degc - ambient)

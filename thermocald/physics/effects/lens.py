@@ -56,9 +56,7 @@ class DecenteringDrift(Proportional):
     noun = "a drift of the decentering distortion"
     linear: Mapping[str, str] = coefficient_units("K", ("B1", "B2"))
     usual = ("B1", "B2")
-    behaviour: Mapping[str, str] = {
-        **Proportional.behaviour, "turn": "turns with the camera"
-    }  # fmt: skip
+    behaviour: Mapping[str, str] = {**Proportional.behaviour, "turn": "turns with the camera"}
 
 
 class AffinityDrift(Proportional):

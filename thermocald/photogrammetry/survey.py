@@ -155,6 +155,13 @@ def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> 
     return TestField.build(network.names, network.points, network.sigmas, diameters, codes=codes)
 
 
+def surveyed_field(network: Network, template: TestField) -> TestField:
+    """The field of the network's targets: coordinates and sigmas surveyed, the rest as it was."""
+    order = np.argsort([template.index[name] for name in network.names])
+    part = template.subset([template.index[network.names[i]] for i in order])
+    return replace(part, points=network.points[order], sigmas=network.sigmas[order])
+
+
 _PASSES = 2
 
 
@@ -277,12 +284,8 @@ def survey(
         network = adjust_network(
             sensor, photos, expected.names, distances, free=free, start=start, nominal=of_field
         )
-    # coordinates and sigmas are surveyed, the rest is as it was
     template = expected if nominal is None else nominal
-    order = np.argsort([template.index[name] for name in network.names])
-    part = template.subset([template.index[network.names[i]] for i in order])
-    field = replace(part, points=network.points[order], sigmas=network.sigmas[order])
-    return Survey(network, field, said)
+    return Survey(network, surveyed_field(network, template), said)
 
 
 def _provisional(

@@ -248,10 +248,9 @@ class Scene:
             random_bytes = raw.view(np.uint8)[: 2 * size].reshape(2, *canvas.shape)
             first, second = cv2.LUT(random_bytes[0], even), cv2.LUT(random_bytes[1], odd)
             cv2.add(first, second, dst=first)
-            noisy = cv2.addWeighted(canvas, 1 / _FRACTION, first, 1 / _FRACTION, 0, dtype=cv2.CV_8U)
         else:
-            canvas += 1
-            noisy = cv2.addWeighted(canvas, 1 / _FRACTION, canvas, 0.0, 0, dtype=cv2.CV_8U)
+            first = np.ones_like(canvas)
+        noisy = cv2.addWeighted(canvas, 1 / _FRACTION, first, 1 / _FRACTION, 0, dtype=cv2.CV_8U)
         return np.asarray(noisy, dtype=np.uint8)
 
     def _draw(

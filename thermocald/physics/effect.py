@@ -456,5 +456,8 @@ class Proportional(Effect):
 
     def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
         channel = self.channel(history, **nonlinear)
+        matrix = history.temperature_matrix(channel)
+        if self.power == 1:
+            return matrix
         slope = self.power * (history.temperature(channel) - history.T0) ** (self.power - 1)
-        return history.temperature_matrix(channel).multiply(slope[:, None]).tocsr()
+        return matrix.multiply(slope[:, None]).tocsr()

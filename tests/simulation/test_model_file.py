@@ -10,9 +10,11 @@ import pytest
 
 from thermocald.errors import ConfigurationError
 from thermocald.files import dump_yaml
+from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.device import read_camera_device, read_programme
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import model_document, read_model, write_model
+from thermocald.physics.presets import given_simulation
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 
 
@@ -96,6 +98,14 @@ def test_camera_file(tmp_path):
     assert device.measuring.missed == 0.1
     assert device.look.blur_px == 1.1
     assert device.network.boundaries == ("ambient",)
+
+
+def test_a_camera_and_its_model_together_take_the_place_of_a_preset_s(tmp_path):
+    sensor = Sensor(1640, 1232, 0.00224)
+    write_model(tmp_path / "m.yaml", replace(full_model(), sensor=sensor))
+    camera = write(tmp_path / "c.yaml", CAMERA)
+    found = given_simulation("nexus5-cold", tmp_path / "m.yaml", camera, None, None)
+    assert found.model.sensor == found.device.sensor == sensor
 
 
 PROGRAMME = {

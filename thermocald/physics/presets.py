@@ -45,10 +45,12 @@ from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import RPI_INTERIOR, corner_field, corner_view, load_field
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.effect import Effect
 
 _EPOCHS = 150
 _INTERVAL_S = 10.0
@@ -202,24 +204,18 @@ def preset_simulation(
     return Simulation(model, device, test_field, programme, seed)
 
 
-def _effects(preset: Preset, way: Any, warming: float) -> list[ModelEffect]:
-    found = []
-    if preset.set_share:
-        x0, y0 = (float(v) for v in way * preset.set_share / warming)
-        stays = catalogue.find(lambda e: e.irreversible)
-        found.append(ModelEffect(stays.name, {"x0": x0, "y0": y0}))
-    a1, b1, b2 = preset.distortion_drift
-    if a1:
-        radial = catalogue.find(lambda e: e.usual == ("A1",))
-        found.append(ModelEffect(radial.name, {"A1": a1 / warming}))
-    if b1 or b2:
-        decentering = catalogue.find(lambda e: e.usual == ("B1", "B2"))
-        found.append(ModelEffect(decentering.name, {"B1": b1 / warming, "B2": b2 / warming}))
-    if preset.noise_ratio != 1.0:
-        noise = catalogue.seen_in("noise")
-        rise = (preset.noise_ratio - 1.0) / warming
-        found.append(ModelEffect(noise.name, dict.fromkeys(noise.linear, rise)))
-    return found
+def _effects(preset: Preset, way: Array, warming: float) -> list[ModelEffect]:
+    x0, y0 = (way * preset.set_share / warming).tolist()
+    a1, b1, b2 = (change / warming for change in preset.distortion_drift)
+    wanted: list[tuple[Callable[[Effect], bool], dict[str, float]]] = [
+        (lambda e: e.irreversible, {"x0": x0, "y0": y0}),
+        (lambda e: e.usual == ("A1",), {"A1": a1}),
+        (lambda e: e.usual == ("B1", "B2"), {"B1": b1, "B2": b2}),
+        (lambda e: e.seen_in == "noise", {"factor": (preset.noise_ratio - 1.0) / warming}),
+    ]
+    return [
+        ModelEffect(catalogue.find(one).name, sizes) for one, sizes in wanted if any(sizes.values())
+    ]
 
 
 def given_simulation(
@@ -236,22 +232,21 @@ def given_simulation(
     Raises UsageError where neither preset nor model and programme are given.
     """
     if preset is not None:
-        simulation = preset_simulation(preset, seed, series, field)
-        if camera is not None:
-            simulation = replace(simulation, device=read_camera_device(camera))
-        if programme is not None:
-            simulation = replace(simulation, programme=read_programme(programme))
-        if model is not None:
-            simulation = replace(simulation, model=read_model(model))
-        return simulation
+        usual = preset_simulation(preset, seed, series, field)
+        return replace(  # together: a model and a camera of one's own need not fit the preset's
+            usual,
+            device=usual.device if camera is None else read_camera_device(camera),
+            programme=usual.programme if programme is None else read_programme(programme),
+            model=usual.model if model is None else read_model(model),
+        )
     if model is None or programme is None:
         raise UsageError(
             f"give --preset ({', '.join(PRESETS)}), or --model and --programme "
             "(--camera and --testfield as well, where the usual ones do not fit)"
         )
     thermal = read_model(model)
-    usual = CameraDevice(thermal.camera, thermal.sensor)
-    device = usual if camera is None else read_camera_device(camera)
+    plain = CameraDevice(thermal.camera, thermal.sensor)
+    device = plain if camera is None else read_camera_device(camera)
     chosen = load_field("circles") if field is None else field
     return Simulation(thermal, device, chosen, read_programme(programme), seed)
 

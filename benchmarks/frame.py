@@ -26,8 +26,9 @@ from thermocald_drivers import support
 
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR, corner_field, draw, station
+from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.epoch.adjustment import Adjustment, adjust
-from thermocald.photogrammetry.frame.measurement import Prior, measure
+from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 
@@ -92,7 +93,7 @@ def main() -> int:
         images: Callable[[int], np.ndarray | EncodedImage], staged: bool = False
     ) -> Callable[[], object]:
         """One epoch after the other, of frames by number; staged: its parts are measured too."""
-        tracker = Tracker(field, Prior(PI_SENSOR, principal_distance=3.04))
+        tracker = Tracker(field, CameraSpec("", PI_SENSOR, 3.04))
         start = tracker.measure(images(0))
         assert start.orientation is not None
         o = start.orientation
@@ -140,7 +141,7 @@ def main() -> int:
         return lambda number: TimedImage(files[number])
 
     def from_nothing() -> Adjustment:
-        measured = measure(decode(), field, Prior(PI_SENSOR, principal_distance=3.04))
+        measured = measure(decode(), field, CameraSpec("", PI_SENSOR, 3.04))
         o = measured.orientation
         assert o is not None
         result = adjust(PI_SENSOR, field, measured.observations, o.camera.interior, o.exterior)

@@ -37,7 +37,6 @@ from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR, corner_field, draw
 from thermocald.analysis.thermal.gauge import plan_gauge
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.epoch.adjustment import adjust
-from thermocald.photogrammetry.frame.measurement import Prior
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 from thermocald.store.recording.head import Head
@@ -136,7 +135,7 @@ def tick_is_cheap(site: Site) -> bool:
     banks = [path.read_bytes() for path in site.frames]
     passed = True
     for encoded in (True, False):
-        tracker = Tracker(field, Prior(PI_SENSOR, principal_distance=3.04))
+        tracker = Tracker(field, CameraSpec("", PI_SENSOR, 3.04))
         o = tracker.measure(EncodedImage(fields[0])).orientation
         assert o is not None
         camera, exterior = o.camera.interior, o.exterior

@@ -58,7 +58,8 @@ if TYPE_CHECKING:
 
     from thermocald.hal import Reading
     from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.model import Prediction, ThermalModel
+    from thermocald.physics.effect import Prediction
+    from thermocald.physics.model import ThermalModel
     from thermocald.physics.scene import Scene
 
 Kind = Literal["timeout", "unplugged", "truncated", "wrong_size", "stuck"]

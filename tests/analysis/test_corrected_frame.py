@@ -17,9 +17,8 @@ from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.correction import FrameCorrector
 from thermocald.epoch import Epoch
 from thermocald.errors import ImageError
-from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation, project
+from thermocald.photogrammetry.camera.camera_model import CameraSpec, ExteriorOrientation, project
 from thermocald.photogrammetry.epoch.adjustment import failed
-from thermocald.photogrammetry.frame.measurement import Prior
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.physics.scene import Look, Scene
 from thermocald.physics.testfields import demonstration_field, demonstration_model
@@ -70,8 +69,8 @@ def test_targets_of_a_corrected_frame_are_where_its_camera_and_pose_put_them(the
     jpeg = corrected(thermal, png(hot))
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     steady = thermal.at(thermal.model.T0)
-    found = Tracker(FIELD, Prior(steady.sensor, steady.interior)).measure(image).observations
-    as_it_was = Tracker(FIELD, Prior(steady.sensor, steady.interior)).measure(hot).observations
+    known = CameraSpec("", steady.sensor, interior=steady.interior)
+    found, as_it_was = (Tracker(FIELD, known).measure(frame).observations for frame in (image, hot))
     told = json.loads(Image.open(io.BytesIO(jpeg)).info["comment"])
     pose = np.array([told["pose"][n] for n in ("omega", "phi", "kappa", "X0", "Y0", "Z0")])
     at = project(steady.sensor, steady.values, pose, FIELD.points)

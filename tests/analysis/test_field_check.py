@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,7 +40,7 @@ def _printed(paper, sheets=1, diameter=12.0):
 @pytest.mark.parametrize("exact", [True, False], ids=["image noise alone", "field uncertain too"])
 def test_predicted_are_the_standard_deviations_of_an_adjustment(exact):
     """`adjust` of one simulated image with the same stochastic model: its a-priori covariance."""
-    field = corner_field(sigma_mm=1e-9 if exact else 0.05)
+    field = replace(corner_field(), sigmas=np.full((147, 3), 1e-9 if exact else 0.05))
     station = usual_station(CAMERA, field)
     check = check_field(CAMERA, field, station, 0.04)
     rng = np.random.default_rng(0)
@@ -148,7 +150,7 @@ def test_empty_parts_and_unsurveyed_print_are_named():
 
 
 def test_small_targets_are_told_to_be_larger():
-    field = corner_field(size_mm=6.0)
+    field = replace(corner_field(), diameters=np.full(147, 6.0))
     check = check_field(CAMERA, field, usual_station(CAMERA, field))
     assert any("come nearer or print larger" in note for note in check.advice)
 

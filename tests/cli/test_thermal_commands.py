@@ -18,7 +18,7 @@ from thermocald.errors import ThermocaldError
 from thermocald.photogrammetry import camera_files
 from thermocald.photogrammetry.camera.camera_model import CameraModel, Sensor
 from thermocald.photogrammetry.camera_files import read_camera
-from thermocald.physics.device import CameraDevice, Programme, default_heat
+from thermocald.physics.device import CameraDevice, Programme
 from thermocald.physics.heat import Course
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.simulation import Simulation
@@ -32,8 +32,7 @@ def simulated(seed=1, effect=None, epochs=90, interval=20.0, series="M1", kind="
     model = demonstration_model(field)
     if effect is not None:
         model = model.with_effect(effect)
-    network, thermometers = default_heat()
-    device = CameraDevice(name, model.sensor, network, thermometers)
+    device = CameraDevice(name, model.sensor)
     lamp = Course.steps([0, 100, 900, 1e4], [0.0, 10.0, 0.0])
     board = Course.polygon([0, 350, 700, 1200, 1e4], [0.5, 3.0, 0.8, 4.0, 1.0])
     programme = Programme(

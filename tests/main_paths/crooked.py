@@ -169,10 +169,11 @@ def write(folder: Path, kind: str, seed: int, epochs: int = 70) -> dict[str, np.
 def write_frames(folder: Path, epochs: int, seed: int) -> dict[str, np.ndarray]:
     """A recording of JPEG frames (1640 × 1232) of bent planes of markers, surveyed to 2 µm."""
     rng = np.random.default_rng([seed, 99])
-    plane = corner_field("markers", per_side=4, sigma_mm=0.002)
+    plane = corner_field("markers", per_side=4)
     u, v, w = plane.points.T
     bend = np.column_stack([np.sin(v / 90) + w / 90, np.cos(w / 70), np.sin(u / 110) - v / 120])
-    field = replace(plane, points=plane.points + 1.5 * bend)
+    sigmas = np.full(plane.points.shape, 0.002)
+    field = replace(plane, points=plane.points + 1.5 * bend, sigmas=sigmas)
     sensor = Sensor(1640, 1232, 2 * PITCH)
     view = corner_view(field, 900.0).as_array()
     scene = Scene(sensor, field)

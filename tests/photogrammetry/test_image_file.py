@@ -10,7 +10,7 @@ import simplejpeg
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
 from thermocald.errors import ImageError
-from thermocald.photogrammetry.frame.measurement import Prior
+from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets import image_file
 from thermocald.photogrammetry.targets.image_file import EncodedImage, decode_grey, decode_parts
@@ -119,7 +119,7 @@ def test_tracked_centres_are_the_same_to_the_last_bit(frames, restart, monkeypat
     options = [cv2.IMWRITE_JPEG_RST_INTERVAL, restart] if restart else []
     encoded = [_cv2_jpeg(frame, *options) for frame in frames]
     field, _ = small_field()
-    parts, wholes = (Tracker(field, Prior(SMALL_SENSOR)) for _ in range(2))
+    parts, wholes = (Tracker(field, CameraSpec("", SMALL_SENSOR)) for _ in range(2))
     parts.measure(EncodedImage(encoded[0]))
     wholes.measure(_opencv(encoded[0]))
     monkeypatch.setattr(image_file.simplejpeg, "decode_jpeg", _forbidden(restart))

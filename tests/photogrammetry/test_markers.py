@@ -57,9 +57,7 @@ def _truth(exterior) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "view", ["oblique", *(pytest.param(v, marks=pytest.mark.slow) for v in VIEWS if v != "oblique")]
-)
+@pytest.mark.parametrize("view", VIEWS)
 def test_corners_scatter_as_stated(view):
     exterior = VIEWS[view]
     image = SCENE.render(SMALL_CAMERA, exterior)

@@ -55,13 +55,19 @@ def placed(rng: np.random.Generator, n: int = 6):
     return centres, field, Observations(np.arange(n), clicks, np.full((n, 2), CLICK))
 
 
+def prepared(seed: int, drawn: int | None = None):
+    """Random numbers, centres of crosses, clicks, templates of a noisy scene that shows them."""
+    rng = np.random.default_rng(seed)
+    centres, field, clicks = placed(rng)
+    still = scene(centres, STILL, seed if drawn is None else drawn)
+    return rng, centres, clicks, Templates(noisy(still, rng), field, clicks)
+
+
 @pytest.mark.slow
 def test_centres_of_crosses_are_better_than_the_clicks_and_have_true_sds():
     ratio, errors, clicked = [], [], []
     for seed in range(12):
-        rng = np.random.default_rng(seed)
-        centres, field, clicks = placed(rng)
-        made = Templates(noisy(scene(centres, STILL, seed), rng), field, clicks)
+        _, centres, clicks, made = prepared(seed)
         found = made.reference
         error = found.points - centres
         errors.append(error)
@@ -77,9 +83,7 @@ def test_patches_are_found_again_with_true_sds():
     """A camera that turns and zooms a little, in other light: error over sd from frame to frame."""
     ratio = []
     for seed in range(6):
-        rng = np.random.default_rng(50 + seed)
-        centres, field, clicks = placed(rng)
-        made = Templates(noisy(scene(centres, STILL, seed), rng), field, clicks)
+        rng, centres, _, made = prepared(50 + seed, seed)
         for k in range(1, 3):
             turn, zoom = 0.004 * k, 1 + 0.001 * k
             A = zoom * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -94,10 +98,8 @@ def test_patches_are_found_again_with_true_sds():
 
 
 def test_hidden_points_are_left_out_and_the_dark_gives_none():
-    rng = np.random.default_rng(4)
-    centres, field, clicks = placed(rng)
+    rng, centres, _, made = prepared(4)
     clear = scene(centres, STILL, 4)
-    made = Templates(noisy(clear, rng), field, clicks)
     hidden = clear.copy()
     x, y = np.round(centres[2]).astype(int)
     hidden[y - 25 : y + 25, x - 25 : x + 25] = 120  # a cow
@@ -112,9 +114,7 @@ def test_hidden_points_are_left_out_and_the_dark_gives_none():
 
 
 def test_another_scene_is_not_taken_for_it():
-    rng = np.random.default_rng(6)
-    centres, field, clicks = placed(rng)
-    made = Templates(noisy(scene(centres, STILL, 6), rng), field, clicks)
+    rng, _, _, made = prepared(6)
     found = made.measure(noisy(scene(np.zeros((0, 2)), STILL, 7), rng))
     assert found.status.word == "too_few"
     assert len(found.observations) == 0

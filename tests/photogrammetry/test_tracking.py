@@ -7,9 +7,8 @@ import pytest
 
 from tests.photogrammetry.exact_rendering import noisy
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
-from thermocald.photogrammetry.camera.camera_model import CameraModel
+from thermocald.photogrammetry.camera.camera_model import CameraModel, CameraSpec
 from thermocald.photogrammetry.frame import tracking
-from thermocald.photogrammetry.frame.measurement import Prior
 from thermocald.photogrammetry.frame.tracking import Tracker
 
 FIELD, NORMALS = small_field()
@@ -40,7 +39,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def tracker(clean, rng) -> Tracker:
     """A tracker that has seen the first frame."""
-    tracker = Tracker(FIELD, Prior(SMALL_SENSOR))
+    tracker = Tracker(FIELD, CameraSpec("", SMALL_SENSOR))
     first = tracker.measure(noisy(clean, rng))
     assert first.status.ok
     assert first.searched
@@ -92,10 +91,11 @@ def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
 
 
 def test_weights_are_renewed_when_targets_have_moved(tracker, rng, no_search):
-    assert tracker.measure(noisy(_render(_shifted(0.08)), rng)).renewed == 0
-    image = _render(_shifted(0.4))
-    assert tracker.measure(noisy(image, rng)).renewed > 50
-    assert tracker.measure(noisy(image, rng)).renewed == 0
+    weights = []
+    for px in (0.0, 0.08, 0.4, 0.4):
+        tracker.measure(noisy(_render(_shifted(px)), rng))
+        weights.append(tracker._circles[1])
+    assert weights[0] is weights[1] is not weights[2] is weights[3]
 
 
 def test_light_and_noise_may_change(tracker, clean, rng, no_search):

@@ -10,9 +10,11 @@ import pytest
 
 from thermocald.errors import ConfigurationError
 from thermocald.files import dump_yaml
+from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.physics.device import read_camera_device, read_programme
 from thermocald.physics.model import ModelEffect
-from thermocald.physics.model_file import model_document, parse_model, read_model, write_model
+from thermocald.physics.model_file import model_document, read_model, write_model
+from thermocald.physics.presets import given_simulation
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 
 
@@ -51,38 +53,6 @@ def change(document, path, value):
         del document[last]
     else:
         document[last] = value
-
-
-BAD = [
-    (("format",), "thermocald-model/9", "this program reads 'thermocald-model/1'"),
-    (("effects", 0, "effect"), "thermal_leg", "did you mean 'thermal_lag'"),
-    (("effects", 0, "parameters"), {}, "'tau' .s. is missing"),
-    (("effects", 0, "parameters", "tau", "unit"), "min", "'min'; it must be 's'"),
-    (("effects", 0, "parameters", "tau", "value"), -5.0, "negative"),
-    (("effects", 0, "parameters", "tau", "value"), float("nan"), "not a finite number"),
-    (("effects", 0, "parameters", "tua"), 5.0, "did you mean 'tau'"),
-    (("rates", "x0", "unit"), "px/K", "it must be 'mm/K'"),
-    (("rates", "A1"), 1e-5, "unknown"),
-    (("rates", "x0", "sd"), -1e-5, "not negative"),
-    (("interior", "c"), None, "interior.c: is missing"),
-    (("camera", "width"), 3280.5, "whole number"),
-    (("camera", "pixel_pitch"), 1.12, "thousandths of a mm"),
-    (("reference_temperature",), {"value": 298.0, "unit": "K"}, "'K'; it must be 'degC'"),
-    (("exterior", "Z0"), None, "exterior.Z0: is missing"),
-    (("covariance", "matrix"), [[1.0]], "2 × 2"),
-    (("covariance", "matrix"), [[1.0, 2.0], [0.0, 1.0]], "not symmetric"),
-    (("validity", "temperature"), [50.0, 20.0], "begins at 50"),
-    (("efects",), [], "did you mean 'effects'"),
-]
-
-
-@pytest.mark.parametrize(("path", "value", "says"), BAD, ids=[str(b[0]) + b[2][:9] for b in BAD])
-def test_bad_models(path, value, says):
-    document = model_document(full_model())
-    change(document, path, value)
-    with pytest.raises(ConfigurationError, match=says) as error:
-        parse_model(document, "m.yaml")
-    assert "m.yaml" in str(error.value)
 
 
 def test_missing_and_broken_files(tmp_path):
@@ -130,26 +100,12 @@ def test_camera_file(tmp_path):
     assert device.network.boundaries == ("ambient",)
 
 
-@pytest.mark.parametrize(
-    ("path", "value", "says"),
-    [
-        (("heat", "bodies", "lens", "capacity"), -2.0, "-2 J/K; it must be above 0"),
-        (("heat", "links", 0, "conductance"), 0.0, "0 W/K; it must be above 0"),
-        (("heat", "links", 0, "between"), ["lens"], "must be .one, other."),
-        (("heat", "links", 0, "between"), ["lens", "board", "air"], "must be .one, other."),
-        (("thermometers", "temperature", "body"), "lans", "is 'lans'; bodies are lens, board"),
-        (("thermometers", "air", "missing"), 1.0, "share below 1"),
-        (("measuring", "sigma"), 0.0, "above 0"),
-        (("look", "paper"), 300, "at most 255"),
-        (("pixel_pitch",), {"value": 2.24, "unit": "um"}, "'um'; it must be 'mm'"),
-        (("width",), None, "width: is missing"),
-    ],
-)
-def test_bad_cameras(tmp_path, path, value, says):
-    document = copy.deepcopy(CAMERA)
-    change(document, path, value)
-    with pytest.raises(ConfigurationError, match=says):
-        read_camera_device(write(tmp_path / "c.yaml", document))
+def test_a_camera_and_its_model_together_take_the_place_of_a_preset_s(tmp_path):
+    sensor = Sensor(1640, 1232, 0.00224)
+    write_model(tmp_path / "m.yaml", replace(full_model(), sensor=sensor))
+    camera = write(tmp_path / "c.yaml", CAMERA)
+    found = given_simulation("nexus5-cold", tmp_path / "m.yaml", camera, None, None)
+    assert found.model.sensor == found.device.sensor == sensor
 
 
 PROGRAMME = {
@@ -176,9 +132,41 @@ def test_programme_file(tmp_path):
     assert programme.duration == 990.0
 
 
-@pytest.mark.parametrize(
-    ("path", "value", "says"),
-    [
+BAD = {
+    "model": [
+        (("format",), "thermocald-model/9", "this program reads 'thermocald-model/1'"),
+        (("effects", 0, "effect"), "thermal_leg", "did you mean 'thermal_lag'"),
+        (("effects", 0, "parameters"), {}, "'tau' .s. is missing"),
+        (("effects", 0, "parameters", "tau", "unit"), "min", "'min'; it must be 's'"),
+        (("effects", 0, "parameters", "tau", "value"), -5.0, "negative"),
+        (("effects", 0, "parameters", "tau", "value"), float("nan"), "not a finite number"),
+        (("effects", 0, "parameters", "tua"), 5.0, "did you mean 'tau'"),
+        (("rates", "x0", "unit"), "px/K", "it must be 'mm/K'"),
+        (("rates", "A1"), 1e-5, "unknown"),
+        (("rates", "x0", "sd"), -1e-5, "not negative"),
+        (("interior", "c"), None, "interior.c: is missing"),
+        (("camera", "width"), 3280.5, "whole number"),
+        (("camera", "pixel_pitch"), 1.12, "thousandths of a mm"),
+        (("reference_temperature",), {"value": 298.0, "unit": "K"}, "'K'; it must be 'degC'"),
+        (("exterior", "Z0"), None, "exterior.Z0: is missing"),
+        (("covariance", "matrix"), [[1.0]], "2 × 2"),
+        (("covariance", "matrix"), [[1.0, 2.0], [0.0, 1.0]], "not symmetric"),
+        (("validity", "temperature"), [50.0, 20.0], "begins at 50"),
+        (("efects",), [], "did you mean 'effects'"),
+    ],
+    "camera": [
+        (("heat", "bodies", "lens", "capacity"), -2.0, "-2 J/K; it must be above 0"),
+        (("heat", "links", 0, "conductance"), 0.0, "0 W/K; it must be above 0"),
+        (("heat", "links", 0, "between"), ["lens"], "must be .one, other."),
+        (("heat", "links", 0, "between"), ["lens", "board", "air"], "must be .one, other."),
+        (("thermometers", "temperature", "body"), "lans", "is 'lans'; bodies are lens, board"),
+        (("thermometers", "air", "missing"), 1.0, "share below 1"),
+        (("measuring", "sigma"), 0.0, "above 0"),
+        (("look", "paper"), 300, "at most 255"),
+        (("pixel_pitch",), {"value": 2.24, "unit": "um"}, "'um'; it must be 'mm'"),
+        (("width",), None, "width: is missing"),
+    ],
+    "programme": [
         (("sources", "lens", 1, "from"), 130, "ends at 100 s: a gap"),
         (("sources", "lens", 1, "from"), 90, "ends at 100 s: an overlap"),
         (("sources", "lens", 2, "to"), 800, "covers 0 to 800 s; the programme lasts from 0 to 990"),
@@ -190,12 +178,24 @@ def test_programme_file(tmp_path):
         (("interval",), -1, "above 0"),
         (("sources", "lens", 0, "value"), "bright", "not a finite number"),
     ],
+}
+FILES = {
+    "model": (read_model, model_document(full_model())),
+    "camera": (read_camera_device, CAMERA),
+    "programme": (read_programme, PROGRAMME),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "path", "value", "says"), [(kind, *row) for kind, rows in BAD.items() for row in rows]
 )
-def test_bad_programmes(tmp_path, path, value, says):
-    document = copy.deepcopy(PROGRAMME)
+def test_a_file_that_is_wrong_is_named_with_its_key(tmp_path, kind, path, value, says):
+    read, right = FILES[kind]
+    document = copy.deepcopy(right)
     change(document, path, value)
-    with pytest.raises(ConfigurationError, match=says):
-        read_programme(write(tmp_path / "p.yaml", document))
+    with pytest.raises(ConfigurationError, match=says) as error:
+        read(write(tmp_path / "m.yaml", document))
+    assert "m.yaml" in str(error.value) or "csv" in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from thermocald.errors import ConfigurationError, GeometryError
 from thermocald.photogrammetry.camera.camera_model import Sensor
-from thermocald.physics.device import CameraDevice, Measuring, Programme, default_heat
+from thermocald.physics.device import CameraDevice, Measuring, Programme
 from thermocald.physics.heat import Course, SimulatedThermometer
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.simulation import Simulation
@@ -22,8 +22,7 @@ def simulation(epochs=180, seed=1, effects=(), measuring=None, field=None, **cha
     model = demonstration_model(test_field)
     for effect in effects:
         model = model.with_effect(effect)
-    network, thermometers = default_heat()
-    device = CameraDevice("rpi", model.sensor, network, thermometers)
+    device = CameraDevice("rpi", model.sensor)
     if measuring:
         device = replace(device, measuring=measuring)
     programme = Programme(

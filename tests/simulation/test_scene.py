@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from thermocald.photogrammetry.camera.camera_model import (
+    CameraSpec,
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
@@ -168,7 +169,7 @@ def test_portable_arithmetic_is_right():
         np.testing.assert_allclose(k, expected / expected.sum(), rtol=1e-11)
     field = corner_field("plain", 3, 200.0)
     iop = np.array([3.04, 0.01, -0.02, -0.004, 5e-4, 1e-5, 1e-4, -2e-4, 3e-4, -2e-4])
-    eop = corner_view(field, 1200.0, roll_deg=13.0).as_array()
+    eop = corner_view(field, 1200.0).with_values(kappa=0.4).as_array()
     np.testing.assert_allclose(
         portable.project(SENSOR, iop, eop, field.points),
         project(SENSOR, iop, eop, field.points),
@@ -179,13 +180,13 @@ def test_portable_arithmetic_is_right():
 
 def test_a_coded_field_is_measured_from_nothing():
     """Drawn the way it is read: found by ring codes, measured with the true centres' sigmas."""
-    from thermocald.photogrammetry.frame.measurement import Prior, measure
+    from thermocald.photogrammetry.frame.measurement import measure
 
     field = demonstration_field("circles")
     model = demonstration_model(field)
     iop, eop = model.interior.as_array(), model.exterior.as_array()
     image = Scene(SENSOR, field).render(iop, eop, seed=3)
-    found = measure(image, field, Prior(SENSOR, principal_distance=3.04))
+    found = measure(image, field, CameraSpec("", SENSOR, 3.04))
     assert found.status.ok, found.status
     seen = found.observations
     assert len(seen) >= 140

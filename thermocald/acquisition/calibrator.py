@@ -16,6 +16,7 @@ import numpy as np
 
 from thermocald.errors import ImageError
 from thermocald.parallel import in_order
+from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.epoch.adjustment import (
     Adjustment,
     AdjustmentSettings,
@@ -24,7 +25,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
     failed,
     pose_only,
 )
-from thermocald.photogrammetry.frame.measurement import Prior, frame_figures
+from thermocald.photogrammetry.frame.measurement import frame_figures
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets.image_file import EncodedImage
 
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.camera.camera_model import (
-        CameraSpec,
         InteriorOrientation,
         Sensor,
     )
@@ -95,9 +95,7 @@ class Calibrator:
         self._nominal_c = nominal_c
         self._interior = interior
         self._floor = sigma_floor_px
-        self._tracker = Tracker(
-            testfield, Prior(sensor, interior=interior, principal_distance=nominal_c)
-        )
+        self._tracker = Tracker(testfield, CameraSpec("", sensor, nominal_c, interior))
         self._last: Adjustment | None = None
         self._usual = float("nan")
 

@@ -33,24 +33,17 @@ def median_known(values: Array) -> Array:
         return np.asarray(np.nanmedian(values, axis=0))
 
 
-def diagonal_scale(N: Array) -> Array:
-    """Factors (..., p) that scale matrices (..., p, p) to a unit diagonal; 1 where that is ≤ 0."""
-    diagonal = np.diagonal(N, axis1=-2, axis2=-1)
-    scale: Array = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    return scale
-
-
 def unit_diagonal(N: Array, ridge: float = 0.0) -> tuple[Array, Array]:
     """Scale matrices (..., p, p) to a unit diagonal; return them and the factors (..., p).
 
     ridge: added to the unit diagonal, so that undetermined unknowns stay near 0; an unknown without
     any weight then has weight 1.
     """
-    scale = diagonal_scale(N)
+    diagonal = np.diagonal(N, axis1=-2, axis2=-1)
+    scale: Array = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = N * scale[..., :, None] * scale[..., None, :]
     if ridge:
-        empty = np.diagonal(N, axis1=-2, axis2=-1) <= 0
-        np.einsum("...ii->...i", scaled)[...] += ridge + empty
+        np.einsum("...ii->...i", scaled)[...] += ridge + (diagonal <= 0)
     return scaled, scale
 
 
@@ -117,7 +110,7 @@ def inverse_of_determined(N: Array) -> Array:
     """Inverse of one matrix, restricted to the combinations of unknowns that it determines."""
     if len(N) == 0:
         return N
-    scale = diagonal_scale(N)
+    scale = unit_diagonal(N)[1]
     both = np.outer(scale, scale)
     try:
         factor = np.linalg.cholesky(N * both).astype(np.float64, copy=False)

@@ -308,13 +308,12 @@ def _quick_start(
     best = None
     for candidate in candidates:
         try:
-            solutions = resection(sensor, candidate, X, uv)
-        except (GeometryError, cv2.error):
+            rms, pose = resection(sensor, candidate, X, uv)[0]
+        except (GeometryError, cv2.error, IndexError):
             continue
-        for rms, pose in solutions[:1]:
-            if best is None or rms < best[0]:
-                best = (rms, candidate, pose)
-        if best is not None and best[0] < _GOOD_START * sensor.width:
+        if best is None or rms < best[0]:
+            best = (rms, candidate, pose)
+        if best[0] < _GOOD_START * sensor.width:
             break
     return None if best is None else best[1:]
 

@@ -11,6 +11,7 @@ this one chain, forward and as the matrix that carries the readings' errors thro
 
 from __future__ import annotations
 
+from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import entry_points
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.errors import ConfigurationError
 from thermocald.physics.effect import Effect
-from thermocald.physics.formula import formula_effect, is_formula
+from thermocald.physics.formula import OfFormula, is_formula
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -55,7 +56,7 @@ def get(name: str) -> Effect:
     ConfigurationError where there is none, or where it is not one.
     """
     if is_formula(name):
-        return formula_effect(name)
+        return OfFormula(name)
     if name not in names():
         near = get_close_matches(name, names(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"known are: {', '.join(names())}"
@@ -89,8 +90,8 @@ def seen_in(place: str) -> Effect:
 def driven_history(history: History, drives: Drives) -> History:
     """Send the readings of a history's reference through drives [(effect, values)]."""
     for name, values in drives:
-        at_readings = history.at(history.reading_times)
-        history = history.with_reference(get(name).drive(at_readings, **values))
+        driven = get(name).drive(history.at(history.reading_times), **values)
+        history = replace(history, readings={**history.readings, history.reference: driven})
     return history
 
 
@@ -109,15 +110,10 @@ def drive_matrix(history: History, drives: Drives, at_readings: bool = False) ->
     drive.
     """
     chain: csr_array | None = None
-    for name, values in drives if at_readings else drives[:-1]:
-        here = history.at(history.reading_times)
+    for number, (name, values) in enumerate(drives, start=1):
+        here = driven_history(history, drives[: number - 1])
+        if at_readings or number < len(drives):
+            here = here.at(history.reading_times)
         own = get(name).sensitivity(here, **values)
         chain = own if chain is None else own @ chain
-        history = history.with_reference(get(name).drive(here, **values))
-    if at_readings:
-        return chain
-    if not drives:
-        return history.temperature_matrix()
-    name, values = drives[-1]
-    last = get(name).sensitivity(history, **values)
-    return last if chain is None else last @ chain
+    return chain if drives or at_readings else history.temperature_matrix()

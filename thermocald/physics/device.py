@@ -49,13 +49,11 @@ from thermocald.physics.effect import PARAMETER_UNITS
 from thermocald.physics.heat import (
     Course,
     HeatNetwork,
-    Link,
     SimulatedThermometer,
     read_course,
     read_network,
     read_thermometer,
 )
-from thermocald.physics.model_file import read_sensor
 from thermocald.physics.scene import Look
 
 if TYPE_CHECKING:
@@ -84,7 +82,7 @@ class Programme:
     reading_offset: float = 0.0
     reading_spread: float = 1.0
     begin: float = 1_600_000_000.0
-    initial: float | Mapping[str, float] | None = None
+    initial: float | None = None
 
     @property
     def duration(self) -> float:
@@ -153,14 +151,36 @@ class Measuring:
     gross_size: float = 3.0
 
 
+USUAL_NETWORK = HeatNetwork(
+    {"sensor": 1.0, "lens": 1.5, "board": 40.0, "housing": 60.0, "test_field": 2000.0},
+    (
+        ("sensor", "lens", 0.05),
+        ("sensor", "board", 0.05),
+        ("lens", "housing", 0.02),
+        ("board", "housing", 0.25),
+        ("housing", "ambient", 0.4),
+        ("test_field", "ambient", 5.0),
+    ),
+)
+"""A camera module on a board in a housing before a test field: of the order of a Raspberry Pi in a
+plastic case, whose module warms with a time constant of a few minutes.
+"""
+USUAL_THERMOMETERS: Mapping[str, SimulatedThermometer] = {
+    "temperature": SimulatedThermometer("lens"),
+    "board_temperature": SimulatedThermometer("board"),
+}
+
+
 @dataclass(frozen=True)
 class CameraDevice:
     """A camera in its set-up, as the camera file describes it."""
 
     name: str
     sensor: Sensor
-    network: HeatNetwork
-    thermometers: Mapping[str, SimulatedThermometer]
+    network: HeatNetwork = USUAL_NETWORK
+    thermometers: Mapping[str, SimulatedThermometer] = field(
+        default_factory=lambda: USUAL_THERMOMETERS
+    )
     exterior: ExteriorOrientation | None = None
     distance: float = 1300.0
     measuring: Measuring = field(default_factory=Measuring)
@@ -172,32 +192,6 @@ class CameraDevice:
         return next(iter(self.thermometers))
 
 
-USUAL_THERMOMETERS: Mapping[str, SimulatedThermometer] = {
-    "temperature": SimulatedThermometer("lens"),
-    "board_temperature": SimulatedThermometer("board"),
-}
-
-
-def default_heat() -> tuple[HeatNetwork, dict[str, SimulatedThermometer]]:
-    """Return a camera module on a board in a housing before a test field, and two thermometers.
-
-    Capacities and conductances are of the order of a Raspberry Pi in a plastic case: the module
-    warms with a time constant of a few minutes.
-    """
-    network = HeatNetwork(
-        {"sensor": 1.0, "lens": 1.5, "board": 40.0, "housing": 60.0, "test_field": 2000.0},
-        (
-            Link("sensor", "lens", 0.05),
-            Link("sensor", "board", 0.05),
-            Link("lens", "housing", 0.02),
-            Link("board", "housing", 0.25),
-            Link("housing", "ambient", 0.4),
-            Link("test_field", "ambient", 5.0),
-        ),
-    )
-    return network, dict(USUAL_THERMOMETERS)
-
-
 def read_camera_device(path: Path) -> CameraDevice:
     """Read a camera file; ConfigurationError names file and key."""
     document = read_yaml(path)
@@ -207,7 +201,7 @@ def read_camera_device(path: Path) -> CameraDevice:
         ("format", "name", "width", "height", "pixel_pitch", "exterior", "distance", "measuring",
          "look", "heat", "thermometers")
     )  # fmt: skip
-    network, thermometers = default_heat()
+    network, thermometers = USUAL_NETWORK, USUAL_THERMOMETERS
     if document.get("heat") is not None:
         network = read_network(top.inner("heat"))
     if document.get("thermometers") is not None:
@@ -227,7 +221,7 @@ def read_camera_device(path: Path) -> CameraDevice:
     usual, seen = Measuring(), Look()
     return CameraDevice(
         top.text("name", "camera"),
-        read_sensor(top),
+        Sensor.read(top),
         network,
         thermometers,
         ExteriorOrientation(*(where.number(n, PARAMETER_UNITS[n]) for n in EOP_NAMES))

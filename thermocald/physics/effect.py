@@ -17,9 +17,8 @@ are linear: for a `signal` they bear the names of the parameters they act on.
 
 from __future__ import annotations
 
-from abc import ABC
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -41,21 +40,15 @@ if TYPE_CHECKING:
     Estimates = Mapping[str, Mapping[str, Any]]  # {parameter: {value, sd, unit}}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Displacement:
-    """Some targets have moved: rows (k,) of the test field, vector (3,) mm, active (E,) when."""
+@dataclass(slots=True, eq=False)
+class Prediction:
+    """What a model says of E times; its effects add their influence to it one after the other.
 
-    rows: NDArray[np.int64]
-    vector: Array
-    active: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Influence:
-    """What an effect changes at E times.
-
-    iop (E, 10), eop (E, 6): added, in the order of IOP_NAMES and EOP_NAMES; scale (E, 3): factors
-    of the object coordinates; displacements: of single targets; noise_factor, blur_factor (E,).
+    iop (E, 10), eop (E, 6): orientations, in the order of IOP_NAMES and EOP_NAMES (eop is what
+    effects add where the model has no exterior orientation); scale (E, 3): factors of the object
+    coordinates; noise_factor, blur_factor (E,); displacements: of some targets, their rows (k,) of
+    the test field, vector (3,) mm, and when (E,); drive (E,) °C: the temperature behind the linear
+    terms; field: where it is known what stands before the camera.
     """
 
     iop: Array
@@ -63,35 +56,36 @@ class Influence:
     scale: Array
     noise_factor: Array
     blur_factor: Array
-    displacements: tuple[Displacement, ...]
+    drive: Array
+    displacements: list[tuple[NDArray[np.int64], Array, NDArray[np.bool_]]]
+    field: TestField | None
 
     @classmethod
-    def none(cls, epochs: int) -> Influence:
-        """Return an influence that changes nothing."""
-        one = np.ones(epochs)
-        return Influence(
-            np.zeros((epochs, 10)), np.zeros((epochs, 6)), np.ones((epochs, 3)), one, one, ()
-        )
+    def none(cls, epochs: int, field: TestField | None = None) -> Prediction:
+        """Return a prediction without any influence."""
+        one, (iop, eop) = np.ones, (np.zeros((epochs, n)) for n in (10, 6))
+        factors = one((epochs, 3)), one(epochs), one(epochs)
+        return cls(iop, eop, *factors, np.zeros(epochs), [], field)
 
-    def __add__(self, other: Influence) -> Influence:
-        """Add another influence."""
-        return Influence(
-            self.iop + other.iop,
-            self.eop + other.eop,
-            self.scale * other.scale,
-            self.noise_factor * other.noise_factor,
-            self.blur_factor * other.blur_factor,
-            self.displacements + other.displacements,
-        )
+    @property
+    def moves_points(self) -> bool:
+        """Whether object points are anywhere else than in the test field's file."""
+        return bool(self.displacements) or bool(np.any(self.scale != 1.0))
+
+    def points(self, points: Array, epochs: slice = slice(None)) -> Array:
+        """Move object points (n, 3) mm to where they are at some of the epochs, (e, n, 3)."""
+        moved = points[None, :, :] * self.scale[epochs][:, None, :]
+        for rows, vector, active in self.displacements:
+            moved[:, rows, :] += active[epochs].astype(float)[:, None, None] * vector
+        return moved
 
 
 Role = Literal["", "period", "phase", "event", "delay", "time_constant", "threshold", "width"]
 
 # Units of IOP and EOP as the files write them (CONVENTIONS §2).
-PARAMETER_UNITS: dict[str, str] = {
-    "c": "mm", "x0": "mm", "y0": "mm", "A1": "mm-2", "A2": "mm-4", "A3": "mm-6",
-    "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1",
-    "omega": "rad", "phi": "rad", "kappa": "rad", "X0": "mm", "Y0": "mm", "Z0": "mm",
+PARAMETER_UNITS = dict.fromkeys(PARAMETER_NAMES, "mm") | {
+    "A1": "mm-2", "A2": "mm-4", "A3": "mm-6", "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1",
+    "omega": "rad", "phi": "rad", "kappa": "rad",
 }  # fmt: skip
 
 # Experiments that separate two effects; each effect states how it responds to some of them.
@@ -185,13 +179,14 @@ class Steady:
     knee_name: str = ""
 
 
-class Effect(ABC):
+class Effect:
     """One physical cause. Subclasses are stateless; their docstrings state the formula.
 
-    name: as in the catalogue; noun: for sentences; nonlinear: searched parameters; linear:
-    {coefficient: unit}; usual: the coefficients that act unless told otherwise; fresh: non-linear
-    parameters that belong to one series and do not carry over to another; optional: non-linear
-    parameters that a model may leave out; behaviour: answers to EXPERIMENTS.
+    name: as in the catalogue; noun: for sentences; says: a sentence with its estimates in braces;
+    nonlinear: searched parameters; linear: {coefficient: unit}; usual: the coefficients that act
+    unless told otherwise; fresh: non-linear parameters that belong to one series and do not carry
+    over to another; optional: non-linear parameters that a model may leave out; behaviour: answers
+    to EXPERIMENTS.
 
     For a search: seen_in: the trajectories of the camera's parameters, the measuring noise, or
     single targets; parameter_sets: the sets of coefficients that it may act on, by default the
@@ -203,23 +198,24 @@ class Effect(ABC):
     a live camera need not keep the others.
     """
 
-    name: ClassVar[str]
-    noun: ClassVar[str]
-    kind: ClassVar[Kind] = "signal"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {}
-    linear: ClassVar[Mapping[str, str]] = {}
-    usual: ClassVar[tuple[str, ...]] = ()
-    fresh: ClassVar[tuple[str, ...]] = ()
-    optional: ClassVar[tuple[str, ...]] = ()
-    behaviour: ClassVar[Mapping[str, str]] = {}
-    seen_in: ClassVar[SeenIn] = "trajectory"
-    parameter_sets: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    moves_mount: ClassVar[bool] = False
-    irreversible: ClassVar[bool] = False
-    follows_rate: ClassVar[bool] = False
-    columns: ClassVar[Mapping[str, str]] = {}
-    steady_signal: ClassVar[Steady | None] = None
-    of_now: ClassVar[bool] = False
+    name: str
+    noun: str
+    says: str = ""
+    kind: Kind = "signal"
+    nonlinear: Mapping[str, Parameter] = {}
+    linear: Mapping[str, str] = {}
+    usual: tuple[str, ...] = ()
+    fresh: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+    behaviour: Mapping[str, str] = {}
+    seen_in: SeenIn = "trajectory"
+    parameter_sets: tuple[tuple[str, ...], ...] = ()
+    moves_mount: bool = False
+    irreversible: bool = False
+    follows_rate: bool = False
+    columns: Mapping[str, str] = {}
+    steady_signal: Steady | None = None
+    of_now: bool = False
 
     def follower(self, values: Values) -> Follower | None:  # noqa: ARG002
         """The drive with its state, for readings one by one; None where it needs them all."""
@@ -289,7 +285,7 @@ class Effect(ABC):
         """Return the same for every further column that it reads, {channel: (E, R)}."""
         return {}
 
-    def unresolved(self, history: History, rate_jump: Array | None = None, **_: Any) -> Array:  # noqa: ARG002
+    def unresolved(self, history: History, rate_jump: Array, **_: Any) -> Array:  # noqa: ARG002
         """Return the sd (E,) of drive or first signal that the times of the readings leave.
 
         What happens between two readings, or after the last, no reading tells; their noise is not
@@ -328,30 +324,14 @@ class Effect(ABC):
         searched = {k: values[k] for k in self.nonlinear if k in values}
         return searched, {k: float(values[k]) for k in self.linear if k in values}
 
-    def influence(
-        self,
-        history: History,
-        values: Values,
-        field: TestField | None = None,  # noqa: ARG002
-    ) -> Influence:
-        """Return what it changes at the history's times; a drive changes nothing by itself."""
-        found = Influence.none(len(history.times))
-        if self.kind == "image":
-            return replace(found, **self.image_changes(history, values))
+    def influence(self, history: History, values: Values, found: Prediction) -> None:
+        """Add what it changes at the history's times; a drive changes nothing by itself."""
         searched, coefficients = self.split(values)
         if self.kind == "signal" and any(coefficients.values()):
             course = self.signal(history, **searched)
             for name in coefficients:
-                change = course @ self.weights(values, name)
-                if name in IOP_NAMES:
-                    found.iop[:, IOP_NAMES.index(name)] += change
-                else:
-                    found.eop[:, EOP_NAMES.index(name)] += change
-        return found
-
-    def image_changes(self, history: History, values: Values) -> dict[str, Any]:  # noqa: ARG002
-        """Return what an `image` effect without need of a test field changes of an `Influence`."""
-        return {}
+                names, to = (IOP_NAMES, found.iop) if name in IOP_NAMES else (EOP_NAMES, found.eop)
+                to[:, names.index(name)] += course @ self.weights(values, name)
 
     def units(self) -> dict[str, str]:
         """Return the unit of every parameter by its name."""
@@ -388,7 +368,14 @@ class Effect(ABC):
 
     def sentence(self, estimates: Estimates) -> str:
         """Write one sentence for a report; estimates: {parameter: {value, sd, unit}}."""
-        numbers = ", ".join(f"{name} = {say_estimate(e)}" for name, e in estimates.items())
+        said = {}
+        for name, estimate in estimates.items():
+            value = estimate["value"]
+            names = [value] if isinstance(value, str) else value
+            said[name] = ", ".join(names) if isinstance(names, list) else say_estimate(estimate)
+        if self.says:
+            return self.says.format_map(said)
+        numbers = ", ".join(f"{name} = {value}" for name, value in said.items())
         return f"{self.noun}{': ' if numbers else ''}{numbers}"
 
     def experiment_against(self, other: Effect) -> str:
@@ -407,18 +394,20 @@ class Effect(ABC):
         return f"record longer and under another programme than now ({self.noun}, {other.noun})"
 
 
-class Remembering(Effect):
-    """An effect that sends the reference temperature through an operator with memory.
+class Operated(Effect):
+    """An effect that sends the reference temperature through an operator.
 
     operator: its key in `operators.OPERATORS`; its constants are the effect's parameters.
     """
 
-    operator: ClassVar[str]
+    operator: str
 
     def _arguments(self, history: History, values: Values) -> tuple[Any, ...]:
-        """Return what the operator takes: knots, their values, its constants, times."""
-        p = history.polygon()
+        """Return what the operator takes: values, or a polygon and times; and its constants."""
         constants = [values.get(name, c.default) for name, c in self.nonlinear.items()]
+        if not OPERATORS[self.operator].remembers:
+            return history.temperature(), *constants
+        p = history.polygon()
         return p.times, p.values, *constants, history.times
 
     def drive(self, history: History, **nonlinear: Any) -> Array:
@@ -428,15 +417,18 @@ class Remembering(Effect):
         return self.drive(history, **nonlinear)[:, None]
 
     def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
-        matrix: csr_array = OPERATORS[self.operator].derivatives(
-            *self._arguments(history, nonlinear)
-        )
-        return matrix @ history.polygon().matrix
+        kind = OPERATORS[self.operator]
+        found = kind.derivatives(*self._arguments(history, nonlinear))
+        if not kind.remembers:
+            return history.temperature_matrix().multiply(found[0][:, None]).tocsr()
+        matrix: csr_array = found @ history.polygon().matrix
+        return matrix
 
 
 class OfTime(Effect):
     """An effect that knows the time alone: the thermometer's error does not reach it."""
 
+    usual: tuple[str, ...] = IOP_NAMES[:3]
     of_now = True
     steady_signal = Steady()
 
@@ -447,17 +439,25 @@ class OfTime(Effect):
 
 
 class Proportional(Effect):
-    """An effect whose signal is T - T₀, at once."""
+    """An effect whose signal is a power of T - T₀, at once; T is that of its `channel`."""
 
+    power: int = 1
+    usual: tuple[str, ...] = IOP_NAMES[:3]
     of_now = True
     steady_signal = Steady((0.0, 1.0, 0.0))
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "does not move while the temperature stands",
         "cycle": "runs along the same line up and down",
     }
 
-    def signal(self, history: History, **_: Any) -> Array:
-        return (history.temperature() - history.T0)[:, None]
+    def signal(self, history: History, **nonlinear: Any) -> Array:
+        T = history.temperature(self.channel(history, **nonlinear))
+        return ((T - history.T0) ** self.power)[:, None]
 
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        return history.temperature_matrix()
+    def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
+        channel = self.channel(history, **nonlinear)
+        matrix = history.temperature_matrix(channel)
+        if self.power == 1:
+            return matrix
+        slope = self.power * (history.temperature(channel) - history.T0) ** (self.power - 1)
+        return matrix.multiply(slope[:, None]).tocsr()

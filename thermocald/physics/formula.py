@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import ast
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -93,10 +93,6 @@ class Node:
     def channels(self) -> tuple[str, ...]:
         """List the temperature channels that it reads, in order."""
         return tuple(dict.fromkeys(n.name for n in self.walk() if n.is_leaf and not n.operator))
-
-    def columns(self) -> tuple[str, ...]:
-        """List the other recorded columns that it reads, in order."""
-        return tuple(dict.fromkeys(n.name for n in self.walk() if n.operator == _COLUMN))
 
     def free(self) -> Iterator[tuple[str, Constant, Node]]:
         """Yield the constants that are names: (name, what it is, the node that it belongs to)."""
@@ -329,7 +325,7 @@ class Evaluator:
                     f"there is no recorded column {node.name!r}, which the formula reads; there "
                     f"are: {', '.join(self.history.columns) or 'none'}"
                 )
-            return self.history.column(node.name, at)
+            return np.interp(at, *self.history.columns[node.name])
         return self.history.polygon(node.name).at(at)
 
     def sensitivity(self, node: Node, channel: str, at_knots: bool = False) -> csr_array:
@@ -355,25 +351,35 @@ class Evaluator:
             total = total + diags_array(slope) @ matrix
         return csr_array(total)
 
-    def rate_jumps(self, node: Node, jump: Array) -> Array:
-        """Return by how much (E,) values change where rates at the frames are off by `jump` K/s."""
-        if not any(n.operator == "rate" and n.inputs[0].is_leaf for n in node.walk()):
-            return np.zeros(len(self.history.times))
-        return np.abs(self._shifted(node, jump) - self.values(node))
-
-    def _shifted(self, node: Node, jump: Array) -> Array:
+    def shifted(self, node: Node, jump: Array) -> Array:
+        """Return the values (E,) where rates of readings are off by `jump` (E,), per s."""
         if node.operator == "rate" and node.inputs[0].is_leaf:
             return self.values(node) + jump
         if node.is_leaf or node.kind.remembers:
             return self.values(node)
-        return node.kind.value(*(self._shifted(n, jump) for n in node.inputs), *node.constants)
+        return node.kind.value(*(self.shifted(n, jump) for n in node.inputs), *node.constants)
 
 
-class _OfFormula(Effect):
-    """Adds a × formula. The formula is data: a tree of known operators over recorded quantities."""
+class OfFormula(Effect):
+    """Adds a × formula. The formula is data: a tree of known operators over recorded quantities.
+
+    Raises ConfigurationError where its text cannot be read.
+    """
 
     usual = ("c", "x0", "y0")
-    node: ClassVar[Node]
+
+    def __init__(self, text: str) -> None:
+        self.name, self.node = text, parse(text)
+        self.noun = f"an influence that follows {self.node.words({})}"
+        self.nonlinear = {}
+        for name, constant, owner in self.node.free():
+            unit, above_0 = owner.unit_of(constant), constant.positive
+            start, low = {"degC": 30.0, "s": 60.0}.get(unit, 1.0), 1e-9 if above_0 else -1e9
+            self.nonlinear[name] = Parameter(
+                unit, low, 1e9, start, log=above_0, sized=unit != _OFFSET_C
+            )
+        per = unit_text(self.node.unit())
+        self.linear = coefficient_units(per if per.isalnum() else f"({per})")
 
     def channel(self, history: History, **_: Any) -> str:
         channels = self.node.channels()
@@ -392,10 +398,9 @@ class _OfFormula(Effect):
         found = {n: evaluator.sensitivity(node, n) for n in self.node.channels() if n != first}
         return {name: matrix for name, matrix in found.items() if matrix.nnz}
 
-    def unresolved(self, history: History, rate_jump: Array | None = None, **given: Any) -> Array:
-        if rate_jump is None:
-            return np.zeros(len(history.times))
-        return Evaluator(history).rate_jumps(self.node.bound(given), rate_jump)
+    def unresolved(self, history: History, rate_jump: Array, **given: Any) -> Array:
+        evaluator, node = Evaluator(history), self.node.bound(given)
+        return np.abs(evaluator.shifted(node, rate_jump) - evaluator.values(node))
 
     def sentence(self, estimates: Estimates) -> str:
         said = {
@@ -415,26 +420,6 @@ def _say_constant(estimate: Values, parameter: Parameter) -> str:
     if sd is None or (parameter.log and not sd <= abs(value)):
         return f"about {value:.{2 if sd is None else 3}g}{unit}"
     return say_estimate(estimate)
-
-
-def formula_effect(text: str) -> Effect:
-    """Make an effect of a formula. ConfigurationError where its text cannot be read."""
-    tree = parse(text)
-    per = unit_text(tree.unit())
-
-    class OfFormula(_OfFormula):
-        name = text
-        noun = f"an influence that follows {tree.words({})}"
-        node = tree
-        nonlinear: ClassVar[Mapping[str, Parameter]] = {
-            constant_name: _make_parameter(owner.unit_of(constant), constant.positive)
-            for constant_name, constant, owner in tree.free()
-        }
-        linear: ClassVar[Mapping[str, str]] = coefficient_units(
-            per if per.isalnum() else f"({per})"
-        )
-
-    return OfFormula()
 
 
 def known_together(
@@ -468,7 +453,7 @@ def known_together(
     low, mean, high = temperatures
     T = np.linspace(low, high, _ON_THE_CURVE)
     parabola = np.linalg.pinv(np.vander(T - mean, 3, increasing=True))[1:] * [[1.0], [2.0]]
-    effect, constants = formula_effect(text), dict(zip(names, x[:L].tolist(), strict=False))
+    effect, constants = OfFormula(text), dict(zip(names, x[:L].tolist(), strict=False))
 
     def shape(**changed: float) -> Array | None:
         f = parse(text).bound({**constants, **changed}).steady(T)
@@ -528,8 +513,3 @@ def say_together(known: Mapping[str, Any]) -> str:
 def is_formula(name: str) -> bool:
     """Return whether an effect's name is a formula's text: it calls an operator."""
     return "(" in name
-
-
-def _make_parameter(unit: str, positive: bool) -> Parameter:
-    start = {"degC": 30.0, "s": 60.0}.get(unit, 1.0)
-    return Parameter(unit, 1e-9 if positive else -1e9, 1e9, start, positive, sized=unit != "degC")

@@ -27,7 +27,7 @@ Thermometers as instruments: what one says is not the temperature of what it is 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
@@ -76,11 +76,6 @@ class Course:
         v = np.asarray(values, dtype=float)
         return cls(np.asarray(times, dtype=float), v, v.copy())
 
-    @property
-    def span(self) -> tuple[float, float]:
-        """Where it begins and ends, s."""
-        return float(self.times[0]), float(self.times[-1])
-
     def at(self, times: ArrayLike, side: Literal["left", "right"] = "right") -> Array:
         """Return the value right after each time, or right before it (side: left), if it jumps."""
         t = np.asarray(times, dtype=float)
@@ -104,7 +99,7 @@ def read_course(
         course = _read_log(reader.inner(key), unit, folder)
     else:
         return Course.constant(reader.number(key, unit))
-    begin, end = course.span
+    begin, end = course.times[[0, -1]]
     if begin > 0 or end < duration:
         raise reader.fail(
             key, f"covers {begin:g} to {end:g} s; the programme lasts from 0 to {duration:g} s"
@@ -235,41 +230,23 @@ def read_thermometer(reader: QuantityReader) -> SimulatedThermometer:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Link:
-    """A conductance W/K between two bodies, or a body and a boundary."""
-
-    first: str
-    second: str
-    conductance: float
-
-
 @dataclass(frozen=True)
 class HeatNetwork:
-    """Bodies {name: capacity J/K} and the links between them; other names in links are boundaries.
+    """Bodies {name: capacity J/K} and the links between two each: names and a conductance W/K.
 
-    Raises ConfigurationError for a capacity or conductance that is not above 0.
+    Other names in links are boundaries; capacities and conductances are above 0. Raises
+    ConfigurationError where a link has no body.
     """
 
     capacities: Mapping[str, float]
-    links: tuple[Link, ...]
+    links: tuple[tuple[str, str, float], ...]
 
     def __post_init__(self) -> None:
         if not self.capacities:
             raise ConfigurationError("a heat network needs at least one body")
-        for name, capacity in self.capacities.items():
-            if not (np.isfinite(capacity) and capacity > 0):
-                raise ConfigurationError(
-                    f"body {name!r} has a capacity of {capacity:g} J/K; it must be above 0"
-                )
-        for link in self.links:
-            if not (np.isfinite(link.conductance) and link.conductance > 0):
-                raise ConfigurationError(
-                    f"the link {link.first}–{link.second} conducts {link.conductance:g} W/K; it "
-                    "must be above 0"
-                )
-            if link.first not in self.capacities and link.second not in self.capacities:
-                raise ConfigurationError(f"neither {link.first!r} nor {link.second!r} is a body")
+        for first, second, _ in self.links:
+            if first not in self.capacities and second not in self.capacities:
+                raise ConfigurationError(f"neither {first!r} nor {second!r} is a body")
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -279,36 +256,32 @@ class HeatNetwork:
     @property
     def boundaries(self) -> tuple[str, ...]:
         """Names of what has a given temperature."""
-        names = dict.fromkeys(n for link in self.links for n in (link.first, link.second))
+        names = dict.fromkeys(n for link in self.links for n in link[:2])
         return tuple(n for n in names if n not in self.capacities)
 
     def _matrices(self) -> tuple[Array, Array, Array]:
         """Return capacities (n,), conductances (n, n) and those to the boundaries (n, m)."""
-        row = {name: i for i, name in enumerate(self.bodies)}
-        column = {name: i for i, name in enumerate(self.boundaries)}
-        K, B = np.zeros((len(row), len(row))), np.zeros((len(row), len(column)))
-        for link in self.links:
-            for here, there in ((link.first, link.second), (link.second, link.first)):
-                if here in row:
-                    K[row[here], row[here]] += link.conductance
-                    if there in row:
-                        K[row[here], row[there]] -= link.conductance
-                    else:
-                        B[row[here], column[there]] += link.conductance
-        return np.array([self.capacities[n] for n in self.bodies]), K, B
+        names, n = [*self.bodies, *self.boundaries], len(self.bodies)
+        G = np.zeros((len(names), len(names)))
+        for first, second, conductance in self.links:
+            i, j = names.index(first), names.index(second)
+            for here, there in ((i, j), (j, i)):
+                G[here, here] += conductance
+                G[here, there] -= conductance
+        return np.array([*self.capacities.values()]), G[:n, :n], -G[:n, n:]
 
     def solve(
         self,
         times: ArrayLike,
-        initial: Mapping[str, float] | float,
+        initial: ArrayLike,
         powers: Mapping[str, Course],
         temperatures: Mapping[str, Course],
     ) -> dict[str, Array]:
         """Return temperatures °C of all bodies and boundaries at times (E,) s, ascending, from 0
         on.
 
-        initial: °C at time 0, per body or for all; powers: W into bodies; temperatures: °C of the
-        boundaries.
+        initial: °C at time 0, of each body or of all; powers: W into bodies; temperatures: °C of
+        the boundaries.
         """
         t = np.asarray(times, dtype=float)
         capacity, K, B = self._matrices()
@@ -321,22 +294,24 @@ class HeatNetwork:
                     f"a source heats {name!r}, which is not a body; bodies are "
                     f"{', '.join(self.bodies)}"
                 )
-        start = np.array(
-            [initial if isinstance(initial, int | float) else initial[n] for n in self.bodies],
-            dtype=float,
-        )
         inner = [c.times for c in (*powers.values(), *temperatures.values())]
         last = float(t.max(initial=0.0))
         grid = np.unique(np.concatenate([[0.0], t, *inner]))
         grid = grid[(grid >= 0.0) & (grid <= last)]
-        begin, end = (self._drive(grid, B, powers, temperatures, s) for s in ("right", "left"))
+        begin, end = np.zeros((2, len(capacity), len(grid)))  # heat flow W into each body
+        sides: tuple[tuple[Array, Literal["right", "left"]], ...] = (begin, "right"), (end, "left")
+        for q, side in sides:
+            for j, name in enumerate(self.boundaries):
+                q += B[:, j : j + 1] * temperatures[name].at(grid, side)
+            for name, course in powers.items():
+                q[self.bodies.index(name)] += course.at(grid, side)
         root = np.sqrt(capacity)
         rate, modes = np.linalg.eigh(K / np.outer(root, root))
         into = (modes / root[:, None]).T
         z = np.stack(
             [
                 _solve_mode(grid, max(float(rate[k]), 0.0), into[k] @ begin, into[k] @ end,
-                      float(modes[:, k] @ (root * start)))
+                      float(modes[:, k] @ (root * initial)))
                 for k in range(len(rate))
             ]
         )  # fmt: skip
@@ -346,22 +321,6 @@ class HeatNetwork:
         for name in self.boundaries:
             result[name] = temperatures[name].at(t)
         return result
-
-    def _drive(
-        self,
-        grid: Array,
-        B: Array,
-        powers: Mapping[str, Course],
-        temperatures: Mapping[str, Course],
-        side: Any,
-    ) -> Array:
-        """Return the heat flow (n, g) W into each body, on one side of the instants."""
-        q = np.zeros((len(self.bodies), len(grid)))
-        for j, name in enumerate(self.boundaries):
-            q += B[:, j : j + 1] * temperatures[name].at(grid, side)
-        for name, course in powers.items():
-            q[self.bodies.index(name)] += course.at(grid, side)
-        return q
 
 
 def _solve_mode(grid: Array, rate: float, begin: Array, end: Array, start: float) -> Array:
@@ -394,5 +353,5 @@ def read_network(reader: QuantityReader) -> HeatNetwork:
         ends = link.mapping.get("between")
         if not isinstance(ends, list) or len(ends) != 2:
             raise link.fail("between", "must be [one, other]")
-        links.append(Link(str(ends[0]), str(ends[1]), link.number("conductance", "W/K", above=0.0)))
+        links.append((str(ends[0]), str(ends[1]), link.number("conductance", "W/K", above=0.0)))
     return HeatNetwork(capacities, tuple(links))

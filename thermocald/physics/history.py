@@ -79,11 +79,6 @@ class History:
         """Ask for other times."""
         return replace(self, times=np.asarray(times, dtype=float))
 
-    def with_reference(self, readings: ArrayLike) -> Self:
-        """Replace the readings (R,) °C of the reference channel."""
-        changed = {**self.readings, self.reference: np.asarray(readings, dtype=float)}
-        return replace(self, readings=changed)
-
     @cached_property
     def _polygons(self) -> dict[str, Polygon]:
         return {}
@@ -107,12 +102,6 @@ class History:
         """Return the temperature (E,) °C of a channel at the frames' times."""
         return self.polygon(channel).at(self.times)
 
-    def column(self, name: str, at: ArrayLike) -> Array:
-        """Return another recorded column at some times (...,), held beyond its ends."""
-        times, values = self.columns[name]
-        result: Array = np.interp(np.asarray(at, dtype=float), times, values)
-        return result
-
     def temperature_matrix(self, channel: str | None = None) -> csr_array:
         """Return ∂ temperature / ∂ readings (E, R)."""
         p = self.polygon(channel)
@@ -130,30 +119,24 @@ def _lay_polygon(times: Array, readings: Array, frames: Array) -> Polygon:
     # of several readings with one time stamp the last one counts
     rows = rows[np.append(np.diff(times[rows]) > 0, True)]
     t, n = times[rows], len(rows)
-    column, weight, knot = [rows], [np.ones(n)], [np.arange(n)]
-    knots = [t]
     begin, end = frames.min(initial=t[0]), frames.max(initial=t[-1])
-    for first, second, edge in ((0, 1, begin), (-1, -2, end)):
-        if (edge < t[0]) if first == 0 else (edge > t[-1]):
-            share = 0.0
-            if n > 1:
-                step = t[first] - t[second]
-                share = float(np.clip((edge - t[first]) / step, 0.0, 1.0))
-            column.append(rows[[first, second]] if n > 1 else rows[[0, 0]])
+    early, late = int(begin < t[0]), int(end > t[-1])
+    column, weight, knot = [rows], [np.ones(n)], [np.arange(n) + early]
+    for first, second, edge, place in (
+        (0, 1 % n, begin, 0), (n - 1, max(n - 2, 0), end, n + early)
+    ):  # fmt: skip
+        if edge != t[first]:
+            step = t[first] - t[second]
+            share = float(np.clip((edge - t[first]) / step, 0.0, 1.0)) if n > 1 else 0.0
+            column.append(rows[[first, second]])
             weight.append(np.array([1.0 + share, -share]))
-            knot.append(np.full(2, sum(map(len, knots))))
-            knots.append(np.array([edge]))
-    all_times = np.concatenate(knots)
-    order = np.argsort(all_times, kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
+            knot.append(np.full(2, place))
     matrix = csr_array(
-        (np.concatenate(weight), (rank[np.concatenate(knot)], np.concatenate(column))),
-        shape=(len(order), len(times)),
+        (np.concatenate(weight), (np.concatenate(knot), np.concatenate(column))),
+        shape=(n + early + late, len(times)),
     )
-    return Polygon(
-        all_times[order], matrix @ np.where(np.isfinite(readings), readings, 0.0), matrix
-    )
+    knots = np.concatenate([[begin], t, [end]])[1 - early : n + 1 + late]
+    return Polygon(knots, matrix @ np.where(np.isfinite(readings), readings, 0.0), matrix)
 
 
 Follower = Callable[[float, float], float]

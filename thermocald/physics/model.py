@@ -32,7 +32,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.physics import catalogue
 from thermocald.physics.catalogue import drive
-from thermocald.physics.effect import Influence
+from thermocald.physics.effect import Prediction
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -110,31 +110,6 @@ class ModelEffect:
         catalogue.get(self.name).check(self.values)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction(Influence):
-    """What a model says of E times: the influence of all effects, on the whole camera.
-
-    iop (E, 10), eop (E, 6): orientations themselves (eop is what effects add where the model has no
-    exterior orientation); drive (E,) °C: the temperature behind the linear terms.
-    """
-
-    drive: Array
-
-    @property
-    def moves_points(self) -> bool:
-        """Whether object points are anywhere else than in the test field's file."""
-        return bool(self.displacements) or bool(np.any(self.scale != 1.0))
-
-    def points(self, points: Array, epochs: slice = slice(None)) -> Array:
-        """Move object points (n, 3) mm to where they are at some of the epochs, (e, n, 3)."""
-        scale = self.scale[epochs]
-        moved = points[None, :, :] * scale[:, None, :]
-        for d in self.displacements:
-            shift = d.active[epochs].astype(float)[:, None, None] * d.vector
-            moved[:, d.rows, :] += shift
-        return moved
-
-
 @dataclass(frozen=True)
 class ThermalModel:
     """One camera's thermal model; immutable, written to and read from YAML by `model_file`.
@@ -199,18 +174,16 @@ class ThermalModel:
         Raises DataError where a temperature column is missing, ConfigurationError where the test
         field lacks a target that an effect names.
         """
-        epochs = len(history.times)
         history = replace(history, T0=self.T0)
-        total = Influence.none(epochs)
+        found = Prediction.none(len(history.times), test_field)
         for effect in self.effects:
-            total = total + catalogue.get(effect.name).influence(history, effect.values, test_field)
-        drive = self.drive(history)
-        linear = self.interior.as_array() + (drive - self.T0)[:, None] * self.rate_vector
-        iop = self.carried(linear + total.iop)
-        eop = total.eop + (self.exterior.as_array() if self.exterior else 0.0)
-        return Prediction(
-            iop, eop, total.scale, total.noise_factor, total.blur_factor, total.displacements, drive
-        )
+            catalogue.get(effect.name).influence(history, effect.values, found)
+        found.drive = self.drive(history)
+        linear = self.interior.as_array() + (found.drive - self.T0)[:, None] * self.rate_vector
+        found.iop = self.carried(linear + found.iop)
+        if self.exterior:
+            found.eop += self.exterior.as_array()
+        return found
 
     def carried(self, linear: Array) -> Array:
         """Return the interior orientations (…, 10) of those that rates and effects add up to."""

@@ -48,7 +48,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.physics import catalogue
 from thermocald.physics.effect import PARAMETER_UNITS
-from thermocald.physics.model import BASES, RATED, Distortion, ModelEffect, ThermalModel
+from thermocald.physics.model import BASES, RATED, ModelEffect, ThermalModel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -167,16 +167,20 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
         if exterior and name not in exterior:
             raise top.fail(f"exterior.{name}", "is missing")
     rates = group("rates", RATED, "/K")
+    said = top.text("distortion", BASES[0])
+    distortion = next((basis for basis in BASES if basis == said), None)
+    if distortion is None:
+        raise top.fail("distortion", f"is {said[:40]!r}; it follows the {' or the '.join(BASES)}")
     names, matrix = _read_covariance(top)
     return ThermalModel(
         camera=camera.text("name", "camera"),
-        sensor=read_sensor(camera),
+        sensor=Sensor.read(camera),
         T0=top.number("reference_temperature", "degC", low=-273.15),
         interior=InteriorOrientation.from_mapping({"c": 0.0, **interior}),
         rates=rates,
         effects=tuple(effect_of(reader) for reader in top.items("effects")),
         exterior=ExteriorOrientation.from_mapping(exterior) if exterior else None,
-        distortion=_read_distortion(top),
+        distortion=distortion,
         image_sigma=top.number("image_sigma", "px", 0.04, above=0.0),
         sds=sds,
         covariance_names=names,
@@ -187,22 +191,6 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
         name=top.text("name", ""),
         version=top.whole("version", "1") if "version" in document else 1,
     )
-
-
-def _read_distortion(top: QuantityReader) -> Distortion:
-    found = top.text("distortion", BASES[0])
-    for basis in BASES:
-        if found == basis:
-            return basis
-    raise top.fail("distortion", f"is {found[:40]!r}; it follows the {' or the '.join(BASES)}")
-
-
-def read_sensor(camera: QuantityReader) -> Sensor:
-    """Read width and height in px and the pixel pitch in mm."""
-    pitch = camera.number("pixel_pitch", "mm", above=0.0)
-    if pitch > 0.1:
-        raise camera.fail("pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm")
-    return Sensor(camera.whole("width", "px"), camera.whole("height", "px"), pitch)
 
 
 def _read_covariance(

@@ -57,11 +57,26 @@ def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64
     return left, right, share
 
 
-def interpolation_matrix(knots: Array, at: Array) -> csr_array:
-    """Return the matrix (E, K) that interpolates knots (K,) linearly at times (E,)."""
+def _input(knots: Array, values: Array, at: Array) -> tuple[NDArray[np.int64], Array]:
+    """Find the left knot of times, and the polygon's value there, (E,) both."""
+    left, right, share = _edges(knots, at)
+    return left, values[left] * (1.0 - share) + values[right] * share
+
+
+def interpolation_matrix(
+    knots: Array,
+    at: Array,
+    held: tuple[NDArray[np.bool_], NDArray[np.int64]] | None = None,
+) -> csr_array:
+    """Return the matrix (E, K) that interpolates knots (K,) linearly at times (E,).
+
+    held: which times (E,) have the value of a former knot instead, and of which (E,).
+    """
     from scipy.sparse import csr_array
 
     left, right, share = _edges(knots, at)
+    if held is not None:
+        left, share = np.where(held[0], held[1], left), np.where(held[0], 0.0, share)
     rows = np.arange(len(at))
     return csr_array(
         (
@@ -166,10 +181,8 @@ def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:
     P = min(max(P, T - r), T + r), P = T at the first knot. knots, values (K,), at (E,); (E,).
     Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis.
     """
-    states = _play_states(values, half_width)
-    left, right, share = _edges(knots, at)
-    now = values[left] * (1.0 - share) + values[right] * share
-    return np.clip(states[left], now - half_width, now + half_width)
+    left, now = _input(knots, values, at)
+    return np.clip(_play_states(values, half_width)[left], now - half_width, now + half_width)
 
 
 def _play_states(values: Array, half_width: float) -> Array:
@@ -186,7 +199,8 @@ def _play_states(values: Array, half_width: float) -> Array:
 
 def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> csr_array:
     """Return ∂ play / ∂ values (E, K): each output depends on the reading that moved it last."""
-    return _switched(knots, at, *_play_moves(knots, values, half_width, at)[:2])
+    moving, source, _ = _play_moves(knots, values, half_width, at)
+    return interpolation_matrix(knots, at, (~moving, source))
 
 
 def _play_moves(
@@ -198,10 +212,9 @@ def _play_moves(
     states = _play_states(values, half_width)
     moved = np.append(True, states[1:] != states[:-1])
     source = np.maximum.accumulate(np.where(moved, np.arange(len(values)), 0))
-    left, right, share = _edges(knots, at)
-    now = values[left] * (1.0 - share) + values[right] * share
+    left, now = _input(knots, values, at)
     moving = (states[left] < now - half_width) | (states[left] > now + half_width)
-    return moving, source[left], (share == 0) & moved[left]
+    return moving, source[left], (at == knots[left]) & moved[left]
 
 
 def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDArray[np.bool_]:
@@ -222,8 +235,7 @@ def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDA
 
 def running_maximum(knots: Array, values: Array, at: Array) -> Array:
     """Return the highest value from the first knot to each time, (E,)."""
-    left, right, share = _edges(knots, at)
-    now = values[left] * (1.0 - share) + values[right] * share
+    left, now = _input(knots, values, at)
     return np.asarray(np.maximum(np.maximum.accumulate(values)[left], now))
 
 
@@ -232,29 +244,8 @@ def running_maximum_matrix(knots: Array, values: Array, at: Array) -> csr_array:
     highest = np.maximum.accumulate(values)
     risen = np.append(True, values[1:] > highest[:-1])
     source = np.maximum.accumulate(np.where(risen, np.arange(len(values)), 0))
-    left, right, share = _edges(knots, at)
-    now = values[left] * (1.0 - share) + values[right] * share
-    return _switched(knots, at, now > highest[left], source[left])
-
-
-def _switched(
-    knots: Array, at: Array, current: NDArray[np.bool_], source: NDArray[np.int64]
-) -> csr_array:
-    """Return rows that follow the input now where `current`, and a former knot elsewhere."""
-    from scipy.sparse import csr_array
-
-    left, right, share = _edges(knots, at)
-    rows = np.arange(len(at))
-    return csr_array(
-        (
-            np.concatenate([np.where(current, 1.0 - share, 1.0), np.where(current, share, 0.0)]),
-            (
-                np.concatenate([rows, rows]),
-                np.concatenate([np.where(current, left, source), right]),
-            ),
-        ),
-        shape=(len(at), len(knots)),
-    )
+    left, now = _input(knots, values, at)
+    return interpolation_matrix(knots, at, (now <= highest[left], source[left]))
 
 
 def slope_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
@@ -271,23 +262,11 @@ def slope_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: 
     if n == 2:
         h = knots[1] - knots[0]
         return csr_array(np.tile([-1.0 / h, 1.0 / h], (len(at), 1)))
-    h = np.diff(knots)
-    h0, h1 = h[:-1], h[1:]
-    inner = np.arange(1, n - 1)
-    a, b = h[0], h[1]
-    y, z = h[-1], h[-2]
-    weights = [
-        -h1 / (h0 * (h0 + h1)),
-        (h1 - h0) / (h0 * h1),
-        h0 / (h1 * (h0 + h1)),
-        np.array([-(2 * a + b) / (a * (a + b)), (a + b) / (a * b), -a / (b * (a + b))]),
-        np.array([y / (z * (y + z)), -(y + z) / (y * z), (2 * y + z) / (y * (y + z))]),
-    ]
-    rows = [inner, inner, inner, np.zeros(3, dtype=int), np.full(3, n - 1)]
-    columns = [inner - 1, inner, inner + 1, np.arange(3), np.arange(n - 3, n)]
-    slopes = csr_array(
-        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)
-    )
+    # each row has three neighbours: NumPy's derivatives of combs that hold every third knot
+    combs = (np.arange(n)[:, None] % 3 == np.arange(3)).astype(float)
+    columns = np.clip(np.arange(n) - 1, 0, n - 3)[:, None] + np.arange(3)
+    weights = np.take_along_axis(np.gradient(combs, knots, axis=0, edge_order=2), columns % 3, 1)
+    slopes = csr_array((weights.ravel(), columns.ravel(), 3 * np.arange(n + 1)), shape=(n, n))
     return interpolation_matrix(knots, at) @ slopes
 
 

@@ -26,27 +26,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import ConfigurationError, UsageError
-from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.photogrammetry.camera.camera_model import (
+    RASPBERRY_PI_V2,
+    InteriorOrientation,
+    Sensor,
+)
 from thermocald.physics import catalogue
 from thermocald.physics.device import (
-    USUAL_THERMOMETERS,
     CameraDevice,
     Programme,
-    default_heat,
     read_camera_device,
     read_programme,
 )
-from thermocald.physics.heat import Course, HeatNetwork, Link
+from thermocald.physics.heat import Course, HeatNetwork
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.physics.model_file import read_model
 from thermocald.physics.simulation import Simulation
-from thermocald.physics.testfields import corner_field, corner_view, load_field
+from thermocald.physics.testfields import RPI_INTERIOR, corner_field, corner_view, load_field
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from thermocald.arrays import Array
     from thermocald.photogrammetry.field.testfield import TestField
+    from thermocald.physics.effect import Effect
 
 _EPOCHS = 150
 _INTERVAL_S = 10.0
@@ -90,10 +94,6 @@ _S8 = Sensor(4032, 3024, 0.0014)
 _S8_INTERIOR = InteriorOrientation(
     c=4.2, x0=-0.017, y0=0.042, A1=0.0062, A2=-3.6e-4, B1=-0.7e-4, B2=1.1e-4
 )
-_RPI = Sensor(3280, 2464, 0.00112)
-_RPI_INTERIOR = InteriorOrientation(
-    c=3.04, x0=0.012, y0=-0.018, A1=-0.0040, A2=5.0e-4, B1=1.0e-4, B2=-2.0e-4
-)
 
 PRESETS: Mapping[str, Preset] = {
     p.name: p
@@ -124,7 +124,7 @@ PRESETS: Mapping[str, Preset] = {
         ),
         Preset(
             "rpi-v2.1-heating", "Raspberry Pi camera v2.1, heated by a lamp, then left to cool",
-            "rpi-v2.1", _RPI, _RPI_INTERIOR, 2.0, 900.0,
+            "rpi-v2.1", RASPBERRY_PI_V2.sensor, RPI_INTERIOR, 2.0, 900.0,
             drift_px=10.5, direction_deg=-150.0, drift_c_mm=0.005, begin_degc=25.0, end_degc=52.0,
             noise_ratio=3.5, set_share=0.06, lamp=True, distortion_drift=(2e-5, -2e-5, -2e-5),
         ),
@@ -139,19 +139,17 @@ def _device(preset: Preset) -> CameraDevice:
     network = HeatNetwork(
         {"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4},
         (
-            Link("board", "housing", 6.0),
-            Link("lens", "housing", 0.4),
-            Link("sensor", "lens", 0.2),
-            Link("housing", "ambient", loss),
+            ("board", "housing", 6.0),
+            ("lens", "housing", 0.4),
+            ("sensor", "lens", 0.2),
+            ("housing", "ambient", loss),
         ),
     )
-    return CameraDevice(
-        preset.camera, preset.sensor, network, USUAL_THERMOMETERS, distance=preset.distance_mm
-    )
+    return CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
 
 
 def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
-    (loss,) = (k.conductance for k in device.network.links if k.second == "ambient")
+    (loss,) = (g for _, second, g in device.network.links if second == "ambient")
     duration = (_EPOCHS - 1) * _INTERVAL_S
     ambient = preset.begin_degc if preset.lamp else 23.0
     power = loss * (preset.end_degc - ambient)
@@ -206,24 +204,18 @@ def preset_simulation(
     return Simulation(model, device, test_field, programme, seed)
 
 
-def _effects(preset: Preset, way: Any, warming: float) -> list[ModelEffect]:
-    found = []
-    if preset.set_share:
-        x0, y0 = (float(v) for v in way * preset.set_share / warming)
-        stays = catalogue.find(lambda e: e.irreversible)
-        found.append(ModelEffect(stays.name, {"x0": x0, "y0": y0}))
-    a1, b1, b2 = preset.distortion_drift
-    if a1:
-        radial = catalogue.find(lambda e: e.usual == ("A1",))
-        found.append(ModelEffect(radial.name, {"A1": a1 / warming}))
-    if b1 or b2:
-        decentering = catalogue.find(lambda e: e.usual == ("B1", "B2"))
-        found.append(ModelEffect(decentering.name, {"B1": b1 / warming, "B2": b2 / warming}))
-    if preset.noise_ratio != 1.0:
-        noise = catalogue.seen_in("noise")
-        rise = (preset.noise_ratio - 1.0) / warming
-        found.append(ModelEffect(noise.name, dict.fromkeys(noise.linear, rise)))
-    return found
+def _effects(preset: Preset, way: Array, warming: float) -> list[ModelEffect]:
+    x0, y0 = (way * preset.set_share / warming).tolist()
+    a1, b1, b2 = (change / warming for change in preset.distortion_drift)
+    wanted: list[tuple[Callable[[Effect], bool], dict[str, float]]] = [
+        (lambda e: e.irreversible, {"x0": x0, "y0": y0}),
+        (lambda e: e.usual == ("A1",), {"A1": a1}),
+        (lambda e: e.usual == ("B1", "B2"), {"B1": b1, "B2": b2}),
+        (lambda e: e.seen_in == "noise", {"factor": (preset.noise_ratio - 1.0) / warming}),
+    ]
+    return [
+        ModelEffect(catalogue.find(one).name, sizes) for one, sizes in wanted if any(sizes.values())
+    ]
 
 
 def given_simulation(
@@ -240,25 +232,21 @@ def given_simulation(
     Raises UsageError where neither preset nor model and programme are given.
     """
     if preset is not None:
-        simulation = preset_simulation(preset, seed, series, field)
-        if camera is not None:
-            simulation = replace(simulation, device=read_camera_device(camera))
-        if programme is not None:
-            simulation = replace(simulation, programme=read_programme(programme))
-        if model is not None:
-            simulation = replace(simulation, model=read_model(model))
-        return simulation
+        usual = preset_simulation(preset, seed, series, field)
+        return replace(  # together: a model and a camera of one's own need not fit the preset's
+            usual,
+            device=usual.device if camera is None else read_camera_device(camera),
+            programme=usual.programme if programme is None else read_programme(programme),
+            model=usual.model if model is None else read_model(model),
+        )
     if model is None or programme is None:
         raise UsageError(
             f"give --preset ({', '.join(PRESETS)}), or --model and --programme "
             "(--camera and --testfield as well, where the usual ones do not fit)"
         )
     thermal = read_model(model)
-    if camera is not None:
-        device = read_camera_device(camera)
-    else:
-        network, thermometers = default_heat()
-        device = CameraDevice(thermal.camera, thermal.sensor, network, thermometers)
+    plain = CameraDevice(thermal.camera, thermal.sensor)
+    device = plain if camera is None else read_camera_device(camera)
     chosen = load_field("circles") if field is None else field
     return Simulation(thermal, device, chosen, read_programme(programme), seed)
 

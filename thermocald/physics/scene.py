@@ -248,10 +248,9 @@ class Scene:
             random_bytes = raw.view(np.uint8)[: 2 * size].reshape(2, *canvas.shape)
             first, second = cv2.LUT(random_bytes[0], even), cv2.LUT(random_bytes[1], odd)
             cv2.add(first, second, dst=first)
-            noisy = cv2.addWeighted(canvas, 1 / _FRACTION, first, 1 / _FRACTION, 0, dtype=cv2.CV_8U)
         else:
-            canvas += 1
-            noisy = cv2.addWeighted(canvas, 1 / _FRACTION, canvas, 0.0, 0, dtype=cv2.CV_8U)
+            first = np.ones_like(canvas)
+        noisy = cv2.addWeighted(canvas, 1 / _FRACTION, first, 1 / _FRACTION, 0, dtype=cv2.CV_8U)
         return np.asarray(noisy, dtype=np.uint8)
 
     def _draw(
@@ -292,24 +291,12 @@ class Scene:
             mine = place[member] >= 0
             steps = coverage_steps(a[mine], b[mine], sign[mine], place[member[mine]], windows)
             stack = average(fill(average(steps.astype(np.float32), kernel, 0)), kernel, 1)
-            for k in range(len(windows.members)):
-                self._paste(canvas, gain, stack, depth, windows, k)
-
-    def _paste(
-        self,
-        canvas: NDArray[np.int16],
-        gain: NDArray[np.float32],
-        stack: NDArray[np.float32],
-        depth: np.float32,
-        windows: Windows,
-        k: int,
-    ) -> None:
-        """Take the ink of one window off the canvas."""
-        row, left, top = windows.row[k], windows.left[k], windows.top[k]
-        y0, y1 = max(0, top), min(self.sensor.height, top + windows.height[k])
-        x0, x1 = max(0, left), min(self.sensor.width, left + windows.width)
-        if y0 >= y1 or x0 >= x1:
-            return
-        ink = stack[row + y0 - top : row + y1 - top, x0 - left : x1 - left]
-        taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
-        canvas[y0:y1, x0:x1] -= taken + taken
+            for row, left, top, height in zip(
+                windows.row, windows.left, windows.top, windows.height, strict=True
+            ):
+                y0, y1 = max(0, top), min(self.sensor.height, top + height)
+                x0, x1 = max(0, left), min(self.sensor.width, left + windows.width)
+                if y0 < y1 and x0 < x1:  # the ink is taken off the canvas
+                    ink = stack[row + y0 - top : row + y1 - top, x0 - left : x1 - left]
+                    taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
+                    canvas[y0:y1, x0:x1] -= taken + taken

@@ -175,14 +175,6 @@ def surface_normals(field: TestField) -> Array:
     return normals
 
 
-def _find_basis(normal: Array) -> tuple[Array, Array]:
-    """Return `right` and `down` in the plane, for a viewer whom the normal points at."""
-    helper = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
-    right = np.cross(helper, normal)
-    right = right / np.sqrt(right[0] * right[0] + right[1] * right[1] + right[2] * right[2])
-    return right, -np.cross(normal, right)
-
-
 def _lay_arc(turns: Array) -> Array:
     sine, cosine = sin_cos(2.0 * np.pi * turns)
     return np.stack([cosine, sine], axis=1)
@@ -269,8 +261,13 @@ def _shapes(field: TestField, normals: Array) -> Iterator[tuple[int, Array, list
                 if corner is not None:
                     markers.setdefault((dictionary, marker), {})[corner] = i
         elif field.diameters[i] > 0:
-            right, down = _find_basis(normals[i])
-            yield i, normals[i], [
+            # right and down in the plane, for a viewer whom the normal points at
+            up = normals[i]
+            helper = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
+            right = np.cross(helper, up)
+            right = right / np.sqrt(right[0] * right[0] + right[1] * right[1] + right[2] * right[2])
+            down = -np.cross(up, right)
+            yield i, up, [
                 (1.0, [i] * 4, np.tile([1.0, 0.0, 0.0, 0.0], (len(p), 1)),
                  p[:, :1] * right + p[:, 1:] * down)
                 for p in _disc_polygons(float(field.diameters[i]), code)

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.physics.device import CameraDevice, Programme
-    from thermocald.physics.model import Prediction, ThermalModel
+    from thermocald.physics.effect import Prediction
+    from thermocald.physics.model import ThermalModel
 
 _CHUNK = 64  # epochs at a time
 _MARGIN_PX = 5.0  # a target nearer to the image's edge is not measured
@@ -211,11 +212,16 @@ class Simulation:
 
         advance: called with the number of epochs done. Raises RecordingError if `path` exists.
         """
-        frames = self.frames() if with_frames else None
+        import simplejpeg
+
+        frames = self.frames()
         with RecordingWriter(path, self.head, self.field) as writer:
             for epoch in self.epochs(observed=not with_frames):
-                image = next(frames) if frames is not None else None
-                writer.append(epoch, None if image is None else _jpeg(image))
+                jpeg = None
+                if with_frames:
+                    image = np.ascontiguousarray(next(frames)[:, :, None])
+                    jpeg = simplejpeg.encode_jpeg(image, quality=95, colorspace="GRAY")
+                writer.append(epoch, jpeg)
                 advance(1)
 
     def as_dict(self) -> dict[str, Any]:
@@ -261,12 +267,3 @@ class Simulation:
                 f"{drift['c_mm'] * 1000:.1f} µm"
             )
         ]
-
-
-def _jpeg(image: NDArray[np.uint8]) -> bytes:
-    import simplejpeg
-
-    data: bytes = simplejpeg.encode_jpeg(
-        np.ascontiguousarray(image[:, :, None]), quality=95, colorspace="GRAY"
-    )
-    return data

@@ -19,15 +19,19 @@ import numpy as np
 
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import (
+    RASPBERRY_PI_V2,
     ExteriorOrientation,
     InteriorOrientation,
-    Sensor,
 )
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
 from thermocald.physics.model import ThermalModel
 from thermocald.store.recording.reader import read_testfield
 
+RPI_INTERIOR = InteriorOrientation(
+    c=3.04, x0=0.012, y0=-0.018, A1=-0.0040, A2=5.0e-4, B1=1.0e-4, B2=-2.0e-4
+)
+"""Of a Raspberry Pi camera v2.1; the distortion is of usual size."""
 # In-plane directions (right, down) of a viewer in front of each plane.
 _PLANES = {
     "x": (np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])),
@@ -36,25 +40,22 @@ _PLANES = {
 }
 
 
-def corner_field(
-    kind: Literal["markers", "circles", "plain"] = "circles",
-    per_side: int = 7,
-    pitch_mm: float = 90.0,
-    size_mm: float | None = None,
-    coded_every: int = 4,
-    dictionary: str = "DICT_APRILTAG_36h11",
-    sigma_mm: float = 0.02,
-) -> TestField:
-    """Lay out a corner field of per_side² targets on each of three planes.
+FieldKind = Literal["markers", "circles", "plain"]
 
-    markers: per_side² square markers per plane, four targets each (default side 0.7 pitch);
-    circles: circular targets (default diameter 0.22 pitch), every `coded_every`-th with a 12-bit
-    ring code; plain: all without. Pitch, size and sigma (all coordinates) in mm. 7 a side are 147
-    circles; 4 a side are 192 marker corners.
+
+def corner_field(
+    kind: FieldKind = "circles", per_side: int = 7, pitch_mm: float = 90.0
+) -> TestField:
+    """Lay out a corner field of per_side² targets on each of three planes, `pitch_mm` apart.
+
+    markers: per_side² square markers per plane, four targets each, of 0.7 pitch; circles: circular
+    targets of 0.22 pitch, every fourth with a 12-bit ring code; plain: all without. Standard
+    deviations of all coordinates 0.02 mm. 7 a side are 147 circles; 4 a side are 192 marker
+    corners.
     """
     if per_side < 1 or pitch_mm <= 0:
         raise ConfigurationError("a corner field needs at least one target a side, and a pitch > 0")
-    size = size_mm or (0.7 if kind == "markers" else 0.22) * pitch_mm
+    size = (0.7 if kind == "markers" else 0.22) * pitch_mm
     names, points, codes = [], [], []
     number = 0
     ring = ring_code.codes(12)
@@ -69,47 +70,36 @@ def corner_field(
                     for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
                         names.append(f"{number}.{corner}")
                         points.append(centre + 0.5 * size * (a * right + b * down))
-                        codes.append(f"{dictionary}:{number}:{corner}")
+                        codes.append(f"DICT_APRILTAG_36h11:{number}:{corner}")
                 else:
-                    coded = kind == "circles" and number % coded_every == 0
-                    place = number // coded_every
-                    if coded and place >= len(ring):
-                        raise ConfigurationError(
-                            f"there are {len(ring)} ring codes of 12 bit: code every "
-                            f"{-(-3 * per_side**2 // len(ring))}th target or fewer"
-                        )
+                    coded = kind == "circles" and number % 4 == 0
                     names.append(f"{plane}{j + 1}{i + 1}" if per_side < 10 else str(number))
                     points.append(centre)
-                    codes.append(ring_code.write(12, ring[place]) if coded else "")
+                    codes.append(ring_code.write(12, ring[number // 4]) if coded else "")
                 number += 1
     return TestField.build(
         names,
         np.array(points),
-        sigma_mm,
+        0.02,
         np.nan if kind == "markers" else size,
         "marker_corner" if kind == "markers" else "circle",
         codes,
     )
 
 
-def corner_view(field: TestField, distance_mm: float, roll_deg: float = 0.0) -> ExteriorOrientation:
+def corner_view(field: TestField, distance_mm: float) -> ExteriorOrientation:
     """Return the orientation of a camera that looks into the corner along its diagonal.
 
-    From `distance_mm` it looks at the middle of the targets; Z is up in the image at roll 0.
+    From `distance_mm` it looks at the middle of the targets; Z is up in the image.
     """
     middle = field.points.mean(axis=0)
     backward = np.ones(3) / np.sqrt(3.0)
     right = np.cross([0.0, 0.0, 1.0], backward)
     right /= np.linalg.norm(right)
-    up = np.cross(backward, right)
-    a = np.deg2rad(roll_deg)
-    columns = [np.cos(a) * right + np.sin(a) * up, -np.sin(a) * right + np.cos(a) * up, backward]
+    columns = [right, np.cross(backward, right), backward]
     return ExteriorOrientation.from_rotation(
         np.stack(columns, axis=1), middle + distance_mm * backward
     )
-
-
-FieldKind = Literal["markers", "circles", "plain"]
 
 
 def demonstration_field(kind: FieldKind = "markers") -> TestField:
@@ -130,11 +120,9 @@ def demonstration_model(field: TestField) -> ThermalModel:
     """Return a camera 1.3 m before a corner field: half a pixel of drift per kelvin, T₀ = 25 °C."""
     return ThermalModel(
         camera="rpi-v2.1",
-        sensor=Sensor(3280, 2464, 0.00112),
+        sensor=RASPBERRY_PI_V2.sensor,
         T0=25.0,
-        interior=InteriorOrientation(
-            c=3.04, x0=0.012, y0=-0.018, A1=-0.004, A2=0.0005, B1=1e-4, B2=-2e-4
-        ),
+        interior=RPI_INTERIOR,
         rates={"c": 2.0e-4, "x0": -4.5e-4, "y0": -3.0e-4},
         exterior=corner_view(field, 1300.0),
         name="demonstration",

@@ -24,7 +24,7 @@ from thermocald.photogrammetry.epoch.adjustment import (
     cold_start,
     pose_only,
 )
-from thermocald.photogrammetry.frame.measurement import Prior, measure
+from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.linalg import correlation_matrix
 from thermocald.photogrammetry.network.common_interior import CommonInterior, adjust_common_interior
 from thermocald.photogrammetry.orientation import approximate_orientation
@@ -157,13 +157,12 @@ def calibrate_photographs(
     """Measure and calibrate photographs; a file that is not an image has a status and a reason."""
     measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
-    prior = Prior(camera.sensor, camera.interior, principal_distance=camera.principal_distance)
     copies = find_copies(paths)
     for k, path in enumerate(paths):
         try:
             if k in copies:
                 raise ImageError(f"is a copy of {paths[copies[k]].name}")
-            found = measure(decode_grey(path), testfield, prior)
+            found = measure(decode_grey(path), testfield, camera)
         except (ImageError, GeometryError) as error:
             word = "bad_image" if isinstance(error, ImageError) else "no_orientation"
             failures[k] = (word, str(error))

@@ -31,6 +31,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     EOP,
     IOP,
     IOP_NAMES,
+    CameraSpec,
     ExteriorOrientation,
     partials,
     project,
@@ -38,7 +39,6 @@ from thermocald.photogrammetry.camera.camera_model import (
 from thermocald.photogrammetry.epoch.adjustment import Adjustment, failed
 from thermocald.photogrammetry.epoch.measuring import resect
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.frame.measurement import Prior
 from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets.image_file import EncodedImage
@@ -410,8 +410,9 @@ def plan_gauge(
                 f"{control}: no control point has a code; `control_reference` names the frame in "
                 "which x, y are those of natural points"
             )
-        prior = Prior(thermal.model.sensor, thermal.model.interior)
-        finder = Tracker(given.field, prior)
+        model = thermal.model
+        known = CameraSpec(model.camera, model.sensor, interior=model.interior)
+        finder = Tracker(given.field, known)
     else:
         finder = Templates.read(reference, given.field, given.seen)
         size, sensor = finder.image_size, thermal.model.sensor

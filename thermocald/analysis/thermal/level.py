@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array
-    from thermocald.physics.model import Prediction, ThermalModel
+    from thermocald.physics.effect import Prediction
+    from thermocald.physics.model import ThermalModel
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -54,11 +55,11 @@ def series_means(
     total, weight = np.zeros((T, 2)), np.zeros((T, 2))
     moved = np.zeros(T, dtype=bool)
     use = series.weights[..., :2]
-    for d in prediction.displacements:
-        moved[d.rows] = True
-        if d.active.any():
+    for rows, _, active in prediction.displacements:
+        moved[rows] = True
+        if active.any():
             use = use.copy()
-            use[np.ix_(d.active, d.rows)] = 0.0
+            use[np.ix_(active, rows)] = 0.0
     points = series.source.grid.points
     for part in chunks(*points.shape[:2]):
         w = use[part]

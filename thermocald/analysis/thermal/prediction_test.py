@@ -69,8 +69,8 @@ def derivatives(
         for side in sides:
             d, p = np.zeros((len(history.times), 22)), side.predict(history, field)
             d[:, :10], d[:, 10:16], d[:, 16:19] = p.iop, p.eop, p.scale
-            for displacement in p.displacements:
-                d[:, 19:22] += displacement.active[:, None] * displacement.vector
+            for _, vector, active in p.displacements:
+                d[:, 19:22] += active[:, None] * vector
             columns.append(d)
         found.append((columns[0] - columns[1]) / (2.0 * step))
     return np.stack(found, axis=2) if found else np.zeros((len(history.times), 22, 0))

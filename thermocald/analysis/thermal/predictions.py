@@ -17,7 +17,7 @@ from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.errors import DataError
 from thermocald.numbers import plain
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, rays
-from thermocald.physics.device import CameraDevice, default_heat, read_camera_device, read_programme
+from thermocald.physics.device import CameraDevice, read_camera_device, read_programme
 from thermocald.physics.simulation import Simulation
 from thermocald.physics.testfields import demonstration_field
 from thermocald.result import Result
@@ -229,11 +229,8 @@ def advise_warm_up(
     """Say how long the camera needs within a programme until it is steady to `wanted` mm at
     `distance` m; camera: its file, which says how it warms.
     """
-    if camera is not None:
-        device = read_camera_device(camera)
-    else:
-        network, thermometers = default_heat()
-        device = CameraDevice(thermal.model.camera, thermal.model.sensor, network, thermometers)
+    usual = CameraDevice(thermal.model.camera, thermal.model.sensor)
+    device = usual if camera is None else read_camera_device(camera)
     history = Simulation(
         thermal.model, device, demonstration_field("plain"), read_programme(programme)
     ).true_history

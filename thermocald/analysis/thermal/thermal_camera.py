@@ -33,6 +33,7 @@ from thermocald.figures import BAND
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
+from thermocald.physics.effect import Prediction
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
 from thermocald.result import Result, jsonable, new_figure
@@ -436,7 +437,9 @@ def load_camera(path: Path | str) -> ThermalCamera:
 def _influence(model: ThermalModel, name: str, history: History) -> Array:
     """Return what an effect of a model adds to the interior orientation (E, 10)."""
     effect = next(e for e in model.effects if e.name == name)
-    return catalogue.get(name).influence(history, effect.values, None).iop
+    found = Prediction.none(len(history.times))
+    catalogue.get(name).influence(history, effect.values, found)
+    return found.iop
 
 
 def _followers(model: ThermalModel) -> list[Any]:

@@ -54,19 +54,6 @@ EOP_COLUMNS = np.arange(EOP.start, EOP.stop)
 """The exterior orientation as an index array."""
 EOP_COLUMNS.flags.writeable = False
 
-UNITS = {
-    **dict.fromkeys(("c", "x0", "y0", "X0", "Y0", "Z0"), "mm"),
-    "A1": "mm⁻²",
-    "A2": "mm⁻⁴",
-    "A3": "mm⁻⁶",
-    "B1": "mm⁻¹",
-    "B2": "mm⁻¹",
-    "C1": "1",
-    "C2": "1",
-    **dict.fromkeys(("omega", "phi", "kappa"), "rad"),
-}
-"""Unit of each parameter."""
-
 
 def free_columns(names: tuple[str, ...]) -> list[int]:
     """Positions of the named interior parameters, in the order of `PARAMETER_NAMES`."""
@@ -91,6 +78,17 @@ class Sensor:
     width: int
     height: int
     pixel_pitch: float
+
+    @classmethod
+    def read(cls, reader: QuantityReader) -> Self:
+        """Read width, height and pixel_pitch from a mapping of a YAML file."""
+        pitch = reader.number("pixel_pitch", "mm", above=0.0)
+        if not 1e-5 <= pitch <= 0.1:
+            raise reader.fail(
+                "pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm"
+            )
+        width, height = (reader.whole(side, "px", high=_MOST_PX) for side in ("width", "height"))
+        return cls(width, height, pitch)
 
     @property
     def centre(self) -> Array:
@@ -214,12 +212,7 @@ class CameraSpec:
     @classmethod
     def read(cls, reader: QuantityReader, name: str = "camera") -> Self:
         """Read a camera from a mapping of a YAML file; name: where it has none."""
-        pitch = reader.number("pixel_pitch", "mm", above=0.0)
-        if not 1e-5 <= pitch <= 0.1:
-            raise reader.fail(
-                "pixel_pitch", f"is {pitch:g} mm; pixels are a few thousandths of a mm"
-            )
-        width, height = (reader.whole(side, "px", high=_MOST_PX) for side in ("width", "height"))
+        sensor = Sensor.read(reader)
         distance = None
         if reader.mapping.get("principal_distance") is not None:
             distance = reader.number("principal_distance", "mm", above=0.0, low=1e-3, high=1e5)
@@ -230,7 +223,7 @@ class CameraSpec:
             inner.number("c", "mm", above=0.0, low=1e-3, high=1e5)
             known = {k: inner.finite(k, v) for k, v in inner.mapping.items() if v is not None}
             interior = InteriorOrientation.from_mapping(known)
-        return cls(reader.text("name", name), Sensor(width, height, pitch), distance, interior)
+        return cls(reader.text("name", name), sensor, distance, interior)
 
 
 def rotation(angles: ArrayLike) -> Array:

@@ -306,12 +306,8 @@ _AICON_FIELDS = ("camera", "type", *_AICON_LINES, *_AICON_SIZES)
 _TAGS = METASHAPE_FRAME.parameters
 
 
-def _aicon_family(model: CameraModel) -> Family:
-    """The radial correction vanishes at two thirds of the way to the corner, as is usual."""
-    return aicon(_usual_r0((model.sensor.width, model.sensor.height), model.sensor.pixel_pitch))
-
-
 def _usual_r0(size: Sequence[float] | Array, pitch: float) -> float:
+    """The radial correction vanishes at two thirds of the way to the corner, as is usual."""
     half_diagonal = 0.5 * float(np.hypot(*size)) * pitch
     return float(f"{2 / 3 * half_diagonal:.4g}")
 
@@ -406,7 +402,9 @@ def _typed(text: str) -> tuple[dict[str, str], dict[str, float], str]:
 
 
 AICON = Format(
-    "aicon", ".ior", "AICON interior orientation", _aicon_family, _encode_aicon, _decode_aicon,
+    "aicon", ".ior", "AICON interior orientation",
+    lambda m: aicon(_usual_r0((m.sensor.width, m.sensor.height), m.sensor.pixel_pitch)),
+    _encode_aicon, _decode_aicon,
     lambda text: _aicon_record(text) is not None
     or any(line.split()[:1] == ["Ck"] for line in text.splitlines()),
 )  # fmt: skip

@@ -20,8 +20,8 @@ import numpy as np
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
+    CameraSpec,
     ExteriorOrientation,
-    InteriorOrientation,
     Sensor,
 )
 from thermocald.photogrammetry.field.testfield import Observations, TestField, field_normals
@@ -99,27 +99,12 @@ _REMEDIES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Prior:
-    """What is known of the camera before a frame is measured; None for what is not.
-
-    With both orientations the targets are looked for where they should be first; where they are
-    not, and without, they are found by their codes. principal_distance: mm, from a data sheet.
-    """
-
-    sensor: Sensor | None = None
-    interior: InteriorOrientation | None = None
-    exterior: ExteriorOrientation | None = None
-    principal_distance: float | None = None
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
     """What a frame gave: observations (none where the status is not ok), {row: reason} for targets
     of the field that are in view and not measured, the approximate orientation (None where the
     targets did not carry one), and where the marker corners are. Where targets are tracked,
-    `searched` says why the whole frame was searched, empty where only windows were read, and
-    renewed how many targets got new weights.
+    `searched` says why the whole frame was searched, empty where only windows were read.
     """
 
     observations: Observations
@@ -128,52 +113,45 @@ class Measurement:
     orientation: Orientation | None = None
     markers: Corners | None = None
     searched: str = ""
-    renewed: int = 0
 
 
-def measure(image: NDArray[Any], testfield: TestField, prior: Prior | None = None) -> Measurement:
+def measure(
+    image: NDArray[Any], testfield: TestField, camera: CameraSpec | None = None
+) -> Measurement:
     """Measure a test field in a frame (H, W), grey, 8 or 16 bit.
 
+    camera: what is known of it beforehand; the targets are found by their codes.
     Never raises for what a camera may deliver: the status says what is wrong with the frame.
     Quality per target: `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` and
     `misfit` (residuals over noise; markers have none: NaN).
     Raises TestFieldError where the field's codes are wrong.
     """
-    prior = prior or Prior()
-    size = (prior.sensor.width, prior.sensor.height) if prior.sensor is not None else None
+    size = None if camera is None else (camera.sensor.width, camera.sensor.height)
     status = inspect_frame(image, size)
     if not status.ok:
         return Measurement(Observations.none(), status)
-    return _Frame(image, testfield, prior).measure()
+    height, width = image.shape
+    return _Frame(image, testfield, camera or CameraSpec("", Sensor(width, height, 1.0))).measure()
 
 
 class _Frame:
     """One frame while it is measured; `missed` grows and shrinks."""
 
-    def __init__(self, image: Image, testfield: TestField, prior: Prior) -> None:
-        self._image, self._field, self._prior = image, testfield, prior
-        self._sensor = prior.sensor or Sensor(image.shape[1], image.shape[0], 1.0)
+    def __init__(self, image: Image, testfield: TestField, camera: CameraSpec) -> None:
+        self._image, self._field, self._camera = image, testfield, camera
         self._missed: dict[int, str] = {}
         self._markers = locate_markers(image, testfield, self._missed)
 
     def measure(self) -> Measurement:
         """Measure markers and squares, then the circles."""
         if turned := corners_turned_deg(self._markers, self._field):
-            return self._result("other_field", _TURNED.format(turned))
+            return self._another_field(_TURNED.format(turned))
         corners = measure_corners(self._image, self._markers, self._missed)
         if "chess_corner" in self._field.kinds:
             corners = corners.joined(find_chessboards(self._image, self._field, self._missed))
         corners = corners.joined(self._second_look(corners))
         if not self._field.circles.any():
             return self._finished(corners)
-        prior = self._prior
-        if prior.interior is not None and prior.exterior is not None:
-            camera = CameraModel(self._sensor, prior.interior)
-            known = Orientation(camera, prior.exterior, np.zeros((0, 2)))
-            found, missed, orientation = self._circles(known, corners, known=False)
-            if len(found) >= max(_FEWEST, 0.5 * (len(found) + len(missed))):
-                self._missed.update(missed)
-                return self._finished(corners.joined(found), orientation)
         return self._by_codes(corners)
 
     def _second_look(self, corners: Observations) -> Observations:
@@ -205,11 +183,10 @@ class _Frame:
         return found
 
     def _orient(self, rows: NDArray[np.int64], points: Array) -> Orientation:
-        prior = self._prior
+        known = self._camera
         return orient(
-            self._sensor, self._field.points[rows], points, prior.principal_distance,
-            prior.interior,
-        )  # fmt: skip
+            known.sensor, self._field.points[rows], points, known.principal_distance, known.interior
+        )
 
     def _by_codes(self, corners: Observations) -> Measurement:
         """Find the circles by their codes and the corners."""
@@ -225,24 +202,21 @@ class _Frame:
         try:
             orientation = self._orient(pairs, np.concatenate([corners.points, maps.centre]))
         except GeometryError as error:
-            return self._result(
-                "other_field",
+            return self._another_field(
                 f"{len(pairs)} codes of the test field are seen, but not where it has them "
-                f"({error})",
+                f"({error})"
             )
-        measured, missed, orientation = self._circles(
-            orientation, corners, known=self._prior.interior is not None
-        )
+        measured, missed, orientation = self._circles(orientation, corners)
         self._missed.update(missed)
         return self._finished(corners.joined(measured), orientation, foreign)
 
     def _circles(
-        self, orientation: Orientation, corners: Observations, known: bool
+        self, orientation: Orientation, corners: Observations
     ) -> tuple[Observations, dict[int, str], Orientation]:
         """Fit every circle in view, improve the orientation with them, and fit once more if needed.
 
-        corners: what was measured before; known: whether the interior orientation is. Returns the
-        observations, {row: reason} for circles that were not measured, and the orientation.
+        corners: what was measured before. Returns the observations, {row: reason} for circles that
+        were not measured, and the orientation.
         """
         image, field = self._image, self._field
         rows, maps = predict_circles(field, orientation.camera, orientation.exterior)
@@ -258,8 +232,9 @@ class _Frame:
             return Observations.none(), missed, orientation
         pairs = np.concatenate([corners.targets, rows[good]])
         better = refine(
-            self._sensor, orientation.camera.interior, orientation.exterior, field.points[pairs],
-            np.concatenate([corners.points, fit.points[good]]), known=known,
+            self._camera.sensor, orientation.camera.interior, orientation.exterior,
+            field.points[pairs], np.concatenate([corners.points, fit.points[good]]),
+            known=self._camera.interior is not None,
         )  # fmt: skip
         new_rows, new_maps = predict_circles(field, better.camera, better.exterior)
         same = np.array_equal(new_rows, rows)
@@ -306,19 +281,12 @@ class _Frame:
                 )
         elif n < _FEWEST:
             word, why = "too_few", f"only {n} targets are found in the frame"
-        return self._result(word, why, observations, orientation)
+        status = FrameStatus(word, why)
+        return Measurement(observations, status, self._missed, orientation, self._markers)
 
-    def _result(
-        self,
-        word: Word,
-        reason: str,
-        observations: Observations | None = None,
-        orientation: Orientation | None = None,
-    ) -> Measurement:
-        return Measurement(
-            observations or Observations.none(), FrameStatus(word, reason), self._missed,
-            orientation, self._markers,
-        )  # fmt: skip
+    def _another_field(self, why: str) -> Measurement:
+        status = FrameStatus("other_field", why)
+        return Measurement(Observations.none(), status, self._missed, None, self._markers)
 
 
 def _why_nothing(missed: dict[int, str]) -> str:

@@ -24,12 +24,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 import numpy as np
 
 from thermocald.photogrammetry.field.testfield import Observations, TestField
-from thermocald.photogrammetry.frame.measurement import (
-    Measurement,
-    Prior,
-    measure,
-    predict_circles,
-)
+from thermocald.photogrammetry.frame.measurement import Measurement, measure, predict_circles
 from thermocald.photogrammetry.linalg import scaled_solve
 from thermocald.photogrammetry.targets.circle import CircleFit, blurred_disc, fit_circles
 from thermocald.photogrammetry.targets.corner import REACH_PX as CORNER_REACH_PX
@@ -43,6 +38,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from thermocald.arrays import Array, Image, Single
+    from thermocald.photogrammetry.camera.camera_model import CameraSpec
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,9 +137,8 @@ _Circles: TypeAlias = "tuple[NDArray[np.int64], GradientWeights, NDArray[np.bool
 class Tracker:
     """Measures the frames of one camera and one test field, one after the other."""
 
-    def __init__(self, testfield: TestField, prior: Prior | None = None) -> None:
-        self._testfield = testfield
-        self._prior = prior or Prior()
+    def __init__(self, testfield: TestField, camera: CameraSpec) -> None:
+        self._testfield, self._camera = testfield, camera
         self.reset()
 
     def reset(self) -> None:
@@ -158,7 +153,7 @@ class Tracker:
         """
         if isinstance(image, EncodedImage):
             if self._shape is not None and self._dtype == np.uint8:
-                parts = image.around(self._boxes, self._shape)
+                parts = image.around(_boxes(self._circles, self._markers), self._shape)
                 found = None if parts is None else self._track(parts, _MARGIN_PX)
                 if found is not None:
                     return found
@@ -175,14 +170,11 @@ class Tracker:
         )
 
     def _search(self, image: NDArray[Any], why: str) -> Measurement:
-        found = measure(image, self._testfield, self._prior)
+        found = measure(image, self._testfield, self._camera)
         # A frame that shows nothing says nothing about where the targets are: keep what is known.
         if found.status.ok:
             self._shape, self._dtype, self._seen = image.shape, image.dtype, len(found.observations)
             self._circles, self._markers = self._begin(image, found), found.markers or None
-            self._boxes = _boxes(
-                self._circles, self._markers
-            )  # what the next frame is looked at in
         return replace(found, searched=why)
 
     def _begin(self, image: Image, found: Measurement) -> _Circles | None:
@@ -215,7 +207,7 @@ class Tracker:
         `farthest` px.
         """
         missed: dict[int, str] = {}
-        found, circles, renewed = Observations.none(), self._circles, 0
+        found, circles = Observations.none(), self._circles
         markers = self._markers
         if markers is not None:
             found = measure_corners(image, markers, missed)
@@ -224,13 +216,11 @@ class Tracker:
             tracked = _track_circles(image, circles, missed, farthest)
             if tracked is None:
                 return None
-            found, circles, renewed = found.joined(tracked[0]), *tracked[1:]
+            found, circles = found.joined(tracked[0]), tracked[1]
         if len(found) < max(_FEWEST, (1 - _LOST_SHARE) * self._seen):
             return None
         self._seen, self._circles, self._markers = len(found), circles, markers
-        if renewed or markers is not None:
-            self._boxes = _boxes(circles, markers)
-        return Measurement(found, OK, missed, None, markers, "", renewed)
+        return Measurement(found, OK, missed, None, markers)
 
 
 def _boxes(circles: _Circles | None, markers: Corners | None) -> NDArray[np.int64]:
@@ -251,9 +241,9 @@ def _boxes(circles: _Circles | None, markers: Corners | None) -> NDArray[np.int6
 
 def _track_circles(
     image: Image, circles: _Circles, missed: dict[int, str], farthest: float
-) -> tuple[Observations, _Circles, int] | None:
-    """Return observations, the new state, and how many weights were renewed; None where all is
-    lost, or where targets that have to be fitted again moved by more than `farthest` px.
+) -> tuple[Observations, _Circles] | None:
+    """Return observations and the new state; None where all is lost, or where targets that have to
+    be fitted again moved by more than `farthest` px.
     """
     rows, weights, seen = circles
     fit = weights.apply(image)
@@ -288,17 +278,14 @@ def _track_circles(
     good = fit.good
     if good.sum() < (1 - _LOST_SHARE) * seen.sum():
         return None
-    renewed = int(np.sum(again & good))
-    if renewed > _RENEW_SHARE * good.sum():
+    if np.sum(again & good) > _RENEW_SHARE * good.sum():
         base = np.where(good[:, None], p, old)
         base[~good, :2] += shift
         weights = GradientWeights.build(image, weights.maps, weights.coded, base, weights.noise)
-    else:
-        renewed = 0
     if not good.all():
         missed.update(fit.missed(rows))
     fit = replace(fit, noise=fit.noise.scaled(factor))
-    return fit.observations(rows, good), (rows, weights, good), renewed
+    return fit.observations(rows, good), (rows, weights, good)
 
 
 def _median(values: Array) -> Array:

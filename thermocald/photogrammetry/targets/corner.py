@@ -95,11 +95,6 @@ def measure_corners(
     return found
 
 
-def _unit(v: Array) -> Array:
-    length: Array = np.linalg.norm(v, axis=-1, keepdims=True)
-    return v / np.where(length > 0, length, 1.0)
-
-
 def _wedge(h: Single, k: Single, rho: Single) -> Single:
     """P(H < h, K < k) of standard normals with correlation rho; h, k (n, m), rho (n, 1)."""
     value: Single = normal_cdf(h) * normal_cdf(k)
@@ -186,7 +181,9 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     # Inward normals of the two edges: perpendicular to one side, towards the other.
     normals = []
     for edge, other in ((sides[0], sides[1]), (sides[1], sides[0])):
-        normal = _unit(np.stack([-edge[:, 1], edge[:, 0]], axis=-1))
+        across = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
+        length = np.linalg.norm(across, axis=-1, keepdims=True)
+        normal = across / np.where(length > 0, length, 1.0)
         normals.append(normal * np.sign(np.sum(normal * other, axis=-1, keepdims=True)))
     px, py = x.astype(float), y.astype(float)
     dx, dy = px - corners[:, 0, None], py - corners[:, 1, None]

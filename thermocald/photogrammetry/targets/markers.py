@@ -179,7 +179,7 @@ def halved(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def detect_markers(
-    image: Image, name: str, expected: frozenset[int] | None = None
+    image: Image, name: str, expected: frozenset[int]
 ) -> tuple[dict[int, Array], int]:
     """Find the markers of one dictionary in an image; `expected` numbers, others are ignored.
 
@@ -200,7 +200,7 @@ def detect_markers(
         seen: defaultdict[int, list[Array]] = defaultdict(list)
         if numbers is not None:
             for number, corners in zip(numbers.ravel().tolist(), found, strict=True):
-                if expected is None or number in expected:
+                if number in expected:
                     at = scale * corners.reshape(4, 2).astype(float) + (scale - 1) / 2
                     if _outlined(grey, at):
                         seen[number].append(np.roll(at, corner_shift(name), axis=0))
@@ -212,7 +212,7 @@ def detect_markers(
                 single[number] = quads[0]
         if len(single) > len(best):
             best, best_border = single, border
-        if len(best) > 0.5 * (len(expected) if expected is not None else 0) and best:
+        if len(best) > 0.5 * len(expected):
             break
     return best, best_border
 

@@ -54,7 +54,7 @@ from thermocald.photogrammetry.targets.outline import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Sequence
 
     from numpy.typing import NDArray
 
@@ -149,11 +149,17 @@ def _circle(angles: int) -> Array:
 
 
 def sample(
-    image: NDArray[np.uint8], maps: LocalMap, radii: tuple[float, ...], angles: int
+    image: NDArray[np.uint8],
+    maps: LocalMap,
+    radii: Sequence[float],
+    angles: int,
+    ink: tuple[Single, Single] | None = None,
 ) -> Single:
     """Grey values (n, radii, angles) on circles about discs, clockwise from the first axis.
 
-    radii: of the circles, in radii of the disc; angles: how many samples a circle has.
+    radii: of the circles, in radii of the disc; angles: how many samples a circle has; ink: grey
+    value of the gap, and contrast (n,) of the disc: levels are returned then, 0 as the background,
+    1 as the disc.
     """
     circle = _circle(angles)
     grey = np.empty((len(maps), len(radii), angles), dtype=np.float32)
@@ -169,16 +175,15 @@ def sample(
         around += maps.centre[part].astype(np.float32)[:, None, :, None]
         x, y = (np.ascontiguousarray(around[:, :, k]).reshape(-1, angles) for k in (0, 1))
         grey[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, len(radii), angles)
-    return grey
+    return grey if ink is None else (grey - ink[0][:, None, None]) / ink[1][:, None, None]
 
 
-def sized(image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single) -> LocalMap:
-    """The maps with the size that the discs have at half of their contrast.
+def sized(image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]) -> LocalMap:
+    """The maps with the size that the discs have at half of their contrast; ink as of `sample`.
 
     A contour lies where its threshold does, which may be a pixel off.
     """
-    level = sample(image, maps, _EDGE_RADII, COARSE_ANGLES)
-    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    level = sample(image, maps, _EDGE_RADII, COARSE_ANGLES, ink)
     # The disc reaches as far as ink goes: its level, summed outwards.
     step = _EDGE_RADII[1] - _EDGE_RADII[0]
     radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
@@ -190,18 +195,17 @@ def sized(image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Singl
 
 
 def in_perspective(
-    image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
+    image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]
 ) -> LocalMap:
     """The maps (n,) of discs with the perspective in which their rings are seen.
 
-    gap, contrast (n,) DN. The edges of disc and ring are looked for along each radius; those of a
+    ink: as of `sample`. The edges of disc and ring are looked for along each radius; those of a
     target seen in perspective w about a centre that is e off lie at R − e·u − uᵀA u R − (w·u) R²
-    instead of at R = 1, 2, 3, with u the direction and A the ellipse's error. What the ring says
-    is of no matter here.
+    instead of at R = 1, 2, 3, with u the direction and A the ellipse's error. What the ring says is
+    of no matter here.
     """
     rho = np.arange(_PROFILE[0], _PROFILE[1], _PROFILE_STEP)
-    level = sample(image, maps, tuple(rho.tolist()), ANGLES)
-    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    level = sample(image, maps, rho.tolist(), ANGLES, ink)
     u = _circle(ANGLES)
     # away from the ends of an arc, whose corners are rounded by blur
     ring = level[:, np.argmin(np.abs(rho - 2.5))] > _INSIDE
@@ -344,14 +348,15 @@ def read_codes(
     them are enough: discs about which no code was found are then not looked at in perspective.
     """
     rows, gap, contrast = _disc_and_gap(image, candidates, polarity)
-    maps = sized(image, candidates.select(rows), gap, contrast)
-    found = _read(image, maps, gap, contrast)
+    ink = gap, contrast
+    maps = sized(image, candidates.select(rows), ink)
+    found = _read(image, maps, ink)
     # Seen from near and aslant, a ring is not concentric with its disc: by pixels if it is large.
     left = np.nonzero(found[:, 0] == 0)[0]
     codes, enough = wanted
     if len(left) and sum(tuple(c) in codes for c in found.tolist()) < enough:
         grey = gap[left], contrast[left]
-        found[left] = _read(image, in_perspective(image, maps.select(left), *grey), *grey)
+        found[left] = _read(image, in_perspective(image, maps.select(left), grey), grey)
     read = [(bits, number) for bits, number in found.tolist()]
     count = Counter(read)
     return {
@@ -360,15 +365,13 @@ def read_codes(
 
 
 def _read(
-    image: NDArray[np.uint8], maps: LocalMap, gap: Single, contrast: Single
+    image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]
 ) -> NDArray[np.int64]:
     """Bits, 0 where no code can be trusted, and numbers (n, 2) of the codes about discs."""
-    level = sample(image, maps, RADII, ANGLES)
-    level = (level - gap[:, None, None]) / contrast[:, None, None]
+    level = sample(image, maps, RADII, ANGLES, ink)
     families = np.array(BITS, dtype=np.int64)
-    readings = [_read_family(level, maps, n) for n in families.tolist()]
-    numbers = np.array([r[0] for r in readings]).reshape(len(families), len(maps))
-    misfits = np.array([r[1] for r in readings]).reshape(len(families), len(maps))
+    readings = zip(*(_read_family(level, maps, n) for n in BITS), strict=True)
+    numbers, misfits = (np.stack(column) for column in readings)
     best, at = np.argmin(misfits, axis=0), np.arange(len(maps))
     misfit = misfits[best, at]
     misfits[best, at] = np.inf

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import DataError
-from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.physics.effect import (
     Effect,
     OfTime,
+    Operated,
     Parameter,
-    Remembering,
+    Proportional,
     Steady,
     coefficient_units,
-    say_estimate,
 )
 from thermocald.physics.history import Follower, History, follow_delay, follow_lag
 from thermocald.physics.operators import interpolation_matrix
@@ -26,10 +25,10 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.physics.effect import Estimates, Values
+    from thermocald.physics.effect import Values
 
 
-class ThermalLag(Remembering):
+class ThermalLag(Operated):
     """The linear terms follow L instead of T, with τ dL/dt = T - L and L = T at the start.
 
     The lumped-capacity body: τ = heat capacity × thermal resistance to where T is measured.
@@ -39,11 +38,12 @@ class ThermalLag(Remembering):
     name = "thermal_lag"
     operator = "lag"
     noun = "a thermal lag"
+    says = "the camera follows the thermometer with a lag of {tau}"
     kind = "drive"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+    nonlinear: Mapping[str, Parameter] = {
         "tau": Parameter("s", 2.0, 3000.0, 60.0, log=True, role="time_constant")
     }
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "settles",
         "rate": "opens the loop more when fast, and rounds its tips",
         "cycle": "returns to the same line each time",
@@ -52,9 +52,6 @@ class ThermalLag(Remembering):
 
     def follower(self, values: Values) -> Follower | None:
         return follow_lag(float(values["tau"]))
-
-    def sentence(self, estimates: Estimates) -> str:
-        return f"the camera follows the thermometer with a lag of {say_estimate(estimates['tau'])}"
 
 
 class TimeOffset(Effect):
@@ -65,11 +62,10 @@ class TimeOffset(Effect):
 
     name = "time_offset"
     noun = "a time offset"
+    says = "the camera follows the thermometer after a pure delay of {d}"
     kind = "drive"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
-        "d": Parameter("s", -300.0, 300.0, 10.0, role="delay")
-    }
-    behaviour: ClassVar[Mapping[str, str]] = {
+    nonlinear: Mapping[str, Parameter] = {"d": Parameter("s", -300.0, 300.0, 10.0, role="delay")}
+    behaviour: Mapping[str, str] = {
         "hold": "stops at once after the delay",
         "rate": "shifts the whole curve by the same time, its tips stay sharp",
         "cycle": "returns to the same line each time",
@@ -82,13 +78,7 @@ class TimeOffset(Effect):
     def drive(self, history: History, d: float = 0.0, **_: Any) -> Array:
         return history.polygon().at(history.times - d)
 
-    def unresolved(
-        self,
-        history: History,
-        rate_jump: Array | None = None,  # noqa: ARG002
-        d: float = 0.0,
-        **_: Any,
-    ) -> Array:
+    def unresolved(self, history: History, rate_jump: Array, d: float = 0.0, **_: Any) -> Array:  # noqa: ARG002
         """Return what is not known after the last reading, where the thermometer is ahead.
 
         As much as the temperature usually changes over the time that is missing.
@@ -106,15 +96,8 @@ class TimeOffset(Effect):
         p = history.polygon()
         return interpolation_matrix(p.times, history.times - d) @ p.matrix
 
-    def sentence(self, estimates: Estimates) -> str:
-        late = say_estimate(estimates["d"])
-        return f"the camera follows the thermometer after a pure delay of {late}"
 
-
-_NOISE_JUMPS = 3.0  # standard deviations that a jump of the rate must be beyond noise
-
-
-class ThermalGradient(Remembering):
+class ThermalGradient(Operated):
     """Adds a dT/dt: the difference across a plate that heat flows through, so its bow.
 
     In a body that warms steadily the difference between its faces is proportional to the rate:
@@ -124,31 +107,22 @@ class ThermalGradient(Remembering):
     name = "thermal_gradient"
     operator = "rate"
     noun = "a thermal gradient"
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("(K/s)")
+    linear: Mapping[str, str] = coefficient_units("(K/s)")
     usual = ("c", "x0", "y0")
     moves_mount = True
     follows_rate = True
     steady_signal = Steady()
     of_now = True
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "vanishes as soon as the temperature stands",
         "rate": "grows in proportion to the rate",
         "cycle": "changes its sign between up and down",
         "idle": "does nothing",
     }
 
-    def unresolved(self, history: History, rate_jump: Array | None = None, **_: Any) -> Array:
+    def unresolved(self, history: History, rate_jump: Array, **_: Any) -> Array:  # noqa: ARG002
         """Return by how much the rate jumps where a lamp is switched between two readings."""
-        if rate_jump is not None:
-            return rate_jump
-        p = history.polygon()
-        if len(p.times) < 5:
-            return np.zeros(len(history.times))
-        jumps = np.abs(np.diff(np.diff(p.values) / np.diff(p.times)))
-        noise = mad_sd(jumps)
-        excess = np.sqrt(np.maximum(jumps**2 - (_NOISE_JUMPS * noise) ** 2, 0.0))
-        at_knots = np.concatenate([excess[:1], excess, excess[-1:]]) / 2.0
-        return np.interp(history.times, p.times, at_knots)
+        return rate_jump
 
 
 class SelfHeating(OfTime):
@@ -160,13 +134,13 @@ class SelfHeating(OfTime):
 
     name = "self_heating"
     noun = "self-heating"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+    says = "the device warms itself, unseen by the thermometer, with a time constant of {tau}"
+    nonlinear: Mapping[str, Parameter] = {
         "tau": Parameter("s", 10.0, 10000.0, 300.0, log=True, role="time_constant")
     }
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("1")
-    usual = ("c", "x0", "y0")
+    linear: Mapping[str, str] = coefficient_units("1")
     steady_signal = Steady((1.0, 0.0, 0.0))
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "idle": "rises and settles although the thermometer stands",
         "restart": "comes again after each power-on",
         "hold": "goes on with its own time constant",
@@ -176,36 +150,21 @@ class SelfHeating(OfTime):
     def signal(self, history: History, tau: float = 300.0, **_: Any) -> Array:
         return -np.expm1(-history.times / tau)[:, None]
 
-    def sentence(self, estimates: Estimates) -> str:
-        return (
-            "the device warms itself, unseen by the thermometer, with a time constant of "
-            f"{say_estimate(estimates['tau'])}"
-        )
 
-
-class SecondHeatSource(Effect):
+class SecondHeatSource(Proportional):
     """Adds a (T_channel - T₀), linear in another temperature column of the recording."""
 
     name = "second_heat_source"
     noun = "a second heat source"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
-        "channel": Parameter("name", 0.0, 0.0, 0.0, text=True)
-    }
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
-    usual = ("c", "x0", "y0")
-    of_now = True
-    behaviour: ClassVar[Mapping[str, str]] = dict.fromkeys(
+    says = "{channel} heats the camera too"
+    nonlinear: Mapping[str, Parameter] = {"channel": Parameter("name", 0.0, 0.0, 0.0, text=True)}
+    linear: Mapping[str, str] = coefficient_units("K")
+    behaviour: Mapping[str, str] = dict.fromkeys(
         ("load", "idle", "hold"), "follows the other thermometer"
     )
 
     def channel(self, history: History, channel: str = "", **_: Any) -> str:
         return channel or next(c for c in history.readings if c != history.reference)
-
-    def signal(self, history: History, channel: str = "", **_: Any) -> Array:
-        return (history.temperature(self.channel(history, channel)) - history.T0)[:, None]
-
-    def sensitivity(self, history: History, channel: str = "", **_: Any) -> csr_array:
-        return history.temperature_matrix(self.channel(history, channel))
 
     def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:
         channel = str(values["channel"])
@@ -215,6 +174,3 @@ class SecondHeatSource(Effect):
                 f"{{{channel!r}: …}}"
             )
         return Steady((float(channels[channel]) - T0, 0.0, 0.0))
-
-    def sentence(self, estimates: Estimates) -> str:
-        return f"{estimates['channel']['value']} heats the camera too"

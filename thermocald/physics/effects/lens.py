@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.physics.effect import Effect, Proportional, Steady, coefficient_units, say_estimate
+from thermocald.physics.effect import Proportional, Steady, coefficient_units
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from scipy.sparse import csr_array
-
-    from thermocald.arrays import Array
-    from thermocald.physics.effect import Estimates, Values
+    from thermocald.physics.effect import Prediction, Values
     from thermocald.physics.history import History
 
 
-class NonlinearExpansion(Effect):
+class NonlinearExpansion(Proportional):
     """Adds a (T - T₀)² to c, x0, y0.
 
     Source: the second coefficient of length and of refractive index against temperature, e.g.
@@ -27,11 +24,10 @@ class NonlinearExpansion(Effect):
 
     name = "nonlinear_expansion"
     noun = "a quadratic expansion"
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K2")
-    usual = ("c", "x0", "y0")
+    power = 2
+    linear: Mapping[str, str] = coefficient_units("K2")
     steady_signal = Steady((0.0, 0.0, 1.0))
-    of_now = True
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "does not move while the temperature stands",
         "cycle": "runs along the same curve up and down",
         "hotter": "keeps bending at every temperature",
@@ -39,23 +35,16 @@ class NonlinearExpansion(Effect):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, **_: Any) -> Array:
-        return ((history.temperature() - history.T0) ** 2)[:, None]
-
-    def sensitivity(self, history: History, **_: Any) -> csr_array:
-        slope = 2.0 * (history.temperature() - history.T0)
-        return history.temperature_matrix().multiply(slope[:, None]).tocsr()
-
 
 class RadialDistortionDrift(Proportional):
     """Adds a (T - T₀) to A1 (A2, A3)."""
 
     name = "radial_distortion_drift"
     noun = "a drift of the radial distortion"
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("A1", "A2", "A3"))
+    linear: Mapping[str, str] = coefficient_units("K", ("A1", "A2", "A3"))
     usual = ("A1",)
     parameter_sets = (("A1",), ("A1", "A2"), ("A1", "A2", "A3"))
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         **Proportional.behaviour, "turn": "stays radial about the principal point"
     }  # fmt: skip
 
@@ -65,11 +54,9 @@ class DecenteringDrift(Proportional):
 
     name = "decentering_drift"
     noun = "a drift of the decentering distortion"
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("B1", "B2"))
+    linear: Mapping[str, str] = coefficient_units("K", ("B1", "B2"))
     usual = ("B1", "B2")
-    behaviour: ClassVar[Mapping[str, str]] = {
-        **Proportional.behaviour, "turn": "turns with the camera"
-    }  # fmt: skip
+    behaviour: Mapping[str, str] = {**Proportional.behaviour, "turn": "turns with the camera"}
 
 
 class AffinityDrift(Proportional):
@@ -77,9 +64,9 @@ class AffinityDrift(Proportional):
 
     name = "affinity_drift"
     noun = "a drift of the affinity"
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("C1", "C2"))
+    linear: Mapping[str, str] = coefficient_units("K", ("C1", "C2"))
     usual = ("C1", "C2")
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         **Proportional.behaviour, "turn": "turns with the camera, along the sensor axes"
     }  # fmt: skip
 
@@ -94,18 +81,17 @@ class Defocus(Proportional):
 
     name = "defocus"
     noun = "defocus"
+    says = "heat defocuses: the measuring noise grows by {factor}"
     kind = "image"
-    linear: ClassVar[Mapping[str, str]] = {"factor": "1/K"}
+    linear: Mapping[str, str] = {"factor": "1/K"}
     usual = ("factor",)
     seen_in = "noise"
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "leaves positions alone; noise stays as large as it is",
         "cycle": "makes noise come and go with the temperature",
     }
 
-    def image_changes(self, history: History, values: Values) -> dict[str, Any]:
+    def influence(self, history: History, values: Values, found: Prediction) -> None:
         factor = np.maximum(1.0 + values["factor"] * self.signal(history)[:, 0], 0.1)
-        return {"noise_factor": factor, "blur_factor": factor}
-
-    def sentence(self, estimates: Estimates) -> str:
-        return f"heat defocuses: the measuring noise grows by {say_estimate(estimates['factor'])}"
+        found.noise_factor *= factor
+        found.blur_factor *= factor

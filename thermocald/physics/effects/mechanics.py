@@ -6,21 +6,17 @@ its targets.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermocald.errors import ConfigurationError
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
 from thermocald.physics.effect import (
-    Displacement,
-    Effect,
-    Influence,
     OfTime,
+    Operated,
     Parameter,
     Proportional,
-    Remembering,
     Steady,
     coefficient_units,
     say_estimate,
@@ -35,11 +31,10 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
-    from thermocald.physics.effect import Estimates, Values
+    from thermocald.physics.effect import Estimates, Prediction, Values
 
 
-class Hysteresis(Remembering):
+class Hysteresis(Operated):
     """The linear terms follow P = min(max(P, T - r), T + r): a play of half-width r on T.
 
     P rests until T is r away from it, then follows; the loop closes. P = T at the start.
@@ -49,11 +44,12 @@ class Hysteresis(Remembering):
     name = "hysteresis"
     operator = "play"
     noun = "hysteresis"
+    says = "the way up is not the way down: the camera follows with a play of ± {half_width}"
     kind = "drive"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+    nonlinear: Mapping[str, Parameter] = {
         "half_width": Parameter("K", 0.05, 20.0, 1.0, log=True, role="width")
     }
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "does not settle: it stays where it is",
         "cycle": "closes its loop each time, with flat pieces at the turns",
         "rate": "shows the same loop at any rate",
@@ -67,14 +63,8 @@ class Hysteresis(Remembering):
         p = history.polygon()
         return play_turns(p.times, p.values, half_width, history.times)
 
-    def sentence(self, estimates: Estimates) -> str:
-        return (
-            "the way up is not the way down: the camera follows with a play of "
-            f"± {say_estimate(estimates['half_width'])}"
-        )
 
-
-class Softening(Effect):
+class Softening(Operated):
     """Adds a max(T - T_k, 0): a second slope above the knee T_k.
 
     Source: expansion of a polymer is two straight lines that meet at the glass transition (ISO
@@ -82,14 +72,16 @@ class Softening(Effect):
     """
 
     name = "softening"
+    operator = "above"
     noun = "softening"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+    says = "something gives way above {T_k}"
+    nonlinear: Mapping[str, Parameter] = {
         "T_k": Parameter("degC", -40.0, 150.0, 40.0, role="threshold")
     }
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
+    linear: Mapping[str, str] = coefficient_units("K")
     usual = ("c", "x0", "y0")
     of_now = True
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "does not move while the temperature stands",
         "cycle": "runs along the same bent line up and down",
         "hotter": "goes on along a straight line above its knee",
@@ -97,21 +89,11 @@ class Softening(Effect):
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, T_k: float = 40.0, **_: Any) -> Array:
-        return np.maximum(history.temperature() - T_k, 0.0)[:, None]
-
-    def sensitivity(self, history: History, T_k: float = 40.0, **_: Any) -> csr_array:
-        above = (history.temperature() > T_k).astype(float)
-        return history.temperature_matrix().multiply(above[:, None]).tocsr()
-
     def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:  # noqa: ARG002
         return Steady(knee=float(values["T_k"]), knee_name="T_k")
 
-    def sentence(self, estimates: Estimates) -> str:
-        return f"something gives way above {say_estimate(estimates['T_k'])}"
 
-
-class PermanentSet(Remembering):
+class PermanentSet(Operated):
     """Adds a (max over the past of T - T₀); the past begins with the series.
 
     Source: the reference study found it in the RPi camera v2.1 (Elias et al. 2020, Sensors 20, 643,
@@ -121,12 +103,12 @@ class PermanentSet(Remembering):
     name = "permanent_set"
     operator = "maximum"
     noun = "a permanent set"
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K")
+    linear: Mapping[str, str] = coefficient_units("K")
     usual = ("c", "x0", "y0")
     irreversible = True
     steady_signal = Steady((0.0, 1.0, 0.0))
     of_now = True
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "stays where it is",
         "cycle": "appears the first time only: the second loop does not widen it",
         "hotter": "grows again as soon as it is hotter than ever before",
@@ -147,10 +129,9 @@ class Creep(OfTime):
 
     name = "creep"
     noun = "creep"
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("s")
-    usual = ("c", "x0", "y0")
+    linear: Mapping[str, str] = coefficient_units("s")
     moves_mount = True
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "idle": "goes on at the same rate and never settles",
         "restart": "goes on from where it was, whether powered or not",
         "hold": "goes on at the same rate",
@@ -169,14 +150,12 @@ class Slip(OfTime):
 
     name = "slip"
     noun = "a slip"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
-        "time": Parameter("s", 0.0, 1e9, 600.0, role="event")
-    }
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("1")
-    usual = ("c", "x0", "y0")
+    says = "a part slipped at {time} after the start"
+    nonlinear: Mapping[str, Parameter] = {"time": Parameter("s", 0.0, 1e9, 600.0, role="event")}
+    linear: Mapping[str, str] = coefficient_units("1")
     fresh = ("time",)
     moves_mount = True
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "hold": "does not come again",
         "cycle": "does not come again at the same temperature",
         "idle": "does nothing",
@@ -185,23 +164,20 @@ class Slip(OfTime):
     def signal(self, history: History, time: float = 600.0, **_: Any) -> Array:
         return (history.times >= time).astype(float)[:, None]
 
-    def sentence(self, estimates: Estimates) -> str:
-        return f"a part slipped at {say_estimate(estimates['time'])} after the start"
-
 
 class HousingTilt(Proportional):
     """Adds a (T - T₀) to omega, phi, kappa; the projection centre stays."""
 
     name = "housing_tilt"
     noun = "a tilt of the housing"
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", ("omega", "phi", "kappa"))
+    linear: Mapping[str, str] = coefficient_units("K", ("omega", "phi", "kappa"))
     usual = ("omega", "phi", "kappa")
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         **Proportional.behaviour, "turn": "keeps its direction in space"
     }  # fmt: skip
 
 
-class MountMotion(Remembering):
+class MountMotion(Operated):
     """Adds a (L - T₀) to the orientation and the projection centre; τ dL/dt = T - L, L = T at the
     start. Without tau, or where it is 0, L is T.
 
@@ -213,15 +189,15 @@ class MountMotion(Remembering):
     name = "mount_motion"
     operator = "lag"
     noun = "a motion of the mount"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+    nonlinear: Mapping[str, Parameter] = {
         "tau": Parameter("s", 2.0, 3000.0, 300.0, log=True, role="time_constant")
     }
     optional = ("tau",)
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("K", EOP_NAMES)
+    linear: Mapping[str, str] = coefficient_units("K", EOP_NAMES)
     usual = EOP_NAMES
     parameter_sets = (EOP_NAMES, EOP_NAMES[:3])
     steady_signal = Steady((0.0, 1.0, 0.0))
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "turn": "keeps its direction in space",
         "hold": "settles",
         "rate": "opens a loop when fast",
@@ -253,15 +229,15 @@ class CyclicInterference(OfTime):
 
     name = "cyclic_interference"
     noun = "a cyclic interference"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+    says = "something cycles with a period of {P}"
+    nonlinear: Mapping[str, Parameter] = {
         "P": Parameter("s", 20.0, 5000.0, 120.0, log=True, role="period"),
         "phase": Parameter("rad", -np.pi, np.pi, 0.0, role="phase"),
     }
-    linear: ClassVar[Mapping[str, str]] = coefficient_units("1")
-    usual = ("c", "x0", "y0")
+    linear: Mapping[str, str] = coefficient_units("1")
     fresh = ("phase",)
     moves_mount = True
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "disconnect": "stops",
         "idle": "goes on at the same period",
         "hold": "goes on at the same period",
@@ -275,9 +251,6 @@ class CyclicInterference(OfTime):
         a, phase = float(values[name]), float(values["phase"])
         return a * np.array([np.cos(phase), np.sin(phase)])
 
-    def sentence(self, estimates: Estimates) -> str:
-        return f"something cycles with a period of {say_estimate(estimates['P'])}"
-
 
 class TestFieldExpansion(Proportional):
     """Object coordinates times 1 + α (T - T₀), one α per axis, about the origin of the field.
@@ -288,14 +261,14 @@ class TestFieldExpansion(Proportional):
     name = "test_field_expansion"
     noun = "expansion of the test field"
     kind = "image"
-    linear: ClassVar[Mapping[str, str]] = {"X": "1/K", "Y": "1/K", "Z": "1/K"}
+    linear: Mapping[str, str] = {"X": "1/K", "Y": "1/K", "Z": "1/K"}
     usual = ("X", "Y", "Z")
-    columns: ClassVar[Mapping[str, str]] = {"X": "scale_X", "Y": "scale_Y", "Z": "scale_Z"}
-    behaviour: ClassVar[Mapping[str, str]] = {**Proportional.behaviour, "shade": "stops"}
+    columns: Mapping[str, str] = {"X": "scale_X", "Y": "scale_Y", "Z": "scale_Z"}
+    behaviour: Mapping[str, str] = {**Proportional.behaviour, "shade": "stops"}
 
-    def image_changes(self, history: History, values: Values) -> dict[str, Any]:
+    def influence(self, history: History, values: Values, found: Prediction) -> None:
         rates = np.array([float(values.get(axis, 0.0)) for axis in self.linear])
-        return {"scale": 1.0 + self.signal(history) * rates}
+        found.scale *= 1.0 + self.signal(history) * rates
 
 
 class TargetDisplacement(OfTime):
@@ -303,30 +276,26 @@ class TargetDisplacement(OfTime):
 
     name = "target_displacement"
     noun = "displaced targets"
+    says = "targets {targets} have moved at {time} after the start"
     kind = "image"
-    nonlinear: ClassVar[Mapping[str, Parameter]] = {
+    nonlinear: Mapping[str, Parameter] = {
         "time": Parameter("s", 0.0, 1e9, 600.0, role="event"),
         "targets": Parameter("names", 0.0, 0.0, 0.0, text=True),
     }
-    linear: ClassVar[Mapping[str, str]] = {"dX": "mm", "dY": "mm", "dZ": "mm"}
+    linear: Mapping[str, str] = {"dX": "mm", "dY": "mm", "dZ": "mm"}
     usual = ("dX", "dY", "dZ")
     fresh = ("time", "targets")
     seen_in = "targets"
-    behaviour: ClassVar[Mapping[str, str]] = {
+    behaviour: Mapping[str, str] = {
         "turn": "concerns the same targets, wherever the camera looks",
         "cycle": "does not come again",
         "idle": "does nothing",
     }
 
-    def signal(self, history: History, time: float = 600.0, **_: Any) -> Array:
-        return (history.times >= time).astype(float)[:, None]
-
-    def influence(
-        self, history: History, values: Values, field: TestField | None = None
-    ) -> Influence:
-        nothing = Influence.none(len(history.times))
+    def influence(self, history: History, values: Values, found: Prediction) -> None:
+        field = found.field
         if field is None:
-            return nothing
+            return
         targets = values["targets"]
         named = [targets] if isinstance(targets, str) else list(targets)
         for target in named:
@@ -335,14 +304,6 @@ class TargetDisplacement(OfTime):
                     f"effect {self.name}: the test field has no target {target!r}; it has "
                     f"{len(field)}, {field.names[0]!r} the first"
                 )
-        moved = Displacement(
-            np.array([field.index[target] for target in named], dtype=np.int64),
-            np.array([float(values.get(axis, 0.0)) for axis in self.linear]),
-            history.times >= float(values["time"]),
-        )
-        return replace(nothing, displacements=(moved,))
-
-    def sentence(self, estimates: Estimates) -> str:
-        targets = estimates["targets"]["value"]
-        named = targets if isinstance(targets, str) else ", ".join(targets)
-        return f"targets {named} have moved at {say_estimate(estimates['time'])} after the start"
+        rows = np.array([field.index[target] for target in named], dtype=np.int64)
+        vector = np.array([float(values.get(axis, 0.0)) for axis in self.linear])
+        found.displacements.append((rows, vector, history.times >= float(values["time"])))

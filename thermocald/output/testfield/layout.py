@@ -60,10 +60,6 @@ _EDGES = {
 }
 
 
-class _OutOfCodes(UsageError):
-    """There are fewer codes than places on the sheets."""
-
-
 @dataclass(frozen=True, slots=True)
 class Design:
     """What is asked of a print.
@@ -164,7 +160,7 @@ def lay_out(design: Design) -> tuple[Sheet, ...]:
     if design.bits is None:
         try:
             return lay_out(replace(design, bits=12))
-        except _OutOfCodes:
+        except UsageError:  # where it is not the codes, it fails again
             return lay_out(replace(design, bits=14))
     _check(design)
     width, height = (side - 2 * TRIM for side in design.page)
@@ -240,7 +236,7 @@ def _codes(design: Design) -> Iterator[str]:
         available = ring_code.codes(design.bits)
         for number in available[design.first_code :]:
             yield ring_code.write(design.bits, number)
-        raise _OutOfCodes(
+        raise UsageError(
             f"the field needs more than the {len(available) - design.first_code} ring codes of "
             f"{design.bits} bits that are left: "
             + ("take --bits 14, or " if design.bits == 12 else "take ")

@@ -113,24 +113,21 @@ def forward(
     import socket
     import threading
 
-    from thermocald.fleet.forward import Forwarder, FrameRule, forward_forever
+    from thermocald.fleet.forward import Forwarder, forward_forever
 
-    rule = None
+    frames: dict[str, Any] = {}
     if config is not None:
         read = load_config(config)
         store, to = store or read.store.path, to or read.forward.to
         station = station or read.forward.station
-        section = read.forward
-        if section.frames != "none":
-            most = int(section.frames_mb_per_day * 1e6)
-            rule = FrameRule(read.frames.folder, section.frames, section.every_n, most)
+        frames = {"frames": read.frames.folder, "rule": read.forward}
         if to is None:
             say(f"{config}: forward.to is null: nothing is sent")
             return
     if store is None or to is None:
         raise UsageError("give STORE and --to ADDRESS, or --config FILE")
     address = ServerAddress.parse(to)
-    forwarder = Forwarder(store, address, station or socket.gethostname(), cursor, frames=rule)
+    forwarder = Forwarder(store, address, station or socket.gethostname(), cursor, **frames)
     if once:
         done = forwarder.send_waiting()
         write_json({"sent": dict(done.sent), "refused": done.refused}, json)

@@ -64,7 +64,7 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
         "servers": [str(address) for address in addresses],
         "time": now,
         "cameras": [document_of(camera) for camera in cameras],
-        "types": [document_of(kind) for kind in types],
+        "types": types,
         "summary": {
             "cameras": len(cameras),
             "stations": len({c.station for c in cameras}),

@@ -15,7 +15,7 @@ from thermocald.physics.scene import Scene
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.recording.testfield_file import write_testfield
 
-MAKE, MODEL = 0x010F, 0x0110
+MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
 TAKEN, SUBSECONDS, OFFSET, FOCAL, F35, SERIAL = 0x9003, 0x9291, 0x9011, 0x920A, 0xA405, 0xA431
 GREY = np.full((48, 64), 90, np.uint8)
 
@@ -28,7 +28,7 @@ def save_photograph(
 
     exif = Image.Exif()
     for tag, value in tags.items():
-        (exif if tag in (MAKE, MODEL) else exif.get_ifd(0x8769))[tag] = value
+        (exif if tag in (MAKE, MODEL, ORIENTATION) else exif.get_ifd(0x8769))[tag] = value
     Image.fromarray(grey).save(file, exif=exif, **options)
 
 

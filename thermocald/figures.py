@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from matplotlib.figure import Figure as Drawing
+
     from thermocald.arrays import Array
 
 # Colour-blind safe (Okabe & Ito 2008), dark enough for thin lines on white paper.
@@ -268,10 +270,11 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
         return drawing
 
 
-def draw_figure(figure: Figure) -> Any:
+def draw_figure(figure: Figure) -> Drawing:
     """All of a figure in one drawing, for a paper."""
-    if figure.drawing is not None:
-        return figure.drawing
+    drawing: Drawing | None = figure.drawing
+    if drawing is not None:
+        return drawing
     with drawing_style():
         columns = figure.in_a_row
         rows = -(-len(figure.panels) // columns)

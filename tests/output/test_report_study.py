@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.pictures import ORIENTATION, save_photograph
 from thermocald.analysis.study.measured import Clip
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.output.study.report import cut_clip, render_study, save_figures
@@ -71,7 +72,7 @@ def test_a_study_of_nearly_nothing_says_why(empty_study):
     assert "No Monte-Carlo" in words
 
 
-def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told):
+def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told, tmp_path):
     clip = told.cameras[0].series[0].series.clip
     cut = cut_clip(clip.first, clip.centre, 15)
     assert cut[7, 7] == 250
@@ -79,6 +80,11 @@ def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told
     assert (cut[:, 2] == 50).all()
     assert len(re.findall(r'src="data:image/png;base64,', html)) == 2
     assert "Image around target 17" in html
+    # how a camera says that its picture is to be shown does not turn where the target was
+    turned = np.zeros((30, 40), np.uint8)
+    turned[10, 5] = 250
+    save_photograph(tmp_path / "turned.jpg", {ORIENTATION: 6}, turned, quality=100)
+    assert cut_clip(tmp_path / "turned.jpg", clip.centre, 15)[7, 7] > 200
 
 
 @pytest.mark.slow

@@ -13,12 +13,13 @@ import io
 import json
 import math
 import shutil
+from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import generate_latest
 from prometheus_client.core import GaugeMetricFamily
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
@@ -66,14 +67,14 @@ _ONLINE = {
 }
 
 
+@dataclass(frozen=True)
 class _StatusCollector:
     """A daemon's status as metrics; an empty one says that none runs."""
 
-    def __init__(self, status: Mapping[str, Any]) -> None:
-        self._status = status
+    status: Mapping[str, Any]
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        status = self._status
+        status = self.status
         single: list[tuple[str, str, float]] = [("up", "Whether a daemon answers.", bool(status))]
         if status:
             store = status["store"]
@@ -108,14 +109,13 @@ class _StatusCollector:
 
 def _metrics(request: Request) -> Response:
     """The status in the text format of Prometheus."""
-    registry = CollectorRegistry()
-    registry.register(_StatusCollector(_view(request).status()))
-    content_type = "text/plain; version=0.0.4; charset=utf-8"
-    return Response(generate_latest(registry), media_type=content_type)
+    text = generate_latest(_StatusCollector(_view(request).status()))
+    return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 _STATIC = Path(__file__).parent / "static"
 _FILES = {
+    "index.html": "text/html",
     "page.js": "text/javascript; charset=utf-8",
     "page.css": "text/css; charset=utf-8",
     "icon.svg": "image/svg+xml",
@@ -141,7 +141,7 @@ def build_application(
     """The application; token: None if whoever reaches it may look; names: further ones of ours."""
     application = Starlette(
         routes=[
-            Route("/", _page),
+            Route("/", partial(_static, name="index.html")),
             Route("/static/plotly.js", _plotly),
             Route("/static/{name}", _static),
             Route("/api/stream", _stream),
@@ -246,12 +246,8 @@ def _view(request: Request) -> View:
     return view
 
 
-def _page(_: Request) -> Response:
-    return Response((_STATIC / "index.html").read_bytes(), media_type="text/html")
-
-
-def _static(request: Request) -> Response:
-    name = request.path_params["name"]
+def _static(request: Request, name: str = "") -> Response:
+    name = name or request.path_params["name"]
     if name not in _FILES:
         raise DataError("there is no such file")
     return Response((_STATIC / name).read_bytes(), media_type=_FILES[name])

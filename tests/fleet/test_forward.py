@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import ServerError, ServerGone, UsageError
-from thermocald.fleet.forward import Forwarder, forward_forever
+from thermocald.fleet.forward import Forwarder, Progress, forward_forever
 from thermocald.store.database.store import Store
 from thermocald.store.series import Event, LoggedReading
 
@@ -153,12 +153,16 @@ def test_a_row_that_the_server_refuses_stops_no_other(filled, server):
 
 def test_a_server_that_dies_and_comes_back_gets_everything_once(filled, server, make_epoch):
     store, series = filled
-    troubles, sent, rounds = [], [], []
+    forwarder = Forwarder(store.path, address(server), "bank", batch=4)
+    told, rounds, send_waiting = [], [], forwarder.send_waiting
 
-    def report(progress, trouble):
-        troubles.append(trouble)
-        if progress:
-            sent.append(progress.rows)
+    def send():
+        try:
+            told.append(send_waiting().rows)
+        except ServerGone as error:
+            told.append(str(error))
+            raise
+        return Progress({}, 0)
 
     def wait(_seconds):
         rounds.append(len(rounds))
@@ -170,9 +174,11 @@ def test_a_server_that_dies_and_comes_back_gets_everything_once(filled, server, 
             server.start()
         return len(rounds) == 6
 
-    forward_forever(Forwarder(store.path, address(server), "bank", batch=4), wait, report)
-    assert [bool(t) for t in troubles[:4]] == [False, True, True, False]
-    assert "cannot be reached" in troubles[1]
+    forwarder.send_waiting = send
+    forward_forever(forwarder, wait)
+    assert [isinstance(t, str) for t in told[:4]] == [False, True, True, False]
+    assert "cannot be reached" in told[1]
+    sent = [t for t in told if not isinstance(t, str)]
     assert sum(sent) == count(server, "epoch") == 20 + 5 * 3
 
 

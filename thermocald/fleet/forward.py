@@ -305,15 +305,10 @@ def _read_frame(files: FileFolder, frame: KeptFrame) -> bytes | None:
         return None
 
 
-def forward_forever(
-    forwarder: Forwarder,
-    wait: Callable[[float], bool],
-    report: Callable[[Progress | None, str], None] = lambda *_: None,
-) -> None:
+def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None:
     """Send what waits, again and again, until `wait(seconds)` says that it should end.
 
-    report(progress, trouble): after each round; trouble is empty where all was sent. An error
-    that a person must mend is reported and tried again at the longest pause: nothing is lost
+    An error that a person must mend is logged and tried again at the longest pause: nothing is lost
     meanwhile, the store keeps it.
     """
     pause, trouble = _FIRST_PAUSE_S, ""
@@ -324,16 +319,13 @@ def forward_forever(
             if str(error) != trouble:
                 log.warning("%s; rows wait in the store", error)
             trouble = str(error)
-            report(None, trouble)
-            pause = min(2 * pause, _LONGEST_PAUSE_S)
-            if not isinstance(error, ServerGone):
-                pause = _LONGEST_PAUSE_S
+            passing = isinstance(error, ServerGone)
+            pause = min(2 * pause, _LONGEST_PAUSE_S) if passing else _LONGEST_PAUSE_S
             if wait(pause):
                 return
             continue
         if trouble:
             log.info("%s is reached again, %d rows sent", forwarder.address, progress.rows)
         pause, trouble = _FIRST_PAUSE_S, ""
-        report(progress, "")
         if wait(_IDLE_S):
             return

@@ -17,7 +17,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.commands import call
+from tests.commands import call, finish
 from tests.daemon.conftest import make_recording
 from thermocald import addresses
 from thermocald.acquisition.device_loop import Link
@@ -349,7 +349,7 @@ def test_no_file_is_everybody_s_or_nobody_s(tmp_path, recording, umask, what):
         if command[0] == "run":  # it has a process to itself, threads and signals
             subprocess.run([*program, *command], cwd=tmp_path, check=True, capture_output=True)
         else:
-            assert call(*command, folder=tmp_path).returncode == 0
+            finish(*command, folder=tmp_path)
     finally:
         os.umask(before)
     found = list(tmp_path.rglob("*"))

@@ -7,7 +7,7 @@ import json
 import pytest
 import yaml
 
-from tests.commands import answer
+from tests.commands import answer, succeed
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
 from thermocald.config import parse_config
 from thermocald.daemon import soundness as devices
@@ -67,8 +67,7 @@ def test_what_is_attached_can_be_written_as_it_is_shown(sysfs):
 
 def test_the_command(sysfs, tmp_path):
     out = tmp_path / "devices.json"
-    result = answer("devices", "--json", out)
-    assert result.exit_code == 0, result.output
+    result = succeed("devices", "--json", out)
     document = json.loads(out.read_text())
     assert document["format"] == "thermocald-devices/1"
     assert len(document["devices"]) == 6

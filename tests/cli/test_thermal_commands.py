@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from tests.commands import answer as run
+from tests.commands import succeed
 from tests.pictures import MODEL, TAKEN, save_photograph, write_markers
 from thermocald.errors import ThermocaldError
 from thermocald.photogrammetry import camera_files
@@ -82,8 +83,7 @@ def folder(tmp_path_factory):
                  lambda x, y, sx, sy: (x - 140, y - 232, sx, sy))  # fmt: skip
     with_columns(path / "M2", path / "swapped", ("board_temperature", "temperature"))
     with_columns(path / "M2", path / "board", ("board_temperature",))
-    result = run("fit", path / "M1", "-o", path / "cam.yaml")
-    assert result.exit_code == 0, result.exception
+    succeed("fit", path / "M1", "-o", path / "cam.yaml")
     return path
 
 
@@ -108,10 +108,9 @@ def folder(tmp_path_factory):
 )  # fmt: skip
 def test_an_effect_that_needs_a_name(tmp_path, effect, option, keys):
     simulated(4, effect).write(tmp_path / "M1")
-    result = run(
+    result = succeed(
         "fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--effect", option, "--json", "-"
     )
-    assert result.exit_code == 0, result.exception
     (found,) = json.loads(result.stdout)["effects"]
     for key in keys:
         estimate = found["parameters"][key]
@@ -152,8 +151,7 @@ def test_an_effect_twice_is_refused(folder):
 def test_a_model_is_tested_on_another_series(folder, series):
     """Also where pixels were binned, or where another thermometer stands first."""
     test = ("--test", folder / series, "--json", "-")
-    result = run("predict", "--model", folder / "cam.yaml", *test)
-    assert result.exit_code == 0, result.exception
+    result = succeed("predict", "--model", folder / "cam.yaml", *test)
     (found,) = json.loads(result.stdout)["series"]
     assert found["rms_px"] < 1.1 * found["floor_px"]
     assert 0.93 < found["coverage"] < 0.97
@@ -170,9 +168,8 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
         for one in model["fitted_on"]:
             one["thermometer_sd_K"] = noise
         (tmp_path / "cam.yaml").write_text(yaml.safe_dump(model, sort_keys=False))
-        done = run("correct", points, "--log", folder / "M1" / "epochs.csv",
+        succeed("correct", points, "--log", folder / "M1" / "epochs.csv",
                    "--model", tmp_path / "cam.yaml", "--out", tmp_path / "out.csv")  # fmt: skip
-        assert done.exit_code == 0, done.exception
         sds.append(float(np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)["sd_x"]))
     assert sds[1] > 5 * sds[0]
 
@@ -279,10 +276,9 @@ def test_binned_points_are_scaled(folder, tmp_path):
     moved = {}
     for size, x, y in (("3280x2464", 2000.5, 800.5), ("1640x1232", 1000.0, 400.0)):
         (tmp_path / "p.csv").write_text(f"time,x,y\n{time:.2f},{x},{y}\n")
-        done = run("correct", tmp_path / "p.csv", "--model", folder / "cam.yaml", "--log",
+        succeed("correct", tmp_path / "p.csv", "--model", folder / "cam.yaml", "--log",
                    folder / "M1" / "epochs.csv", "--size", size,
                    "--out", tmp_path / "o.csv")  # fmt: skip
-        assert done.exit_code == 0, done.exception
         table = np.genfromtxt(tmp_path / "o.csv", delimiter=",", names=True)
         moved[size] = np.array([table["dx"], table["dy"]])
     assert np.abs(moved["3280x2464"]).max() > 0.5
@@ -290,9 +286,9 @@ def test_binned_points_are_scaled(folder, tmp_path):
 
 
 def test_far_outside_by_name_is_done_and_said(folder):
-    result = run("predict", "--model", folder / "cam.yaml", "--temperature", -40, "--extrapolate")
-    assert result.exit_code == 0
-    assert "standard deviations are widened" in result.stderr
+    outside = ("--temperature", -40, "--extrapolate")
+    told = succeed("predict", "--model", folder / "cam.yaml", *outside).stderr
+    assert "standard deviations are widened" in told
 
 
 # --- images ------------------------------------------------------------------------------------
@@ -394,8 +390,7 @@ def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
     (tmp_path / "p.csv").write_text(points)
     told = ["--model", str(folder / "cam.yaml"), "--log", str(folder / "M1" / "epochs.csv")]
     of_file = run("correct", tmp_path / "p.csv", *told)
-    piped = run("correct", "-", *told, given=points)
-    assert piped.exit_code == 0, piped.exception
+    piped = succeed("correct", "-", *told, given=points)
     assert piped.stdout == of_file.stdout
     assert len(piped.stdout.splitlines()) == len(times) + 1
 
@@ -419,8 +414,7 @@ def test_fit_measures_frames_first(tmp_path):
     simulation = simulated(5, epochs=16, interval=90.0, kind="markers")
     simulation.write(tmp_path / "M1", with_frames=True)
     assert not (tmp_path / "M1" / "observations.csv").exists()
-    result = run("fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--json", "-")
-    assert result.exit_code == 0, result.exception
+    result = succeed("fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--json", "-")
     document = json.loads(result.stdout)
     assert document["series"][0]["epochs"] == 16
     for name in ("c", "x0", "y0"):
@@ -453,9 +447,8 @@ def test_calibrate_starts_from_the_camera_of_another_program(tmp_path, camera):
     near = CameraModel(camera.sensor, camera.interior.with_values(c=camera.interior.c * 1.01))
     camera_files.write(near, path, "opencv")
     images = sorted(tmp_path.glob("*.png"))
-    result = run("calibrate", *images, "--testfield", tmp_path / "field.csv", "--camera", path,
+    result = succeed("calibrate", *images, "--testfield", tmp_path / "field.csv", "--camera", path,
                  "--json", "-")  # fmt: skip
-    assert result.exit_code == 0, result.exception
     interior = json.loads(result.stdout)["interior"]
     for key in ("c", "x0", "y0"):
         assert abs(interior[key] - getattr(camera.interior, key)) < 4 * interior[f"sd_{key}"], key

@@ -259,20 +259,6 @@ def test_a_wrong_address_of_a_server_is_not_quoted_with_it(address):
     assert SECRET not in call("study", address).stderr
 
 
-def test_a_cursor_knows_the_whole_address_but_not_the_password():
-    one = "postgresql://u:hunter2@h:5433/db?sslmode=require&host=/run/a"
-    places = {
-        ServerAddress.parse(text).place
-        for text in (
-            one, one.replace("/run/a", "/run/b"), one.replace("/db", "/other"),
-            one.replace("u:", "v:"), one.replace("@h", "@g"), one.replace("5433", "5434"),
-        )
-    }  # fmt: skip
-    assert len(places) == 6
-    assert ServerAddress.parse(one).place == ServerAddress.parse(one.replace(SECRET, "x")).place
-    assert not [place for place in places if SECRET in place]
-
-
 @pytest.mark.parametrize("kind", [DeviceGone, DeviceDenied, ValueError])
 def test_what_a_library_says_is_clean_in_status_event_and_log(caplog, kind):
     class Quoting(Device):

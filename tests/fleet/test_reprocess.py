@@ -17,8 +17,8 @@ from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
 
 
-def files(out):
-    return {p.relative_to(out): p.read_bytes() for p in sorted(out.rglob("*.parquet"))}
+def files(out, pattern="*.parquet"):
+    return {p.relative_to(out): p.read_bytes() for p in sorted(out.rglob(pattern))}
 
 
 def blocks_of(archive, out, size=40):

@@ -19,16 +19,6 @@ from thermocald.physics.scene import Scene
 from thermocald.store.recording.testfield_file import read_testfield
 
 
-def test_print_writes_files_and_says_what_to_measure(tmp_path):
-    result = succeed("testfield", "print", "--paper", "A4", "--out", tmp_path / "field")
-    assert sorted(p.name for p in (tmp_path / "field").iterdir()) == [
-        "testfield-1.svg", "testfield-2.svg", "testfield-3.svg", "testfield.csv", "testfield.pdf",
-    ]  # fmt: skip
-    assert result.stdout.count("for --scale R") == 3
-    field = read_testfield(tmp_path / "field" / "testfield.csv")
-    assert f"{sum(bool(c) for c in field.codes)} coded" in result.stdout
-
-
 def test_a_printed_field_is_not_overwritten(tmp_path):
     folder = tmp_path / "not" / "there" / "yet"
     printed = partial(run, "testfield", "print", "--paper", "200x150", "--flat", "--out", folder)

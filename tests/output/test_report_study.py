@@ -14,7 +14,6 @@ from thermocald.analysis.study.measured import Clip
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.output.study.report import cut_clip, render_study, save_figures
 from thermocald.output.study.summary import study_document
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 
 @pytest.fixture(scope="module")
@@ -114,15 +113,9 @@ def test_figures_for_a_paper(told, tmp_path):
     assert all(p.stat().st_size > 3000 for p in paths)
 
 
-def test_json_has_no_nan_and_a_standard_deviation_beside_each_value(told, empty_study):
+def test_json_has_no_nan(told, empty_study):
+    """Its keys are those of tests/golden."""
     for one in (told, empty_study):
         json.dumps(study_document(one), allow_nan=False)
-    document = study_document(told)
-    assert document["format"] == "thermocald-study/1"
-    camera = document["cameras"][0]
-    deviation = camera["series"][0]["deviations"]["x0"]
+    deviation = study_document(told)["cameras"][0]["series"][0]["deviations"]["x0"]
     assert deviation["sd_change"] == pytest.approx(7e-6 * np.sqrt(2))
-    dependence = camera["series"][0]["temperature_dependence"]["temperature"]["parameters"]["c"]
-    assert {"slope", "sd_slope", "p", "p_naive", "p_holm"} <= set(dependence)
-    assert set(camera["sd_over_time"]) == set(IOP_NAMES)
-    assert sum(camera["object_space"]["fractions"]) == pytest.approx(1)

@@ -19,7 +19,7 @@ from thermocald.figures import BAND, PALETTE, Curve, Figure, Panel
 from thermocald.files import write_text
 from thermocald.numbers import UNITS, parameter_label, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.report import Answer, Chapter, Section, Table, as_sentence, render_report
+from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def render_certificate(camera: ThermalCamera) -> str:
     values = np.array([state.interior.as_array() for state in states])
     sds = np.array([[state.sd.get(name, 0.0) for name in IOP_NAMES] for state in states])
     missing = bool(document.get("effect_missing"))
-    chapter = Chapter(
+    return Chapter(
         f"Thermal model of {document['camera']}",
         Answer(
             _sentence(document, camera.model.sensor.pixel_pitch, low, high),
@@ -61,8 +61,7 @@ def render_certificate(camera: ThermalCamera) -> str:
         ),
         about=(_about(camera, document),),
         notes=tuple(as_sentence(line) for line in doubt_lines(document.get("doubts", ()))),
-    )  # fmt: skip
-    return render_report(chapter.title, [chapter])
+    ).page()  # fmt: skip
 
 
 def _section(title: str, *tables: Table) -> Section:

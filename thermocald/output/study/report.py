@@ -113,11 +113,11 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
     drawn = study_figures(camera)
 
     def section(
-        title: str, names: Sequence[str], found: Sequence[Table | None],
+        title: str, names: Sequence[str], found: Sequence[Table],
         more: Sequence[Figure] = (), text: Sequence[str] = (), folded: bool = False,
     ) -> Section:  # fmt: skip
         shown = [drawn[name] for name in names if name in drawn]
-        rows = tuple(t for t in found if t is not None and t.rows)
+        rows = tuple(t for t in found if t.rows)
         return Section(title, tuple(text), (*shown, *more), rows, folded=folded)
 
     matrices = [name for name in drawn if name.startswith("correlation-")]
@@ -132,7 +132,7 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
         ),
         section(
             "What it means in object space", ("object-space-errors", "errors-by-point"),
-            [tables.cluster_table(camera), tables.point_table(camera)],
+            tables.object_space_tables(camera),
         ),
         section(
             "Whether the changes are significant", ("significance",),

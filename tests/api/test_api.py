@@ -83,9 +83,6 @@ def test_a_store_and_its_recording_are_the_same_series(inside, M1):
     assert repr(other) == repr(kept)
     a, b = kept.calibrate(exterior="series"), M1.calibrate(exterior="series")
     np.testing.assert_allclose(a.values, b.values, rtol=1e-6)
-
-
-def test_several_series_have_to_be_told_apart(inside):
     with pytest.raises(StoreError, match=r"camera/series in this store: rpi-v2\.1/M1"):
         tc.open("thermocald.db", "M7")
     with pytest.raises(StoreError, match="does not exist"):

@@ -104,7 +104,6 @@ def test_export_of_several_series_names_the_option(recording, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
-        (("replay", "no-such-folder"), 1, "does not exist"),
         (("export", "{recording}", "--format", "xlsx"), 2, "csv, json and parquet"),
         (("replay", "{recording}", "--free", "c,zoom"), 2, "'zoom' is no IOP"),
         (("replay", "{recording}", "--exterior", "both"), 2, "per_epoch, series, mount, auto"),

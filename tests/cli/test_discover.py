@@ -76,13 +76,10 @@ def test_another_camera_is_refused(recordings, tmp_path):
     other.remove(own)
     series, _ = generate(Case((), 0.1, 3, epochs=30, camera=other[0], with_m2=False))
     write(series[0], tmp_path / "M2")
+    with pytest.raises(UsageError, match="M1 is missing"):
+        discover()
     with pytest.raises(DataError, match="another camera"):
         discover(recordings / "M1", "--verify", tmp_path / "M2")
-
-
-def test_no_m1_is_wrong_usage():
-    with pytest.raises(UsageError):
-        discover()
 
 
 def test_a_real_recording_without_temperature(shared):

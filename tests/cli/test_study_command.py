@@ -90,7 +90,6 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
         ([], UsageError, "give recordings or stores"),
         (["nowhere"], DataError, "nowhere: does not exist"),
         (["--reference", "x"], UsageError, "give no recordings with it"),
-        (["RECORDING", "--window", "30"], UsageError, "must be odd"),
         (["RECORDING", "--report", "RECORDING/epochs.csv/r.html"], OutputError, "written"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
         (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no IOP"),

@@ -87,6 +87,10 @@ def folder(tmp_path_factory):
     return path
 
 
+def times_of(folder):
+    return np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+
+
 # --- effects by name ---------------------------------------------------------------------------
 
 
@@ -159,7 +163,7 @@ def test_a_model_is_tested_on_another_series(folder, series):
 
 def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_path):
     """What the fit found, not what thermometers usually have."""
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     points = tmp_path / "points.csv"
     points.write_text(f"time,x,y\n{times[20]:.3f},500,400\n")
     model = yaml.safe_load((folder / "cam.yaml").read_text())
@@ -208,8 +212,7 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
     ],
 )
 def test_wrong_use_is_refused(folder, tmp_path, arguments, says):
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
-    begin, end = times[0], times[-1]
+    begin, *_, end = times_of(folder)
     files = {
         "points": f"time,x,y\n{begin + 60:.1f},500,400\n",
         "images": f"time,image\n{begin + 60:.1f},small.png\n",
@@ -272,7 +275,7 @@ def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
 
 def test_binned_points_are_scaled(folder, tmp_path):
     """Points of 2 × 2 binned images get half the correction."""
-    time = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)[40]
+    time = times_of(folder)[40]
     moved = {}
     for size, x, y in (("3280x2464", 2000.5, 800.5), ("1640x1232", 1000.0, 400.0)):
         (tmp_path / "p.csv").write_text(f"time,x,y\n{time:.2f},{x},{y}\n")
@@ -296,7 +299,7 @@ def test_far_outside_by_name_is_done_and_said(folder):
 
 def correct_images(folder, source, out, *more):
     """Images at the start and in the heat, as a camera of 8 × 8 binned pixels takes them."""
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     (source / "i.csv").write_text(f"time,image\n{times[0]:.2f},a.png\n{times[45]:.2f},b.png\n")
     return run("correct", source / "i.csv", "--model", folder / "cam.yaml", "--log",
                folder / "M1" / "epochs.csv", "--size", "410x308", "--out", out, *more)  # fmt: skip
@@ -331,7 +334,7 @@ def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
     tags = {MODEL: "imx219", TAKEN: "2026:06:14 12:00:00"}
     save_photograph(tmp_path / f"a.{kind}", tags, grey)
     (tmp_path / f"b.{kind}").write_bytes(b"no picture")
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     rows = f"{times[40]:.2f},b.{kind}\n{times[45]:.2f},a.{kind}\n"
     (tmp_path / "i.csv").write_text(f"time,image\n{rows}")
     result = run("correct", tmp_path / "i.csv", "--model", folder / "cam.yaml", "--log",
@@ -351,7 +354,7 @@ def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
 
 def test_rows_of_standard_input_are_corrected_as_they_come(folder):
     """Each is answered before the next is written; one that cannot be is named by its line."""
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     command = [sys.executable, "-m", "thermocald", "correct", "-", "--model", folder / "cam.yaml",
                "--log", folder / "M1" / "epochs.csv"]  # fmt: skip
     with subprocess.Popen(
@@ -382,7 +385,7 @@ def test_rows_of_standard_input_are_corrected_as_they_come(folder):
 
 
 def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     points = "time,x,y\n" + "".join(f"{t:.2f},{500 + i},400\n" for i, t in enumerate(times))
     (tmp_path / "p.csv").write_text(points)
     told = ["--model", str(folder / "cam.yaml"), "--log", str(folder / "M1" / "epochs.csv")]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -240,20 +240,12 @@ def test_a_new_store_in_the_place_of_the_old_is_sent_from_its_start(
 
 def test_two_forwarders_at_once_do_no_harm(filled, server, tmp_path):
     store, _ = filled
-    errors = []
 
     def send(name):
-        try:
-            Forwarder(store.path, address(server), "bank", tmp_path / name, batch=2).send_waiting()
-        except Exception as error:
-            errors.append(error)
+        Forwarder(store.path, address(server), "bank", tmp_path / name, batch=2).send_waiting()
 
-    threads = [threading.Thread(target=send, args=(f"c{i}",)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert errors == []
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(send, ("a", "b", "c", "d")))  # none fails
     assert count(server, "epoch") == 20
 
 

@@ -66,8 +66,10 @@ def test_system_clock_is_woken():
 
 
 @pytest.mark.parametrize("kind", ["camera", "thermometer", "output"])
-def test_look_up_names_what_there_is(kind):
+def test_look_up_names_what_there_is(kind, monkeypatch):
     assert "mock" in hal.driver_names(kind)
+    monkeypatch.setattr(hal.metadata, "entry_points", None)  # once: all packages are looked through
+    assert load_driver(kind, "mock").__name__.startswith("Mock")
     with pytest.raises(ConfigurationError, match=f"no {kind} driver 'none'; installed are: .*mock"):
         load_driver(kind, "none")
 

@@ -115,7 +115,6 @@ def _metrics(request: Request) -> Response:
 
 _STATIC = Path(__file__).parent / "static"
 _FILES = {
-    "index.html": "text/html",
     "page.js": "text/javascript; charset=utf-8",
     "page.css": "text/css; charset=utf-8",
     "icon.svg": "image/svg+xml",
@@ -141,7 +140,7 @@ def build_application(
     """The application; token: None if whoever reaches it may look; names: further ones of ours."""
     application = Starlette(
         routes=[
-            Route("/", partial(_static, name="index.html")),
+            Route("/", _page),
             Route("/static/plotly.js", _plotly),
             Route("/static/{name}", _static),
             Route("/api/stream", _stream),
@@ -246,8 +245,12 @@ def _view(request: Request) -> View:
     return view
 
 
-def _static(request: Request, name: str = "") -> Response:
-    name = name or request.path_params["name"]
+def _page(_: Request) -> Response:
+    return Response((_STATIC / "index.html").read_bytes(), media_type="text/html")
+
+
+def _static(request: Request) -> Response:
+    name = request.path_params["name"]
     if name not in _FILES:
         raise DataError("there is no such file")
     return Response((_STATIC / name).read_bytes(), media_type=_FILES[name])

@@ -65,15 +65,14 @@ _STYLE: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """x, y (n,); kind: line, points, or band between `lower` and `upper` (n,) about a line."""
+    """x, y (n,); half: half the width (n,) of a band about the line."""
 
     name: str
     x: Array
     y: Array
-    kind: Literal["line", "points", "band"] = "line"
+    kind: Literal["line", "points"] = "line"
     colour: str = PALETTE[0]
-    lower: Array | None = None
-    upper: Array | None = None
+    half: Array | None = None
     dashed: bool = False
 
 
@@ -374,10 +373,9 @@ def _draw_curve(axis: Any, curve: Curve) -> None:
         return
     style = "--" if curve.dashed else "-"
     axis.plot(curve.x, curve.y, style, color=curve.colour, linewidth=1.1, label=label)
-    if curve.kind == "band" and curve.lower is not None and curve.upper is not None:
-        axis.fill_between(
-            curve.x, curve.lower, curve.upper, color=curve.colour, alpha=0.2, linewidth=0
-        )
+    if curve.half is not None:
+        lower, upper = curve.y - curve.half, curve.y + curve.half
+        axis.fill_between(curve.x, lower, upper, color=curve.colour, alpha=0.2, linewidth=0)
 
 
 def draw_arrows(axis: Any, arrows: Arrows) -> None:

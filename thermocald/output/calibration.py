@@ -179,7 +179,7 @@ def _by_radius(points: Array, residuals: Array, sensor: Sensor) -> Figure:
     ).reshape(-1, 3).T  # fmt: skip
     curves = (
         Curve("points", radius, outwards, "points", "#9fc4dc"),
-        Curve("mean, 95 %", x, y, "band", PALETTE[1], y - BAND * sd, y + BAND * sd),
+        Curve("mean, 95 %", x, y, "line", PALETTE[1], BAND * sd),
     )
     panel = Panel(
         "Residuals outwards", "distance from the image centre in px", "outwards in px", curves,

@@ -210,7 +210,7 @@ def _trajectory(d: Discovery) -> Figure:
         ]
         ends, band = np.array([np.nanmin(x), np.nanmax(x)]), np.full(2, BAND * noise)
         left = [
-            Curve("", ends, np.zeros(2), "band", GREY, -band, band),
+            Curve("", ends, np.zeros(2), "line", GREY, band),
             Curve("", x, before, "points", _BASE),
         ]
         if found:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from thermocald.figures import BAND, PALETTE, Curve, Figure, Panel
+from thermocald.figures import BAND, Curve, Figure, Panel
 from thermocald.files import write_text
 from thermocald.numbers import UNITS, parameter_label, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
@@ -110,10 +110,7 @@ def _drift(T: Array, values: Array, sds: Array, missing: bool) -> Figure:
     for name in ("c", "x0", "y0"):
         k = IOP_NAMES.index(name)
         y, half = 1e3 * (values[:, k] - values[middle, k]), 1e3 * BAND * sds[:, k]
-        curve = (
-            Curve("", T, y, "line", PALETTE[0]) if missing
-            else Curve("", T, y, "band", PALETTE[0], y - half, y + half)
-        )  # fmt: skip
+        curve = Curve("", T, y, half=None if missing else half)
         label = parameter_label(name)
         panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
     band = "no band is stated" if missing else "bands hold 95 %, the level's uncertainty included"

@@ -77,7 +77,7 @@ def deviation_figure(camera: CameraStudy) -> Figure:
             s = study.series
             change, band = scale * (s.values[:, k] - s.values[0, k]), scale * BAND * s.sds[:, k]
             t, y, half = thin(s.time_s / 60, change, band)
-            curves.append(Curve(s.name, t, y, "band", colour, y - half, y + half))
+            curves.append(Curve(s.name, t, y, "line", colour, half))
         panels.append(Panel(f"Δ{parameter_label(name)}", "time in min", label, tuple(curves)))
     for study, colour in _coloured(camera):
         s, d = study.series, study.deviations

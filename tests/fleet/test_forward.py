@@ -204,21 +204,6 @@ def test_a_damaged_row_is_not_sent_and_stops_no_other(filled, server):
     assert execute(server, "SELECT refused FROM station") == [(3,)]
 
 
-def test_a_second_store_of_a_station_adds_what_it_says(server, tmp_path, head, field, make_epoch):
-    """Its ids begin at 1 again: after an SD card was replaced, or with two daemons on one host."""
-    for name in ("first", "second"):
-        path = tmp_path / f"{name}.db"
-        with Store.open(path, "append") as store:
-            series = store.create_series(head, field, created_utc=len(name))
-            store.append(series, make_epoch(1))
-            store.add_event(Event(1.6e9, "knock", name, series.id, 1))
-            store.add_readings([LoggedReading("air", 1.6e9 + len(name), {"t": 20.0})])
-        for _ in range(2):
-            Forwarder(path, address(server), "bank").send_waiting()
-            path.with_name(f"{path.name}.forwarded").unlink()
-    assert [count(server, table) for table in ("epoch", "event", "reading")] == [2, 2, 2]
-
-
 def test_a_new_store_in_the_place_of_the_old_is_sent_from_its_start(
     server, tmp_path, head, field, make_epoch
 ):

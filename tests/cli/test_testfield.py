@@ -12,6 +12,7 @@ import pytest
 from tests.commands import invoke as run
 from tests.commands import succeed
 from tests.photogrammetry import network_cases as cases
+from tests.pictures import ORIENTATION, save_photograph
 from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
@@ -217,12 +218,7 @@ def test_a_turned_camera_does_not_turn_its_picture(tmp_path):
     """
     from thermocald.photogrammetry.targets.image_file import decode_grey
 
-    grey = np.arange(48 * 64, dtype=np.uint32).reshape(48, 64) % 251
-    encoded = cv2.imencode(".jpg", grey.astype(np.uint8))[1].tobytes()
-    tiff = b"II*\0\x08\0\0\0" + b"\x01\0" + b"\x12\x01\x03\0\x01\0\0\0\x06\0\0\0" + b"\0\0\0\0"
-    block = b"Exif\0\0" + tiff
-    marked = encoded[:2] + b"\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block + encoded[2:]
     path = tmp_path / "turned.jpg"
-    path.write_bytes(marked)
+    save_photograph(path, {ORIENTATION: 6})
     assert cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).shape == (64, 48)  # the block is understood
     assert decode_grey(path).shape == (48, 64)

@@ -41,6 +41,13 @@ def call(*arguments: object, folder: Path | None = None) -> subprocess.Completed
     return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
 
 
+def finish(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Return what `call` gives of a command that has to end well."""
+    done = call(*arguments, folder=folder)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
 def answer(*arguments: object, given: str | None = None, **environment: str) -> Result:
     """Return the result of a command; given: its standard input."""
     words = [str(a) for a in arguments]

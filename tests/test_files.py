@@ -23,14 +23,11 @@ def write(tmp_path):
     return write_text
 
 
-def test_a_mapping_is_read_in_its_order(write):
+def test_a_mapping_is_read_in_its_order_also_with_anchors(write):
     document = {"b": 1, "a": {"x": [1, 2.5, "ä"], "y": None}}
     path = write(dump_yaml(document))
     assert read_yaml(path) == document
     assert list(read_yaml(path)) == ["b", "a"]
-
-
-def test_anchors_may_be_used(write):
     assert read_yaml(write("a: &x {k: 1}\nb: {<<: *x, l: 2}\n"))["b"] == {"k": 1, "l": 2}
 
 

@@ -170,9 +170,8 @@ class HostNames:
     """
 
     def __init__(self, host: str, more: Iterable[str] = ()) -> None:
-        names = {_plain(name) for name in ("localhost", host, *more)}
-        self._addresses = {a for name in names if (a := _address(name)) is not None}
-        self._names = {name for name in names if _address(name) is None}
+        names = map(_plain, ("localhost", host, *more))
+        self._known = {_address(name) or name for name in names}
 
     def allow_host(self, header: str) -> bool:
         """Whether a `Host` header, `name`, `name:port` or `[address]:port`, names us."""
@@ -188,7 +187,10 @@ class HostNames:
                 return False
         if port and not (port.isascii() and port.isdigit() and int(port) < 65536):
             return False
-        return self._allow(_plain(text))
+        address = _address(_plain(text))
+        if address is not None and _is_loopback(address):
+            return True
+        return (address or _plain(text)) in self._known
 
     def allow_origin(self, header: str) -> bool:
         """Whether the value of an `Origin` header names a page of ours."""
@@ -197,12 +199,6 @@ class HostNames:
         except ValueError:
             return False
         return parts.scheme in ("http", "https") and self.allow_host(parts.netloc)
-
-    def _allow(self, name: str) -> bool:
-        address = _address(name)
-        if address is None:
-            return name in self._names
-        return _is_loopback(address) or address in self._addresses
 
 
 def _plain(name: str) -> str:

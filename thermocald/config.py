@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from urllib.parse import urlsplit
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -35,12 +36,14 @@ Period = Annotated[float, Field(ge=0.05, le=86400.0)]
 Positive = Annotated[float, Field(gt=0.0, le=1e9)]
 
 
-def relative_to_file(value: Path | None, info: ValidationInfo) -> Path | None:
-    """Return a path of the file, which is relative to its folder."""
-    if value is None:
-        return None
-    folder: Path = (info.context or {}).get("folder", Path())
-    return folder / value.expanduser()
+def _folder(info: ValidationInfo) -> Path:
+    """Return the folder of the file that is read."""
+    found: Path = (info.context or {}).get("folder", Path())
+    return found
+
+
+FilePath = Annotated[Path, AfterValidator(lambda path, info: _folder(info) / path.expanduser())]
+"""A path that is relative to the folder of the file."""
 
 
 def _is_number(annotation: Any) -> bool:
@@ -206,12 +209,8 @@ class DeviceConfig(Section):
     def _resolve(cls, data: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, dict):
             return data
-        folder: Path = (info.context or {}).get("folder", Path())
-        own = keys(cls)
-        resolved = {k: v if k in own else _resolved(v, folder) for k, v in data.items()}
-        if isinstance(data.get("options"), dict):
-            resolved["options"] = _resolved(data["options"], folder)
-        return resolved
+        own = set(keys(cls)) - {"options"}
+        return {k: v if k in own else _resolved(v, _folder(info)) for k, v in data.items()}
 
 
 class ThermometerConfig(DeviceConfig):
@@ -242,15 +241,15 @@ class CameraConfig(DeviceConfig):
     """Size of the image and of a pixel."""
     principal_distance_mm: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = None
     """Nominal; helps to find a first orientation."""
-    testfield: Path | None = None
+    testfield: FilePath | None = None
     """A testfield.csv; without it frames are only taken."""
-    thermal_model: Path | None = None
+    thermal_model: FilePath | None = None
     """In place of a test field: the camera is predicted from its thermometers."""
-    control_points: Path | None = None
+    control_points: FilePath | None = None
     """With a thermal model: surveyed points that give its pose in each frame."""
     control_unit: Literal["mm", "m"] = "m"
     """Of the control points' coordinates in a CSV."""
-    control_reference: Path | None = None
+    control_reference: FilePath | None = None
     """A frame in which the control points' x, y are; without it they are coded targets."""
     mount_sd_deg: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     """How far the mount turns about an axis in an hour; None: not known."""
@@ -258,10 +257,6 @@ class CameraConfig(DeviceConfig):
     """By name; the first is the reference."""
     calibration: CalibrationConfig | None = None
     """Of this camera, in full, in place of the common one."""
-
-    _files = field_validator("testfield", "thermal_model", "control_points", "control_reference")(
-        relative_to_file
-    )
 
     @model_validator(mode="after")
     def _one_task(self) -> Self:
@@ -292,12 +287,10 @@ def _resolved(value: Any, folder: Path) -> Any:
 class StoreConfig(Section):
     """Where results go. durable: what is stored survives a power cut, at the price of a sync."""
 
-    path: Path = Field(default=Path("thermocald.db"), validate_default=True)
+    path: FilePath = Field(default=Path("thermocald.db"), validate_default=True)
     """The SQLite file."""
     durable: bool = True
     """What is stored survives a power cut; false: only the end of the process, but faster."""
-
-    _path = field_validator("path")(relative_to_file)
 
 
 class FramesConfig(Section):
@@ -309,7 +302,7 @@ class FramesConfig(Section):
     """With every_n: one of so many."""
     corrected: bool = False
     """Cameras with a thermal_model: each kept frame a second time, as it had been at T₀."""
-    folder: Path = Field(default=Path("frames"), validate_default=True)
+    folder: FilePath = Field(default=Path("frames"), validate_default=True)
     """Where they are kept."""
     max_age_days: Positive | None = 90.0
     """Older frames are deleted, which is logged; null: no limit."""
@@ -317,8 +310,6 @@ class FramesConfig(Section):
     """Beyond it the oldest frames go first; null: no limit."""
     min_free_gb: Annotated[float, Field(ge=0.0, le=1e6)] = 0.5
     """With less room on the disk no frame is kept."""
-
-    _folder = field_validator("folder")(relative_to_file)
 
 
 class DashboardConfig(Section):
@@ -330,12 +321,10 @@ class DashboardConfig(Section):
     """Elsewhere than on this machine a token_file is needed."""
     port: Annotated[int, Field(ge=1, le=65535)] = 8437
     """Of the page."""
-    token_file: Path | None = None
+    token_file: FilePath | None = None
     """A file that holds the token; others must not be able to read it."""
     names: tuple[Annotated[str, Field(min_length=1, max_length=253)], ...] = ()
     """Further names by which the page may be asked for, such as that of a proxy."""
-
-    _token_file = field_validator("token_file")(relative_to_file)
 
     @model_validator(mode="after")
     def _guarded(self) -> Self:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from matplotlib.figure import Figure as Drawing
+
     from thermocald.arrays import Array
 
 # Colour-blind safe (Okabe & Ito 2008), dark enough for thin lines on white paper.
@@ -63,15 +65,14 @@ _STYLE: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """x, y (n,); kind: line, points, or band between `lower` and `upper` (n,) about a line."""
+    """x, y (n,); half: half the width (n,) of a band about the line."""
 
     name: str
     x: Array
     y: Array
-    kind: Literal["line", "points", "band"] = "line"
+    kind: Literal["line", "points"] = "line"
     colour: str = PALETTE[0]
-    lower: Array | None = None
-    upper: Array | None = None
+    half: Array | None = None
     dashed: bool = False
 
 
@@ -268,10 +269,11 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
         return drawing
 
 
-def draw_figure(figure: Figure) -> Any:
+def draw_figure(figure: Figure) -> Drawing:
     """All of a figure in one drawing, for a paper."""
-    if figure.drawing is not None:
-        return figure.drawing
+    drawing: Drawing | None = figure.drawing
+    if drawing is not None:
+        return drawing
     with drawing_style():
         columns = figure.in_a_row
         rows = -(-len(figure.panels) // columns)
@@ -371,10 +373,9 @@ def _draw_curve(axis: Any, curve: Curve) -> None:
         return
     style = "--" if curve.dashed else "-"
     axis.plot(curve.x, curve.y, style, color=curve.colour, linewidth=1.1, label=label)
-    if curve.kind == "band" and curve.lower is not None and curve.upper is not None:
-        axis.fill_between(
-            curve.x, curve.lower, curve.upper, color=curve.colour, alpha=0.2, linewidth=0
-        )
+    if curve.half is not None:
+        lower, upper = curve.y - curve.half, curve.y + curve.half
+        axis.fill_between(curve.x, lower, upper, color=curve.colour, alpha=0.2, linewidth=0)
 
 
 def draw_arrows(axis: Any, arrows: Arrows) -> None:

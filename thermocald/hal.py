@@ -19,7 +19,8 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
+from functools import cache
+from importlib import metadata
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -328,6 +329,12 @@ class VirtualClock:
         with self._lock:
             self._now = max(self._now, monotonic)
         return True
+
+
+@cache
+def entry_points(group: str) -> metadata.EntryPoints:
+    """Return the drivers of a group; once, since every installed package is looked through."""
+    return metadata.entry_points(group=group)
 
 
 def driver_names(kind: Kind) -> list[str]:

@@ -94,6 +94,10 @@ class Chapter:
     about: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
+    def page(self) -> str:
+        """Return a report of this chapter alone, as HTML text."""
+        return render_report(self.title, [self])
+
 
 def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> str:
     """Return the page as HTML text."""

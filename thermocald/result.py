@@ -51,14 +51,13 @@ class Result(ABC):
     def page(self, title: str = "") -> str:
         """Return the report as HTML text; title: by default `heading`."""
         from thermocald.figures import Figure
-        from thermocald.report import Answer, Chapter, Section, render_report
+        from thermocald.report import Answer, Chapter, Section
 
         answer = self.answer()
         others = [line for line in self.lines() if line != answer]
         proof = Figure("proof", "The result drawn", self.caption, drawing=self.plot())
         said = Section("What the command prints", printed="\n".join(others))
-        chapter = Chapter(title or self.heading, Answer(f"{answer}.", proof), (said,))
-        return render_report(chapter.title, [chapter])
+        return Chapter(title or self.heading, Answer(f"{answer}.", proof), (said,)).page()
 
     def __str__(self) -> str:
         return "\n".join(self.lines())

@@ -74,8 +74,7 @@ class Study(Result, studies.Study):
         from thermocald.figures import draw_figure
         from thermocald.output.study.figures import deviation_figure
 
-        figure: Figure = draw_figure(deviation_figure(self.cameras[0]))
-        return figure
+        return draw_figure(deviation_figure(self.cameras[0]))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -107,8 +106,7 @@ class Discovery(Result, discoveries.Discovery):
         from thermocald.figures import draw_figure
         from thermocald.output.discovery import gap_figure
 
-        figure: Figure = draw_figure(gap_figure(self))
-        return figure
+        return draw_figure(gap_figure(self))
 
     @cached_property
     def model(self) -> ThermalModel:
@@ -264,8 +262,7 @@ class Calibration(Result):
         from thermocald.figures import draw_figure
         from thermocald.output.calibration import residual_figure
 
-        figure: Figure = draw_figure(residual_figure(self.photographs, self.file.sensor))
-        return figure
+        return draw_figure(residual_figure(self.photographs, self.file.sensor))
 
     def save(self, path: Path | str) -> Path:
         """Write the camera as our own file: `.json` with covariance, `.yaml` without.

@@ -27,7 +27,7 @@ def draw_drift(first: tc.Series, second: tc.Series, to: Path) -> None:
     panels = []
     for title, left in (("before", epochs.x0), ("after correction", epochs.x0 - model)):
         y, half = (left - left[0]) / pitch, BAND * epochs.sd_x0 / pitch
-        curve = Curve("", minutes, y, "band", lower=y - half, upper=y + half)
+        curve = Curve("", minutes, y, half=half)
         panels.append(Panel(f"x₀ {title}", "time in min", "Δx₀ in px", (curve,)))
     drawing = draw_figure(Figure("drift", "", "", tuple(panels), columns=2))
     drawing.savefig(to, dpi=110)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import thermocald as tc
-from tests.commands import call
+from tests.commands import finish
 from tests.golden.workshop import photographs
 
 
@@ -18,7 +18,7 @@ def world(tmp_path_factory):
     folder = tmp_path_factory.mktemp("world")
     for k in (1, 2):
         tc.simulate("rpi-v2.1-heating", seed=k, series=f"M{k}", out=folder / f"M{k}")
-    assert call("replay", "M1", "--store", "thermocald.db", folder=folder).returncode == 0
+    finish("replay", "M1", "--store", "thermocald.db", folder=folder)
     M1 = tc.open(folder / "M1")
     camera = tc.fit(M1, tc.open(folder / "M2"))
     camera.save(folder / "camera.yaml")
@@ -34,9 +34,8 @@ def world(tmp_path_factory):
         (folder / "board").mkdir()
         for name in ("f000", "f060", "f090", "f120", "f150", "f180", "f240", "f330"):
             (folder / "board" / f"{name}.jpg").symlink_to(board / f"{name}.jpg")
-    done = call("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", "board.csv",
+    finish("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", "board.csv",
                 folder=folder)  # fmt: skip
-    assert done.returncode == 0
     return folder
 
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from gpiozero.pins.mock import MockFactory
 
+from tests.cli.test_session_separate import LIMIT_C, PIN, heated
 from thermocald.config import parse_config
 from thermocald.daemon.desk import plan_separation
-from thermocald.daemon.plan import mock_config
 from thermocald.daemon.session import Session
 from thermocald.epoch import Epoch
 from thermocald.hal import VirtualClock, open_device
@@ -28,7 +28,7 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.series import EpochResult
 
-PIN, LIMIT_C, RATE, INTERVAL, EPOCHS = 17, 45.0, 2.0, 10.0, 180
+RATE, INTERVAL, EPOCHS = 2.0, 10.0, 180
 AMBIENT, RISE, TAU = 22.0, 35.0, 500.0
 ALTERNATIVES = {
     "permanent_set": {"c": 1e-5, "x0": 6e-5, "y0": 4e-5},
@@ -46,14 +46,7 @@ def pin(monkeypatch):
 
 @pytest.fixture
 def config(tmp_path):
-    document = mock_config().model_dump(mode="json", by_alias=True)
-    document["store"]["path"] = str(tmp_path / "t.db")
-    document["outputs"] = [{
-        "name": "lamp", "driver": "relay", "pin": PIN, "limit_c": LIMIT_C,
-        "programme": [{"seconds": 1, "hold_c": None}],
-    }]  # fmt: skip
-    document["cameras"][0]["period_s"] = INTERVAL
-    return parse_config(document, tmp_path / "config.yaml")
+    return parse_config(heated(tmp_path, INTERVAL), tmp_path / "config.yaml")
 
 
 class Box:

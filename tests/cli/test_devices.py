@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 import yaml
 
-from tests.commands import answer
+from tests.commands import answer, succeed
 from tests.drivers.fakes.sysfs import Sysfs, w1_slave
-from thermocald.config import parse_config
 from thermocald.daemon import soundness as devices
 from thermocald.errors import ConfigurationError, DeviceError
 from thermocald.hal import load_driver, option_names
-from thermocald.result import jsonable
 
 
 @pytest.fixture
@@ -67,30 +66,11 @@ def test_what_is_attached_can_be_written_as_it_is_shown(sysfs):
 
 def test_the_command(sysfs, tmp_path):
     out = tmp_path / "devices.json"
-    result = answer("devices", "--json", out)
-    assert result.exit_code == 0, result.output
+    result = succeed("devices", "--json", out)
     document = json.loads(out.read_text())
     assert document["format"] == "thermocald-devices/1"
     assert len(document["devices"]) == 6
     assert "driver: ds18b20" in result.stdout
-
-
-def test_a_probe_takes_one_of_each_and_names_what_fails(sysfs, tmp_path):
-    root = str(sysfs.root)
-    document = {
-        "thermometers": [
-            {"name": "lens", "driver": "hwmon", "chip": "1-0048", "sysfs": root},
-            {"name": "gone", "driver": "hwmon", "chip": "tmp421", "sysfs": root},
-        ]
-    }
-    config = parse_config(document, tmp_path / "config.yaml", option_names)
-    good, bad = devices.probe_devices(config)
-    assert good.values == {"temperature_c": 21.0}
-    assert good.text.endswith(" ms: temperature_c 21.0")
-    assert "'tmp421' is not there" in bad.error
-    assert good.text.startswith("thermometer lens (hwmon), ")
-    assert "FAILED: " in bad.text
-    assert [entry["error"] is None for entry in jsonable([good, bad])] == [True, False]
 
 
 @pytest.fixture
@@ -134,7 +114,7 @@ def test_check_shows_every_device_though_the_first_fails(sysfs, check):
     shown = {line.split()[1]: line for line in lines if line.startswith("  ")}
     assert "FAILED: " in shown["gone"]
     assert "'tmp421' is not there" in shown["away"]
-    assert "temperature_c 21.0" in shown["lens"]
+    assert re.search(r"thermometer lens \(hwmon\), \d+ ms: temperature_c 21\.0$", shown["lens"])
     assert "width_px 3280, height_px 2464" in shown["left"]
     assert shown["log:"] == "  output log: driver jsonl"  # never tried: it might switch a lamp
     failed = {probe["name"]: probe["error"] is not None for probe in document["probes"]}

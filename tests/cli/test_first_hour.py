@@ -8,6 +8,7 @@ held against the truth.
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import re
@@ -69,6 +70,21 @@ def write_log(path):
     path.write_text("Logger 17\nDatum;Uhrzeit;Temperatur °C;Feuchte %\n" + "".join(rows), "latin-1")
 
 
+def exported(recording):
+    """The rows of its export, of one orientation."""
+    return list(
+        csv.DictReader(run("export", recording, "--exterior", "series").stdout.splitlines())
+    )
+
+
+def require_drift(first, last, warm):
+    for name, rate in (("c", RATE_C), ("x0", RATE_X0), ("y0", 0.0)):
+        drift = float(last[name]) - float(first[name])
+        sd = float(np.hypot(float(last[f"sd_{name}"]), float(first[f"sd_{name}"])))
+        assert 0 < sd < 0.2 * abs(RATE_C * 15)
+        assert drift == pytest.approx(rate * warm, abs=max(5 * sd, 2e-5)), (name, drift, sd)
+
+
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory):
     """A corner printed, put up (as its PDF says), surveyed from eight photographs; its sheets."""
@@ -107,20 +123,13 @@ def test_imported_photographs_of_the_printed_corner_show_the_drift(corner):
     replayed = run("replay", place / "M1", "--exterior", "series", "--json", "-")
     document = json.loads(replayed.stdout)
     assert document["epochs"] == EPOCHS
-    exported = run("export", place / "M1", "--exterior", "series").stdout.splitlines()
-    header = exported[0].split(",")
-    rows = [dict(zip(header, line.split(","), strict=True)) for line in exported[1:]]
+    rows = exported(place / "M1")
     assert [r["status"] for r in rows] == ["ok"] * EPOCHS
     assert (
         float(rows[0]["frame_time"]) == (START - timedelta(hours=2)).replace(tzinfo=UTC).timestamp()
     )
     hot = EPOCHS // 2
-    warm = temperature_of(hot) - temperature_of(0)
-    for name, rate in (("c", RATE_C), ("x0", RATE_X0), ("y0", 0.0)):
-        drift = float(rows[hot][name]) - float(rows[0][name])
-        sd = float(np.hypot(float(rows[hot][f"sd_{name}"]), float(rows[0][f"sd_{name}"])))
-        assert 0 < sd < 0.2 * abs(RATE_C * 15)
-        assert drift == pytest.approx(rate * warm, abs=max(5 * sd, 2e-5)), (name, drift, sd)
+    require_drift(rows[0], rows[hot], temperature_of(hot) - temperature_of(0))
     run("study", place / "M1", "--report", place / "study.html")
     assert (place / "study.html").stat().st_size > 50_000
 
@@ -187,9 +196,7 @@ def test_a_phone_before_the_printed_corner_shows_the_drift(corner, monkeypatch):
     finally:
         server.close()
     assert (place / "phone-1-M1.html").stat().st_size > 50_000
-    said = run("export", "phone-1-M1", "--exterior", "series").stdout.splitlines()
-    header = said[0].split(",")
-    rows = [dict(zip(header, line.split(","), strict=True)) for line in said[1:]]
+    rows = exported("phone-1-M1")
     assert len(rows) == EPOCHS
     assert sum(r["status"] == "ok" for r in rows) >= EPOCHS - 1
     # which frame it was: the one that was taken last before the phone's own time of exposure
@@ -199,11 +206,7 @@ def test_a_phone_before_the_printed_corner_shows_the_drift(corner, monkeypatch):
     warm = temperature_of(known[hot]) - temperature_of(known[0])
     assert warm > 10
     assert abs(float(rows[hot]["temperature"]) - temperature_of(known[hot])) < 4
-    for name, rate in (("c", RATE_C), ("x0", RATE_X0), ("y0", 0.0)):
-        drift = float(rows[hot][name]) - float(rows[0][name])
-        sd = float(np.hypot(float(rows[hot][f"sd_{name}"]), float(rows[0][f"sd_{name}"])))
-        assert 0 < sd < 0.2 * abs(RATE_C * 15)
-        assert drift == pytest.approx(rate * warm, abs=max(5 * sd, 2e-5)), (name, drift, sd)
+    require_drift(rows[0], rows[hot], warm)
     told = run("study", "cold=phone-1-M1", "--report", "phone.html")
     assert "principal point moved" in " ".join(told.stdout.split())
 

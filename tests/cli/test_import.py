@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from tests.commands import invoke, succeed
+from tests.commands import succeed
 from tests.pictures import (
     F35,
     FOCAL,
@@ -30,7 +30,7 @@ START = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()
 
 
 def run(*arguments):
-    return invoke("import", *arguments)
+    return succeed("import", *arguments)
 
 
 def photograph(path, local, subsec="", offset="", size=(64, 48), focal=(304, 100), f35=29):
@@ -66,7 +66,6 @@ def arguments(place, *more):
 
 def test_photographs_and_a_german_log_become_a_recording(place):
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert result.exit_code == 0, result.output
     assert "6 epochs" in result.stdout
     assert "guessed" in result.stderr
     recording = read_recording(place / "M1")
@@ -108,7 +107,6 @@ def test_the_photographs_settle_day_and_month_and_footers_are_passed_over(place)
     for i in range(6):
         photograph(place / "photos" / f"{i}.jpg", f"2026:07:06 12:00:{10 * i:02d}")
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert result.exit_code == 0, result.output
     assert "'06/07/2026 12:00:00' is day/month: so it lies next to the photographs" in result.stderr
     assert "1 rows hold no time: left out (line 4: 'Average')" in result.stderr
 
@@ -130,8 +128,7 @@ def test_clock_errors_and_zones_of_each_device(place):
         photograph(
             place / "photos" / f"{i}.jpg", f"2026:06:14 13:03:{12 + 4 * i:02d}", "", "+03:00"
         )
-    result = run(*arguments(place, "--log-timezone", "+02:00", "--camera-clock", "+00:03:12"))
-    assert result.exit_code == 0, result.output
+    run(*arguments(place, "--log-timezone", "+02:00", "--camera-clock", "+00:03:12"))
     recording = read_recording(place / "M1")
     assert recording.columns.frame_time.tolist() == [START + 4 * i for i in range(6)]
 
@@ -248,7 +245,6 @@ def test_a_copy_of_a_photograph_is_left_out(place):
     for of, copy in (("2.jpg", "2 (1).jpg"), ("4.jpg", "IMG_9.jpeg")):
         (place / "photos" / copy).write_bytes((place / "photos" / of).read_bytes())
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert result.exit_code == 0
     assert "6 epochs" in result.stdout
     assert "photographs: 2.jpg is a copy of 2 (1).jpg: left out" in result.stderr
     assert "photographs: IMG_9.jpeg is a copy of 4.jpg: left out" in result.stderr
@@ -315,7 +311,6 @@ def test_a_unit_that_changes_midway_is_refused(place, later, words, back):
 def test_a_unit_that_is_stated_is_taken(place):
     log_of(place, [20.0, 20.0, 20.1, 20.0, 68.0, 68.1, 68.0, 68.0])
     result = run(*arguments(place, "--timezone", "Europe/Berlin", "--unit", "degC"))
-    assert result.exit_code == 0
     assert "doubtful" in result.stderr
     assert read_recording(place / "M1").columns.at_frame("Temperature").max() > 60
 
@@ -339,4 +334,4 @@ def test_what_a_thermometer_was_to_show_is_no_reference(place, name):
 )
 def test_a_name_that_only_looks_so_is_a_temperature(place, name):
     log_of(place, [21.0, 21.1, 21.1, 21.2, 21.3, 21.4, 21.5, 21.6], f"Time;{name}")
-    assert run(*arguments(place, "--timezone", "Europe/Berlin")).exit_code == 0
+    run(*arguments(place, "--timezone", "Europe/Berlin"))

@@ -11,6 +11,9 @@ import yaml
 
 from tests.commands import call
 from tests.main_paths.crooked import CAMERA, PITCH, SIZE, project
+from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
+from thermocald.physics import model_file
+from thermocald.physics.model import ThermalModel
 
 POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
 ORIGIN_M = np.array([192_000.0, 313_000.0, 138.0])  # a national grid
@@ -26,28 +29,12 @@ PLACES = np.array([[300.0, 9_000.0, 0.0], [-2_000.0, 20_000.0, 0.0], [2_500.0, 1
 def write_model(path) -> None:
     """A thermal model of the crooked camera about 20 °C, with covariance."""
     parameters = [f"interior.{n}" for n in NAMES] + [f"rates.{n}" for n in NAMES]
-    variances = [SD[n] ** 2 for n in NAMES] + [SD_RATE**2] * 3
-    known = {**dict.fromkeys(("A1", "A2", "A3", "B1", "B2", "C1", "C2"), 0.0), **CAMERA}
-    units = {"c": "mm", "x0": "mm", "y0": "mm", "A1": "mm-2", "A2": "mm-4", "A3": "mm-6",
-             "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1"}  # fmt: skip
-    path.write_text(
-        yaml.safe_dump(
-            {
-                "format": "thermocald-model/1", "name": "gauge", "version": 1,
-                "camera": {"name": "gauge", "width": SIZE[0], "height": SIZE[1],
-                           "pixel_pitch": PITCH},
-                "reference_temperature": {"value": 20.0, "unit": "degC"},
-                "interior": {
-                    n: {"value": known[n], "unit": units[n], **({"sd": SD[n]} if n in SD else {})}
-                    for n in units
-                },
-                "rates": {n: {"value": RATES[n], "sd": SD_RATE, "unit": "mm/K"} for n in NAMES},
-                "effects": [], "validity": {"temperature": [-5.0, 45.0]},
-                "covariance": {"parameters": parameters,
-                               "matrix": np.diag(variances).tolist()},
-            }
-        )
-    )  # fmt: skip
+    C = np.diag([SD[n] ** 2 for n in NAMES] + [SD_RATE**2] * 3)
+    model_file.write_model(path, ThermalModel(
+        "gauge", Sensor(*SIZE, PITCH), 20.0, InteriorOrientation(**CAMERA), RATES,
+        covariance_names=tuple(parameters), covariance=tuple(map(tuple, C.tolist())),
+        validity={"temperature": (-5.0, 45.0)},
+    ))  # fmt: skip
 
 
 def world(folder, seed: int, places: np.ndarray = PLACES) -> np.ndarray:

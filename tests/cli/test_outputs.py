@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 import thermocald as tc
-from tests.commands import call, every_command
+from tests.commands import call, every_command, finish
 from tests.photogrammetry.network_cases import convergent_stations
 from tests.pictures import TAKEN, save_photograph
 from thermocald.errors import OutputError
@@ -173,7 +173,7 @@ class World:
 
     def _made(self, *arguments: str, name: str) -> Path:
         path = self.folder / name
-        assert call(*(part.format(path) for part in arguments)).returncode == 0
+        finish(*(part.format(path) for part in arguments))
         return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 
 import numpy as np
@@ -71,31 +72,17 @@ def test_a_prediction_has_no_sd_of_nothing(minute, tmp_path):
     assert not re.search(r"e-0\d", said)
 
 
-class Wide:
-    def __init__(self):
-        self.text = ""
-
-    def isatty(self):
-        return True
-
-    def write(self, text):
-        self.text += text
-
-    def flush(self):
-        pass
-
-
 def test_the_line_of_a_session_stays_one_line(monkeypatch):
-    monkeypatch.setattr("sys.stderr", Wide())
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr("sys.stderr", terminal)
     monkeypatch.setenv("COLUMNS", "80")
     sentence = "drifting 1.1085 ± 0.0015 px/min, ready in about 12.5667 ± 0.0067 min"
     Progress(150, print).show({
         "epoch": 1, "temperature": 25.0, "status": "ok", "c": 3.04, "sd_c": 0.000031,
         "sigma0": 1.0, "online": {"sentence": sentence},
     }, "")  # fmt: skip
-    import sys
-
-    line = sys.stderr.text.removeprefix("\r\x1b[K")
+    line = terminal.getvalue().removeprefix("\r\x1b[K")
     assert len(line) == 79
     assert "c 3.040000 ± 0.000031 mm" in line
 

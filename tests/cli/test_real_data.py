@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.commands import call as run
+from tests.commands import finish
 from tests.golden.workshop import walls
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
@@ -27,8 +28,7 @@ def test_fixed_cameras(shared, camera, exterior):
     Within a tenth as the program chooses; a mode asked for against it may be conservative.
     """
     path = shared / "data" / f"aviary-cam{camera}"
-    done = run("replay", path, "--exterior", exterior, "--json", "-")
-    assert done.returncode == 0
+    done = finish("replay", path, "--exterior", exterior, "--json", "-")
     assert "Warning" not in done.stderr
     document = json.loads(done.stdout)
     assert document["epochs"] == 101
@@ -45,9 +45,8 @@ def test_fixed_cameras(shared, camera, exterior):
 def test_tags_on_walls(shared, tmp_path):
     """A pose where there are tags enough, a reason elsewhere; never a camera from 1 to 3 tags."""
     walls(tmp_path)
-    done = run("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv",
+    done = finish("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv",
                "--camera", tmp_path / "lifecam.yaml", "--json", "-")  # fmt: skip
-    assert done.returncode == 0
     document = json.loads(done.stdout)
     assert document["status"] == "weak_geometry"
     found = {p["image"].rsplit("/", 1)[-1]: p for p in document["photographs"]}
@@ -133,8 +132,7 @@ def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     (folder / "f_text.jpg").write_text("no image")
     board = tmp_path / "board.csv"
     run("testfield", "import", "--chessboard", "9x6", "--square", 25, "-o", board)
-    done = run("calibrate", folder, "--testfield", board, "--pixel-pitch", 0.003, "--json", "-")
-    assert done.returncode == 0, done.stderr
+    done = finish("calibrate", folder, "--testfield", board, "--pixel-pitch", 0.003, "--json", "-")
     document = json.loads(done.stdout)
     status = {p["image"].rsplit("/", 1)[1]: p["status"] for p in document["photographs"]}
     assert sum(status[n] == "ok" for n in images) >= len(opencv) == 9

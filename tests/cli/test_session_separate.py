@@ -13,21 +13,27 @@ from thermocald.daemon.session import Session
 from thermocald.discovery.experiment import Separation
 from thermocald.store.database.store import Store
 
-RELAY = {
-    "name": "lamp", "driver": "relay", "pin": 17, "limit_c": 45.0,
-    "programme": [{"seconds": 1, "hold_c": None}],
-}  # fmt: skip
+PIN, LIMIT_C = 17, 45.0
+
+
+def heated(folder, period_s):
+    """The configuration of the mock camera, a thermometer and a relay that heats."""
+    document = mock_config().model_dump(mode="json", by_alias=True)
+    document["store"]["path"] = str(folder / "t.db")
+    document["outputs"] = [{
+        "name": "lamp", "driver": "relay", "pin": PIN, "limit_c": LIMIT_C,
+        "programme": [{"seconds": 1, "hold_c": None}],
+    }]  # fmt: skip
+    document["cameras"][0]["period_s"] = period_s
+    return document
 
 
 @pytest.fixture
 def config(tmp_path, monkeypatch):
-    """The mock camera, a thermometer and a relay on mock pins, epochs as fast as they come."""
+    """On mock pins, epochs as fast as they come."""
     monkeypatch.setenv("GPIOZERO_PIN_FACTORY", "mock")
     monkeypatch.chdir(tmp_path)
-    document = mock_config().model_dump(mode="json", by_alias=True)
-    document["store"]["path"] = str(tmp_path / "t.db")
-    document["outputs"] = [RELAY]
-    document["cameras"][0]["period_s"] = 0.4
+    document = heated(tmp_path, 0.4)
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
     return parse_config(document, tmp_path / "config.yaml")
 

@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 import thermocald as tc
-from tests.commands import invoke
+from tests.commands import succeed
 from thermocald.errors import DataError, OutputError, ThermocaldError, UsageError
 
 
@@ -28,12 +28,11 @@ def recording(tmp_path_factory):
 @pytest.fixture
 def run():
     """Runs the command with arguments; errors of ours come out as they are raised."""
-    return partial(invoke, "study")
+    return partial(succeed, "study")
 
 
 def test_json_on_standard_output_is_one_document_and_nothing_else(run, recording):
     result = run(recording, "--json", "-", "--sets", "2000")
-    assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
     (camera,) = document["cameras"]
     assert camera["label"] == "nexus5"
@@ -54,7 +53,6 @@ def test_labels_make_cameras_and_a_report_is_written(run, recording, tmp_path):
     result = run(
         f"cold={recording}", f"warm={other}", "--sets", "500", "--report", tmp_path / "r.html"
     )
-    assert result.exit_code == 0, result.output
     assert "cold" in result.stdout
     assert "warm" in result.stdout
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
@@ -92,7 +90,6 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
         ([], UsageError, "give recordings or stores"),
         (["nowhere"], DataError, "nowhere: does not exist"),
         (["--reference", "x"], UsageError, "give no recordings with it"),
-        (["RECORDING", "--window", "30"], UsageError, "must be odd"),
         (["RECORDING", "--report", "RECORDING/epochs.csv/r.html"], OutputError, "written"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
         (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no IOP"),
@@ -120,10 +117,7 @@ def test_a_file_that_is_no_store_is_one_error(run, tmp_path):
 @pytest.mark.slow
 def test_frames_that_are_not_measured_yet_are_measured_and_clipped(run, tmp_path):
     tc.simulate("rpi-v2.1-heating", seed=3, epochs=3, frames=True, out=tmp_path / "frames")
-    result = run(
-        tmp_path / "frames", "--sets", "200", "--free", "c,x0,y0", "--report", tmp_path / "r.html"
-    )
-    assert result.exit_code == 0, result.output
+    run(tmp_path / "frames", "--sets", "200", "--free", "c,x0,y0", "--report", tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png;base64,') == 2
     assert "The F-test needs 31 consecutive epochs; the series has 3" in page
@@ -137,7 +131,6 @@ def test_the_reference_table_is_reproduced(run):
     exp(-t/300 s) no longer moves its principal distance beyond its standard deviation at the end.
     """
     result = run("--reference", "--json", "-")
-    assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)["reference"]
     assert len({f["camera"] for f in figures}) == 5
     missed = {(f["camera"], f["quantity"]) for f in figures if not f["reproduced"]}

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from tests.commands import answer as run
+from tests.commands import succeed
 from tests.pictures import MODEL, TAKEN, save_photograph, write_markers
 from thermocald.errors import ThermocaldError
 from thermocald.photogrammetry import camera_files
@@ -81,9 +82,12 @@ def folder(tmp_path_factory):
                  lambda x, y, sx, sy: (x - 140, y - 232, sx, sy))  # fmt: skip
     with_columns(path / "M2", path / "swapped", ("board_temperature", "temperature"))
     with_columns(path / "M2", path / "board", ("board_temperature",))
-    result = run("fit", path / "M1", "-o", path / "cam.yaml")
-    assert result.exit_code == 0, result.exception
+    succeed("fit", path / "M1", "-o", path / "cam.yaml")
     return path
+
+
+def times_of(folder):
+    return np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
 
 
 # --- effects by name ---------------------------------------------------------------------------
@@ -107,10 +111,9 @@ def folder(tmp_path_factory):
 )  # fmt: skip
 def test_an_effect_that_needs_a_name(tmp_path, effect, option, keys):
     simulated(4, effect).write(tmp_path / "M1")
-    result = run(
+    result = succeed(
         "fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--effect", option, "--json", "-"
     )
-    assert result.exit_code == 0, result.exception
     (found,) = json.loads(result.stdout)["effects"]
     for key in keys:
         estimate = found["parameters"][key]
@@ -151,8 +154,7 @@ def test_an_effect_twice_is_refused(folder):
 def test_a_model_is_tested_on_another_series(folder, series):
     """Also where pixels were binned, or where another thermometer stands first."""
     test = ("--test", folder / series, "--json", "-")
-    result = run("predict", "--model", folder / "cam.yaml", *test)
-    assert result.exit_code == 0, result.exception
+    result = succeed("predict", "--model", folder / "cam.yaml", *test)
     (found,) = json.loads(result.stdout)["series"]
     assert found["rms_px"] < 1.1 * found["floor_px"]
     assert 0.93 < found["coverage"] < 0.97
@@ -160,7 +162,7 @@ def test_a_model_is_tested_on_another_series(folder, series):
 
 def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_path):
     """What the fit found, not what thermometers usually have."""
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     points = tmp_path / "points.csv"
     points.write_text(f"time,x,y\n{times[20]:.3f},500,400\n")
     model = yaml.safe_load((folder / "cam.yaml").read_text())
@@ -169,9 +171,8 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
         for one in model["fitted_on"]:
             one["thermometer_sd_K"] = noise
         (tmp_path / "cam.yaml").write_text(yaml.safe_dump(model, sort_keys=False))
-        done = run("correct", points, "--log", folder / "M1" / "epochs.csv",
+        succeed("correct", points, "--log", folder / "M1" / "epochs.csv",
                    "--model", tmp_path / "cam.yaml", "--out", tmp_path / "out.csv")  # fmt: skip
-        assert done.exit_code == 0, done.exception
         sds.append(float(np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)["sd_x"]))
     assert sds[1] > 5 * sds[0]
 
@@ -210,8 +211,7 @@ def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_p
     ],
 )
 def test_wrong_use_is_refused(folder, tmp_path, arguments, says):
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
-    begin, end = times[0], times[-1]
+    begin, *_, end = times_of(folder)
     files = {
         "points": f"time,x,y\n{begin + 60:.1f},500,400\n",
         "images": f"time,image\n{begin + 60:.1f},small.png\n",
@@ -274,14 +274,13 @@ def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
 
 def test_binned_points_are_scaled(folder, tmp_path):
     """Points of 2 × 2 binned images get half the correction."""
-    time = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)[40]
+    time = times_of(folder)[40]
     moved = {}
     for size, x, y in (("3280x2464", 2000.5, 800.5), ("1640x1232", 1000.0, 400.0)):
         (tmp_path / "p.csv").write_text(f"time,x,y\n{time:.2f},{x},{y}\n")
-        done = run("correct", tmp_path / "p.csv", "--model", folder / "cam.yaml", "--log",
+        succeed("correct", tmp_path / "p.csv", "--model", folder / "cam.yaml", "--log",
                    folder / "M1" / "epochs.csv", "--size", size,
                    "--out", tmp_path / "o.csv")  # fmt: skip
-        assert done.exit_code == 0, done.exception
         table = np.genfromtxt(tmp_path / "o.csv", delimiter=",", names=True)
         moved[size] = np.array([table["dx"], table["dy"]])
     assert np.abs(moved["3280x2464"]).max() > 0.5
@@ -289,9 +288,9 @@ def test_binned_points_are_scaled(folder, tmp_path):
 
 
 def test_far_outside_by_name_is_done_and_said(folder):
-    result = run("predict", "--model", folder / "cam.yaml", "--temperature", -40, "--extrapolate")
-    assert result.exit_code == 0
-    assert "standard deviations are widened" in result.stderr
+    outside = ("--temperature", -40, "--extrapolate")
+    told = succeed("predict", "--model", folder / "cam.yaml", *outside).stderr
+    assert "standard deviations are widened" in told
 
 
 # --- images ------------------------------------------------------------------------------------
@@ -299,7 +298,7 @@ def test_far_outside_by_name_is_done_and_said(folder):
 
 def correct_images(folder, source, out, *more):
     """Images at the start and in the heat, as a camera of 8 × 8 binned pixels takes them."""
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     (source / "i.csv").write_text(f"time,image\n{times[0]:.2f},a.png\n{times[45]:.2f},b.png\n")
     return run("correct", source / "i.csv", "--model", folder / "cam.yaml", "--log",
                folder / "M1" / "epochs.csv", "--size", "410x308", "--out", out, *more)  # fmt: skip
@@ -313,7 +312,7 @@ def two_images(tmp_path):
     return tmp_path
 
 
-def test_images_are_corrected_and_said_how_much(folder, two_images):
+def test_images_are_corrected_and_said_how_much_and_never_overwritten(folder, two_images):
     result = correct_images(folder, two_images, two_images / "out", "--json", "-")
     document = json.loads(result.stdout)
     cold, hot = document["images"]
@@ -322,11 +321,8 @@ def test_images_are_corrected_and_said_how_much(folder, two_images):
         assert found["largest_correction_px"] >= found["rms_correction_px"] > 0.02
         assert 0 < found["rms_left_over_px"] < 0.02
     assert {p.name for p in (two_images / "out").iterdir()} == {"a.png", "b.png"}
-
-
-def test_images_are_never_overwritten(folder, two_images):
-    result = correct_images(folder, two_images, two_images)
-    assert "would be overwritten" in str(result.exception)
+    again = correct_images(folder, two_images, two_images)
+    assert "would be overwritten" in str(again.exception)
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png"])
@@ -337,7 +333,7 @@ def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
     tags = {MODEL: "imx219", TAKEN: "2026:06:14 12:00:00"}
     save_photograph(tmp_path / f"a.{kind}", tags, grey)
     (tmp_path / f"b.{kind}").write_bytes(b"no picture")
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     rows = f"{times[40]:.2f},b.{kind}\n{times[45]:.2f},a.{kind}\n"
     (tmp_path / "i.csv").write_text(f"time,image\n{rows}")
     result = run("correct", tmp_path / "i.csv", "--model", folder / "cam.yaml", "--log",
@@ -357,7 +353,7 @@ def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
 
 def test_rows_of_standard_input_are_corrected_as_they_come(folder):
     """Each is answered before the next is written; one that cannot be is named by its line."""
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     command = [sys.executable, "-m", "thermocald", "correct", "-", "--model", folder / "cam.yaml",
                "--log", folder / "M1" / "epochs.csv"]  # fmt: skip
     with subprocess.Popen(
@@ -388,13 +384,12 @@ def test_rows_of_standard_input_are_corrected_as_they_come(folder):
 
 
 def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
-    times = np.loadtxt(folder / "M1" / "epochs.csv", delimiter=",", skiprows=1, usecols=1)
+    times = times_of(folder)
     points = "time,x,y\n" + "".join(f"{t:.2f},{500 + i},400\n" for i, t in enumerate(times))
     (tmp_path / "p.csv").write_text(points)
     told = ["--model", str(folder / "cam.yaml"), "--log", str(folder / "M1" / "epochs.csv")]
     of_file = run("correct", tmp_path / "p.csv", *told)
-    piped = run("correct", "-", *told, given=points)
-    assert piped.exit_code == 0, piped.exception
+    piped = succeed("correct", "-", *told, given=points)
     assert piped.stdout == of_file.stdout
     assert len(piped.stdout.splitlines()) == len(times) + 1
 
@@ -418,8 +413,7 @@ def test_fit_measures_frames_first(tmp_path):
     simulation = simulated(5, epochs=16, interval=90.0, kind="markers")
     simulation.write(tmp_path / "M1", with_frames=True)
     assert not (tmp_path / "M1" / "observations.csv").exists()
-    result = run("fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--json", "-")
-    assert result.exit_code == 0, result.exception
+    result = succeed("fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--json", "-")
     document = json.loads(result.stdout)
     assert document["series"][0]["epochs"] == 16
     for name in ("c", "x0", "y0"):
@@ -452,9 +446,8 @@ def test_calibrate_starts_from_the_camera_of_another_program(tmp_path, camera):
     near = CameraModel(camera.sensor, camera.interior.with_values(c=camera.interior.c * 1.01))
     camera_files.write(near, path, "opencv")
     images = sorted(tmp_path.glob("*.png"))
-    result = run("calibrate", *images, "--testfield", tmp_path / "field.csv", "--camera", path,
+    result = succeed("calibrate", *images, "--testfield", tmp_path / "field.csv", "--camera", path,
                  "--json", "-")  # fmt: skip
-    assert result.exit_code == 0, result.exception
     interior = json.loads(result.stdout)["interior"]
     for key in ("c", "x0", "y0"):
         assert abs(interior[key] - getattr(camera.interior, key)) < 4 * interior[f"sd_{key}"], key

@@ -17,21 +17,7 @@ from tests.store.conftest import field, filled, head, make_epoch, make_result, s
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.server.connection import ServerAddress
 
-__all__ = [
-    "address",
-    "cluster",
-    "count",
-    "execute",
-    "field",
-    "filled",
-    "head",
-    "make_epoch",
-    "make_result",
-    "new_cluster",
-    "server",
-    "store_path",
-    "template",
-]
+__all__ = ["field", "filled", "head", "make_epoch", "make_result", "store_path"]
 
 
 def address(server: Server, query: str = "", **given: str) -> ServerAddress:

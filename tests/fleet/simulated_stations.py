@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from thermocald.epoch import Epoch
-from thermocald.fleet.forward import Forwarder, forward_forever
+from thermocald.fleet.forward import Forwarder, Progress, forward_forever
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.store.database.store import Store
@@ -76,11 +76,14 @@ def run(folder: Path, first: int, count: int, epochs: int, address: str) -> dict
     def forward(number: int) -> None:
         name = station_name(number)
         forwarder = Forwarder(folder / f"{name}.db", ServerAddress.parse(address), name, batch=50)
-        idle = False
+        idle, send_waiting = False, forwarder.send_waiting
 
-        def report(progress, trouble) -> None:
+        def send() -> Progress:
             nonlocal idle
-            idle = progress is not None and progress.rows == 0 and not trouble
+            idle = False
+            progress = send_waiting()
+            idle = progress.rows == 0
+            return progress
 
         def wait(seconds: float) -> bool:
             if idle and written.is_set():
@@ -88,7 +91,8 @@ def run(folder: Path, first: int, count: int, epochs: int, address: str) -> dict
             time.sleep(seconds / SPEED)
             return False
 
-        forward_forever(forwarder, wait, report)
+        forwarder.send_waiting = send  # type: ignore[method-assign]
+        forward_forever(forwarder, wait)
         lag[name] = time.monotonic() - ended
 
     threads = [threading.Thread(target=forward, args=(first + i,)) for i in range(count)]

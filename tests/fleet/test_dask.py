@@ -9,8 +9,8 @@ import time
 import pytest
 
 from tests.fleet.dask_cluster import DaskCluster, write_frame_archive
-from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
-from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
+from tests.fleet.test_reprocess import blocks_of, files
+from thermocald.fleet.reprocess import calibrate_block, run_tasks
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
 pytestmark = pytest.mark.slow
@@ -32,36 +32,15 @@ def dask(tmp_path):
         yield found
 
 
-def files(out, pattern="*.parquet"):
-    return {p.relative_to(out): p.read_bytes() for p in sorted(out.rglob(pattern))}
-
-
-def blocks_of(archive, out, size):
-    return find_blocks([archive], out, tuple(DEFAULT_FREE), size)
-
-
 def start_client(archive, out, dask):
     command = [sys.executable, "-c", RUN_BLOCKS, archive, out, dask.address]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
-def test_a_cluster_gives_the_bits_of_one_process(archive, tmp_path, dask):
-    """Two workers; one of them is killed while it works."""
-    run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10))
-    out = tmp_path / "again"
-    client = start_client(archive, out, dask)
-    deadline = time.monotonic() + 120
-    while len(list(out.rglob("*.parquet"))) < 4:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    dask.workers[0].kill()
-    errors, _ = client.communicate(timeout=180)
-    assert errors.splitlines()[-1] == "[]"
-    assert files(tmp_path / "one") == files(out)
-
-
 def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archive, tmp_path, dask):
-    """One after every few blocks, and another takes its place, as on machines that are lent."""
+    """One of two; the other after every few blocks, and another takes its place, as on machines
+    that are lent.
+    """
     run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10))
     out = tmp_path / "many"
     client = start_client(archive, out, dask)
@@ -73,7 +52,10 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archi
         if (now := len(files(out))) < done + 4:
             continue
         done = now
-        dask.replace_worker(killed % 2)
+        if killed:
+            dask.replace_worker(1)
+        else:
+            dask.workers[0].kill()
         killed += 1
     errors, _ = client.communicate()
     assert errors.splitlines()[-1] == "[]"

@@ -12,7 +12,8 @@ import pytest
 pytest.importorskip("psycopg", reason="pip install thermocald[server]")
 
 from tests.fleet.conftest import address, count, execute
-from thermocald.fleet.forward import Forwarder, FrameRule
+from thermocald.config import ForwardConfig
+from thermocald.fleet.forward import Forwarder
 from thermocald.store.database.store import Store
 
 
@@ -31,6 +32,12 @@ def station(tmp_path, store_path, head, field, make_epoch, make_result):
     return store_path, folder
 
 
+def forwarder(server, station, choose, user="owner:secret", **rule):
+    store, folder = station
+    to = address(server, user=user)
+    return Forwarder(store, to, "bank", frames=folder, rule=ForwardConfig(frames=choose, **rule))
+
+
 def there(server):
     rows = execute(server, "SELECT number, name, digest, data FROM frame ORDER BY number")
     return {number: (name, digest, data) for number, name, digest, data in rows}
@@ -41,9 +48,7 @@ def there(server):
     [("events", [7, 13]), ("every_n", [5, 10, 15, 20]), ("all", list(range(1, 21)))],
 )
 def test_the_chosen_frames_arrive_whole(server, station, choose, numbers):
-    store, folder = station
-    rule = FrameRule(folder, choose, every_n=5)
-    done = Forwarder(store, address(server), "bank", frames=rule).send_waiting()
+    done = forwarder(server, station, choose, every_n=5).send_waiting()
     assert done.sent["frame"] == len(numbers)
     found = there(server)
     assert [*found] == numbers
@@ -54,15 +59,13 @@ def test_the_chosen_frames_arrive_whole(server, station, choose, numbers):
 
 
 def test_a_day_has_a_limit_and_the_next_goes_on(server, station):
-    store, folder = station
-    rule = FrameRule(folder, "all", daily_bytes=3500)
-    forwarder = Forwarder(store, address(server), "bank", frames=rule)
+    limited = forwarder(server, station, "all", frames_mb_per_day=0.0035)
     day = [1.7e9]
-    forwarder._clock = lambda: day[0]
-    assert forwarder.send_waiting().sent["frame"] == 3
-    assert forwarder.send_waiting().sent["frame"] == 0
+    limited._clock = lambda: day[0]
+    assert limited.send_waiting().sent["frame"] == 3
+    assert limited.send_waiting().sent["frame"] == 0
     day[0] += 86400
-    assert forwarder.send_waiting().sent["frame"] == 3
+    assert limited.send_waiting().sent["frame"] == 3
     assert [*there(server)] == [1, 2, 3, 4, 5, 6]
 
 
@@ -70,7 +73,6 @@ def test_it_goes_on_where_the_network_failed(server, station, monkeypatch):
     from thermocald.errors import ServerGone
     from thermocald.store.server.reader import ServerWriter
 
-    store, folder = station
     send, calls = ServerWriter.write_frame, []
 
     def fails_twice(self, series, frame, data):
@@ -80,39 +82,37 @@ def test_it_goes_on_where_the_network_failed(server, station, monkeypatch):
         send(self, series, frame, data)
 
     monkeypatch.setattr(ServerWriter, "write_frame", fails_twice)
-    forwarder = Forwarder(store, address(server), "bank", frames=FrameRule(folder, "all"))
+    every = forwarder(server, station, "all")
     for _ in range(2):
         with pytest.raises(ServerGone):
-            forwarder.send_waiting()
-    forwarder.send_waiting()
+            every.send_waiting()
+    every.send_waiting()
     assert [*there(server)] == list(range(1, 21))
     assert len(calls) == 22  # each frame once, and the two that failed again
 
 
 def test_what_retention_has_deleted_is_passed_over(server, station):
-    store, folder = station
+    _, folder = station
     for number in (2, 3, 20):
         (folder / f"rpi/M1/{number:07d}.jpg").unlink()
-    done = Forwarder(store, address(server), "b", frames=FrameRule(folder, "all")).send_waiting()
+    done = forwarder(server, station, "all").send_waiting()
     assert done.sent["frame"] == 17
     assert len([*folder.rglob("*.jpg")]) == 17
 
 
 def test_a_frame_that_leads_out_of_its_folder_is_not_read(server, station, tmp_path):
-    store, folder = station
+    _, folder = station
     (tmp_path / "secret").write_text("key")
     (folder / "rpi/M1/0000001.jpg").unlink()
     (folder / "rpi/M1/0000001.jpg").symlink_to(tmp_path / "secret")
-    Forwarder(store, address(server), "b", frames=FrameRule(folder, "all")).send_waiting()
+    forwarder(server, station, "all").send_waiting()
     assert 1 not in there(server)
 
 
 def test_the_server_refuses_a_frame_that_is_not_what_was_read(server, station, monkeypatch):
-    store, folder = station
     wrong = SimpleNamespace(sha256=hashlib.md5)
     monkeypatch.setattr("thermocald.store.server.reader.hashlib", wrong)
-    forwarder = Forwarder(store, address(server), "bank", frames=FrameRule(folder, "events"))
-    done = forwarder.send_waiting()
+    done = forwarder(server, station, "events").send_waiting()
     assert (done.sent["frame"], done.refused) == (0, 2)
     assert there(server) == {}
 
@@ -120,9 +120,7 @@ def test_the_server_refuses_a_frame_that_is_not_what_was_read(server, station, m
 def test_a_role_that_may_only_insert_sends_frames(server, station, role):
     from thermocald.store.server.connection import grant
 
-    store, folder = station
     grant(address(server), role, writes=True)
-    pi = address(server, user=f"{role}:berry")
-    Forwarder(store, pi, "bank", frames=FrameRule(folder, "events")).send_waiting()
+    forwarder(server, station, "events", user=f"{role}:berry").send_waiting()
     assert count(server, "frame") == 2
     assert execute(server, "SELECT name, waiting FROM station") == [("bank", 0)]

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from tests.fleet.deadly import die
+from thermocald.cli.server import find_series_tasks
 from thermocald.errors import DataError, UsageError
 from thermocald.fleet.reprocess import calibrate_block, find_blocks, run_tasks
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
@@ -17,8 +18,8 @@ from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 parquet = pytest.importorskip("pyarrow.parquet", reason="pip install thermocald[parquet]")
 
 
-def files(out):
-    return {p.relative_to(out): p.read_bytes() for p in sorted(out.rglob("*.parquet"))}
+def files(out, pattern="*.parquet"):
+    return {p.relative_to(out): p.read_bytes() for p in sorted(out.rglob(pattern))}
 
 
 def blocks_of(archive, out, size=40):
@@ -67,6 +68,10 @@ def test_bad_usage_is_said(archive, tmp_path):
         find_blocks([tmp_path], tmp_path, ())
     with pytest.raises(UsageError, match="there is `local`"):
         run_tasks(calibrate_block, [], "fast")
+    with pytest.raises(UsageError, match="there are calibrate, discover, study"):
+        find_series_tasks([archive], tmp_path, "dream")
+    with pytest.raises(DataError, match="no recording or series is there"):
+        find_series_tasks([tmp_path], tmp_path, "study")
 
 
 @pytest.mark.slow
@@ -80,15 +85,6 @@ def test_series_are_analysed_one_by_one_and_done_ones_are_left(archive, tmp_path
     (tmp_path / "o" / names[0]).unlink()
     again = subprocess.run(run, check=True, capture_output=True, text=True, timeout=120)
     assert json.loads(again.stdout)["series"] == 1
-
-
-def test_an_unknown_analysis_and_a_server_to_calibrate_are_said(archive, tmp_path):
-    from thermocald.cli.server import find_series_tasks
-
-    with pytest.raises(UsageError, match="there are calibrate, discover, study"):
-        find_series_tasks([archive], tmp_path, "dream")
-    with pytest.raises(DataError, match="no recording or series is there"):
-        find_series_tasks([tmp_path], tmp_path, "study")
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from tests.fleet.conftest import address, count, execute
 from thermocald.fleet.forward import Cursor, Forwarder
 from thermocald.fleet.overview import add_findings, read_overview
 from thermocald.store.database.store import Store
+from thermocald.store.series import Event, LoggedReading
 from thermocald.store.server.connection import ServerAddress, create_tables
 from thermocald.store.server.fleet_reader import FleetReader
 
@@ -39,43 +40,21 @@ def two(tmp_path, head, field, make_epoch, make_result):
 
 
 def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):
+    """As after a card was replaced, or with two daemons on one host: ids begin at 1 in both."""
     place = address(server)
-    for store in two:
-        assert Forwarder(store, place, "gauge-7").send_waiting().rows == 5
-    assert count(server, "series") == 2
-    assert count(server, "epoch") == 10
-    assert count(server, "station") == 2
+    for path in two:
+        with Store.open(path, "append", durable=False) as store:
+            (series,) = store.all_series()
+            store.add_event(Event(1.6e9, "knock", path.stem, series.id, 1))
+            store.add_readings([LoggedReading("air", 1.6e9 + two.index(path), {"t": 20.0})])
+        for _ in range(2):
+            assert Forwarder(path, place, "gauge-7").send_waiting().rows == 7
+            path.with_name(f"{path.name}.forwarded").unlink()
+    tables = ("series", "epoch", "event", "reading", "station")
+    assert [count(server, table) for table in tables] == [2, 10, 2, 2, 2]
     with FleetReader(place) as fleet:
         assert fleet.stations()["gauge-7"].stores == 2
     assert "twins" in findings(place)
-
-
-@pytest.mark.parametrize("names", [("gauge-7", "gauge-7"), ("gauge-7", "gauge-8")])
-@pytest.mark.parametrize("behind", [0, 3])
-def test_a_copied_store_that_runs_at_two_stations_is_reported(
-    server, two, make_epoch, make_result, names, behind
-):
-    """Its identity is copied with it: what the two take afterwards tells them apart."""
-    place = address(server)
-    clone = two[0].with_name("clone.db")
-    shutil.copyfile(two[0], clone)
-    for path, ahead in ((two[0], behind), (clone, 0)):
-        with Store.open(path, "append", durable=False) as store:
-            (series,) = store.all_series()
-            for i in range(6, 9 + ahead):
-                epoch = make_epoch(i)
-                shift = 0.0 if path == two[0] else 4.0 + 10.0 * behind
-                epoch = replace(epoch, frame_time=epoch.frame_time + shift)
-                store.append(series, epoch, make_result(i))
-    cursors = [path.with_name(f"{path.stem}.cursor") for path in (two[0], clone)]
-
-    Forwarder(two[0], place, names[0], cursors[0]).send_waiting()
-    assert "twins" not in findings(place)
-    Forwarder(clone, place, names[1], cursors[1]).send_waiting()
-    one_name = names[0] == names[1]
-    assert count(server, "series") == (1 if one_name else 2)
-    assert count(server, "epoch") == (11 + behind if one_name else 16 + behind)  # each is there
-    assert ("twins" in findings(place)) == one_name
 
 
 def test_epochs_calibrated_again_are_no_twins(server, two, make_result):
@@ -206,16 +185,22 @@ def test_a_cursor_is_of_its_store_wherever_that_stands(two, tmp_path, what):
     assert found.sent["epoch"] == MOVES[what]
 
 
-CLONES = ["copied", "by backup", "with its cursor", "before the first report", "the clone first"]
+CLONES = ["copied", "by backup", "with its cursor", "before the first report", "the clone first",
+          "far behind", "under another name"]  # fmt: skip
 
 
 @pytest.mark.parametrize("how", CLONES)
 def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, make_result, how):
-    """An image of a card has the cursor too, and the store's inode."""
+    """An image of a card has the cursor too, and the store's inode and identity: what the two take
+    afterwards tells them apart.
+    """
     place, one, clone = address(server), two[0], two[0].with_name("clone.db")
     cursors = {path: path.with_suffix(".cursor") for path in (one, clone)}
+    apart, ahead = how == "under another name", 3 if how == "far behind" else 0
+    names = {one: "gauge-7", clone: "gauge-8" if apart else "gauge-7"}
     if how != "before the first report":
         Forwarder(one, place, "gauge-7", cursors[one]).send_waiting()
+        assert "twins" not in findings(place)
     if how == "by backup":
         with Store.open(one) as store:
             store.copy_to(clone)
@@ -224,15 +209,16 @@ def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, ma
     if how == "with its cursor":
         inode = [f'"inode": {path.stat().st_ino}' for path in (one, clone)]
         cursors[clone].write_text(cursors[one].read_text().replace(*inode))
-    for path, shift in ((one, 0.0), (clone, 4.0)):
+    for path, shift, end in ((one, 0.0, 9 + ahead), (clone, 4.0 + 10.0 * ahead, 9)):
         with Store.open(path, "append", durable=False) as store:
             (series,) = store.all_series()
-            for i in range(6, 9):
+            for i in range(6, end):
                 epoch = make_epoch(i)
                 moved = replace(epoch, frame_time=epoch.frame_time + shift)
                 store.append(series, moved, make_result(i))
     order = (clone, one) if how == "the clone first" else (one, clone)
     for path in (*order, *order):
-        Forwarder(path, place, "gauge-7", cursors[path]).send_waiting()
-    assert count(server, "epoch") == 11
-    assert "twins" in findings(place)
+        Forwarder(path, place, names[path], cursors[path]).send_waiting()
+    assert count(server, "series") == 1 + apart
+    assert count(server, "epoch") == (16 if apart else 11 + ahead)  # each is there
+    assert ("twins" in findings(place)) is not apart

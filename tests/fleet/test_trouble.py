@@ -72,21 +72,6 @@ def test_a_newer_server_is_told_from_an_older_one(filled, server):
     assert Forwarder(store.path, address(server), "b").send_waiting().rows == 20
 
 
-def test_a_clock_that_jumps_loses_nothing(server, tmp_path, head, field, make_epoch):
-    """Before 1970, in the far future, back again: every epoch arrives, in its own month or none."""
-    times = [-5.0, 0.0, 3.0e3, 1.7e9, 1.7e9 + 10, 9.0e11, 1.7e9 + 20, 1.69e9]
-    with Store.open(tmp_path / "k.db", "append") as store:
-        series = store.create_series(head, field)
-        for number, time in enumerate(times, 1):
-            store.append(series, replace(make_epoch(number), frame_time=time), clock_trusted=False)
-        Forwarder(store.path, address(server), "bank").send_waiting()
-        with ServerStore(address(server)) as there:
-            found = there.find_series()
-            columns = there.series_columns(found, ["frame_time", "clock_trusted"])
-        assert columns["frame_time"].tolist() == times
-        assert not columns["clock_trusted"].any()
-
-
 @pytest.fixture
 def small_disk():
     """A disk of 16 MB of PostgreSQL's user's own."""

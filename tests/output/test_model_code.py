@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
-from thermocald.output.thermal_model import c_header, python_module, write_code
+from thermocald.output.thermal_model import code_of, write_code
 from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
     InteriorOrientation,
@@ -63,7 +63,7 @@ TEMPERATURES = (20.0, 31.7, 35.0, 55.0)
 @pytest.mark.parametrize(("affine", "distortion"), KINDS)
 def test_the_python_module_is_the_model(tmp_path, affine, distortion):
     camera = thermal_camera(affine, distortion)
-    (tmp_path / "m.py").write_text(python_module(camera, "m"))
+    (tmp_path / "m.py").write_text(code_of(camera, "m", "py"))
     module = runpy.run_path(str(tmp_path / "m.py"))
     X = points()
     for T in TEMPERATURES:
@@ -137,6 +137,6 @@ int main(void)
 
 
 def test_names_cannot_break_out_of_the_comment():
-    text = c_header(thermal_camera(), "x*/y")
+    text = code_of(thermal_camera(), "x*/y", "h")
     assert text.split("*/")[0].count("/*") == 1
     assert "*/ x" not in text

@@ -18,6 +18,7 @@ from tests.blind.case import Case
 from tests.blind.generator import generate
 from tests.commands import call
 from tests.daemon.conftest import make_recording
+from tests.pictures import from_five_places
 from thermocald.analysis.camera.photographs import calibrate_observations
 from thermocald.analysis.series.drift import with_drifts
 from thermocald.analysis.series.recorded import recorded_table
@@ -27,7 +28,7 @@ from thermocald.fleet.page import render_fleet
 from thermocald.output.calibration import render_calibration
 from thermocald.output.discovery import report_html
 from thermocald.output.study.report import render_study
-from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor, project
+from thermocald.photogrammetry.camera.camera_model import CameraSpec, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.field.testfield import Observations
 from thermocald.physics.testfields import corner_field, demonstration_model
@@ -149,13 +150,7 @@ def _calibration(**_):
     """Photographs from five places, with a gross error and a photograph without targets."""
     field = corner_field("plain", per_side=6, pitch_mm=100.0)
     model = demonstration_model(field)
-    rng = np.random.default_rng(5)
-    measured = []
-    for turn in (0.0, 0.05, -0.05, 0.1, -0.1):
-        eop = model.exterior.as_array() + np.array([0, 1, 20, 400, 0, 0]) * turn
-        points = project(model.sensor, model.interior.as_array(), eop, field.points)
-        points = points + rng.normal(0, 0.04, points.shape)
-        measured.append(Observations(np.arange(len(field)), points, np.full(points.shape, 0.04)))
+    measured = from_five_places(field, model)
     measured[1].points[3] += 20.0
     names = [f"{NAMES[k % 3]}-{k}.jpg" for k in range(5)]
     result = calibrate_observations(
@@ -312,6 +307,7 @@ def test_a_report_as_a_page(name, page_text, open_page):
         keep(page, f"{name}-{width}")
         if width == 390:
             assert (page.evaluate(_DRAGGED), page.evaluate(_SMALL)) == ([], [])
+            assert not any(page.evaluate(_SCROLLED))  # what a command prints may be wider
         if width == 1280 and name != "study-names":
             assert page.evaluate(_SCROLLED) == []
     page = open_page(html, 794)  # A4 at 96 px per inch

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.pictures import ORIENTATION, save_photograph
 from thermocald.analysis.study.measured import Clip
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.output.study.report import cut_clip, render_study, save_figures
 from thermocald.output.study.summary import study_document
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_a_study_of_nearly_nothing_says_why(empty_study):
     assert "No Monte-Carlo" in words
 
 
-def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told):
+def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told, tmp_path):
     clip = told.cameras[0].series[0].series.clip
     cut = cut_clip(clip.first, clip.centre, 15)
     assert cut[7, 7] == 250
@@ -79,6 +79,11 @@ def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told
     assert (cut[:, 2] == 50).all()
     assert len(re.findall(r'src="data:image/png;base64,', html)) == 2
     assert "Image around target 17" in html
+    # how a camera says that its picture is to be shown does not turn where the target was
+    turned = np.zeros((30, 40), np.uint8)
+    turned[10, 5] = 250
+    save_photograph(tmp_path / "turned.jpg", {ORIENTATION: 6}, turned, quality=100)
+    assert cut_clip(tmp_path / "turned.jpg", clip.centre, 15)[7, 7] > 200
 
 
 @pytest.mark.slow
@@ -108,15 +113,9 @@ def test_figures_for_a_paper(told, tmp_path):
     assert all(p.stat().st_size > 3000 for p in paths)
 
 
-def test_json_has_no_nan_and_a_standard_deviation_beside_each_value(told, empty_study):
+def test_json_has_no_nan(told, empty_study):
+    """Its keys are those of tests/golden."""
     for one in (told, empty_study):
         json.dumps(study_document(one), allow_nan=False)
-    document = study_document(told)
-    assert document["format"] == "thermocald-study/1"
-    camera = document["cameras"][0]
-    deviation = camera["series"][0]["deviations"]["x0"]
+    deviation = study_document(told)["cameras"][0]["series"][0]["deviations"]["x0"]
     assert deviation["sd_change"] == pytest.approx(7e-6 * np.sqrt(2))
-    dependence = camera["series"][0]["temperature_dependence"]["temperature"]["parameters"]["c"]
-    assert {"slope", "sd_slope", "p", "p_naive", "p_holm"} <= set(dependence)
-    assert set(camera["sd_over_time"]) == set(IOP_NAMES)
-    assert sum(camera["object_space"]["fractions"]) == pytest.approx(1)

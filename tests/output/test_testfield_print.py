@@ -179,17 +179,15 @@ def test_corner_is_three_perpendicular_sheets_with_distinct_codes(printed):
     ]  # fmt: skip
     field = done.field
     planes = [np.flatnonzero(np.abs(field.points[:, axis]) < 1e-9) for axis in (2, 1, 0)]
-    assert [len(p) for p in planes] == [len(s.targets) for s in done.sheets]
+    assert [len(p) for p in planes] == [len(s.field) for s in done.sheets]
     assert field.points.min() >= 0
     codes = [c for c in field.codes if c]
     assert len(set(codes)) == len(codes)
     # seen from outside, on each sheet the order right, up, towards the viewer is right-handed:
     # otherwise the ring codes of that sheet would be mirrored
     for rows, sheet, normal in zip(planes, done.sheets, np.eye(3)[[2, 1, 0]], strict=True):
-        local = np.array([[t.x, t.y] for t in sheet.targets])
-        axes = np.linalg.lstsq(
-            np.column_stack([local, np.ones(len(local))]), field.points[rows], rcond=None
-        )[0][:2]
+        local = np.column_stack([sheet.field.points[:, :2], np.ones(len(rows))])
+        axes = np.linalg.lstsq(local, field.points[rows], rcond=None)[0][:2]
         assert np.cross(axes[0], axes[1]) == pytest.approx(normal, abs=1e-9)
 
 
@@ -199,14 +197,14 @@ def test_the_plan_and_the_coordinates_agree_on_left_and_right(printed):
     field = field_of(sheets)
     camera = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(3.04))
     image = camera.project(usual_station(camera, field), field.points)
-    rows = {s.title: [field.index[t.name] for t in s.targets] for s in sheets}
+    rows = {s.title: [field.index[name] for name in s.field.names] for s in sheets}
     floor, left, right = (image[r].mean(axis=0) for r in rows.values())
     assert left[0] < floor[0] < right[0]
     assert floor[1] > max(left[1], right[1])
     ends = {"left": ((0, 0), (0, 1)), "right": ((1, 0), (1, 1)), "lower": ((0, 0), (1, 0))}
     edges: dict[str, list[set[int]]] = {}
     for sheet, (_, r) in zip(sheets, rows.items(), strict=True):
-        local = np.array([[t.x, t.y, 1.0] for t in sheet.targets])
+        local = np.column_stack([sheet.field.points[:, :2], np.ones(len(r))])
         placing = np.linalg.lstsq(local, field.points[r], rcond=None)[0]
         for side, letter in sheet.edges.items():
             line = np.array([[*np.array(end) * sheet.size, 1.0] for end in ends[side]]) @ placing
@@ -243,14 +241,14 @@ def test_sigmas_are_those_of_an_unsurveyed_print():
 def test_every_paper_has_a_sensible_default(name, landscape):
     page = paper_size(name, landscape=landscape)
     (sheet,) = lay_out(Design(page, default_diameter(page)))
-    assert 60 < len(sheet.targets) < 160
-    a, b = sheet.scale_bar
-    assert a.y == b.y
-    assert b.x - a.x > 0.6 * sheet.size[0]
-    for target in sheet.targets:
-        reach = 3 * default_diameter(page) / 2 if target.code else default_diameter(page) / 2
-        assert reach < target.x < sheet.size[0] - reach
-        assert reach < target.y < sheet.size[1] - reach
+    assert 60 < len(sheet.field) < 160
+    a, b = sheet.field.points[[*sheet.scale_bar]]
+    assert a[1] == b[1]
+    assert b[0] - a[0] > 0.6 * sheet.size[0]
+    for (x, y, _), code in zip(sheet.field.points, sheet.field.codes, strict=True):
+        reach = 3 * default_diameter(page) / 2 if code else default_diameter(page) / 2
+        assert reach < x < sheet.size[0] - reach
+        assert reach < y < sheet.size[1] - reach
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def sheet():
     nominal = field_of((sheet,))
     truth = bent(nominal, sheet.size)
     stations = cases.convergent_stations(truth.points, 12, distance=620.0)
-    a, b = (target.name for target in sheet.scale_bar)
+    a, b = (nominal.names[row] for row in sheet.scale_bar)
     return nominal, truth, photograph(truth, stations), measured_distance(truth, a, b, 0.02)
 
 

@@ -173,22 +173,11 @@ class _LogLine(CleanFormatter):
 def progress(total: int | None, label: str) -> Iterator[Callable[[int], None]]:
     """Yield a function that counts steps: a bar on a terminal, some lines otherwise."""
     if sys.stderr.isatty():
+        from rich import progress as rich
         from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
 
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=Console(stderr=True)) as bar:
+        columns = (rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeRemainingColumn())
+        with rich.Progress("{task.description}", *columns, console=Console(stderr=True)) as bar:
             task = bar.add_task(label, total=total)
             yield lambda steps: bar.advance(task, steps)
         return

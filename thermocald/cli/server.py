@@ -6,6 +6,7 @@ analysed on its own, wherever that is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -113,24 +114,21 @@ def forward(
     import socket
     import threading
 
-    from thermocald.fleet.forward import Forwarder, FrameRule, forward_forever
+    from thermocald.fleet.forward import Forwarder, forward_forever
 
-    rule = None
+    frames: dict[str, Any] = {}
     if config is not None:
         read = load_config(config)
         store, to = store or read.store.path, to or read.forward.to
         station = station or read.forward.station
-        section = read.forward
-        if section.frames != "none":
-            most = int(section.frames_mb_per_day * 1e6)
-            rule = FrameRule(read.frames.folder, section.frames, section.every_n, most)
+        frames = {"frames": read.frames.folder, "rule": read.forward}
         if to is None:
             say(f"{config}: forward.to is null: nothing is sent")
             return
     if store is None or to is None:
         raise UsageError("give STORE and --to ADDRESS, or --config FILE")
     address = ServerAddress.parse(to)
-    forwarder = Forwarder(store, address, station or socket.gethostname(), cursor, frames=rule)
+    forwarder = Forwarder(store, address, station or socket.gethostname(), cursor, **frames)
     if once:
         done = forwarder.send_waiting()
         write_json({"sent": dict(done.sent), "refused": done.refused}, json)
@@ -220,6 +218,7 @@ def reprocess(
     from thermocald.series import free_names
 
     sources = [Path(archive) for archive in archives]
+    tasks: Sequence[Any]
     if do == "calibrate":
         for source in sources:
             if is_server(source):
@@ -227,14 +226,12 @@ def reprocess(
                     f"{source_name(source)}: a server has no recordings to calibrate again; "
                     "--do discover and --do study read one"
                 )
-        blocks = find_blocks(sources, out, free_names(free))
-        with progress(len(blocks), "blocks") as advance:
-            outcomes = run_tasks(calibrate_block, blocks, engine, jobs, lambda _: advance(1))
+        tasks, what = find_blocks(sources, out, free_names(free)), "blocks"
     else:
-        tasks = find_series_tasks(sources, out, do)
-        work = partial(analyse, do, sets)
-        with progress(len(tasks), "series") as advance:
-            outcomes = run_tasks(work, tasks, engine, jobs, lambda _: advance(1))
+        tasks, what = find_series_tasks(sources, out, do), "series"
+    work = calibrate_block if do == "calibrate" else partial(analyse, do, sets)
+    with progress(len(tasks), what) as advance:
+        outcomes = run_tasks(work, tasks, engine, jobs, lambda _: advance(1))
     count, failed = len(outcomes), [o for o in outcomes if o.error]
     document: dict[str, Any]
     if do == "calibrate":
@@ -257,5 +254,4 @@ def reprocess(
     if first.not_written:
         raise OutputError(first.error, first.not_written)
     where = places[0].get("source") or f"{first.task.recording}, epoch {first.task.first + 1} on"
-    what = next(iter(document))
     raise DataError(f"{len(failed)} of {count} {what} failed; {where}: {first.error}")

@@ -18,10 +18,12 @@ import json
 import logging
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from thermocald.config import ForwardConfig
 from thermocald.errors import ServerError, ServerGone, StoreError
 from thermocald.files import write_text
 from thermocald.names import FileFolder
@@ -31,7 +33,6 @@ from thermocald.store.server.reader import ServerWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from pathlib import Path
 
     from thermocald.store.database.epochs import KeptFrame
     from thermocald.store.series import StoredSeries
@@ -98,27 +99,6 @@ _LARGEST = 64_000_000
 """Bytes of a frame: a raw of 48 megapixels is below, and a row of PostgreSQL may be far larger."""
 
 
-@dataclass(frozen=True, slots=True)
-class FrameRule:
-    """Which frames are sent.
-
-    folder: where the daemon keeps them; choose: `events` (epochs without a result, or in which the
-    camera moved), `every_n`, or `all` that are kept; daily_bytes: what is above waits for the next
-    day.
-    """
-
-    folder: Path
-    choose: Literal["events", "every_n", "all"] = "events"
-    every_n: int = 360
-    daily_bytes: int = 200_000_000
-
-    def wants(self, frame: KeptFrame) -> bool:
-        """Whether the frame of an epoch is one to send."""
-        if frame.path is None or self.choose == "all":
-            return frame.path is not None
-        return frame.eventful if self.choose == "events" else frame.number % self.every_n == 0
-
-
 BATCH = 200
 """Rows of a transaction: about 1 MB of epochs with 150 targets."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 2.0, 300.0
@@ -142,8 +122,8 @@ class Progress:
 class Forwarder:
     """Sends one store to one server as one station.
 
-    cursor: the file that holds how far; by default next to it. frames: which frames are sent
-    too, None for none.
+    cursor: the file that holds how far; by default next to it; frames: the folder in which the
+    daemon keeps them; rule: which of them are sent too, and how much a day; None: none.
     """
 
     def __init__(
@@ -153,13 +133,14 @@ class Forwarder:
         station: str,
         cursor: Path | None = None,
         batch: int = BATCH,
-        frames: FrameRule | None = None,
+        frames: Path = Path(),
+        rule: ForwardConfig | None = None,
     ) -> None:
         self.store = store
         self.address = address
         self.station = station
         self.batch = batch
-        self.frames = frames
+        self.frames, self.rule = frames, rule or ForwardConfig()
         self._path = cursor or store.with_name(f"{store.name}.forwarded")
         self._clock = time.time
         self._reported = -_REPORT_S
@@ -176,14 +157,15 @@ class Forwarder:
             cursor = Cursor.read(self._path, store, self.address.place, self.station)
             before = cursor.rows_refused
             count = dict.fromkeys(_COUNTED, 0)
-            frames = self.frames is not None and store.frames_after(cursor.sent["frame"], 1)
+            choose = self.rule.frames != "none"
+            frames = choose and store.frames_after(cursor.sent["frame"], 1)
             report = self._report_is_due or self._waiting
             if report or frames or store.rows_waiting(cursor.sent):
                 with ServerWriter(self.address, self.station, store.identity) as writer:
                     for table in KEPT:
                         count[table] = self._send_rows(store, writer, cursor, table)
-                    if self.frames is not None:
-                        count["frame"] = self._send_frames(store, writer, cursor, self.frames)
+                    if choose:
+                        count["frame"] = self._send_frames(store, writer, cursor)
                     if self._waiting:
                         self._report(store, writer, cursor)
             return Progress(count, cursor.rows_refused - before)
@@ -236,21 +218,19 @@ class Forwarder:
             ]
         return []
 
-    def _send_frames(
-        self, store: Store, writer: ServerWriter, cursor: Cursor, rule: FrameRule
-    ) -> int:
+    def _send_frames(self, store: Store, writer: ServerWriter, cursor: Cursor) -> int:
         """Send the chosen frames that wait, up to the day's limit; how many the server took.
 
         A frame that retention has deleted is passed over.
         """
         count = 0
-        files = FileFolder(rule.folder)
+        files = FileFolder(self.frames)
         series = {one.id: one for one in store.all_series()}
         while frames := store.frames_after(cursor.sent["frame"], _FRAMES):
             for frame in frames:
-                data = _read_frame(files, frame) if rule.wants(frame) else None
+                data = _read_frame(files, frame) if self._wants(frame) else None
                 if frame.series not in series or (
-                    data is not None and not self._has_room(cursor, rule, len(data))
+                    data is not None and not self._has_room(cursor, len(data))
                 ):
                     cursor.write(self._path)
                     return count
@@ -270,12 +250,21 @@ class Forwarder:
             cursor.write(self._path)
         return count
 
-    def _has_room(self, cursor: Cursor, rule: FrameRule, size: int) -> bool:
+    def _wants(self, frame: KeptFrame) -> bool:
+        """Whether the frame of an epoch is one to send."""
+        if frame.path is None or self.rule.frames == "all":
+            return frame.path is not None
+        if self.rule.frames == "events":
+            return frame.eventful
+        return frame.number % self.rule.every_n == 0
+
+    def _has_room(self, cursor: Cursor, size: int) -> bool:
         day = int(self._clock() // _DAY_S)
         if day != cursor.day:
             cursor.day, cursor.frame_bytes = day, 0
         # one frame a day goes through whatever its size, else nothing ever would
-        if not cursor.frame_bytes or cursor.frame_bytes + size <= rule.daily_bytes:
+        most = int(self.rule.frames_mb_per_day * 1e6)
+        if not cursor.frame_bytes or cursor.frame_bytes + size <= most:
             return True
         if self._full_on != day:
             log.warning(
@@ -316,15 +305,10 @@ def _read_frame(files: FileFolder, frame: KeptFrame) -> bytes | None:
         return None
 
 
-def forward_forever(
-    forwarder: Forwarder,
-    wait: Callable[[float], bool],
-    report: Callable[[Progress | None, str], None] = lambda *_: None,
-) -> None:
+def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None:
     """Send what waits, again and again, until `wait(seconds)` says that it should end.
 
-    report(progress, trouble): after each round; trouble is empty where all was sent. An error
-    that a person must mend is reported and tried again at the longest pause: nothing is lost
+    An error that a person must mend is logged and tried again at the longest pause: nothing is lost
     meanwhile, the store keeps it.
     """
     pause, trouble = _FIRST_PAUSE_S, ""
@@ -335,16 +319,13 @@ def forward_forever(
             if str(error) != trouble:
                 log.warning("%s; rows wait in the store", error)
             trouble = str(error)
-            report(None, trouble)
-            pause = min(2 * pause, _LONGEST_PAUSE_S)
-            if not isinstance(error, ServerGone):
-                pause = _LONGEST_PAUSE_S
+            passing = isinstance(error, ServerGone)
+            pause = min(2 * pause, _LONGEST_PAUSE_S) if passing else _LONGEST_PAUSE_S
             if wait(pause):
                 return
             continue
         if trouble:
             log.info("%s is reached again, %d rows sent", forwarder.address, progress.rows)
         pause, trouble = _FIRST_PAUSE_S, ""
-        report(progress, "")
         if wait(_IDLE_S):
             return

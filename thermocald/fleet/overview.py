@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -49,24 +48,6 @@ _RESOLUTION = 0.02  # K, of a thermometer that does not state one
 _LEAST_RANGE_K = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class TypeRate(Rate):
-    """The mean of a type's specimens; sd_between: their standard deviation about it, mm/K."""
-
-    sd_between: float = math.nan
-
-
-@dataclass(frozen=True, slots=True)
-class TypeOverview:
-    """A type, its cameras, and their rates by parameter."""
-
-    JSON: ClassVar = {"name": "type"}
-
-    name: str
-    cameras: tuple[str, ...]
-    rates: dict[str, TypeRate]
-
-
 def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[FleetCamera]]:
     """The server's time (s UTC) and all cameras that an address selects; path: for messages.
 
@@ -81,8 +62,11 @@ def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[Fleet
     return now, cameras
 
 
-def camera_types(cameras: Sequence[FleetCamera]) -> list[TypeOverview]:
-    """The types of which enough specimens are known; sets `odd` of their cameras."""
+def camera_types(cameras: Sequence[FleetCamera]) -> list[dict[str, Any]]:
+    """The types of which enough specimens are known, as documents; sets `odd` of their cameras.
+
+    rates: the mean of a type's specimens, its sd, and their standard deviation about it, mm/K.
+    """
     groups: dict[str, list[FleetCamera]] = defaultdict(list)
     for camera in cameras:
         if len(camera.rates) == len(RATED):
@@ -103,18 +87,13 @@ def camera_types(cameras: Sequence[FleetCamera]) -> list[TypeOverview]:
         people = population(values[like], covariances[like])
         between = np.sqrt(np.diag(people.between))
         sd_mean = np.sqrt(np.diag(people.mean_covariance))
-        found.append(
-            TypeOverview(
-                name,
-                tuple(c.name for c in group),
-                {
-                    rated: TypeRate(float(mean), float(sd), sd_between=float(scatter))
-                    for rated, mean, sd, scatter in zip(
-                        RATED, people.mean, sd_mean, between, strict=True
-                    )
-                },
+        rates = {
+            rated: {"value": mean, "sd": sd, "unit": "mm/K", "sd_between": scatter}
+            for rated, mean, sd, scatter in zip(
+                RATED, people.mean.tolist(), sd_mean.tolist(), between.tolist(), strict=True
             )
-        )
+        }
+        found.append({"type": name, "cameras": [c.name for c in group], "rates": rates})
     return found
 
 
@@ -199,9 +178,11 @@ _OUTSIDE_K = 2.0
 _SHIFT_PX, _SHIFT_SDS = 0.3, 6.0
 
 
-def add_findings(cameras: Sequence[FleetCamera], types: Sequence[TypeOverview], now: float) -> None:
+def add_findings(
+    cameras: Sequence[FleetCamera], types: Sequence[dict[str, Any]], now: float
+) -> None:
     """Fill `findings` of all cameras; now: s UTC, by the server's clock."""
-    of_name = {name: kind for kind in types for name in kind.cameras}
+    of_name = {name: kind for kind in types for name in kind["cameras"]}
     for camera in cameras:
         found = chain(
             _late(camera, now),
@@ -309,20 +290,20 @@ def _calibration(camera: FleetCamera, now: float) -> Findings:
         yield "calibrate", f"has lately moved by {camera.shift_px:.1f} px from its own line"
 
 
-def _odd(camera: FleetCamera, kind: TypeOverview | None) -> Findings:
+def _odd(camera: FleetCamera, kind: dict[str, Any] | None) -> Findings:
     if kind is None or not camera.odd < ODD:
         return
 
     def distance(name: str) -> float:
-        rate = camera.rates[name]
-        usual = kind.rates[name]
-        return abs(rate.value - usual.value) / math.hypot(rate.sd, usual.sd_between, 1e-12)
+        rate, usual = camera.rates[name], kind["rates"][name]
+        scatter = math.hypot(rate.sd, usual["sd_between"], 1e-12)
+        return float(abs(rate.value - usual["value"]) / scatter)
 
     name = max(RATED, key=distance)
-    usual = kind.rates[name]
+    usual = kind["rates"][name]
     text = (
         f"{name} moves by {camera.rates[name].value * 1e3:+.3f} µm/K, the others "
-        f"by {usual.value * 1e3:+.3f} ± {usual.sd_between * 1e3:.3f} (p = {camera.odd:.1g})"
+        f"by {usual['value'] * 1e3:+.3f} ± {usual['sd_between'] * 1e3:.3f} (p = {camera.odd:.1g})"
     )
     yield "odd", text
 

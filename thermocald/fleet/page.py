@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.figures import BAND, PALETTE, Figure, drawing_style, label_axes, new_drawing
 from thermocald.fleet.overview import add_findings, camera_types, read_overview
 from thermocald.numbers import parameter_label, percent, short_duration, shortened
-from thermocald.report import Answer, Chapter, Section, Table, render_report
+from thermocald.report import Answer, Chapter, Section, Table
 from thermocald.result import document_of
 from thermocald.store.server.connection import ServerAddress
 
@@ -64,7 +64,7 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
         "servers": [str(address) for address in addresses],
         "time": now,
         "cameras": [document_of(camera) for camera in cameras],
-        "types": [document_of(kind) for kind in types],
+        "types": types,
         "summary": {
             "cameras": len(cameras),
             "stations": len({c.station for c in cameras}),
@@ -172,7 +172,7 @@ def render_fleet(document: Mapping[str, Any]) -> str:
         ),
     ]
     about = (f"From {', '.join(document['servers'])}.",)
-    return render_report(title, [Chapter(title, answer, tuple(sections), about)])
+    return Chapter(title, answer, tuple(sections), about).page()
 
 
 def _name(camera: Mapping[str, Any]) -> str:

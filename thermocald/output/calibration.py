@@ -17,7 +17,7 @@ from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, image_panel
 from thermocald.numbers import UNITS, coefficient, parameter_label, percent, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, Sensor, project
-from thermocald.report import Answer, Chapter, Section, Table, as_sentence, render_report
+from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,13 +44,12 @@ def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
         Section("Interior orientation", tables=tuple(t for t in tables if t.rows)),
         Section("Photographs", tables=(_photographs(result),)),
     )
-    chapter = Chapter(
+    return Chapter(
         f"Calibration of {name}",
         _answer(result, posed, sensor),
         tuple(s for s in sections if s.figures or s.tables),
         (f"{name}, {sensor.width} × {sensor.height} px of {sensor.pixel_pitch * 1000:g} µm.",),
-    )
-    return render_report(chapter.title, [chapter])
+    ).page()
 
 
 def coverage(points: Array, sensor: Sensor) -> float:
@@ -180,7 +179,7 @@ def _by_radius(points: Array, residuals: Array, sensor: Sensor) -> Figure:
     ).reshape(-1, 3).T  # fmt: skip
     curves = (
         Curve("points", radius, outwards, "points", "#9fc4dc"),
-        Curve("mean, 95 %", x, y, "band", PALETTE[1], y - BAND * sd, y + BAND * sd),
+        Curve("mean, 95 %", x, y, "line", PALETTE[1], BAND * sd),
     )
     panel = Panel(
         "Residuals outwards", "distance from the image centre in px", "outwards in px", curves,
@@ -283,7 +282,7 @@ def render_field_check(result: FieldCheck) -> str:
         more += f" With the errors of the targets' places as they are stated it gives {stated}."
     rows = tuple((parameter_label(n), *(_sd(value) for value in row)) for n, row in sds.items())
     reasons = list(result.hidden.values())
-    chapter = Chapter(
+    return Chapter(
         "Check of a test field",
         Answer(
             sentence,
@@ -316,8 +315,7 @@ def render_field_check(result: FieldCheck) -> str:
             ),
         ),
         (f"{model.sensor.width} × {model.sensor.height} px of {pitch * 1000:g} µm.",),
-    )
-    return render_report(chapter.title, [chapter])
+    ).page()
 
 
 def _sd(value: float) -> str:

@@ -29,7 +29,7 @@ from thermocald.figures import (
     tick_text,
 )
 from thermocald.numbers import parameter_label, plain, shortened, with_sd
-from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day, render_report
+from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ _AT_NOISE = 1.1  # times the noise: what an effect leaves counts as noise
 
 def report_html(discovery: Discovery, title: str) -> str:
     """Return the whole page."""
-    chapter = Chapter(
+    return Chapter(
         f"Discovery: {title}",
         _answer(discovery),
         tuple(_sections(discovery)),
@@ -59,8 +59,7 @@ def report_html(discovery: Discovery, title: str) -> str:
                 *field_lines(discovery.examination),
             )
         ),
-    )
-    return render_report(chapter.title, [chapter])
+    ).page()
 
 
 def _answer(d: Discovery) -> Answer:
@@ -211,7 +210,7 @@ def _trajectory(d: Discovery) -> Figure:
         ]
         ends, band = np.array([np.nanmin(x), np.nanmax(x)]), np.full(2, BAND * noise)
         left = [
-            Curve("", ends, np.zeros(2), "band", GREY, -band, band),
+            Curve("", ends, np.zeros(2), "line", GREY, band),
             Curve("", x, before, "points", _BASE),
         ]
         if found:

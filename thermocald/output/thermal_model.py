@@ -11,15 +11,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from thermocald.figures import BAND, PALETTE, Curve, Figure, Panel
+from thermocald.figures import BAND, Curve, Figure, Panel
 from thermocald.files import write_text
 from thermocald.numbers import UNITS, parameter_label, signed, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
-from thermocald.report import Answer, Chapter, Section, Table, as_sentence, render_report
+from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 from thermocald.store.recording.sense import doubt_lines
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def render_certificate(camera: ThermalCamera) -> str:
     values = np.array([state.interior.as_array() for state in states])
     sds = np.array([[state.sd.get(name, 0.0) for name in IOP_NAMES] for state in states])
     missing = bool(document.get("effect_missing"))
-    chapter = Chapter(
+    return Chapter(
         f"Thermal model of {document['camera']}",
         Answer(
             _sentence(document, camera.model.sensor.pixel_pitch, low, high),
@@ -61,8 +61,7 @@ def render_certificate(camera: ThermalCamera) -> str:
         ),
         about=(_about(camera, document),),
         notes=tuple(as_sentence(line) for line in doubt_lines(document.get("doubts", ()))),
-    )  # fmt: skip
-    return render_report(chapter.title, [chapter])
+    ).page()  # fmt: skip
 
 
 def _section(title: str, *tables: Table) -> Section:
@@ -111,10 +110,7 @@ def _drift(T: Array, values: Array, sds: Array, missing: bool) -> Figure:
     for name in ("c", "x0", "y0"):
         k = IOP_NAMES.index(name)
         y, half = 1e3 * (values[:, k] - values[middle, k]), 1e3 * BAND * sds[:, k]
-        curve = (
-            Curve("", T, y, "line", PALETTE[0]) if missing
-            else Curve("", T, y, "band", PALETTE[0], y - half, y + half)
-        )  # fmt: skip
+        curve = Curve("", T, y, half=None if missing else half)
         label = parameter_label(name)
         panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
     band = "no band is stated" if missing else "bands hold 95 %, the level's uncertainty included"
@@ -206,32 +202,28 @@ _FOLLOW_PYTHON = """\
 """
 
 
-def c_header(camera: ThermalCamera, name: str) -> str:
-    """Return the model as a C header; UsageError where it needs more than one thermometer."""
-    knees = ", ".join([*(f"{{{_row(k)}}}" for k in camera.steady_knees()), "{0}"])
-    return _filled("model.h.txt", camera, name, _FOLLOW_C, knees)
-
-
-def python_module(camera: ThermalCamera, name: str) -> str:
-    """Return the model as a Python module; UsageError where it needs more than one thermometer."""
-    knees = "".join(f"({_row(k)}), " for k in camera.steady_knees()).strip()
-    return _filled("model.py.txt", camera, name, _FOLLOW_PYTHON, knees)
-
-
 def write_code(camera: ThermalCamera, path: Path) -> tuple[Path, Path]:
     """Write PATH.h and PATH.py; OutputError where they cannot be written."""
     header, module = path.with_suffix(".h"), path.with_suffix(".py")
-    texts = {header: c_header(camera, path.stem), module: python_module(camera, path.stem)}
-    for file, text in texts.items():
+    texts = [code_of(camera, path.stem, kind) for kind in ("h", "py")]
+    for file, text in zip((header, module), texts, strict=True):
         write_text(file, text)
     return header, module
 
 
-def _filled(file: str, camera: ThermalCamera, name: str, follow: str, knees: str) -> str:
-    """Return a template with the model's numbers; follow: what lets the distortion follow c."""
+def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
+    """Return the model as a C header or a Python module.
+
+    Raises UsageError where it needs more than one thermometer.
+    """
     model = camera.model
     sensor = model.sensor
     p = camera.steady_polynomials()
+    rows = [_row(k) for k in camera.steady_knees()]
+    if kind == "h":
+        follow, knees = _FOLLOW_C, ", ".join([*(f"{{{row}}}" for row in rows), "{0}"])
+    else:
+        follow, knees = _FOLLOW_PYTHON, "".join(f"({row}), " for row in rows).strip()
     identifier = re.sub(r"\W", "_", name, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"camera_{identifier}"
     reference, limits = next(iter(model.validity.items()), ("the thermometer", (-273.0, 1000.0)))
@@ -244,11 +236,12 @@ def _filled(file: str, camera: ThermalCamera, name: str, follow: str, knees: str
         "low": repr(float(limits[0])), "high": repr(float(limits[1])), "width": sensor.width,
         "height": sensor.height, "pitch": repr(float(sensor.pixel_pitch)),
         "T0": repr(float(model.T0)), "p0": _row(p[0]), "p1": _row(p[1]), "p2": _row(p[2]),
-        "n": len(camera.steady_knees()), "knees": knees,
+        "n": len(rows), "knees": knees,
         "follow": follow.format(c0=c0) if model.distortion == "angle" else "",
         "exact": exact if affine else "OpenCV's parameters are exact.",
     }  # fmt: skip
-    return Template((_TEMPLATES / file).read_text(encoding="utf-8")).substitute(fields)
+    text = (_TEMPLATES / f"model.{kind}.txt").read_text(encoding="utf-8")
+    return Template(text).substitute(fields)
 
 
 def _plain(text: str) -> str:

@@ -13,12 +13,13 @@ import io
 import json
 import math
 import shutil
+from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import generate_latest
 from prometheus_client.core import GaugeMetricFamily
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
@@ -66,14 +67,14 @@ _ONLINE = {
 }
 
 
+@dataclass(frozen=True)
 class _StatusCollector:
     """A daemon's status as metrics; an empty one says that none runs."""
 
-    def __init__(self, status: Mapping[str, Any]) -> None:
-        self._status = status
+    status: Mapping[str, Any]
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        status = self._status
+        status = self.status
         single: list[tuple[str, str, float]] = [("up", "Whether a daemon answers.", bool(status))]
         if status:
             store = status["store"]
@@ -108,10 +109,8 @@ class _StatusCollector:
 
 def _metrics(request: Request) -> Response:
     """The status in the text format of Prometheus."""
-    registry = CollectorRegistry()
-    registry.register(_StatusCollector(_view(request).status()))
-    content_type = "text/plain; version=0.0.4; charset=utf-8"
-    return Response(generate_latest(registry), media_type=content_type)
+    text = generate_latest(_StatusCollector(_view(request).status()))
+    return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 _STATIC = Path(__file__).parent / "static"

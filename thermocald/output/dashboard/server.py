@@ -10,7 +10,6 @@ import asyncio
 import errno
 import logging
 import socket
-from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import uvicorn
@@ -20,8 +19,6 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from thermocald.errors import ConfigurationError, ThermocaldError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     from starlette.applications import Starlette
     from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -131,29 +128,24 @@ class Limits:
         if path not in _COSTLY:
             await self._app(scope, receive, send)
             return
-        if self._slots[path].locked() and self._waiting[path] >= _COSTLY[path][1]:
+        slot = self._slots[path]
+        if slot.locked() and self._waiting[path] >= _COSTLY[path][1]:
             busy = JSONResponse(
                 {"error": "too many ask for this at once; ask again"}, 503, {"retry-after": "5"}
             )
             await busy(scope, receive, send)
             return
-        async with self._slot(path):
-            try:
-                await self._app(scope, receive, send)
-            except RuntimeError as error:
-                if not isinstance(error.__cause__, ThermocaldError):
-                    raise
-                # half of the answer is sent: all that can be done is to end it there
-                log.warning("%s: %s", path, error.__cause__)
-
-    @asynccontextmanager
-    async def _slot(self, path: str) -> AsyncIterator[None]:
         self._waiting[path] += 1
         try:
-            await self._slots[path].acquire()
+            await slot.acquire()
         finally:
             self._waiting[path] -= 1
         try:
-            yield
+            await self._app(scope, receive, send)
+        except RuntimeError as error:
+            if not isinstance(error.__cause__, ThermocaldError):
+                raise
+            # half of the answer is sent: all that can be done is to end it there
+            log.warning("%s: %s", path, error.__cause__)
         finally:
-            self._slots[path].release()
+            slot.release()

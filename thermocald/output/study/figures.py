@@ -37,8 +37,7 @@ def study_figures(camera: CameraStudy) -> dict[str, Figure]:
         _movement_figure(camera),
         _significance_figure(camera),
         dependence_figure(camera),
-        _error_figure(camera),
-        _point_figure(camera),
+        *_object_space(camera),
         *_matrices(camera),
     )
     return {figure.name: figure for figure in made if figure is not None}
@@ -78,7 +77,7 @@ def deviation_figure(camera: CameraStudy) -> Figure:
             s = study.series
             change, band = scale * (s.values[:, k] - s.values[0, k]), scale * BAND * s.sds[:, k]
             t, y, half = thin(s.time_s / 60, change, band)
-            curves.append(Curve(s.name, t, y, "band", colour, y - half, y + half))
+            curves.append(Curve(s.name, t, y, "line", colour, half))
         panels.append(Panel(f"Δ{parameter_label(name)}", "time in min", label, tuple(curves)))
     for study, colour in _coloured(camera):
         s, d = study.series, study.deviations
@@ -264,11 +263,13 @@ def _fitted(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Cu
     ]
 
 
-def _error_figure(camera: CameraStudy) -> Figure | None:
-    """Error clouds on the object plane, one panel per grid point (Figures 10 and 11)."""
+def _object_space(camera: CameraStudy) -> Iterator[Figure]:
+    """Error clouds on the object plane, one panel per grid point; mean and largest error of each,
+    and the mean of the largest (Figures 10 and 11).
+    """
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
-        return None
+        return
     limits = mc.clusters_mm
     names = cluster_names(limits)
     size = round(np.sqrt(len(mc.image_points)))
@@ -287,7 +288,7 @@ def _error_figure(camera: CameraStudy) -> Figure | None:
         curves.append(Curve("95 %, first order", x / 10, y / 10, "line", "#d55e00", dashed=True))
         panels.append(Panel(_place(k, size), "ΔX in cm", "ΔY in cm", tuple(curves), equal=True))
     worst = int(np.argmax(mc.largest))
-    return Figure(
+    yield Figure(
         "object-space-errors", f"Errors on a plane at {mc.distance_mm / 1000:g} m",
         f"Where {mc.sets:,} drawn interior orientations put each image point on a plane at "
         f"{mc.distance_mm / 1000:g} m, relative to where it belongs ({min(_DRAWN, mc.sets)} are "
@@ -296,16 +297,9 @@ def _error_figure(camera: CameraStudy) -> Figure | None:
         f"arises at the {_place(worst, size)}.",
         tuple(panels), columns=size,
     )  # fmt: skip
-
-
-def _point_figure(camera: CameraStudy) -> Figure | None:
-    """Mean and largest error of each grid point, and the mean of the largest (Figure 11)."""
-    mc, first = camera.montecarlo, camera.first_order
-    if mc is None or first is None:
-        return None
     number = np.arange(1.0, len(mc.image_points) + 1)
     middle = np.full(len(number), mc.mean_largest / 10)
-    curves = (
+    by_point = (
         Curve("largest", number, mc.largest / 10, colour="#7fbf7b"),
         Curve("mean", number, mc.mean / 10, colour="#1b7837"),
         Curve("to first order", number, first.expected_largest / 10, colour="#d55e00", dashed=True),
@@ -313,14 +307,14 @@ def _point_figure(camera: CameraStudy) -> Figure | None:
         Curve("mean of largest", number, middle, colour=GREY, dashed=True),
     )
     panel = Panel(
-        "Mean and largest error", "image point from top left (number)", "error in cm", curves
+        "Mean and largest error", "image point from top left (number)", "error in cm", by_point
     )
-    k = int(np.argmin(mc.largest))
-    return Figure(
+    least = int(np.argmin(mc.largest))
+    yield Figure(
         "errors-by-point", "Errors by image point",
         f"Mean and largest error of each image point, and the mean of the largest, "
         f"{mc.mean_largest / 10:.1f} cm. The largest error is least at the "
-        f"{_place(k, round(np.sqrt(len(number))))}. A "
+        f"{_place(least, size)}. A "
         "shifting principal point moves all points alike, a changing principal distance those "
         "at the image's edges most.",
         (panel,),

@@ -22,6 +22,7 @@ from thermocald.output.study.figures import (
     study_figures,
 )
 from thermocald.output.study.summary import answer_sentences, detail_sentences
+from thermocald.photogrammetry.targets.image_file import decode_grey
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day, render_report
 from thermocald.store.recording.sense import doubt_lines
 
@@ -112,11 +113,11 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
     drawn = study_figures(camera)
 
     def section(
-        title: str, names: Sequence[str], found: Sequence[Table | None],
+        title: str, names: Sequence[str], found: Sequence[Table],
         more: Sequence[Figure] = (), text: Sequence[str] = (), folded: bool = False,
     ) -> Section:  # fmt: skip
         shown = [drawn[name] for name in names if name in drawn]
-        rows = tuple(t for t in found if t is not None and t.rows)
+        rows = tuple(t for t in found if t.rows)
         return Section(title, tuple(text), (*shown, *more), rows, folded=folded)
 
     matrices = [name for name in drawn if name.startswith("correlation-")]
@@ -131,7 +132,7 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
         ),
         section(
             "What it means in object space", ("object-space-errors", "errors-by-point"),
-            [tables.cluster_table(camera), tables.point_table(camera)],
+            tables.object_space_tables(camera),
         ),
         section(
             "Whether the changes are significant", ("significance",),
@@ -188,15 +189,8 @@ def cut_clip(path: Path, centre: tuple[float, float], size: int) -> NDArray[np.u
 
     Raises ImageError for what is not an image.
     """
-    import cv2
-
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-    if image is None:
-        raise ImageError(f"{path}: is not an image")
+    image = decode_grey(path)
+    image = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
     left, top = (round(v - (size - 1) / 2) for v in centre)
     clip = np.zeros((size, size), dtype=np.uint8)
     height, width = image.shape

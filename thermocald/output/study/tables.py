@@ -202,18 +202,20 @@ def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
     )
 
 
-def cluster_table(camera: CameraStudy) -> Table | None:
-    """Fractions of the errors, means, maxima (Table 7), and of the camera's own path."""
+def object_space_tables(camera: CameraStudy) -> list[Table]:
+    """Fractions of the errors, means, maxima (Table 7), and of the camera's own path; errors per
+    grid point (Figure 11).
+    """
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
-        return None
+        return []
 
     def row(label: str, fractions: Array, mean: float, largest: float) -> tuple[str, ...]:
         shown = [percent(float(v), 1) for v in fractions]
         return (label, *shown, f"{mean / 10:.2f} cm", f"{largest / 10:.1f} cm")
 
     linear = np.maximum(first.fractions, 0.0)
-    return Table(
+    clusters = Table(
         f"Errors on a plane at {mc.distance_mm / 1000:g} m",
         ("", *cluster_names(mc.clusters_mm), "mean", "mean of maxima"),
         (
@@ -231,17 +233,10 @@ def cluster_table(camera: CameraStudy) -> Table | None:
         "mean, with the correlations of the adjustments; the own path is that of the measured "
         "epochs, against one interior orientation that is held fixed.",
     )
-
-
-def point_table(camera: CameraStudy) -> Table | None:
-    """Errors per grid point (Figure 11)."""
-    mc, first = camera.montecarlo, camera.first_order
-    if mc is None or first is None:
-        return None
     values, vectors = np.linalg.eigh(mc.covariance)  # the longer axis is the last
     axes = np.sqrt(np.maximum(values, 0.0)) / 10
     direction = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])) % 180
-    return Table.of(
+    points = Table.of(
         "Errors by image point",
         range(len(mc.image_points)),
         {
@@ -257,3 +252,4 @@ def point_table(camera: CameraStudy) -> Table | None:
         "Direction of the longer axis, from X (right) towards Y (up) as the camera looks. "
         "Bias is what the mean error vector keeps: an effect of second order.",
     )
+    return [clusters, points]

@@ -20,9 +20,8 @@ from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Curve
 from matplotlib.transforms import Affine2D
 
-from thermocald.output.testfield.layout import STRIP, TRIM, Sheet, Target
+from thermocald.output.testfield.layout import STRIP, TRIM, Sheet, markers_of
 from thermocald.photogrammetry.targets import outline, ring_code
-from thermocald.photogrammetry.targets.markers import marker_cells
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -232,22 +231,18 @@ def draw(sheet: Sheet) -> Any:
     pen = Pen(sheet.design.page, sheet.design.light)
     if sheet.design.light:
         pen.fill(rectangle(0.0, 0.0, *sheet.size), "black")
-    r = sheet.design.diameter / 2
-    for target in sheet.targets:
-        pen.fill(Curve.circle((target.x, target.y), r), pen.colour)
-        arcs = ring_code.segments(*ring_code.parse(target.code)) if target.code else ()
-        for begin, end in arcs:
-            pen.fill(_ring_segment(target, r, begin, end), pen.colour)
-        below = (outline.RING_OUTER if target.code else 1.0) * r
-        _label(pen, target.x, target.y - below, target.name, r)
-    for marker in sheet.markers:
-        name, number = marker.code.split(":")
-        cells = marker_cells(name, int(number))
+    r, field = sheet.design.diameter / 2, sheet.field
+    for row in np.flatnonzero(field.circles):
+        (x, y, _), code = field.points[row].tolist(), field.codes[row]
+        pen.fill(Curve.circle((x, y), r), pen.colour)
+        for begin, end in ring_code.segments(*ring_code.parse(code)) if code else ():
+            pen.fill(_ring_segment((x, y), r, begin, end), pen.colour)
+        _label(pen, x, y - (outline.RING_OUTER if code else 1.0) * r, field.names[row], r)
+    for name, (x, y), side, cells in markers_of(field):
         if sheet.design.light:  # a marker is black on white, whatever the circles are
-            surround = marker.side * (1 + 2 / len(cells))
-            pen.fill(square(marker.x, marker.y, surround), "white")
-        draw_marker(pen, (marker.x, marker.y), marker.side, cells)
-        _label(pen, marker.x, marker.y - marker.side / 2, marker.name, r)
+            pen.fill(square(x, y, side * (1 + 2 / len(cells))), "white")
+        draw_marker(pen, (x, y), side, cells)
+        _label(pen, x, y - side / 2, name, r)
     crop_marks(pen, sheet.size)
     rulers(pen, sheet.size)
     _legend(pen, sheet)
@@ -273,7 +268,7 @@ def _label(pen: Pen, x: float, below: float, name: str, r: float) -> None:
     pen.text(x, below - 0.35 * r - height, name, height, ha="center", color=GREY)
 
 
-def _ring_segment(target: Target, r: float, begin: float, end: float) -> Any:
+def _ring_segment(centre: tuple[float, float], r: float, begin: float, end: float) -> Any:
     """An arc of the ring; codes run clockwise as seen, the sheet's y is up: angles are negated."""
     arc = Curve.arc(-360 * end, -360 * begin, n=max(2, int(np.ceil(16 * (end - begin)))))
     unit = np.asarray(arc.vertices, dtype=float)
@@ -286,22 +281,22 @@ def _ring_segment(target: Target, r: float, begin: float, end: float) -> Any:
             [Curve.CLOSEPOLY],
         ]
     )
-    vertices = np.concatenate([outer, inner, outer[:1]]) + np.array([target.x, target.y])
-    return Curve(vertices, codes)
+    return Curve(np.concatenate([outer, inner, outer[:1]]) + np.array(centre), codes)
 
 
 def _legend(pen: Pen, sheet: Sheet) -> None:
     bar = sheet.scale_bar
     words = f"{sheet.title}, discs {sheet.design.diameter:g} mm"
     if bar is not None:
-        a, b = bar
-        distance = float(np.hypot(b.x - a.x, b.y - a.y))
-        words += f"; scale {a.name}–{b.name}: nominal {distance:.2f} mm, measured ________ mm"
-        if a.y == b.y:
+        a, b = (sheet.field.names[row] for row in bar)
+        ends, levels = sheet.field.points[[*bar], :2].T.tolist()
+        distance = float(np.hypot(np.diff(ends), np.diff(levels))[0])
+        words += f"; scale {a}–{b}: nominal {distance:.2f} mm, measured ________ mm"
+        if levels[0] == levels[1]:
             y = STRIP - 1.0
-            for x in (a.x, b.x):
+            for x in ends:
                 pen.line([(x, y - 1.2), (x, y + 1.2)], pen.colour, 0.1)
-            pen.line([(a.x, y), (b.x, y)], GREY, 0.1)
+            pen.line([(x, y) for x in ends], GREY, 0.1)
     pen.text(STRIP, STRIP - 4.6, words, _LEGEND_HEIGHT)
 
 
@@ -316,8 +311,8 @@ def draw_board(board: Board, page: tuple[float, float]) -> Any:
     dx, dy = board.place(page)
     for x, y, side in board.squares():
         pen.fill(rectangle(x + dx, y + dy, side, side), "black")
-    for (x, y), cells in board.markers():
-        draw_marker(pen, (x + dx, y + dy), board.marker, cells)
+    for _, (x, y), side, cells in board.markers():
+        draw_marker(pen, (x + dx, y + dy), side, cells)
     return pen.figure
 
 

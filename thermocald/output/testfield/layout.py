@@ -21,10 +21,16 @@ import numpy as np
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.photogrammetry.targets import ring_code
-from thermocald.photogrammetry.targets.markers import dictionary, marker_dictionaries
+from thermocald.photogrammetry.targets.markers import (
+    dictionary,
+    marker_cells,
+    marker_dictionaries,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
 
     from thermocald.arrays import Array
 
@@ -44,6 +50,8 @@ _PITCH = 8.5
 _MAX_SIDE = 5000.0
 _MARKER_EVERY = 5
 """Every so many places of the grid one is a marker's."""
+_CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))
+"""Of a marker in OpenCV's order: right and up of its centre."""
 _MARKER_SIDE = 6.0
 """Side of a marker in radii of a disc; its white surround then still fits into the pitch."""
 # What a print is worth before it has been surveyed (1 sigma): the printer's own raggedness, its
@@ -58,10 +66,6 @@ _EDGES = {
     _TITLES[1]: {"lower": "B", "right": "C"},
     _TITLES[2]: {"lower": "A", "left": "C"},
 }
-
-
-class _OutOfCodes(UsageError):
-    """There are fewer codes than places on the sheets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,43 +89,14 @@ class Design:
     pitch: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
-    """A circle on a sheet: centre mm; its ring code or an empty string."""
-
-    name: str
-    x: float
-    y: float
-    code: str
-
-
-@dataclass(frozen=True, slots=True)
-class Marker:
-    """A marker on a sheet: centre and side mm; `DICT_…:17`."""
-
-    name: str
-    x: float
-    y: float
-    side: float
-    code: str
-
-    def corners(self) -> Array:
-        """The corners (4, 2) mm in OpenCV's order: clockwise from the upper left."""
-        h = self.side / 2
-        square = np.array([[-h, h], [h, h], [h, -h], [-h, -h]])
-        placed: Array = square + np.array([self.x, self.y])
-        return placed
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """One sheet: its title, trimmed size (width, height) mm, and what is on it."""
+    """One sheet: its title, trimmed size (width, height) mm, and what is on it: x, y mm, z = 0."""
 
     title: str
     design: Design
     size: tuple[float, float]
-    targets: tuple[Target, ...]
-    markers: tuple[Marker, ...]
+    field: TestField
 
     @property
     def edges(self) -> dict[str, str]:
@@ -129,15 +104,17 @@ class Sheet:
         return _EDGES.get(self.title, {})
 
     @property
-    def scale_bar(self) -> tuple[Target, Target] | None:
-        """The two coded targets to measure between: the ends of the lowest row."""
-        coded = [t for t in self.targets if t.code] or list(self.targets)
+    def scale_bar(self) -> tuple[int, int] | None:
+        """The rows of the two coded circles to measure between: the ends of the lowest row."""
+        circles = np.flatnonzero(self.field.circles).tolist()
+        coded = [i for i in circles if self.field.codes[i]] or circles
         if len(coded) < 2:
             return None
-        lowest = min(t.y for t in coded)
-        row = sorted((t for t in coded if t.y == lowest), key=lambda t: t.x)
+        x, y, _ = self.field.points.T
+        lowest = [i for i in coded if y[i] == y[coded].min()]
+        row = sorted(lowest, key=lambda i: x[i])
         if len(row) < 2:
-            row = sorted(coded, key=lambda t: t.y)
+            row = sorted(coded, key=lambda i: y[i])
         return row[0], row[-1]
 
 
@@ -164,7 +141,7 @@ def lay_out(design: Design) -> tuple[Sheet, ...]:
     if design.bits is None:
         try:
             return lay_out(replace(design, bits=12))
-        except _OutOfCodes:
+        except UsageError:  # where it is not the codes, it fails again
             return lay_out(replace(design, bits=14))
     _check(design)
     width, height = (side - 2 * TRIM for side in design.page)
@@ -176,24 +153,33 @@ def lay_out(design: Design) -> tuple[Sheet, ...]:
     codes, markers, plain = _codes(design), _marker_codes(design), count(1)
     sheets = []
     for title, size in zip(titles, sizes, strict=True):
-        targets: list[Target] = []
-        marked: list[Marker] = []
+        circles: list[tuple[str, float, float, str]] = []
+        corners: list[tuple[str, float, float, str]] = []
         x, y = (axis.tolist() for axis in _grid(design, size))
         for (j, v), (i, u) in product(enumerate(y), enumerate(x)):
             if design.dictionary and (i + 2 * j) % _MARKER_EVERY == _MARKER_EVERY // 2:
                 code = next(markers)
-                side = _MARKER_SIDE * design.diameter / 2
-                marked.append(Marker(f"M{code.rpartition(':')[2]}", u, v, side, code))
+                name, h = f"M{code.rpartition(':')[2]}", _MARKER_SIDE * design.diameter / 4
+                corners += [
+                    (f"{name}.{i}", u + h * right, v + h * up, f"{code}:{i}")
+                    for i, (right, up) in enumerate(_CORNERS)
+                ]
             elif design.bits:
                 code = next(codes)
-                targets.append(Target(f"R{code.rpartition(':')[2]}", u, v, code))
+                circles.append((f"R{code.rpartition(':')[2]}", u, v, code))
             else:
-                targets.append(Target(f"P{next(plain)}", u, v, ""))
+                circles.append((f"P{next(plain)}", u, v, ""))
         if design.plain and design.bits:
             half = (x[1] - x[0]) / 2
             for v, u in product(y[:-1], x[:-1]):
-                targets.append(Target(f"P{next(plain)}", u + half, v + half, ""))
-        sheets.append(Sheet(title, design, size, tuple(targets), tuple(marked)))
+                circles.append((f"P{next(plain)}", u + half, v + half, ""))
+        names, right, up, written = zip(*circles, *corners, strict=True)
+        n, m = len(circles), len(corners)
+        field = TestField.build(
+            names, np.column_stack([right, up, np.zeros(n + m)]), 0.0,
+            [design.diameter] * n + [np.nan] * m, ["circle"] * n + ["marker_corner"] * m, written,
+        )  # fmt: skip
+        sheets.append(Sheet(title, design, size, field))
     return tuple(sheets)
 
 
@@ -240,7 +226,7 @@ def _codes(design: Design) -> Iterator[str]:
         available = ring_code.codes(design.bits)
         for number in available[design.first_code :]:
             yield ring_code.write(design.bits, number)
-        raise _OutOfCodes(
+        raise UsageError(
             f"the field needs more than the {len(available) - design.first_code} ring codes of "
             f"{design.bits} bits that are left: "
             + ("take --bits 14, or " if design.bits == 12 else "take ")
@@ -270,26 +256,39 @@ def _placement(sheets: Sequence[Sheet], k: int) -> tuple[Array, Array]:
 
 def field_of(sheets: Sequence[Sheet]) -> TestField:
     """The nominal test field of the sheets, with the standard deviations of an unsurveyed print."""
-    names, points, sigmas, diameters, kinds, codes = [], [], [], [], [], []
+    points, sigmas = [], []
     mount = _SIGMA_MOUNT if len(sheets) > 1 else 0.0
     for k, sheet in enumerate(sheets):
         origin, axes = _placement(sheets, k)
-        rows = [
-            (t.name, (t.x, t.y), sheet.design.diameter, "circle", t.code) for t in sheet.targets
-        ]
-        rows += [
-            (f"{m.name}.{i}", tuple(corner), float("nan"), "marker_corner", f"{m.code}:{i}")
-            for m in sheet.markers
-            for i, corner in enumerate(m.corners())
-        ]
-        for name, xy, diameter, kind, code in rows:
-            local = np.asarray(xy) - np.asarray(sheet.size) / 2
-            in_plane = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local) @ np.abs(axes)
-            normal = _SIGMA_FLAT * np.abs(np.cross(axes[0], axes[1]))
-            names.append(name)
-            points.append(origin + np.asarray(xy) @ axes)
-            sigmas.append(np.sqrt(in_plane**2 + normal**2 + mount**2))
-            diameters.append(diameter)
-            kinds.append(kind)
-            codes.append(code)
-    return TestField.build(names, np.array(points), np.array(sigmas), diameters, kinds, codes)
+        xy = sheet.field.points[:, :2]
+        local = xy - np.asarray(sheet.size) / 2
+        in_plane = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local) @ np.abs(axes)
+        normal = _SIGMA_FLAT * np.abs(np.cross(axes[0], axes[1]))
+        points.append(origin + xy @ axes)
+        sigmas.append(np.sqrt(in_plane**2 + normal**2 + mount**2))
+    flat = [sheet.field for sheet in sheets]
+    return TestField.build(
+        [name for field in flat for name in field.names], np.concatenate(points),
+        np.concatenate(sigmas), np.concatenate([field.diameters for field in flat]),
+        [kind for field in flat for kind in field.kinds],
+        [code for field in flat for code in field.codes],
+    )  # fmt: skip
+
+
+def markers_of(
+    field: TestField, border: int = 1
+) -> Iterator[tuple[str, tuple[float, float], float, NDArray[np.bool_]]]:
+    """Yield the markers of a flat field: name, centre and side mm, cells (n, n).
+
+    border: of black cells; a cell is True where black, the first row on top.
+    """
+    rows = [r for r, kind in enumerate(field.kinds) if kind == "marker_corner"]
+    for first in range(0, len(rows), 4):
+        quad = field.points[rows[first : first + 4], :2]
+        name, number, _ = field.codes[rows[first]].split(":")
+        cells = marker_cells(name, int(number), border)
+        # corner 0 is where the cells' first one is; turns of 90° bring it there
+        x, y = quad.mean(axis=0).tolist()
+        turns = {(False, True): 0, (False, False): 1, (True, False): 2, (True, True): 3}
+        turned = np.rot90(cells, turns[bool(quad[0, 0] > x), bool(quad[0, 1] > y)])
+        yield field.names[rows[first]].rpartition(".")[0], (x, y), float(np.ptp(quad[:, 0])), turned

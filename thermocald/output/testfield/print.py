@@ -18,9 +18,16 @@ import numpy as np
 
 from thermocald.errors import DriverMissing, UsageError
 from thermocald.files import new_file
-from thermocald.output.testfield.layout import STRIP, TRIM, Design, Sheet, field_of, lay_out
+from thermocald.output.testfield.layout import (
+    STRIP,
+    TRIM,
+    Design,
+    Sheet,
+    field_of,
+    lay_out,
+    markers_of,
+)
 from thermocald.photogrammetry.targets import boards
-from thermocald.photogrammetry.targets.markers import marker_cells
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
@@ -155,26 +162,14 @@ class Board:
                 if (i + self.rows - j) % 2 == 0:  # the upper left one is black
                     yield i * s, j * s, s
         else:
-            white = {(int(x // s), int(y // s)) for (x, y), _ in self.markers()}
+            white = {(int(x // s), int(y // s)) for _, (x, y), *_ in self.markers()}
             for j, i in product(range(self.rows), range(self.columns)):
                 if (i, j) not in white:
                     yield i * s, j * s, s
 
-    def markers(self) -> list[tuple[tuple[float, float], NDArray[np.bool_]]]:
-        """The markers: centre mm, and cells (n, n), True where black, the first row on top."""
-        field = self.field()
-        found = []
-        rows = [r for r, kind in enumerate(field.kinds) if kind == "marker_corner"]
-        for first in range(0, len(rows), 4):
-            quad = field.points[rows[first : first + 4], :2]
-            name, number, _ = field.codes[rows[first]].split(":")
-            cells = marker_cells(name, int(number), _APRIL_BORDER if self._tags else 1)
-            # corner 0 is where the cells' first one is; turns of 90° bring it there
-            right, up = (quad[0] > quad.mean(axis=0)).tolist()
-            turns = {(False, True): 0, (False, False): 1, (True, False): 2, (True, True): 3}
-            x, y = quad.mean(axis=0).tolist()
-            found.append(((x, y), np.rot90(cells, turns[right, up])))
-        return found
+    def markers(self) -> Iterator[tuple[str, tuple[float, float], float, NDArray[np.bool_]]]:
+        """Its markers, as `markers_of`."""
+        return markers_of(self.field(), _APRIL_BORDER if self._tags else 1)
 
 
 def counts_of(option: str, text: str) -> tuple[int, int]:
@@ -231,18 +226,20 @@ class Printed:
             return document | {
                 "board": board.kind, "square": board.square, "marker": board.marker
             }  # fmt: skip
-        circles = [t for sheet in self.sheets for t in sheet.targets]
         bars = []
         for sheet in self.sheets:
             if sheet.scale_bar is not None:
-                a, b = sheet.scale_bar
-                length = ((b.x - a.x) ** 2 + (b.y - a.y) ** 2) ** 0.5
-                bars.append({"sheet": sheet.title, "a": a.name, "b": b.name, "nominal": length})
+                a, b = (sheet.field.names[row] for row in sheet.scale_bar)
+                dx, dy, _ = np.diff(sheet.field.points[[*sheet.scale_bar]], axis=0)[0]
+                length = float(np.hypot(dx, dy))
+                bars.append({"sheet": sheet.title, "a": a, "b": b, "nominal": length})
+        corners = self.field.kinds.count("marker_corner")
+        plain = self.field.codes.count("")
         return document | {
             "diameter": self.sheets[0].design.diameter,
-            "coded": sum(bool(t.code) for t in circles),
-            "plain": sum(not t.code for t in circles),
-            "markers": sum(len(sheet.markers) for sheet in self.sheets),
+            "coded": len(self.field) - corners - plain,
+            "plain": plain,
+            "markers": corners // 4,
             "scale_bars": bars,
         }
 

@@ -183,12 +183,12 @@ def test_epochs_too_weak_by_themselves(shared, forker, tmp_path):
     assert len(good(live)) >= 38
 
 
-@pytest.mark.parametrize(("camera", "seed"), [("aviary-cam1", 1), ("aviary-cam2", 36)])
+@pytest.mark.parametrize(("camera", "seed"), [("aviary-cam1", 1), ("aviary-cam2", 14)])
 def test_few_targets_of_a_wall(shared, tmp_path, camera, seed):
     """Whole steps of Gauss-Newton lead away from what 14 targets show: `replay` had no epoch.
 
-    Of 208 parts of the four walls, of 10 to 19 targets, 170 had a result, and 196 have; their
-    errors are at most 3.4 of the level's sds (c 1.3), or the result is said to be doubtful.
+    Of 264 parts of the four walls, of 10 to 19 targets, 223 had a result, and 244 have, with errors
+    of at most 2.5 of the level's sds; those that the result says to be doubtful had up to 3.
     """
     part = part_of(shared / "data" / camera, tmp_path / "part", 0, drawn=(seed, 14))
     found = good(exported(part, tmp_path / "part.csv"))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from thermocald.analysis.series.epochs import Epochs, calibrate_epochs
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, project
+from thermocald.photogrammetry.epoch.adjustment import NO_BOUNDS
 from thermocald.photogrammetry.linalg import median_known
 from thermocald.photogrammetry.series.long_series import together_at_most
 from thermocald.photogrammetry.series.normals import ObservationGrid
@@ -88,13 +90,18 @@ def _start(
 ) -> Array:
     """Parameters (16,) to start from: medians over some epochs from first to last.
 
-    Where each is too weak by itself, together they may carry the parameters. Raises DataError.
+    Where each is too weak by itself, together they may carry the parameters, and each tells as much
+    of them as a start needs: c and A1. Raises DataError.
     """
-    seen = map(observations, spread_rows(len(source), _STARTS).tolist())
-    results = [calibrator.adjust(points) for points in seen if points is not None and len(points)]
-    found = [r.values for r in results if r.ok] or [
-        r.values for r in results if r.status == "weak_geometry" and r.interior is not None
-    ]
+    some = map(observations, spread_rows(len(source), _STARTS).tolist())
+    seen = [points for points in some if points is not None and len(points)]
+    results = [calibrator.adjust(points) for points in seen]
+    found = [r.values for r in results if r.ok]
+    if not found and any(r.status == "weak_geometry" for r in results):
+        few = tuple(name for name in ("c", "A1") if name in calibrator.settings.free)
+        s = replace(calibrator.settings, free=few, bounds=NO_BOUNDS, priors={})
+        firm = Calibrator.of_recording(source, s)
+        found = [r.values for r in map(firm.adjust, seen) if r.ok]
     if not found:
         statuses = [r.status for r in results]
         common = max(statuses, key=statuses.count, default="")

@@ -136,9 +136,10 @@ class SeriesEstimator:
             estimate = series.snoop(estimate, offered)
             first_look = self.grid.weights is self.stated
             if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE and first_look:
-                series = series._with_target_noise(estimate)
-                estimate = series.solve(estimate, estimate.system.use, 1.0)
-                estimate = series.snoop(estimate, offered)
+                known = series._with_target_noise(estimate)
+                again = known.solve(estimate, estimate.system.use, 1.0)
+                if again.settled or not estimate.settled:
+                    series, estimate = known, known.snoop(again, offered)
             for _ in range(_FIELD_ROUNDS):
                 variance = series.estimate_field_variance(estimate)
                 if variance is None or abs(variance / series.field_variance - 1.0) < _SAME_FIELD:
@@ -294,7 +295,7 @@ class SeriesEstimator:
         """
         variance, typical = 1.0, None
         history = np.zeros(offered.shape, dtype=np.int8)
-        for _ in range(_ROUNDS):
+        for _ in range(_ROUNDS if estimate.settled else 0):
             use = estimate.system.use
             tests = point_tests(estimate.system, estimate.residuals)
             if typical is None:
@@ -311,7 +312,7 @@ class SeriesEstimator:
             if settled and np.array_equal(keep, use):
                 break
             again = self.solve(estimate, keep, variance)
-            if estimate.settled and not again.settled:
+            if not again.settled:
                 break
             estimate = again
         return estimate

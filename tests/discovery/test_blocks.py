@@ -18,7 +18,6 @@ def short_blocks(monkeypatch):
     monkeypatch.setattr(examination, "in_blocks", lambda series: in_blocks(series, rows=60))
 
 
-@pytest.mark.slow
 def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     evidence, _ = evidence_of("nonlinear_expansion", px=0.2, seed=12, with_m2=False)
     found = discover_series(evidence)
@@ -36,7 +35,6 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
     assert len(links) >= 4
 
 
-@pytest.mark.slow
 def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
     """The rate of the temperature is of all epochs, the misfit of blocks: np.gradient of both."""
     evidence, _ = evidence_of("outside", px=0.3, seed=24, with_m2=False)

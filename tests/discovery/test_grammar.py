@@ -50,7 +50,6 @@ def above():
     return examined("integral_above", 41)
 
 
-@pytest.mark.slow
 def test_an_integral_above_a_threshold_is_told_with_its_constant(above):
     found = propose(above, BASE)
     (term,) = found.best.terms

@@ -45,7 +45,6 @@ def test_a_tremble_is_found_along_its_own_directions(px, directions):
     assert (again is None) is not bool(directions)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effects", "px", "expected"),
     [((), 0.0, False), (("thermal_lag",), 0.0, False), (("thermal_lag",), 0.01, True)],
@@ -54,16 +53,15 @@ def test_a_tremble_is_no_drift(effects, px, expected):
     assert [detect_tremble(e) for e in trembling(effects, px, 3)] == [expected] * 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effects", "px", "seed"),
     [
         ((), 0.05, 2),
-        (("softening",), 0.02, 3),
-        (("softening",), 0.05, 2),
-        (("thermal_lag",), 0.02, 3),
-        (("thermal_lag",), 0.05, 2),
-        (("cyclic_interference",), 0.02, 3),
+        pytest.param(("softening",), 0.02, 3, marks=pytest.mark.slow),
+        pytest.param(("softening",), 0.05, 2, marks=pytest.mark.slow),
+        pytest.param(("thermal_lag",), 0.02, 3, marks=pytest.mark.slow),
+        pytest.param(("thermal_lag",), 0.05, 2, marks=pytest.mark.slow),
+        pytest.param(("cyclic_interference",), 0.02, 3, marks=pytest.mark.slow),
     ],
 )
 def test_what_trembles_is_noise_and_the_cause_is_named(effects, px, seed):

@@ -38,7 +38,6 @@ def behind(at, _):
     return out
 
 
-@pytest.mark.slow
 def test_the_afternoon_keeps_short_rows():
     (evidence,) = year(cellar, behind, 5, targets=12)
     blocks = in_blocks(evidence, rows=300)

@@ -131,19 +131,17 @@ def test_the_phones_clock_lies_where_all_round_trips_overlap(trips, offset, half
     assert one.clock_offset() == (pytest.approx(offset), "+0000", pytest.approx(half))
 
 
-def test_without_fractions_the_trigger_within_that_second(server, phone):
-    phone.shoot = shoot(subsecond=None)
+@pytest.mark.parametrize(
+    ("knob", "value"), [("shoot", shoot(subsecond=None)), ("clock_offset", 3600.0)]
+)
+def test_without_fractions_or_with_a_clock_that_was_set_it_is_the_triggers(
+    server, phone, knob, value
+):
     with camera(server) as device:
+        setattr(phone, knob, value)
         called = time.time()
         frame = device.capture()
     assert abs(frame.utc - called) < 1.0
-
-
-def test_a_phone_whose_clock_is_set_meanwhile(server, phone):
-    with camera(server) as device:
-        phone.clock_offset = 3600.0
-        frame = device.capture()
-    assert abs(frame.utc - time.time()) < 1.0
 
 
 def test_a_file_that_grows_is_awaited(server, phone):
@@ -272,17 +270,22 @@ def test_a_phone_that_fell_asleep_is_woken(server, phone):
     assert phone.awake
 
 
+TWICE = f"{SERIAL}\toffline\n{SERIAL}\tdevice\n"
+
+
 @pytest.mark.parametrize(
-    ("state", "error", "message"),
+    ("listing", "error", "message"),
     [
         ("unauthorized", errors.DeviceDenied, "Allow USB debugging"),
         ("offline", errors.DeviceGone, "re-plug"),
         ("no", errors.DeviceDenied, "udev"),
         ("bootloader", errors.DeviceGone, "boot"),
+        ("", errors.DeviceNotFound, "adb lists none"),
+        (TWICE, errors.WrongDevice, "2 devices have this serial number"),
     ],
 )
-def test_states_of_the_server(server, phone, state, error, message):
-    phone.state = state
+def test_what_the_server_lists(server, listing, error, message):
+    server.listing = listing if listing in ("", TWICE) else f"{SERIAL}\t{listing}\n"
     for device in (camera(server), thermometer(server)):
         with pytest.raises(error, match=message):
             device.open()
@@ -297,12 +300,6 @@ def test_states_that_come_later(server, phone, state, error):
         phone.state = state
         with pytest.raises(error):
             device.capture()
-
-
-def test_not_attached(server):
-    del server.phones[SERIAL]
-    with pytest.raises(errors.DeviceNotFound, match="adb lists none"):
-        camera(server).open()
 
 
 def test_a_phone_that_hangs(server, phone):
@@ -368,12 +365,6 @@ def test_a_zone_of_unknown_unit_asks_for_the_option(server, phone):
         assert device.read().values == {"soc": 4.5}
 
 
-def test_two_phones_with_one_serial_number(server):
-    server.listing = f"{SERIAL}\toffline\n{SERIAL}\tdevice\n"
-    with pytest.raises(errors.WrongDevice, match="2 devices have this serial number"):
-        thermometer(server).open()
-
-
 def test_a_phone_without_a_battery_sensor(server, phone):
     phone.battery = "  voltage: 0\n  temperature: 0\n"
     with (
@@ -402,18 +393,23 @@ def heat(phone, celsius):
     phone.battery = f"  voltage: 4000\n  temperature: {round(celsius * 10)}\n"
 
 
-def test_warm_up_by_load(server, phone):
-    clock = VirtualClock()
-    with load(server, clock) as output:
+def test_warm_up_by_load_which_the_limit_stops_for_good(server, phone):
+    with load(server, VirtualClock()) as output:
+        for celsius, heating in ((28.7, True), (38.6, False), (37.0, True)):
+            heat(phone, celsius)
+            output.emit({})
+            assert bool(phone.load) == heating
+    assert not phone.load  # closing stops it
+    with load(server, VirtualClock()) as output:
         output.emit({})
         assert phone.load
-        heat(phone, 38.6)
+        heat(phone, 42.0)
+        with pytest.raises(errors.BadReading, match=r"battery 42\.00 °C reached the limit"):
+            output.emit({})
+        assert not phone.load
+        heat(phone, 20.0)
         output.emit({})
         assert not phone.load
-        heat(phone, 37.0)
-        output.emit({})
-        assert phone.load
-    assert not phone.load  # closing stops it
 
 
 def test_the_load_is_a_lease_that_is_renewed(server, phone):
@@ -428,18 +424,6 @@ def test_the_load_is_a_lease_that_is_renewed(server, phone):
         clock.advance(10)
         output.emit({})
         assert len([c for c in phone.commands if c.startswith("timeout 30 ")]) == 4
-
-
-def test_the_limit_stops_the_load_for_good(server, phone):
-    with load(server, VirtualClock()) as output:
-        output.emit({})
-        heat(phone, 42.0)
-        with pytest.raises(errors.BadReading, match=r"battery 42\.00 °C reached the limit"):
-            output.emit({})
-        assert not phone.load
-        heat(phone, 20.0)
-        output.emit({})
-        assert not phone.load
 
 
 # EXIF, and the proof that focus and exposure stayed where they were

@@ -87,15 +87,6 @@ def test_readings_keep_their_own_instants(write):
     assert [r.utc - BEGIN for r in (first, third)] == [11.5, 31.5]
 
 
-def test_the_end_is_permanent(write):
-    path = write((epoch(1), IMAGE))
-    with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
-        camera.capture()
-        with pytest.raises(DeviceFinished, match="has ended"):
-            camera.capture()
-    assert issubclass(DeviceFinished, PermanentDeviceError)
-
-
 def test_loop_goes_on_in_time(write):
     path = write((epoch(1), IMAGE), (epoch(2), IMAGE))
     options = {"recording": path, "loop": True}
@@ -103,7 +94,7 @@ def test_loop_goes_on_in_time(write):
         assert [camera.capture().utc - BEGIN for _ in range(5)] == [10, 20, 30, 40, 50]
 
 
-def test_closed_and_opened_it_goes_on(write):
+def test_closed_and_opened_it_goes_on_to_its_end_which_is_permanent(write):
     path = write(*((epoch(i), IMAGE) for i in (1, 2, 3)))
     camera = open_device("camera", "replay", {"recording": path}, VirtualClock())
     numbers = []
@@ -111,6 +102,9 @@ def test_closed_and_opened_it_goes_on(write):
         with camera:
             numbers.append(camera.capture().sequence)
     assert numbers == [1, 2, 3]
+    with camera, pytest.raises(DeviceFinished, match="has ended"):
+        camera.capture()
+    assert issubclass(DeviceFinished, PermanentDeviceError)
 
 
 def test_what_is_broken_is_a_bad_reading(write, tmp_path):

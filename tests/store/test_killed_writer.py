@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 import resource
-import shutil
 import signal
-import subprocess
-import sys
 import textwrap
 import time
 
 import numpy as np
 import pytest
 
-from thermocald.errors import StoreError, StoreFullError
+from thermocald.errors import RecordingError, StoreError, StoreFullError
 from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import write_recording
 
 # Appends for ever, and says after each commit what it has committed.
 WRITER = textwrap.dedent(
@@ -129,9 +127,6 @@ def test_space_again_after_a_full_disk(store_path, head, field, make_epoch, make
 
 
 def test_a_recording_on_a_full_disk_leaves_nothing(tmp_path, head, field, make_epoch, small_disk):
-    from thermocald.errors import RecordingError
-    from thermocald.store.recording.reader import write_recording
-
     with pytest.raises(RecordingError, match="cannot be written"):
         write_recording(tmp_path / "r", head, field, map(make_epoch, range(10_000)))
     assert list(tmp_path.iterdir()) == []
@@ -152,67 +147,3 @@ def test_a_read_only_medium(store_path, head, field, make_epoch, make_result):
                 Store.open(store_path, "append")
     finally:
         store_path.parent.chmod(0o755)
-
-
-# On a file system of 2 MB with a filler of 0.6 MB: fill the store, remove the filler, go on.
-FULL = textwrap.dedent(
-    """
-    import sys
-    from pathlib import Path
-    import numpy as np
-    from thermocald.epoch import Epoch
-    from thermocald.errors import StoreFullError
-    from thermocald.photogrammetry.camera.camera_model import Sensor
-    from thermocald.photogrammetry.field.testfield import Observations, TestField
-    from thermocald.store.database.store import Store
-    from thermocald.store.recording.head import CameraSpec, Head
-    from thermocald.store.series import EpochResult
-
-    disk = Path(sys.argv[1])
-    (disk / "filler").write_bytes(bytes(600_000))
-    points = np.random.default_rng(1).uniform(size=(50, 3))
-    field = TestField.build([str(i) for i in range(50)], points)
-    head = Head("a", "M1", 1.0, CameraSpec("c", Sensor(99, 99, 0.001)))
-    number = 0
-
-    def append():
-        global number
-        seen = Observations(np.arange(50), np.full((50, 2), 1.0 + number), np.ones((50, 2)))
-        result = EpochResult("ok", "", np.full(16, 1.0 + number), np.eye(16))
-        store.append(series, Epoch(number + 1, 10.0 * number, np.nan, observations=seen), result)
-        number += 1
-
-    with Store.open(disk / "store.db", "append") as store:
-        series = store.create_series(head, field)
-        try:
-            while True:
-                append()
-        except StoreFullError as error:
-            print(error)
-        full = number
-        (disk / "filler").unlink()
-        for _ in range(20):
-            append()
-    with Store.open(disk / "store.db") as store:
-        assert store.examine().damaged == ()
-        kept = store.series_columns(store.find_series(), ["c"])["c"].tolist()
-    print(full, kept == [float(i) for i in range(1, full + 21)])
-    """
-)
-
-
-def test_a_file_system_without_room(tmp_path):
-    """A real ENOSPC, on a tmpfs in a mount namespace of its own."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = f'mount -t tmpfs -o size=2m tmpfs \'{disk}\' && exec "$0" "$@"'
-    namespace = ["unshare", "-rm", "sh", "-c", mount]
-    if not shutil.which("unshare") or subprocess.run([*namespace, "true"], check=False).returncode:
-        pytest.skip("no file system can be mounted here: unshare -rm is not permitted")
-    command = [*namespace, sys.executable, "-c", FULL, str(disk)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    message, verdict = done.stdout.splitlines()
-    full, sound = verdict.split()
-    assert f"epoch {int(full) + 1} of series 'M1' was not kept: the disk is full" in message
-    assert int(full) > 20
-    assert sound == "True"

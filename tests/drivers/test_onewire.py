@@ -137,16 +137,11 @@ POWER_ON_PADS = [
 def test_the_power_on_value_of_every_family(sysfs, family, pad, milli):
     rom = f"{family}-000000bfe244"
     sysfs.w1(rom, scratchpad(pad, milli))
-    sensors = {"temperature": rom}
-    with thermometer(sysfs, sensors=sensors) as device:
+    with thermometer(sysfs, sensors={"temperature": rom}) as device:
         with pytest.raises(BadReading, match="power-on value"):
             device.read()
-        near = (
-            w1_slave(milli / 1000 - 1.0)
-            if family != "10"
-            else scratchpad("a8 00 4b 46 ff ff 0c 10", 84000)
-        )
-        sysfs.w1(rom, near)
+        near = scratchpad("a8 00 4b 46 ff ff 0c 10", 84000)
+        sysfs.w1(rom, near if family == "10" else w1_slave(milli / 1000 - 1.0))
         device.read()
         sysfs.w1(rom, scratchpad(pad, milli))
         assert device.read().values["temperature"] == pytest.approx(milli / 1000)

@@ -59,12 +59,8 @@ def test_frames_keep_their_instants_and_bytes(write):
 
 
 def test_measurements_come_without_a_picture(write):
-    seen = Observations(
-        np.array([2, 0]),
-        np.array([[1.5, 2.5], [3.25, 4.0]]),
-        np.full((2, 2), 0.04),
-        np.array([1e-4, -1e-4]),
-    )
+    targets, points = np.array([2, 0]), np.array([[1.5, 2.5], [3.25, 4.0]])
+    seen = Observations(targets, points, np.full((2, 2), 0.04), np.array([1e-4, -1e-4]))
     path = write((epoch(1, seen=seen), None))
     with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
         frame = camera.capture()

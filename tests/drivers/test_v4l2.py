@@ -27,14 +27,8 @@ def kernel(tmp_path, monkeypatch):
 
 
 def camera(kernel, clock=None, **options):
-    options = {
-        "device": str(kernel.path),
-        "width": 64,
-        "height": 48,
-        "pixel_format": "GREY",
-        "timeout_s": 0.3,
-        **options,
-    }
+    size = {"width": 64, "height": 48, "pixel_format": "GREY"}
+    options = {"device": str(kernel.path), **size, "timeout_s": 0.3, **options}
     return open_device("camera", "v4l2", options, clock or SystemClock())
 
 
@@ -329,10 +323,8 @@ JPEG = b"\xff\xd8" + b"\x55" * 300 + b"\xff\xd9"
 def test_a_frame_that_is_none(kernel, knobs, pixel_format, error, message):
     for name, value in knobs.items():
         setattr(kernel, name, value)
-    with (
-        camera(kernel, pixel_format=pixel_format) as device,
-        pytest.raises(error, match=message),
-    ):
+    device = camera(kernel, pixel_format=pixel_format)
+    with device, pytest.raises(error, match=message):
         device.capture()
 
 

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from thermocald.epoch import Epoch
-from thermocald.errors import (
-    BadReading,
-    DeviceFinished,
-    DeviceNotFound,
-    PermanentDeviceError,
-)
+from thermocald.errors import BadReading, DeviceFinished, DeviceNotFound, PermanentDeviceError
 from thermocald.hal import VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import (

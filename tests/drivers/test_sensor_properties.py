@@ -29,8 +29,7 @@ MANY = {**FEW, "max_examples": 3000}
 
 FEWER, MORE = {**FEW, "max_examples": 12}, {**FEW, "max_examples": 200}  # for each driver
 AMOUNTS = pytest.mark.parametrize(
-    "amount",
-    [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.slow)],
+    "amount", [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.slow)]
 )
 
 
@@ -271,8 +270,7 @@ ANYTHING = SCALARS | KEYED | st.lists(SCALARS | KEYED | st.lists(SCALARS, max_si
 
 
 @pytest.mark.parametrize(
-    "amount",
-    [pytest.param(FEWER, id="few"), pytest.param(MORE, id="more", marks=pytest.mark.slow)],
+    "amount", [pytest.param(FEWER, id="few"), pytest.param(MORE, id="more", marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize(
     ("kind", "name"),

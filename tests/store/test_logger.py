@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from thermocald.errors import DataError, UsageError
-from thermocald.store.logger.clock import (
-    DeviceClock,
-    clock_error,
-    parse_moment,
-    time_zone,
-)
+from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment, time_zone
 from thermocald.store.logger.dialect import stated_unit, without_unit
 from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
 

@@ -51,10 +51,7 @@ class SteadyClock:
     """
 
     def __init__(
-        self,
-        machine: Clock | None = None,
-        *,
-        synchronised: Callable[[], bool] | None = None,
+        self, machine: Clock | None = None, *, synchronised: Callable[[], bool] | None = None
     ) -> None:
         self._machine = machine or SystemClock()
         self._synchronised = synchronised or machine_clock_trusted

@@ -5,54 +5,14 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import textwrap
-import time
 
 import numpy as np
 import pytest
 
+from tests.store.test_kills import kill_one
 from thermocald.errors import RecordingError, StoreError, StoreFullError
 from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import write_recording
-
-# Appends for ever, and says after each commit what it has committed.
-WRITER = textwrap.dedent(
-    """
-    import sys
-    from pathlib import Path
-    import numpy as np
-    from thermocald.epoch import Epoch
-    from thermocald.photogrammetry.field.testfield import Observations
-    from thermocald.store.database.store import Store
-    from thermocald.store.series import EpochResult
-
-    with Store.open(Path(sys.argv[1]), "append", durable=False) as store:
-        series = store.find_series()
-        number = (store.last_epoch(series) or 0) + 1
-        while True:
-            seen = Observations(np.arange(12), np.full((12, 2), float(number)), np.ones((12, 2)))
-            result = EpochResult("ok", "", np.full(16, float(number)), np.eye(16))
-            store.append(series, Epoch(number, 10.0 * number, np.nan, observations=seen), result)
-            print(number, flush=True)
-            number += 1
-    """
-)
-
-
-def kill_after(forker, path, epochs: int, delay_s: float) -> int:
-    """Run a writer, kill -9 it a little after some epochs; what it said it had committed."""
-    log = path.parent / "said.txt"
-    log.unlink(missing_ok=True)
-    process = forker.start(path.parent, str(path), script=WRITER, log=log.name)
-    deadline = time.monotonic() + 60
-    while log.read_text().count("\n") < epochs:
-        assert process.poll() is None, log.read_text()
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-    time.sleep(delay_s)
-    process.kill()
-    process.wait()
-    return int(log.read_text().split("\n")[-2])  # what follows the last line end is half a line
 
 
 def test_a_killed_writer_loses_at_most_the_epoch_in_hand(forker, store_path, head, field):
@@ -60,7 +20,7 @@ def test_a_killed_writer_loses_at_most_the_epoch_in_hand(forker, store_path, hea
         store.create_series(head, field)
     rng = np.random.default_rng(5)
     for _ in range(6):
-        said = kill_after(forker, store_path, int(rng.integers(1, 30)), float(rng.uniform(0, 0.02)))
+        said = kill_one(forker, store_path, list, rng)
         with Store.open(store_path) as store:
             assert store.examine().damaged == ()
             series = store.find_series()

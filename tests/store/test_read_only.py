@@ -15,21 +15,9 @@ from thermocald.store.database.store import Store
 
 
 @pytest.fixture
-def with_wal(store_path, field, head, make_epoch, make_result, tmp_path):
+def with_wal(killed):
     """A killed daemon's folder: five epochs in the store, nine more in its -wal file."""
-    folder = tmp_path / "killed"
-    folder.mkdir()
-    store = Store.open(store_path, "append", durable=False)
-    series = store.create_series(head, field)
-    for i in range(1, 6):
-        store.append(series, make_epoch(i), make_result(i))
-    store.checkpoint()
-    for i in range(6, 15):
-        store.append(series, make_epoch(i), make_result(i))
-    for name in (store_path.name, f"{store_path.name}-wal"):
-        shutil.copy(store_path.with_name(name), folder / name)
-    store.close()
-    return folder / store_path.name
+    return killed(5, 14)
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 import threading
 
 import numpy as np
@@ -16,17 +15,9 @@ from thermocald.store.database.store import Store
 
 
 @pytest.fixture
-def crashed(store_path, field, head, make_epoch, make_result, tmp_path):
+def crashed(killed):
     """Store and -wal file of a writer that was killed after nine epochs."""
-    (tmp_path / "k").mkdir()
-    with Store.open(store_path, "append", durable=False) as store:
-        series = store.create_series(head, field)
-        store.checkpoint()
-        for i in range(1, 10):
-            store.append(series, make_epoch(i), make_result(i))
-        for name in (store_path.name, f"{store_path.name}-wal"):
-            shutil.copy(store_path.with_name(name), tmp_path / "k" / name)
-    return tmp_path / "k" / store_path.name
+    return killed(0, 9)
 
 
 def epochs(path) -> list[int]:

@@ -15,10 +15,10 @@ import pytest
 
 from tests.daemon.conftest import ENVIRONMENT, tool
 from tests.store.small import create_small_series, small_epoch, small_result
+from tests.store.small import stored_numbers as numbers
 from thermocald.daemon.store_guard import FollowedStore, Row, StoreGuard
 from thermocald.errors import StoreError
 from thermocald.output.dashboard.view import View
-from thermocald.store.database.store import Store
 from thermocald.store.series import Event
 
 
@@ -50,12 +50,6 @@ def keeping(path, durable=False) -> StoreGuard:
     for number in (1, 2, 3):
         keep(number)
     return guard
-
-
-def numbers(path) -> list[int]:
-    with Store.open(path) as store:
-        assert store.examine().damaged == ()
-        return [s.epoch.number for s in store.epochs(store.find_series())]
 
 
 def delete(path, what: str) -> None:

@@ -93,7 +93,7 @@ def filled(store_path: Path, field: TestField, head: Head, make_epoch, make_resu
 
 @pytest.fixture
 def killed(store_path: Path, field: TestField, head: Head, make_epoch, make_result, tmp_path: Path):
-    """(n, last) → a killed writer's folder: n epochs in the store, those to the last in its -wal."""
+    """(n, last) → what a killed writer left: n epochs in the store, the others in its -wal."""
 
     def make(moved: int, last: int) -> Path:
         folder = tmp_path / "killed"

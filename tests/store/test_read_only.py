@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.store.small import stored_numbers as numbers
 from thermocald.errors import StoreError
 from thermocald.store.database import file
 from thermocald.store.database.store import Store
@@ -32,15 +33,6 @@ def read_only(with_wal):
     subprocess.run([tool, "-o", "remount,ro,bind", folder], check=True)
     yield with_wal
     subprocess.run(["umount", "-l", folder], check=False)
-
-
-def numbers(path: Path) -> list[int]:
-    with Store.open(path) as store:
-        series = store.find_series()
-        assert store.examine().damaged == ()
-        read = store.series_columns(series, ["epoch"])["epoch"].astype(int).tolist()
-        assert [s.epoch.number for s in store.epochs(series)] == read
-        return read
 
 
 def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only, tmp_path):

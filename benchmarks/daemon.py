@@ -135,8 +135,9 @@ def epoch_cost(epochs: int) -> None:
             for k in range(epochs):
                 clock.sleep_until(10.0 * k)
                 frame = plan.camera.capture()
-                paired = pair_readings({"temperature": thermometer.read()}, frame.monotonic)
-                epoch = Epoch(k + 1, frame.utc, paired.utc, paired.temperatures)
+                readings = {"temperature": thermometer.read()}
+                utc, temperatures, _ = pair_readings(readings, frame.monotonic)
+                epoch = Epoch(k + 1, frame.utc, utc, temperatures)
                 jpeg = cv2.imencode(".jpg", frame.image)[1].tobytes()
                 z = time.thread_time()
                 decode_grey(jpeg)  # what a phone's frame costs more; the mock's has grey values

@@ -240,7 +240,10 @@ class AlertOptions(DriverOptions):
 
 
 class AlertOutput(Output):
-    """An output that delivers alerts; a driver says how in `deliver`, and where in `where`."""
+    """An output that delivers alerts; a driver says how in `deliver`, and where in `where`.
+
+    Its `open` looks whether that can be.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -253,10 +256,6 @@ class AlertOutput(Output):
         self._in_a_row: dict[str, int] = {}  # epochs of a device without a result
         self._told: dict[str, tuple[Any, Any]] = {}
         self._lost = self._unstored = 0
-
-    def open(self) -> None:
-        self.reach()
-        self.handle = self.handle or True
 
     def close(self) -> None:
         self.handle = None
@@ -308,10 +307,6 @@ class AlertOutput(Output):
                 )
             )
         return changes
-
-    def reach(self) -> None:
-        """Look whether alerts can be delivered; a DeviceError if not."""
-        raise NotImplementedError
 
     def deliver(self, alert: Alert) -> None:
         """Deliver one alert, within `timeout_s`; a DeviceError if that failed."""

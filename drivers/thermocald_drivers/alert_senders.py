@@ -124,9 +124,10 @@ class ExecAlert(AlertOutput):
         self.where: str = self.options.command[0]
         self._failed = 0
 
-    def reach(self) -> None:
+    def open(self) -> None:
         if shutil.which(self.where) is None:
             raise DeviceNotFound(f"{self.where}: there is no such program that may be run")
+        self.handle = True
 
     def deliver(self, alert: Alert) -> None:
         try:
@@ -198,12 +199,13 @@ class WebhookAlert(AlertOutput):
         self.where = f"webhook at {parts.hostname}:{port}"
         self._open = urllib.request.build_opener(_NoRedirection).open
 
-    def reach(self) -> None:
+    def open(self) -> None:
         self._token()
         try:
             socket.create_connection(self._address, self.options.timeout_s).close()
         except OSError as error:
             raise DeviceGone(f"{self.where}: cannot connect ({support.reason(error)})") from None
+        self.handle = True
 
     def deliver(self, alert: Alert) -> None:
         headers = {"Content-Type": "application/json", "User-Agent": "thermocald"}
@@ -246,8 +248,9 @@ class MailAlert(AlertOutput):
             raise ConfigurationError("security: a password is not sent without TLS")
         self.where = f"mail server {o.host}:{o.port}"
 
-    def reach(self) -> None:
+    def open(self) -> None:
         self._send(None)
+        self.handle = True
 
     def deliver(self, alert: Alert) -> None:
         letter = EmailMessage()

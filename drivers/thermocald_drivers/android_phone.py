@@ -70,7 +70,7 @@ OFFLINE = (
     "offline: re-plug the cable, or `adb reconnect offline`; an unpowered hub is a common cause"
 )
 
-_CLOCK_S = 0.002
+_CLOCK_S, _CLOCK_TRIES = 0.002, 12
 ADB_CLASSES = ("char-usb_device",)
 """Opened by the adb server where this driver starts it."""
 
@@ -187,7 +187,7 @@ class AdbPhone(Device):
         device = self.opened()
         return bytes(self._call(lambda: device.sync.read_bytes(path)))
 
-    def clock_offset(self, tries: int = 12) -> tuple[float, str, float]:
+    def clock_offset(self) -> tuple[float, str, float]:
         """Return (phone minus this machine in s, the phone's time zone as +hhmm, uncertainty in s).
 
         Each round trip bounds the offset by its two ends; the result is the middle of the interval
@@ -196,7 +196,7 @@ class AdbPhone(Device):
         """
         low, high = -math.inf, math.inf
         found: list[tuple[float, str, float]] = []
-        while len(found) < tries and high - low > 2 * _CLOCK_S:
+        while len(found) < _CLOCK_TRIES and high - low > 2 * _CLOCK_S:
             offset, zone, half = self._call(self._ask_clock)
             found.append((offset, zone, half))
             low, high = max(low, offset - half), min(high, offset + half)

@@ -283,7 +283,7 @@ class MqttAlert(_Broker, AlertOutput):
 
     Options = MqttAlertOptions
 
-    def reach(self) -> None:
+    def open(self) -> None:
         self.connect(None)
 
     def deliver(self, alert: Alert) -> None:

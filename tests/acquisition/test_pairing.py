@@ -24,32 +24,25 @@ def housing():
     return Thermometers(parse_config(document, Path("config.yaml")), VirtualClock())
 
 
-def test_frame_and_reading_keep_their_own_times():
-    paired = pair_readings({"housing": reading(10.75, temperature=21.5)}, 10.0)
-    assert paired.utc == 1.6e9 + 10.75
-    assert paired.temperatures == {"temperature": 21.5}
-    assert paired.skew_s == 0.75
+HOUSING = reading(9.0, temperature=21.5)
+PAIRED = {
+    "both keep their own times": (
+        {"housing": reading(10.75, temperature=21.5)}, (10.75, {"temperature": 21.5}, 0.75)),
+    "several have columns of their own, and the first gives the time": (
+        {"housing": HOUSING, "phone": reading(10.0, temperature=30.0, battery=33.0)},
+        (9.0, {"housing": 21.5, "phone": 30.0, "phone_battery": 33.0}, -1.0)),
+    "without the reference the next one gives the time and nothing is filled in": (
+        {"housing": None, "air": reading(10.5, temperature=5.0)}, (10.5, {"air": 5.0}, 0.5)),
+    "none was read": ({"housing": None}, (math.nan, {}, math.nan)),
+}  # fmt: skip
 
 
-def test_several_thermometers_have_columns_of_their_own_and_the_first_gives_the_time():
-    paired = pair_readings(
-        {
-            "housing": reading(9.0, temperature=21.5),
-            "phone": reading(10.0, temperature=30.0, battery=33.0),
-        },
-        10.0,
-    )
-    assert paired.temperatures == {"housing": 21.5, "phone": 30.0, "phone_battery": 33.0}
-    assert paired.skew_s == -1.0
-
-
-def test_without_the_reference_the_next_one_gives_the_time_and_nothing_is_filled_in():
-    paired = pair_readings({"housing": None, "air": reading(10.5, temperature=5.0)}, 10.0)
-    assert paired.temperatures == {"air": 5.0}
-    assert paired.skew_s == 0.5
-    nothing = pair_readings({"housing": None}, 10.0)
-    assert math.isnan(nothing.utc)
-    assert nothing.temperatures == {}
+@pytest.mark.parametrize("case", PAIRED)
+def test_readings_become_the_temperatures_of_a_frame(case):
+    readings, expected = PAIRED[case]
+    utc, temperatures, skew_s = pair_readings(readings, 10.0)
+    assert (utc - 1.6e9, skew_s) == pytest.approx(expected[::2], nan_ok=True)
+    assert temperatures == expected[1]
 
 
 def test_the_nearest_reading_is_taken_and_a_stale_one_is_not(housing):
@@ -64,8 +57,8 @@ def test_a_reading_that_is_being_taken_is_waited_for(housing):
     housing.add("housing", reading(0.0))
     late = threading.Timer(0.05, lambda: housing.add("housing", reading(10.4)))
     late.start()
-    paired = housing.around(["housing"], 10.0, patience_s=5.0)
+    _, _, skew_s = housing.around(["housing"], 10.0, patience_s=5.0)
     late.join()
-    assert paired.skew_s == reading(10.4).monotonic - 10.0
-    (missing,) = housing.around(["housing"], 40.0, patience_s=0.0).temperatures.values()
-    assert math.isnan(missing)
+    assert skew_s == reading(10.4).monotonic - 10.0
+    _, temperatures, _ = housing.around(["housing"], 40.0, patience_s=0.0)
+    assert temperatures == pytest.approx({"temperature": math.nan}, nan_ok=True)

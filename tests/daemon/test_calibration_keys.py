@@ -65,54 +65,25 @@ def stored(tmp_path_factory, forker):
         }
 
 
-def test_there_is_a_test_for_every_key():
+def test_every_key_changes_what_is_stored(stored):
     assert set(KEYS) - {"plain"} == set(CalibrationConfig.model_fields)
-
-
-def test_plain(stored):
-    plain = stored["plain"]
+    plain, series, offsets = stored["plain"], stored["exterior"], stored["target_offsets"]
     assert (plain["status"] == "ok").all()
     assert (plain["n_rejected"] >= 1).all()
-
-
-def test_exterior(stored):
-    """One orientation: next to the epoch's own result stands a far surer principal point."""
-    plain, series = stored["plain"], stored["exterior"]
+    # one orientation: next to the epoch's own result stands a far surer principal point
     assert series["sd_series_x0"][-1] < 0.5 * plain["sd_x0"][-1]
     assert np.ptp(series["series_x0"][-5:]) < 0.5 * np.ptp(plain["x0"][-5:])
     np.testing.assert_array_equal(series["x0"], plain["x0"])
-
-
-def test_free(stored):
     assert np.isnan(stored["free"]["sd_A1"]).all()
-    assert np.isfinite(stored["plain"]["sd_A1"]).all()
-
-
-def test_fixed(stored):
+    assert np.isfinite(plain["sd_A1"]).all()
     assert (stored["fixed"]["A1"] == 0.002).all()
     assert (stored["free"]["A1"] == 0.0).all()
-
-
-def test_priors(stored):
     assert stored["priors"]["c"] == pytest.approx(3.2, abs=1e-4)
-
-
-def test_sigma_floor_px(stored):
     # the sigmas of the object coordinates stay, or it would be a tenth
-    assert (stored["sigma_floor_px"]["sigma0"] < 0.4 * stored["plain"]["sigma0"]).all()
-
-
-def test_target_offsets(stored):
-    """Errors of the field are in every epoch the same, and no longer noise of the epoch."""
-    plain, offsets = stored["plain"], stored["target_offsets"]
+    assert (stored["sigma_floor_px"]["sigma0"] < 0.4 * plain["sigma0"]).all()
+    # errors of the field are in every epoch the same, and no longer noise of the epoch
     assert np.abs(offsets["c"] - plain["c"])[1:].min() > 0
     assert np.median(offsets["sigma0"]) != pytest.approx(np.median(plain["sigma0"]), rel=0.02)
-
-
-def test_correlation_bound(stored):
     assert (stored["correlation_bound"]["status"] == "weak_geometry").all()
-
-
-def test_snooping_alpha(stored):
     assert (stored["snooping_alpha"]["n_rejected"] == 0).all()
-    assert stored["snooping_alpha"]["sigma0"].min() > 2.0 * stored["plain"]["sigma0"].max()
+    assert stored["snooping_alpha"]["sigma0"].min() > 2.0 * plain["sigma0"].max()

@@ -55,22 +55,18 @@ def say(ear, data: bytes) -> dict:
     return json.loads(answer)
 
 
-def test_owner_and_group_may_ask_and_nobody_else(ear):
+def test_an_answer_is_json_and_a_refusal_is_raised(ear, tmp_path):
     mode = stat.S_IMODE((ear.folder / "control.sock").stat().st_mode)
-    assert mode == 0o660
-
-
-def test_an_answer_is_json_and_a_refusal_is_raised(ear):
+    assert mode == 0o660  # owner and group may ask, and nobody else
     assert ask(ear.folder, "session status") == {
         "format": FORMAT, "ok": True, "sessions": {"x": None}
     }  # fmt: skip
     with pytest.raises(DataError, match="nothing may go"):
         ask(ear.folder, "retention")
-
-
-def test_nobody_listens_is_no_error(tmp_path):
-    assert ask(tmp_path, "session status") is None
-    assert ask(tmp_path / "away", "session status") is None
+    with pytest.raises(UsageError, match="epochs"):
+        ask(ear.folder, "session start", session={**SESSION, "epochs": -1})
+    for nobody_listens in (tmp_path, tmp_path / "away"):
+        assert ask(nobody_listens, "session status") is None
 
 
 HOSTILE = [
@@ -134,11 +130,6 @@ def test_random_bytes_never_end_it(ear):
         assert say(ear, data)["ok"] is False
     assert threading.active_count() >= 2
     assert ear.asked == []
-
-
-def test_a_wrong_request_raises_where_it_is_asked(ear):
-    with pytest.raises(UsageError, match="epochs"):
-        ask(ear.folder, "session start", session={**SESSION, "epochs": -1})
 
 
 def test_silent_connections_delay_nobody(ear):

@@ -8,6 +8,8 @@ import socket
 
 import pytest
 
+from tests.daemon.test_page_attacks import free_port
+
 pytestmark = pytest.mark.slow
 
 _UNLABELLED = """() => [...document.querySelectorAll('a, button, select, input, [tabindex="0"]')]
@@ -23,9 +25,7 @@ _DRAWN = """() => [...document.querySelectorAll('#course .scatterlayer path.js-l
 @pytest.fixture
 def shown(daemon, devices):
     """A running daemon with its page: its address."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     # slow enough for a busy machine: what is deferred is calibrated later, and not drawn
     daemon.run(**devices(period_s=1.5), dashboard={"enabled": True, "port": port})
     daemon.more(3)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import sqlite3
 import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from tests.acquisition.test_pipeline import until
 from tests.commands import call
 from tests.daemon.conftest import make_recording
 from tests.daemon.test_store_file import guard, path  # noqa: F401
+from tests.store.small import stored_numbers
 from thermocald.acquisition.pipeline import Pipeline
 from thermocald.acquisition.thermometers import Thermometers
 from thermocald.cli.run import status, status_warnings
@@ -22,13 +23,6 @@ from thermocald.errors import DataError, StoreError
 from thermocald.hal import Frame, SystemClock, open_device
 from thermocald.output.dashboard.view import View
 from thermocald.store.database.store import Store
-
-
-def until(condition) -> None:
-    deadline = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def refuse(path, statement: str) -> None:  # noqa: F811
@@ -96,9 +90,7 @@ def test_the_exit_status_of_run_says_so(tmp_path):
     done = call(*run, folder=tmp_path)
     assert done.returncode == 1
     assert "1 epochs were lost: epoch 7 of rpi" in done.stderr
-    with Store.open(tmp_path / "t.db") as store:
-        numbers = [s.epoch.number for s in store.epochs(store.find_series())]
-    assert numbers == [n for n in range(1, 21) if n != 7]
+    assert stored_numbers(tmp_path / "t.db") == [n for n in range(1, 21) if n != 7]
 
 
 def test_what_waits_at_the_end_for_a_store_that_is_away_is_lost(guard, path):  # noqa: F811

@@ -33,14 +33,8 @@ from thermocald.hal import (
 KINDS = {"camera": Camera, "thermometer": Thermometer, "output": Output}
 REGISTERED = [(kind, name) for kind in KINDS for name in driver_names(kind)]
 
-RESULT = {
-    "epoch": 1,
-    "device": "river",
-    "state": "drifting",
-    "status": "ok",
-    "c": 3.04,
-    "sd_c": None,
-}
+RESULT = {"epoch": 1, "device": "river", "state": "drifting", "status": "ok", "c": 3.04}
+RESULT["sd_c"] = None
 
 
 @pytest.fixture

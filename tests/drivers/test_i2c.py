@@ -8,15 +8,7 @@ import pytest
 import smbus2
 from thermocald_drivers.i2c import bme280_celsius, crc8
 
-from tests.drivers.fakes.chips import (
-    ADC_T,
-    CHIPS,
-    bme280,
-    lm75,
-    mcp9808,
-    sht3x,
-    tmp117,
-)
+from tests.drivers.fakes.chips import ADC_T, CHIPS, bme280, lm75, mcp9808, sht3x, tmp117
 from tests.drivers.fakes.smbus import Bus, Chip
 from thermocald import errors
 from thermocald.hal import VirtualClock, open_device
@@ -221,17 +213,11 @@ def test_a_chip_that_has_just_been_powered_is_read_again(bus):
         assert device.clock.monotonic() >= 0.25
 
 
-def test_sht3x_crc_of_the_data_sheet():
+def test_what_the_data_sheets_compute(bus):
+    assert round(bme280_celsius(ADC_T, (27504, 26435, -1000)), 2) == 25.08
     assert crc8(b"\xbe\xef") == 0x92
-
-
-def test_sht3x_crc_error(bus):
     bus.chips[0x44] = sht3x()
     with thermometer("sht3x") as device:
         bus.chips[0x44] = sht3x(damage=0x10)
         with pytest.raises(errors.BadReading, match="CRC"):
             device.read()
-
-
-def test_bme280_compensation_of_the_data_sheet():
-    assert round(bme280_celsius(ADC_T, (27504, 26435, -1000)), 2) == 25.08

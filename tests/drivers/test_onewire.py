@@ -69,8 +69,10 @@ def test_crc_of_the_application_note():
         (w1_slave(21.0).replace("YES", "NO"), "CRC error"),
         (w1_slave(21.0).splitlines()[0], "not a w1_slave"),
         (w1_slave(125.5), "outside"),
+        *((w1_slave(21.0).replace("t=21000", f"t={milli}"), "not a w1_slave")
+          for milli in ("2_1000", "٢١٠٠٠", "21000.0", "+21000", "nan")),
     ],
-)
+)  # fmt: skip
 def test_what_is_not_believed(sysfs, content, why):
     sysfs.w1(ROM, content)
     with thermometer(sysfs) as device, pytest.raises(BadReading, match=why):
@@ -135,16 +137,11 @@ POWER_ON_PADS = [
 def test_the_power_on_value_of_every_family(sysfs, family, pad, milli):
     rom = f"{family}-000000bfe244"
     sysfs.w1(rom, scratchpad(pad, milli))
-    sensors = {"temperature": rom}
-    with thermometer(sysfs, sensors=sensors) as device:
+    with thermometer(sysfs, sensors={"temperature": rom}) as device:
         with pytest.raises(BadReading, match="power-on value"):
             device.read()
-        near = (
-            w1_slave(milli / 1000 - 1.0)
-            if family != "10"
-            else scratchpad("a8 00 4b 46 ff ff 0c 10", 84000)
-        )
-        sysfs.w1(rom, near)
+        near = scratchpad("a8 00 4b 46 ff ff 0c 10", 84000)
+        sysfs.w1(rom, near if family == "10" else w1_slave(milli / 1000 - 1.0))
         device.read()
         sysfs.w1(rom, scratchpad(pad, milli))
         assert device.read().values["temperature"] == pytest.approx(milli / 1000)
@@ -176,13 +173,6 @@ def test_readings_and_faults_of_the_family(sysfs, family, pad, milli, expected):
             return
         with pytest.raises(BadReading, match=expected):
             device.read()
-
-
-@pytest.mark.parametrize("milli", ["2_1000", "٢١٠٠٠", "21000.0", "+21000", "nan"])
-def test_numbers_that_the_kernel_does_not_print(sysfs, milli):
-    sysfs.w1(ROM, w1_slave(21.0).replace("t=21000", f"t={milli}"))
-    with thermometer(sysfs) as device, pytest.raises(BadReading, match="not a w1_slave"):
-        device.read()
 
 
 def test_a_crc_error_is_read_once_more(sysfs, monkeypatch):

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from thermocald.epoch import Epoch
-from thermocald.errors import (
-    BadReading,
-    DeviceFinished,
-    DeviceNotFound,
-    PermanentDeviceError,
-)
+from thermocald.errors import BadReading, DeviceFinished, DeviceNotFound, PermanentDeviceError
 from thermocald.hal import VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import (
@@ -59,12 +54,8 @@ def test_frames_keep_their_instants_and_bytes(write):
 
 
 def test_measurements_come_without_a_picture(write):
-    seen = Observations(
-        np.array([2, 0]),
-        np.array([[1.5, 2.5], [3.25, 4.0]]),
-        np.full((2, 2), 0.04),
-        np.array([1e-4, -1e-4]),
-    )
+    targets, points = np.array([2, 0]), np.array([[1.5, 2.5], [3.25, 4.0]])
+    seen = Observations(targets, points, np.full((2, 2), 0.04), np.array([1e-4, -1e-4]))
     path = write((epoch(1, seen=seen), None))
     with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
         frame = camera.capture()
@@ -87,15 +78,6 @@ def test_readings_keep_their_own_instants(write):
     assert [r.utc - BEGIN for r in (first, third)] == [11.5, 31.5]
 
 
-def test_the_end_is_permanent(write):
-    path = write((epoch(1), IMAGE))
-    with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
-        camera.capture()
-        with pytest.raises(DeviceFinished, match="has ended"):
-            camera.capture()
-    assert issubclass(DeviceFinished, PermanentDeviceError)
-
-
 def test_loop_goes_on_in_time(write):
     path = write((epoch(1), IMAGE), (epoch(2), IMAGE))
     options = {"recording": path, "loop": True}
@@ -103,7 +85,7 @@ def test_loop_goes_on_in_time(write):
         assert [camera.capture().utc - BEGIN for _ in range(5)] == [10, 20, 30, 40, 50]
 
 
-def test_closed_and_opened_it_goes_on(write):
+def test_closed_and_opened_it_goes_on_to_its_end_which_is_permanent(write):
     path = write(*((epoch(i), IMAGE) for i in (1, 2, 3)))
     camera = open_device("camera", "replay", {"recording": path}, VirtualClock())
     numbers = []
@@ -111,6 +93,9 @@ def test_closed_and_opened_it_goes_on(write):
         with camera:
             numbers.append(camera.capture().sequence)
     assert numbers == [1, 2, 3]
+    with camera, pytest.raises(DeviceFinished, match="has ended"):
+        camera.capture()
+    assert issubclass(DeviceFinished, PermanentDeviceError)
 
 
 def test_what_is_broken_is_a_bad_reading(write, tmp_path):

@@ -29,8 +29,7 @@ MANY = {**FEW, "max_examples": 3000}
 
 FEWER, MORE = {**FEW, "max_examples": 12}, {**FEW, "max_examples": 200}  # for each driver
 AMOUNTS = pytest.mark.parametrize(
-    "amount",
-    [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.slow)],
+    "amount", [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.slow)]
 )
 
 
@@ -226,26 +225,6 @@ def test_a_battery_in_any_unit_is_right_or_refused(amount):
     check()
 
 
-def test_a_battery_whose_unit_was_certain_is_read_in_a_frost(server):
-    from tests.drivers.fakes.adb_server import FakePhone
-
-    def dump(number):
-        return f"present: true\nvoltage: 3900\ntemperature: {number}\n"
-
-    phone = FakePhone(battery=dump(55))
-    server.listing, server.phones = None, {"X": phone}
-    options = {"serial": "X", "port": server.port, "start_server": False}
-    read = []
-    with open_device("thermometer", "android", options, VirtualClock()) as device:
-        for number in (55, 92, 61, 24, 5, 45):  # unknown; then in tenths
-            phone.battery = dump(number)
-            try:
-                read.append(device.read().values["temperature"])
-            except BadReading:
-                read.append(None)
-    assert read == [None, 9.2, 6.1, 2.4, 0.5, 4.5]
-
-
 # --- half a late line ---------------------------------------------------------------------
 
 LINES = [b"+023.5C\r", b"T=+023.5C\r\n", b"  21.75 C\r\n"]
@@ -291,8 +270,7 @@ ANYTHING = SCALARS | KEYED | st.lists(SCALARS | KEYED | st.lists(SCALARS, max_si
 
 
 @pytest.mark.parametrize(
-    "amount",
-    [pytest.param(FEWER, id="few"), pytest.param(MORE, id="more", marks=pytest.mark.slow)],
+    "amount", [pytest.param(FEWER, id="few"), pytest.param(MORE, id="more", marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize(
     ("kind", "name"),

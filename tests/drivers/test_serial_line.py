@@ -45,16 +45,11 @@ PROTOCOLS = [
         "lakeshore-218",
         b"KRDG?\r\n",
         b"+293.15,+294.15,+295.15,+273.15,+300.00,+301.00,+302.00,+303.15\r\n",
-        dict(
-            zip(
-                [f"input{k}" for k in range(1, 9)],
-                [20.0, 21.0, 22.0, 0.0, 26.85, 27.85, 28.85, 30.0],
-                strict=True,
-            )
-        ),
+        {f"input{k}": celsius for k, celsius in enumerate(
+            (20.0, 21.0, 22.0, 0.0, 26.85, 27.85, 28.85, 30.0), 1)},
     ),
     ("fluke-1522", b"read?\r", b"t: 25.587 C\r\n", {"temperature": 25.587}),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "command", "line", "values"), PROTOCOLS)
@@ -190,11 +185,9 @@ def test_the_checksum_is_of_the_bytes(instrument):
     line = "T=20.50°C*".encode()
     total = sum(line) % 256
     pattern = r"T=(?P<temperature>[\d.]+)°C\*(?P<checksum>..)"
+    checked = {"pattern": pattern, "checksum": "sum8", "timeout_s": 2.0}
     for text in (line + b"%02X", line + b"%02x"):
-        assert (
-            answer(instrument, text % total, pattern=pattern, checksum="sum8", timeout_s=2.0)
-            == 20.5
-        )
+        assert answer(instrument, text % total, **checked) == 20.5
 
 
 def test_one_channel_without_a_sensor_does_not_take_the_others_along(instrument):
@@ -205,9 +198,8 @@ def test_one_channel_without_a_sensor_does_not_take_the_others_along(instrument)
 
 
 def test_no_such_port():
-    device = open_device(
-        "thermometer", "serial", {"port": "/dev/ttyNONE", "instrument": "papouch-tm"}, SystemClock()
-    )
+    options = {"port": "/dev/ttyNONE", "instrument": "papouch-tm"}
+    device = open_device("thermometer", "serial", options, SystemClock())
     with pytest.raises(errors.DeviceNotFound, match="dialout"):
         device.open()
 

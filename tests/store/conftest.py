@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,3 +89,23 @@ def filled(store_path: Path, field: TestField, head: Head, make_epoch, make_resu
             extra = {"blur": 0.5 * i}
             store.append(series, make_epoch(i), make_result(i), extra=extra)
         yield store, series
+
+
+@pytest.fixture
+def killed(store_path: Path, field: TestField, head: Head, make_epoch, make_result, tmp_path: Path):
+    """(n, last) → what a killed writer left: n epochs in the store, the others in its -wal."""
+
+    def make(moved: int, last: int) -> Path:
+        folder = tmp_path / "killed"
+        folder.mkdir()
+        with Store.open(store_path, "append", durable=False) as store:
+            series = store.create_series(head, field)
+            for i in range(1, last + 1):
+                if i == moved + 1:
+                    store.checkpoint()
+                store.append(series, make_epoch(i), make_result(i))
+            for name in (store_path.name, f"{store_path.name}-wal"):
+                shutil.copy(store_path.with_name(name), folder / name)
+        return folder / store_path.name
+
+    return make

@@ -7,6 +7,7 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.series import EpochResult
 
@@ -25,3 +26,13 @@ def small_epoch(number: int, begin_s: float = 1e9, interval_s: float = 1.0) -> E
 
 def small_result(number: int) -> EpochResult:
     return EpochResult("ok", "", np.full(16, float(number)), np.eye(16), 1.0, 5, 9)
+
+
+def stored_numbers(path) -> list[int]:
+    """The epochs of the one series of a store that is sound, by its rows and by its columns."""
+    with Store.open(path) as store:
+        assert store.examine().damaged == ()
+        series = store.find_series()
+        numbers = [s.epoch.number for s in store.epochs(series)]
+        assert store.series_columns(series, ["epoch"])["epoch"].tolist() == numbers
+        return numbers

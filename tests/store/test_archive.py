@@ -55,15 +55,12 @@ def test_a_clock_that_was_set_back_is_mended(filled, tmp_path, make_epoch):
     assert ahead == pytest.approx(0.75)
 
 
-def test_corrections_of_several_steps():
+def test_several_steps_and_a_glitch_are_corrected():
+    """Found: 120 days ahead for some epochs, and it was the right ones that were moved."""
     times = np.array([100.0, 110, 50, 60, 0, 10])
     corrected = times + clock_corrections(times, 10.0)
     assert corrected.tolist() == [-40, -30, -20, -10, 0, 10]
     assert not clock_corrections(np.array([0.0, 10, 500]), 10.0).any()
-
-
-def test_a_glitch_moves_back_and_leaves_what_was_right():
-    """Found: 120 days ahead for some epochs, and it was the right ones that were moved."""
     right = np.arange(20) * 10.0
     stamped = right.copy()
     stamped[5:9] += 120 * 86400.0

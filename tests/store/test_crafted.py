@@ -100,30 +100,30 @@ def test_a_link_among_the_frames_is_not_followed_out(crafted, tmp_path):
     assert kept == {"000005.jpg": b"kept"}
 
 
-@pytest.mark.parametrize("kind", ["absolute", "up", "link", "folder link", "device", "pipe"])
-def test_a_recording_names_frames_of_its_own_only(recording_path, tmp_path, kind):
+@pytest.mark.parametrize(
+    ("frame", "leads"),
+    [
+        ("{outside}/secret.jpg", ""),
+        ("../outside/secret.jpg", ""),
+        ("frames/1.jpg", "{outside}/secret.jpg"),
+        ("linked/secret.jpg", "{outside}"),
+        ("frames/1.jpg", "/dev/zero"),
+        ("frames/1.jpg", "a pipe"),
+    ],
+)
+def test_a_recording_names_frames_of_its_own_only(recording_path, tmp_path, frame, leads):
     outside = tmp_path / "outside"
     outside.mkdir()
     (outside / "secret.jpg").write_bytes(b"secret")
-    frames = recording_path / "frames"
-    frames.mkdir()
-    frame = "frames/1.jpg"
-    if kind == "absolute":
-        frame = str(outside / "secret.jpg")
-    elif kind == "up":
-        frame = "../outside/secret.jpg"
-    elif kind == "link":
-        (frames / "1.jpg").symlink_to(outside / "secret.jpg")
-    elif kind == "folder link":
-        (recording_path / "linked").symlink_to(outside)
-        frame = "linked/secret.jpg"
-    elif kind == "device":
-        (frames / "1.jpg").symlink_to("/dev/zero")
-    else:
-        os.mkfifo(frames / "1.jpg")
+    (recording_path / "frames").mkdir()
+    node = recording_path / frame.removesuffix("/secret.jpg")
+    if leads == "a pipe":
+        os.mkfifo(node)
+    elif leads:
+        node.symlink_to(leads.format(outside=outside))
     table = recording_path / "epochs.csv"
     lines = table.read_text().splitlines()
-    lines[1] = lines[1].rsplit(",", 1)[0] + f",{frame}"
+    lines[1] = lines[1].rsplit(",", 1)[0] + f",{frame.format(outside=outside)}"
     table.write_text("\n".join(lines) + "\n")
     with pytest.raises(RecordingError, match="leads out of the recording"):
         read_recording(recording_path)

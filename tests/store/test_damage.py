@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -27,6 +28,15 @@ def whole(store_path, head, field, make_epoch, make_result, monkeypatch) -> byte
         store.amend(series, 7, make_result(70))
         store.add_event(Event(1.6e9, "knock", "somebody came"))
     return store_path.read_bytes()
+
+
+def change(path, *statements: str) -> None:
+    """Change the file as it does not let itself be changed."""
+    with closing(sqlite3.connect(path)) as database, database:
+        for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"):
+            database.execute(f"DROP TRIGGER {name}")
+        for statement in statements:
+            database.execute(statement)
 
 
 def content(path) -> tuple[dict, list, list]:
@@ -70,22 +80,8 @@ def test_a_flipped_bit_is_never_given_out(whole, store_path, caplog):
     assert (silent, unseen) == ([], [])
 
 
-def test_a_damaged_chunk_is_read_from_its_rows(whole, store_path, caplog):
-    truth = content(store_path)
-    database = sqlite3.connect(store_path)
-    database.execute("UPDATE column_chunk SET data = zeroblob(length(data)) WHERE name = 'c'")
-    database.commit()
-    database.close()
-    assert content(store_path) == truth
-    assert "chunk of column c is damaged" in caplog.text
-
-
 def test_a_damaged_row_does_not_stop_new_ones(whole, store_path, make_epoch, make_result):
-    database = sqlite3.connect(store_path)
-    database.execute("DROP TRIGGER epoch_update")
-    database.execute("UPDATE epoch SET x0 = x0 + 1e-9 WHERE number = 36")
-    database.commit()
-    database.close()
+    change(store_path, "UPDATE epoch SET x0 = x0 + 1e-9 WHERE number = 36")
     with Store.open(store_path, "append", durable=False) as store:
         (series,) = store.all_series()
         for i in range(EPOCHS + 1, EPOCHS + 20):
@@ -97,24 +93,17 @@ def test_a_damaged_row_does_not_stop_new_ones(whole, store_path, make_epoch, mak
 
 @pytest.mark.parametrize("table", ["series", "testfield"])
 def test_a_store_whose_series_are_gone_is_not_empty(whole, store_path, table):
-    database = sqlite3.connect(store_path)
-    for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"):
-        database.execute(f"DROP TRIGGER {name}")
-    database.execute(f"DELETE FROM {table}")
-    database.commit()
-    database.close()
+    change(store_path, f"DELETE FROM {table}")
     with Store.open(store_path) as store, pytest.raises(StoreError, match="is damaged"):
         store.all_series()
 
 
 def test_missing_epochs_are_named(whole, store_path):
-    database = sqlite3.connect(store_path)
-    database.execute("DROP TRIGGER epoch_delete")
-    database.execute("DROP TRIGGER detail_delete")
-    database.execute("DELETE FROM epoch WHERE number IN (3, 10, 11, 12)")
-    database.execute("DELETE FROM detail WHERE id / 1024 NOT IN (SELECT id FROM epoch)")
-    database.commit()
-    database.close()
+    change(
+        store_path,
+        "DELETE FROM epoch WHERE number IN (3, 10, 11, 12)",
+        "DELETE FROM detail WHERE id / 1024 NOT IN (SELECT id FROM epoch)",
+    )
     with Store.open(store_path) as store:
         found = store.examine()
     assert [gap.text for gap in found.gaps] == [

@@ -85,6 +85,7 @@ def test_resume_where_it_stopped(filled, store_path, head, field):
     other = store.create_series(replace(head, series="M2"), field)
     assert store.last_epoch(other) is None
     store.close()
+    store.close()
     with Store.open(store_path, "append") as again:
         assert again.last_epoch(again.find_series("rpi", "M1")) == 20
 
@@ -123,9 +124,8 @@ def test_several_cameras_and_series(filled, head, field, make_epoch, make_result
         store.append(second, make_epoch(i), make_result(100 + i))
         store.append(first, make_epoch(20 + i), make_result(20 + i))
     assert [(s.camera, s.name) for s in store.all_series()] == [("rpi", "M1"), ("phone", "M1")]
-    assert store.series_columns(second, ["c"])["c"].tolist() == [
-        make_result(i).values[0] for i in (101, 102)
-    ]
+    found = store.series_columns(second, ["c"])["c"]
+    assert found.tolist() == [make_result(i).values[0] for i in (101, 102)]
     assert len(store.series_columns(first, ["c"])["c"]) == 22
     with pytest.raises(StoreError, match=r"several series fit.*rpi/M1, phone/M1"):
         store.find_series(name="M1")
@@ -150,9 +150,8 @@ def test_events_stand_with_their_epoch(filled, make_epoch):
 def test_untrusted_clock_is_remembered(filled, make_epoch):
     store, series = filled
     store.append(series, make_epoch(21), clock_trusted=False)
-    assert store.series_columns(series, ["clock_trusted"])["clock_trusted"].tolist() == [1] * 20 + [
-        0
-    ]
+    found = store.series_columns(series, ["clock_trusted"])["clock_trusted"]
+    assert found.tolist() == [1] * 20 + [0]
 
 
 @pytest.mark.parametrize("name", ["c", "epoch", "status", "sd_x0"])
@@ -169,10 +168,9 @@ def test_names_that_are_taken(filled, head, field, make_epoch, name):
 def test_the_file_itself_refuses_changes(filled, store_path, table, verb):
     store, _ = filled
     store.add_event(Event(0.0, "note", "x"))
-    database = sqlite3.connect(store_path)
-    with pytest.raises(sqlite3.IntegrityError, match="append-only"):
+    refused = pytest.raises(sqlite3.IntegrityError, match="append-only")
+    with closing(sqlite3.connect(store_path)) as database, refused:
         database.execute(verb.format(table))
-    database.close()
 
 
 def test_an_epoch_without_a_whole_number_is_damage(filled, store_path):
@@ -246,7 +244,6 @@ def test_plain_sql_can_read_it(filled, store_path):
             "SELECT number, c, sd_c, centre_X0, json_extract(temperatures, '$.temperature') "
             "FROM epoch WHERE number = 3"
         ).fetchone()
-    database.close()
     assert row[0] == 3
     assert row[4] == 20.1875
     assert all(isinstance(value, float) for value in row[1:])
@@ -270,7 +267,6 @@ def test_not_ours(tmp_path, mode):
     other = tmp_path / "other.db"
     with closing(sqlite3.connect(other)) as database, database:
         database.execute("CREATE TABLE recipes (id)")
-    database.close()
     before = other.read_bytes()
     with pytest.raises(StoreError, match="no thermocald store"):
         Store.open(other, mode)
@@ -283,7 +279,6 @@ def test_a_newer_version_is_left_alone(filled, store_path, mode):
     store.close()
     with closing(sqlite3.connect(store_path)) as database, database:
         database.execute("PRAGMA user_version = 99")
-    database.close()
     with pytest.raises(StoreVersionError, match=r"version 99.*update thermocald"):
         Store.open(store_path, mode)
 
@@ -295,12 +290,6 @@ def test_empty_file(tmp_path):
         Store.open(path)
     with Store.open(path, "append") as store:
         assert store.all_series() == []
-
-
-def test_close_twice(filled):
-    store, _ = filled
-    store.close()
-    store.close()
 
 
 def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.store.test_damage import change
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError
 from thermocald.photogrammetry.camera.camera_model import Sensor
@@ -66,13 +67,8 @@ def test_a_block_holds_what_its_epochs_hold(path):
 
 
 def test_damage_is_found(path):
-    with Store.open(path, "append") as store:
-        (row,) = store._db.execute("SELECT max(id) FROM detail").fetchone()
-        for (name,) in store._db.execute(
-            "SELECT name FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'detail'"
-        ).fetchall():
-            store._db.execute(f"DROP TRIGGER {name}")
-        store._db.execute("UPDATE detail SET data = zeroblob(length(data)) WHERE id = ?", (row,))
+    last = "WHERE id = (SELECT max(id) FROM detail)"
+    change(path, f"UPDATE detail SET data = zeroblob(length(data)) {last}")
     with Store.open(path) as store:
         (series,) = store.all_series()
         with pytest.raises(StoreError, match="is damaged"):

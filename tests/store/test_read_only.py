@@ -9,27 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from tests.store.small import stored_numbers as numbers
 from thermocald.errors import StoreError
 from thermocald.store.database import file
 from thermocald.store.database.store import Store
 
 
 @pytest.fixture
-def with_wal(store_path, field, head, make_epoch, make_result, tmp_path):
+def with_wal(killed):
     """A killed daemon's folder: five epochs in the store, nine more in its -wal file."""
-    folder = tmp_path / "killed"
-    folder.mkdir()
-    store = Store.open(store_path, "append", durable=False)
-    series = store.create_series(head, field)
-    for i in range(1, 6):
-        store.append(series, make_epoch(i), make_result(i))
-    store.checkpoint()
-    for i in range(6, 15):
-        store.append(series, make_epoch(i), make_result(i))
-    for name in (store_path.name, f"{store_path.name}-wal"):
-        shutil.copy(store_path.with_name(name), folder / name)
-    store.close()
-    return folder / store_path.name
+    return killed(5, 14)
 
 
 @pytest.fixture
@@ -46,25 +35,13 @@ def read_only(with_wal):
     subprocess.run(["umount", "-l", folder], check=False)
 
 
-def numbers(path: Path) -> list[int]:
-    with Store.open(path) as store:
-        series = store.find_series()
-        assert store.examine().damaged == ()
-        read = store.series_columns(series, ["epoch"])["epoch"].astype(int).tolist()
-        assert [s.epoch.number for s in store.epochs(series)] == read
-        return read
-
-
-def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only):
+def test_what_is_in_the_wal_is_read_where_nothing_can_be_written(read_only, tmp_path):
+    """Through a link too."""
     before = set(Path(tempfile.gettempdir()).glob("thermocald-*"))
-    assert numbers(read_only) == list(range(1, 15))
+    (tmp_path / "link.db").symlink_to(read_only)
+    for path in (read_only, tmp_path / "link.db"):
+        assert numbers(path) == list(range(1, 15))
     assert set(Path(tempfile.gettempdir()).glob("thermocald-*")) == before
-
-
-def test_through_a_link_too(read_only, tmp_path):
-    link = tmp_path / "link.db"
-    link.symlink_to(read_only)
-    assert numbers(link) == list(range(1, 15))
 
 
 def test_without_a_wal_it_is_read_in_place(with_wal, monkeypatch):

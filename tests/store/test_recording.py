@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.store.test_bad_recordings import set_field
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation
@@ -69,9 +70,7 @@ def test_stream_gives_the_same_epochs(recording_path, monkeypatch):
 
 def test_epochs_without_observations_are_empty_not_missing(tmp_path, field, head, make_epoch):
     epochs = [make_epoch(1), make_epoch(2, targets=0), make_epoch(3)]
-    with RecordingWriter(tmp_path / "r", head, field) as writer:
-        for epoch in epochs:
-            writer.append(epoch)
+    write_recording(tmp_path / "r", head, field, epochs)
     read = read_recording(tmp_path / "r").epochs
     assert [len(epoch.observations) for epoch in read] == [12, 0, 12]
 
@@ -165,13 +164,6 @@ def test_an_existing_recording_is_not_overwritten(recording_path, field, head):
     assert (recording_path / "epochs.csv").read_bytes() == before
 
 
-def test_writer_refuses_numbers_that_do_not_increase(tmp_path, field, head, make_epoch):
-    epochs = [make_epoch(2), make_epoch(1)]
-    with pytest.raises(RecordingError, match="epoch 1 comes after 2"):
-        write_recording(tmp_path / "r", head, field, epochs)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_writing_does_not_grow_with_length(tmp_path, field, head, make_epoch):
     def peak(epochs: int) -> int:
         tracemalloc.start()
@@ -199,13 +191,21 @@ def test_real_recordings_are_read_and_survive_a_round_trip(shared, tmp_path, cam
         assert a.frame_time == b.frame_time
 
 
-@pytest.mark.parametrize("column", ["frame_time", "temperature_time"])
-def test_writer_refuses_what_could_not_be_read_again(tmp_path, field, head, make_epoch, column):
-    late = replace(make_epoch(2), **{column: 1.0})
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frame_time": 1.0}, "epoch 2: the time of its .* runs backwards"),
+        ({"temperature_time": 1.0}, "epoch 2: the time of its .* runs backwards"),
+        ({"number": 1}, "epoch 1 comes after 1; numbers must increase"),
+    ],
+)
+def test_writer_refuses_what_could_not_be_read_again(
+    tmp_path, field, head, make_epoch, change, message
+):
     with RecordingWriter(tmp_path / "r", head, field) as writer:
         writer.append(make_epoch(1))
-        with pytest.raises(RecordingError, match=r"epoch 2: the time of its .* runs backwards"):
-            writer.append(late)
+        with pytest.raises(RecordingError, match=message):
+            writer.append(replace(make_epoch(2), **change))
         writer.append(make_epoch(3))
     assert [e.number for e in read_recording(tmp_path / "r").epochs] == [1, 3]
 
@@ -260,12 +260,7 @@ def test_long_text_is_parsed_once(recording_path, long_from_nothing, monkeypatch
 
 def test_text_that_was_changed_is_parsed_again(recording_path, long_from_nothing):
     before = next(open_recording(recording_path).iter_epochs()).observations.points[0, 0]
-    file = recording_path / "observations.csv"
-    lines = file.read_text().splitlines()
-    fields = lines[1].split(",")
-    column = lines[0].split(",").index("x")
-    fields[column] = str(float(fields[column]) + 1)
-    file.write_text("\n".join([lines[0], ",".join(fields), *lines[2:]]) + "\n")
+    set_field(recording_path / "observations.csv", 2, "x", str(before + 1))
     after = next(open_recording(recording_path).iter_epochs()).observations.points[0, 0]
     assert after == pytest.approx(before + 1, abs=1e-9)
 
@@ -280,12 +275,7 @@ def test_a_copy_says_where_the_text_is_wrong(
     recording_path, long_from_nothing, column, value, words
 ):
     """What is found in the binary copy is said of the line of the text."""
-    file = recording_path / "observations.csv"
-    lines = file.read_text().splitlines()
-    fields = lines[3].split(",")
-    fields[lines[0].split(",").index(column)] = value
-    lines[3] = ",".join(fields)
-    file.write_text("\n".join(lines) + "\n")
+    set_field(recording_path / "observations.csv", 4, column, value)
     with pytest.raises(RecordingError, match=r"observations\.csv, line 4") as error:
         list(open_recording(recording_path).iter_epochs())
     assert words in str(error.value)

@@ -141,8 +141,17 @@ class Link:
             action()
         except TransientDeviceError as error:
             self._out(str(error), max(self._period_s, _LONGEST_PAUSE_S))
+        except DeviceNotFound as error:
+            self._out(str(error), max(self._period_s, _SEARCH_PAUSE_S))
         except PermanentDeviceError as error:
-            self._permanent(error)
+            self.device.close()
+            self.since = self._clock.utc()
+            self.why = without_secrets(str(error))
+            # a recording that has been played to its end is not a failure
+            finished = isinstance(error, DeviceFinished)
+            self.state = "finished" if finished else "failed"
+            level = logging.INFO if finished else logging.ERROR
+            self._tell(level, f"device_{self.state}", f"{self.called}: {self.why}")
         except Exception as error:
             # a driver's own mistake must not end the daemon
             if self.state != "out":
@@ -190,19 +199,6 @@ class Link:
         now = self._clock.monotonic()
         self._retry_at = now + 0.9 * self._pause_s
         self._pause_s = min(max(2 * self._pause_s, _FIRST_PAUSE_S), longest_s)
-
-    def _permanent(self, error: PermanentDeviceError) -> None:
-        if isinstance(error, DeviceNotFound):
-            self._out(str(error), max(self._period_s, _SEARCH_PAUSE_S))
-            return
-        self.device.close()
-        self.since = self._clock.utc()
-        self.why = without_secrets(str(error))
-        # a recording that has been played to its end is not a failure
-        finished = isinstance(error, DeviceFinished)
-        self.state = "finished" if finished else "failed"
-        level = logging.INFO if finished else logging.ERROR
-        self._tell(level, f"device_{self.state}", f"{self.called}: {self.why}")
 
     def _tell(self, level: int, kind: str, text: str) -> None:
         log.log(level, "%s", text, extra={"device": self.name, "event": kind})

@@ -261,9 +261,10 @@ class Pipeline:
 
     def _pair(self, item: AcquiredEpoch, patience_s: float) -> None:
         frame = item.frame
-        paired = self._thermometers.around(self._names, frame.monotonic, patience_s)
-        item.epoch = Epoch(item.number, frame.utc, paired.utc, paired.temperatures)
-        item.skew_s = paired.skew_s
+        utc, temperatures, item.skew_s = self._thermometers.around(
+            self._names, frame.monotonic, patience_s
+        )
+        item.epoch = Epoch(item.number, frame.utc, utc, temperatures)
 
     def _keep_all(self) -> None:
         while (item := self._next_to_keep()) is not None:

@@ -33,23 +33,15 @@ _SETTLE_S = 86400.0  # after a leap, before anything is deleted for its age
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """The machine's UTC was stepped by `seconds`; adopted: whether time stamps followed, else
-    pending: whether the step waits to be confirmed. utc: as stamped from now on.
+    """The machine's UTC was stepped by `seconds`, which `text` says in a sentence.
+
+    utc: as stamped from now on; adopted: whether time stamps followed.
     """
 
     utc: float
     seconds: float
     adopted: bool
-    pending: bool = False
-
-    @property
-    def text(self) -> str:
-        """The step in a sentence."""
-        where = "forwards" if self.seconds > 0 else "back"
-        then = "time stamps follow" if self.adopted else "time stamps go on as before"
-        if self.pending:
-            then += f" until that has stood for {_CONFIRM_S:.0f} s"
-        return f"the clock was set {where} by {abs(self.seconds):.1f} s; {then}"
+    text: str
 
 
 class SteadyClock:
@@ -59,10 +51,7 @@ class SteadyClock:
     """
 
     def __init__(
-        self,
-        machine: Clock | None = None,
-        *,
-        synchronised: Callable[[], bool] | None = None,
+        self, machine: Clock | None = None, *, synchronised: Callable[[], bool] | None = None
     ) -> None:
         self._machine = machine or SystemClock()
         self._synchronised = synchronised or machine_clock_trusted
@@ -100,15 +89,18 @@ class SteadyClock:
         pending = abs(ahead) >= _STEP_S
         # a clock that shows a time before this program existed has just learned the time, too
         learned |= self.utc() < NOT_BEFORE <= self._machine.utc()
-        if pending and (learned or now - self._seen_at >= _CONFIRM_S):
-            self._offset = offset
-            told = ClockStep(self.utc(), ahead, adopted=True)
+        adopted = pending and (learned or now - self._seen_at >= _CONFIRM_S)
+        if adopted:
+            self._offset, step, then = offset, ahead, "time stamps follow"
         elif stepped:
-            told = ClockStep(self.utc(), step, adopted=False, pending=pending)
+            waits = f" until that has stood for {_CONFIRM_S:.0f} s" if pending else ""
+            then = f"time stamps go on as before{waits}"
         else:
             return None
-        log.warning(told.text, extra={"event": "clock_step"})
-        return told
+        where = "forwards" if step > 0 else "back"
+        text = f"the clock was set {where} by {abs(step):.1f} s; {then}"
+        log.warning(text, extra={"event": "clock_step"})
+        return ClockStep(self.utc(), step, adopted, text)
 
     @property
     def error_s(self) -> float:

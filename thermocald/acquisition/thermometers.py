@@ -10,7 +10,7 @@ import math
 import threading
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from thermocald.acquisition.device_loop import Link
 from thermocald.errors import ConfigurationError, WrongDevice
@@ -29,20 +29,12 @@ _REMEMBERED = 16
 _OLDEST_IN_PERIODS = 1.5
 
 
-class PairedReadings(NamedTuple):
-    """What the thermometers said around a frame.
-
-    utc: s, of the reference thermometer, NaN if there is none; temperatures: {channel: °C};
-    skew_s: reading minus frame, NaN if there is none.
-    """
-
-    utc: float
-    temperatures: Mapping[str, float]
-    skew_s: float
-
-
-def pair_readings(readings: Mapping[str, Reading | None], frame_monotonic: float) -> PairedReadings:
+def pair_readings(
+    readings: Mapping[str, Reading | None], frame_monotonic: float
+) -> tuple[float, dict[str, float], float]:
     """Join one reading per thermometer, the reference first, into the temperatures of an epoch.
+
+    Returns UTC s, of the reference; {channel: °C}; s, reading minus frame; NaN if there is none.
 
     Channels keep the thermometer's own names where there is one thermometer; with several they are
     `<thermometer>` for its channel `temperature` and `<thermometer>_<channel>` for others. Without
@@ -56,8 +48,8 @@ def pair_readings(readings: Mapping[str, Reading | None], frame_monotonic: float
     }
     reference = next((r for r in readings.values() if r is not None), None)
     if reference is None:
-        return PairedReadings(math.nan, {}, math.nan)
-    return PairedReadings(reference.utc, temperatures, reference.monotonic - frame_monotonic)
+        return math.nan, {}, math.nan
+    return reference.utc, temperatures, reference.monotonic - frame_monotonic
 
 
 def require_columns(thermometers: Mapping[str, Iterable[str]], error: type[Exception]) -> list[str]:
@@ -158,8 +150,10 @@ class Thermometers:
             return None
         return found
 
-    def around(self, names: Sequence[str], monotonic: float, patience_s: float) -> PairedReadings:
-        """Return the readings around a frame, NaN where a channel that is known was not read.
+    def around(
+        self, names: Sequence[str], monotonic: float, patience_s: float
+    ) -> tuple[float, dict[str, float], float]:
+        """Return as `pair_readings` those around a frame; a channel that was not read is NaN.
 
         patience_s: of wall time to wait for a reading that is being taken just now; none is waited
         for that cannot come nearer.
@@ -168,10 +162,11 @@ class Thermometers:
             self._changed.wait_for(
                 lambda: all(self._answered(name, monotonic) for name in names), patience_s
             )
-        paired = pair_readings({name: self.nearest(name, monotonic) for name in names}, monotonic)
+        nearest = {name: self.nearest(name, monotonic) for name in names}
+        utc, temperatures, skew_s = pair_readings(nearest, monotonic)
         # a reference that was not read leaves its place empty: no other takes it
         columns = dict.fromkeys(self.columns(names), math.nan)
-        return paired._replace(temperatures={**columns, **paired.temperatures})
+        return utc, {**columns, **temperatures}, skew_s
 
     def _answered(self, name: str, monotonic: float) -> bool:
         kept = self._kept[name]

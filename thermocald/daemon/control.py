@@ -133,21 +133,18 @@ class ControlSocket:
     def _serve_one(self, connection: socket.socket) -> None:
         try:
             with connection:
-                told = self._respond(connection)
+                try:
+                    request = _parse(_line(connection, _LONGEST, _REQUEST_S))
+                    told = {"ok": True, **self._answer(request)}
+                except ThermocaldError as error:
+                    told = {"ok": False, "error": str(error), "exit_status": error.exit_status}
                 connection.settimeout(_REQUEST_S)
-                connection.sendall(json.dumps(jsonable(told)).encode() + b"\n")
+                document = jsonable({"format": FORMAT, **told})
+                connection.sendall(json.dumps(document).encode() + b"\n")
         except OSError as error:  # who asked has gone, or says nothing
             log.debug("control: %s", error)
         finally:
             self._free.release()
-
-    def _respond(self, connection: socket.socket) -> dict[str, Any]:
-        try:
-            request = _parse(_line(connection, _LONGEST, _REQUEST_S))
-            return {"format": FORMAT, "ok": True, **self._answer(request)}
-        except ThermocaldError as error:
-            status = error.exit_status
-            return {"format": FORMAT, "ok": False, "error": str(error), "exit_status": status}
 
 
 def ask(folder: Path, do: str, **values: Any) -> dict[str, Any] | None:

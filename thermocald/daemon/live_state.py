@@ -154,20 +154,15 @@ def find_state(store: Path) -> Path:
         return beside
     wanted = str(store.absolute())
     for found in sorted(_RUN.glob("thermocald*/status.json")):  # thermocald-NAME: of the template
-        if read_state(found.parent).get("store", {}).get("path") == wanted:
+        if read_json(found).get("store", {}).get("path") == wanted:
             return found.parent
     return beside
-
-
-def read_state(folder: Path) -> dict[str, Any]:
-    """status.json of a folder; empty if nobody runs there."""
-    return read_json(folder / "status.json")
 
 
 def running_status(path: Path) -> dict[str, Any]:
     """Return the status of the daemon that writes a store; DataError if none runs."""
     folder = find_state(path)
-    document = read_state(folder)
+    document = read_json(folder / "status.json")
     if not document:
         raise DataError(f"no daemon runs for {path} (there is no {folder}/status.json)")
     # the daemon's own clock may be stepped; how old the file is tells the machine's alone

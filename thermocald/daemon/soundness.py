@@ -15,6 +15,7 @@ import numpy as np
 from thermocald.arrays import spread_rows
 from thermocald.errors import ConfigurationError, DataError, DeviceError, ThermocaldError
 from thermocald.hal import SystemClock, driver_names, load_driver, open_device
+from thermocald.names import file_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -167,6 +168,7 @@ def _examine_recording(path: Path) -> dict[str, Any]:
         name: int(np.isfinite(values).sum()) for name, values in columns.temperatures.items()
     }
     doubts = [
+        *_name_doubts(recording),
         *recording.doubts(),
         *strange_photographs([e.frame for e in recording.epochs if e.frame is not None]),
         *calibration_doubts(recording),
@@ -190,6 +192,15 @@ def _examine_recording(path: Path) -> dict[str, Any]:
         "doubts": doubts,
         "lines": lines,
     }
+
+
+def _name_doubts(recording: Recording) -> Iterator[str]:
+    """Yield which names of a recording no store can keep, and why."""
+    for what, name in (("camera", recording.camera.name), ("series", recording.series)):
+        try:
+            file_name(name, what, DataError)
+        except DataError as error:
+            yield f"{error}; no store can keep it"
 
 
 def calibration_doubts(recording: Recording) -> list[str]:

@@ -151,8 +151,7 @@ class Station:
             "thermometers": {
                 name: {
                     **link.status(
-                        self._readers[name].busy_s() if name in self._readers else 0.0,
-                        hang_after_s,
+                        self._readers[name].busy_s() if name in self._readers else 0.0, hang_after_s
                     ),
                     "last": dict(self.thermometers.last(name)),
                 }

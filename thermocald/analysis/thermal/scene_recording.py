@@ -18,7 +18,6 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.store.recording.head import CameraSpec, Channel, Head
-from thermocald.store.recording.readings import Readings
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ def write_scene(
     )  # fmt: skip
     nearest = np.clip(np.searchsorted(log.times, times, side="right") - 1, 0, None)
     with RecordingWriter(path, head, field) as writer:
-        writer.keep_readings(Readings(log.times, log.channels))
+        writer.keep_readings(log)
         for number, (time, row, track) in enumerate(zip(times, nearest, tracks, strict=True), 1):
             observed = None
             if track is not None:

@@ -466,9 +466,7 @@ class Store(SeriesReader):
                 raise
 
 
-def _sound(
-    rows: Iterable[tuple[dict[str, Any], StoreError | None]],
-) -> Iterator[dict[str, Any]]:
+def _sound(rows: Iterable[tuple[dict[str, Any], StoreError | None]]) -> Iterator[dict[str, Any]]:
     """Yield rows; leave out what is damaged, with a warning: no result depends on it."""
     for row, damage in rows:
         if damage is None:

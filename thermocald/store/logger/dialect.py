@@ -170,8 +170,10 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
     above = tuple(" ".join(row) for row in head)
     # what stood there were statistics, where another head follows
     for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
-        if start[i][1] not in head and _is_head(start[i][1]) and _is_data(start[i + 1][1]):
-            head, first = [start[i][1]], i + 1
+        row, next_row = start[i][1], start[i + 1][1]
+        named = row not in head and not _is_data(row) and any(map(TIME_NAME.search, row))
+        if named and _is_data(next_row):
+            head, first = [row], i + 1
     names = _names(head, width)
     rows = tuple(tuple(_fitted(row, len(names))) for _, row in start[first:] + last)
     found = decimal or _decimal(rows, mark)
@@ -182,10 +184,6 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
             "stand in the numbers and between the columns? Write either another way"
         )
     return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above)
-
-
-def _is_head(row: list[str]) -> bool:
-    return not _is_data(row) and any(map(TIME_NAME.search, row))
 
 
 def _parsed(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:

@@ -32,7 +32,6 @@ from thermocald.store.logger.clock import iso, parse_moment
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import EpochColumns, Recording
-from thermocald.store.recording.readings import Readings
 from thermocald.store.recording.sense import doubt_lines, pitch_doubts
 from thermocald.store.recording.writer import RecordingWriter
 
@@ -335,7 +334,7 @@ def read_series(
     channels = {n: np.where(near, values[row], np.nan) for n, values in logged.channels.items()}
     columns = EpochColumns(
         np.arange(1, len(times) + 1), times, np.where(near, logged.times[row], np.nan), channels,
-        tuple(str(p.path.absolute()) for p in placed), {}, Readings(logged.times, logged.channels),
+        tuple(str(p.path.absolute()) for p in placed), {}, logged,
     )  # fmt: skip
     reference = next(iter(channels))
     at_frame = columns.at_frame(reference)

@@ -38,6 +38,7 @@ from thermocald.store.logger.dialect import (
     to_celsius,
     without_unit,
 )
+from thermocald.store.recording.readings import TemperatureLog as TemperatureLog
 from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts
 
 if TYPE_CHECKING:
@@ -135,24 +136,6 @@ def log_options(
         tuple(time_column or ()), tuple(temperature_column or ()), mark, decimal, date_order, unit,
         clock, names=names,
     )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TemperatureLog:
-    """times (n,) s UTC, increasing; channels {name: (n,) °C}, NaN where there is none, the first is
-    the reference; notes: what was found and guessed, for people.
-    """
-
-    times: Array
-    channels: dict[str, Array]
-    notes: tuple[str, ...] = ()
-
-    def with_reference(self, name: str | None) -> TemperatureLog:
-        """The same with another channel as the first, if it has that one."""
-        if name not in self.channels:
-            return self
-        first = {name: self.channels[name]}
-        return replace(self, channels=first | self.channels)
 
 
 def read_log(

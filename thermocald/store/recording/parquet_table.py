@@ -263,7 +263,7 @@ def write_parquet(
         _write(partial, arrays)
 
 
-def csv_to_parquet(source: Path, target: Path, advance: Any = lambda _: None) -> None:
+def csv_to_parquet(source: Path, target: Path, advance: Any) -> None:
     """Write observations.csv as Parquet, column by column; extra columns of text are kept as text.
 
     advance(n): told of rows done. Raises RecordingError, UsageError without pyarrow.
@@ -289,7 +289,7 @@ def csv_to_parquet(source: Path, target: Path, advance: Any = lambda _: None) ->
         _write(partial, map(columns_of, table.chunks(_ROWS)))
 
 
-def parquet_to_csv(source: Path, target: Path, advance: Any = lambda _: None) -> None:
+def parquet_to_csv(source: Path, target: Path, advance: Any) -> None:
     """Write observations.parquet as CSV, such that every number reads back the same."""
     import csv
 

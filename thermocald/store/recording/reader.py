@@ -18,7 +18,7 @@ from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.observation_file import LONG_FROM_BYTES, ObservationFile
 from thermocald.store.recording.readings import (
     READINGS,
-    Readings,
+    TemperatureLog,
     interpolate_readings,
     read_readings,
 )
@@ -67,7 +67,7 @@ class EpochColumns:
     temperatures: dict[str, Array]
     frames: tuple[str, ...]
     extra: dict[str, tuple[str, ...]]
-    readings: Readings | None = None
+    readings: TemperatureLog | None = None
 
     def __len__(self) -> int:
         return len(self.numbers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +13,7 @@ from thermocald.store.recording.sense import time_fault
 from thermocald.store.recording.table import Table
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import ArrayLike
@@ -27,14 +27,26 @@ _AT_ONCE = 100_000  # frames: a year of them has to fit into memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Readings:
-    """Every reading of a log: times (R,) s, increasing; channels {name: (R,) °C}, NaN for none."""
+class TemperatureLog:
+    """Every reading of a log.
+
+    times (n,) s UTC, increasing; channels {name: (n,) °C}, NaN where there is none, the first is
+    the reference; notes: what was found and guessed where it was read, for people.
+    """
 
     times: Array
-    channels: Mapping[str, Array]
+    channels: dict[str, Array]
+    notes: tuple[str, ...] = ()
+
+    def with_reference(self, name: str | None) -> TemperatureLog:
+        """The same with another channel as the first, if it has that one."""
+        if name not in self.channels:
+            return self
+        first = {name: self.channels[name]}
+        return replace(self, channels=first | self.channels)
 
 
-def write_readings(path: Path, readings: Readings) -> None:
+def write_readings(path: Path, readings: TemperatureLog) -> None:
     """Write readings as `readings.csv`: time, one column per channel."""
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
@@ -44,7 +56,7 @@ def write_readings(path: Path, readings: Readings) -> None:
             rows.writerow([f"{time:.6f}", *("" if math.isnan(v) else f"{v:.10g}" for v in values)])
 
 
-def read_readings(path: Path, channels: Sequence[str]) -> Readings:
+def read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
     """Read a `readings.csv`; RecordingError names line and column of what is wrong."""
     table = Table(path, ["time", *channels])
     columns = table.read(numbers=["time"], optional=channels)
@@ -54,7 +66,7 @@ def read_readings(path: Path, channels: Sequence[str]) -> Readings:
         table.fail(fault[0], "time", fault[1])
     for name, values in columns.items():
         table.check(name, values < -273.15, "is below absolute zero")
-    return Readings(times, {name: columns.get(name, np.empty(0)) for name in channels})
+    return TemperatureLog(times, {name: columns.get(name, np.empty(0)) for name in channels})
 
 
 def interpolate_readings(

@@ -12,7 +12,7 @@ from thermocald.errors import RecordingError
 from thermocald.files import cannot_write, dump_yaml
 from thermocald.names import require_channels
 from thermocald.store.recording.head import Head, head_document
-from thermocald.store.recording.readings import READINGS, Readings, write_readings
+from thermocald.store.recording.readings import READINGS, TemperatureLog, write_readings
 from thermocald.store.recording.testfield_file import testfield_csv
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class RecordingWriter:
         if math.isfinite(epoch.temperature_time):
             self._last_reading = epoch.temperature_time
 
-    def keep_readings(self, readings: Readings) -> None:
+    def keep_readings(self, readings: TemperatureLog) -> None:
         """Keep every reading of a log, not only those next to the frames."""
         try:
             write_readings(self._partial / READINGS, readings)

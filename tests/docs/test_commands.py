@@ -67,7 +67,7 @@ ELSEWHERE = {
         "tests/cli/test_study_command.py", '"--reference", "--json", "-"',
     ),
     "python -m benchmarks.audit": ("tests/test_audit.py", "from benchmarks.audit import"),
-    "python -m benchmarks.object_space --check": (
+    "python -m benchmarks.object_space": (
         "tests/docs/test_object_space.py", "from benchmarks.object_space import",
     ),
 }  # fmt: skip

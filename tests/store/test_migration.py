@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from tests.commands import call
-from tests.fleet.conftest import *  # noqa: F403
-from tests.fleet.conftest import address
+from tests.fleet.conftest import address, cluster, server, template  # noqa: F401
 from thermocald.errors import ServerError, StoreError, StoreVersionError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.store import schema
@@ -132,7 +131,7 @@ def test_a_store_of_an_earlier_development_state_is_refused_with_the_way_out(ver
     assert "damaged" not in done.stderr
 
 
-def test_a_server_is_brought_up_to_date_as_a_whole_or_not_at_all(server, monkeypatch):
+def test_a_server_is_brought_up_to_date_as_a_whole_or_not_at_all(server, monkeypatch):  # noqa: F811
     place = address(server)
     with monkeypatch.context() as broken:
         broken.setattr(schema, "SERVER_STEPS", (*schema.SERVER_STEPS, FAILS))

@@ -35,7 +35,6 @@ from thermocald.thermal.series import COLUMNS, FIELD_SCALES
 if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.discovery.examination import Examination
-    from thermocald.discovery.gap import Gap
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.noise import NoiseGrowth
@@ -161,8 +160,6 @@ class EffectFound:
     estimates: dict[str, dict[str, Any]]
     evidence: dict[str, Any]
     alternatives: list[dict[str, Any]]
-    gap_before: Gap
-    gap_after: Gap
     term: Term | None = None
 
     @property
@@ -314,17 +311,17 @@ def find_tied_constants(fitter: HypothesisFitter, fit: Fit, number: int) -> dict
     )
 
 
-def list_image_effects(x: Examination, gap: Gap) -> list[EffectFound]:
-    """Make the entries of the document; gap: of the base model, which the caller replaces."""
+def list_image_effects(x: Examination) -> list[EffectFound]:
+    """Make the entries of what was found in image space."""
     out = []
     if "targets" in x.image_places:
-        out.append(_describe_moved_targets(x, gap))
+        out.append(_describe_moved_targets(x))
     if x.noise_growth:
-        out.append(_describe_noise_growth(x.fitter.series[0], x.noise_growth, gap))
+        out.append(_describe_noise_growth(x.fitter.series[0], x.noise_growth))
     return out
 
 
-def _describe_moved_targets(x: Examination, gap: Gap) -> EffectFound:
+def _describe_moved_targets(x: Examination) -> EffectFound:
     e = x.fitter.series[0]
     names = e.source.field.names
     group = max(x.displaced[0], key=lambda g: g.gain)
@@ -358,10 +355,10 @@ def _describe_moved_targets(x: Examination, gap: Gap) -> EffectFound:
         "note": "displacements are across the rays; along them one camera sees nothing",
     }
     statement = effect.sentence(estimates)
-    return EffectFound(effect.name, statement, where, estimates, evidence, [], gap, gap)
+    return EffectFound(effect.name, statement, where, estimates, evidence, [])
 
 
-def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth, gap: Gap) -> EffectFound:
+def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth) -> EffectFound:
     effect = catalogue.seen_in("noise")
     estimates = {"factor": _make_estimate(growth.factor, growth.sd, "1/K")}
     where = {
@@ -377,4 +374,4 @@ def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth, gap: Gap) -> E
     statement = effect.sentence(estimates)
     if growth.gain <= growth.other_gain + noise_criteria.CLEAR:
         statement += f"; it follows {growth.other} as well"
-    return EffectFound(effect.name, statement, where, estimates, evidence, [], gap, gap)
+    return EffectFound(effect.name, statement, where, estimates, evidence, [])

@@ -29,6 +29,7 @@ from thermocald.physics.effect import say_estimate
 from thermocald.physics.formula import known_together
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.thermal import criteria as noise_criteria
+from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.scan import normals_of_term
 from thermocald.thermal.series import COLUMNS, FIELD_SCALES
 
@@ -73,30 +74,12 @@ def estimate_term(fit: Fit, number: int, evidence: ReducedSeries) -> dict[str, E
             sd = float(np.sqrt(fit.covariance[place, place]))
         out[name] = _make_estimate(value, sd, units[name])
     own = [b for b in fit.blocks if b.term == number and b.series in (None, 0)]
-    if not own:  # a drive
-        return out
-    (block,) = own
-    places = np.arange(block.start, block.stop)
-    x = fit.coefficients[places].reshape(block.trajectories, -1)
-    C = fit.covariance[np.ix_(places, places)]
-    scale = np.array([evidence.scale[COLUMNS.index(p)] for p in block.parameters])
-    if effect.is_periodic:
-        u, s, v = np.linalg.svd(x, full_matrices=False)
-        a, side = s[0] * v[0], u[:, 0]
-        if side[0] < 0:
-            a, side = -a, -side
-        phase = float(np.arctan2(side[1], side[0]))
-        project = np.kron(side[None], np.eye(x.shape[1]))
-        sds = np.sqrt(np.diag(project @ C @ project.T))
-        across = np.kron(np.array([[-side[1], side[0]]]), v[0][None])
-        out["phase"] = _make_estimate(
-            phase, float(np.sqrt(across @ C @ across.T)[0, 0]) / s[0], "rad"
-        )
-    else:
-        a, sds = x[0], np.sqrt(np.diag(C))
-    for name, value, sd, factor in zip(block.parameters, a, sds, scale, strict=True):
+    found = coefficients_of(fit, own, evidence.scale)
+    for name, (value, row) in sorted(found.items(), key=lambda one: one[0] != "phase"):
         short = name.removeprefix("scale_")
-        out[f"a_{short}"] = _make_estimate(value / factor, sd / factor, units.get(short, ""))
+        sd = float(np.sqrt(row @ fit.covariance @ row))
+        key, unit = ("phase", "rad") if name == "phase" else (f"a_{short}", units.get(short, ""))
+        out[key] = _make_estimate(value, sd, unit)
     return out
 
 

@@ -29,13 +29,13 @@ from thermocald.physics.effect import say_estimate
 from thermocald.physics.formula import known_together
 from thermocald.physics.model import ModelEffect, ThermalModel
 from thermocald.thermal import criteria as noise_criteria
+from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.scan import normals_of_term
 from thermocald.thermal.series import COLUMNS, FIELD_SCALES
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.discovery.examination import Examination
-    from thermocald.discovery.gap import Gap
     from thermocald.thermal.fit import HypothesisFitter
     from thermocald.thermal.hypothesis import Fit, Term
     from thermocald.thermal.noise import NoiseGrowth
@@ -74,30 +74,12 @@ def estimate_term(fit: Fit, number: int, evidence: ReducedSeries) -> dict[str, E
             sd = float(np.sqrt(fit.covariance[place, place]))
         out[name] = _make_estimate(value, sd, units[name])
     own = [b for b in fit.blocks if b.term == number and b.series in (None, 0)]
-    if not own:  # a drive
-        return out
-    (block,) = own
-    places = np.arange(block.start, block.stop)
-    x = fit.coefficients[places].reshape(block.trajectories, -1)
-    C = fit.covariance[np.ix_(places, places)]
-    scale = np.array([evidence.scale[COLUMNS.index(p)] for p in block.parameters])
-    if effect.is_periodic:
-        u, s, v = np.linalg.svd(x, full_matrices=False)
-        a, side = s[0] * v[0], u[:, 0]
-        if side[0] < 0:
-            a, side = -a, -side
-        phase = float(np.arctan2(side[1], side[0]))
-        project = np.kron(side[None], np.eye(x.shape[1]))
-        sds = np.sqrt(np.diag(project @ C @ project.T))
-        across = np.kron(np.array([[-side[1], side[0]]]), v[0][None])
-        out["phase"] = _make_estimate(
-            phase, float(np.sqrt(across @ C @ across.T)[0, 0]) / s[0], "rad"
-        )
-    else:
-        a, sds = x[0], np.sqrt(np.diag(C))
-    for name, value, sd, factor in zip(block.parameters, a, sds, scale, strict=True):
+    found = coefficients_of(fit, own, evidence.scale)
+    for name, (value, row) in sorted(found.items(), key=lambda one: one[0] != "phase"):
         short = name.removeprefix("scale_")
-        out[f"a_{short}"] = _make_estimate(value / factor, sd / factor, units.get(short, ""))
+        sd = float(np.sqrt(row @ fit.covariance @ row))
+        key, unit = ("phase", "rad") if name == "phase" else (f"a_{short}", units.get(short, ""))
+        out[key] = _make_estimate(value, sd, unit)
     return out
 
 
@@ -161,8 +143,6 @@ class EffectFound:
     estimates: dict[str, dict[str, Any]]
     evidence: dict[str, Any]
     alternatives: list[dict[str, Any]]
-    gap_before: Gap
-    gap_after: Gap
     term: Term | None = None
 
     @property
@@ -314,17 +294,17 @@ def find_tied_constants(fitter: HypothesisFitter, fit: Fit, number: int) -> dict
     )
 
 
-def list_image_effects(x: Examination, gap: Gap) -> list[EffectFound]:
-    """Make the entries of the document; gap: of the base model, which the caller replaces."""
+def list_image_effects(x: Examination) -> list[EffectFound]:
+    """Make the entries of what was found in image space."""
     out = []
     if "targets" in x.image_places:
-        out.append(_describe_moved_targets(x, gap))
+        out.append(_describe_moved_targets(x))
     if x.noise_growth:
-        out.append(_describe_noise_growth(x.fitter.series[0], x.noise_growth, gap))
+        out.append(_describe_noise_growth(x.fitter.series[0], x.noise_growth))
     return out
 
 
-def _describe_moved_targets(x: Examination, gap: Gap) -> EffectFound:
+def _describe_moved_targets(x: Examination) -> EffectFound:
     e = x.fitter.series[0]
     names = e.source.field.names
     group = max(x.displaced[0], key=lambda g: g.gain)
@@ -358,10 +338,10 @@ def _describe_moved_targets(x: Examination, gap: Gap) -> EffectFound:
         "note": "displacements are across the rays; along them one camera sees nothing",
     }
     statement = effect.sentence(estimates)
-    return EffectFound(effect.name, statement, where, estimates, evidence, [], gap, gap)
+    return EffectFound(effect.name, statement, where, estimates, evidence, [])
 
 
-def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth, gap: Gap) -> EffectFound:
+def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth) -> EffectFound:
     effect = catalogue.seen_in("noise")
     estimates = {"factor": _make_estimate(growth.factor, growth.sd, "1/K")}
     where = {
@@ -377,4 +357,4 @@ def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth, gap: Gap) -> E
     statement = effect.sentence(estimates)
     if growth.gain <= growth.other_gain + noise_criteria.CLEAR:
         statement += f"; it follows {growth.other} as well"
-    return EffectFound(effect.name, statement, where, estimates, evidence, [], gap, gap)
+    return EffectFound(effect.name, statement, where, estimates, evidence, [])

@@ -150,6 +150,11 @@ class Discovery:
             return None
         return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 
+    def effects_with_gaps(self) -> list[tuple[EffectFound, Gap, Gap]]:
+        """Return each effect with the gap on M1 before and after it: the last stages."""
+        gaps = [stage.fit for stage in self.stages[-len(self.effects) - 1 :]]
+        return list(zip(self.effects, gaps[:-1], gaps[1:], strict=True))
+
     def as_dict(self) -> dict[str, Any]:
         """Return what `discover --json` writes, CONVENTIONS §4.
 
@@ -158,7 +163,10 @@ class Discovery:
         x = self.examination
         gaps = zip(self.stages[0].gaps, self.stages[-1].gaps, strict=True)
         fit, *others = ({"before": before, "after": after} for before, after in gaps)
-        effects = [jsonable(e) for e in self.effects]
+        effects = [
+            {**jsonable(e), "gap_before": before, "gap_after": after}
+            for e, before, after in self.effects_with_gaps()
+        ]
         if effects:  # where the base model is wrong stands with the first of its causes
             effects[0]["evidence"]["base_misfit"] = describe_misfit(x)
         document: dict[str, Any] = {
@@ -219,22 +227,21 @@ def discover_series(
     known = len(x.base.terms)
     fits = [fit_first(x.fitter, terms[:k]) for k in range(known, len(terms) + 1)]
     stages = [measure_stage(x, "", fits[0], 0)]
-    found = list_image_effects(x, stages[0].fit)
+    found = list_image_effects(x)
     n = len(found)
-    for k, entry in enumerate(found):
-        stages.append(measure_stage(x, entry.effect, fits[0], k + 1))
-        found[k] = replace(entry, gap_before=stages[-2].fit, gap_after=stages[-1].fit)
+    for k, entry in enumerate(found, 1):
+        stages.append(measure_stage(x, entry.effect, fits[0], k))
     if not x.adequate:
         return _conclude_unexplained(x, fits[0], stages, n, progress)
     for k in range(known, len(terms)):
         stages.append(measure_stage(x, terms[k].effect, fits[k + 1 - known], n))
-        found.append(_describe_effect(x, fits[-1], k, stages[-2].fit, stages[-1].fit))
+        found.append(_describe_effect(x, fits[-1], k))
     blocks = cross_validation(x.fitter, fits[-1]) if found else (float("nan"), float("nan"))
     verdict = "effects_found" if found else "adequate"
     return Discovery(verdict, tuple(found), tuple(stages), x, fits[0], fits[-1], blocks)
 
 
-def _describe_effect(x: Examination, fit: Fit, k: int, before: Gap, after: Gap) -> EffectFound:
+def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
     """Describe one term beyond the base model; fit: constants of M1 alone."""
     term = fit.terms[k]
     e = x.fitter.series[0]
@@ -279,7 +286,7 @@ def _describe_effect(x: Examination, fit: Fit, k: int, before: Gap, after: Gap) 
             "epochs": _find_epochs(x, fit, k),
             "image_region": None,
         },
-        estimates, evidence, alternatives, before, after, term,
+        estimates, evidence, alternatives, term,
     )  # fmt: skip
 
 
@@ -343,7 +350,7 @@ def _conclude_unexplained(
     """Describe what the catalogue does not explain: a formula where the data allow one, else
     described and bridged, not named.
     """
-    described = describe_unnamed(x, stages[-1].fit)
+    described = describe_unnamed(x)
     resembling: list[dict[str, Any]] = [
         {
             "effect": s.names[0],
@@ -375,14 +382,11 @@ def _conclude_unexplained(
                 "sigmas": [float(a.significance) for a in x.adequacy],
                 "misfit_px": [float(a.misfit_px) for a in x.adequacy],
             },
-            "image_space": [e.effect for e in list_image_effects(x, before.fit)],
+            "image_space": [e.effect for e in list_image_effects(x)],
         }
         statement = f"{described.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}"
         entry = replace(described, statement=statement, evidence=evidence)
-    entry = replace(
-        entry, alternatives=[*entry.alternatives, *resembling],
-        gap_before=stages[-2].fit, gap_after=stages[-1].fit,
-    )  # fmt: skip
+    entry = replace(entry, alternatives=[*entry.alternatives, *resembling])
     nan = float("nan")
     return Discovery("unexplained", (entry,), tuple(stages), x, *fits, (nan, nan))
 

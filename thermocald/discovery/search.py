@@ -84,7 +84,6 @@ def _varies(evidence: ReducedSeries, channel: str) -> bool:
 class Scanned:
     """What a scan of one candidate promises: the best term, gain in χ² less penalty, penalty."""
 
-    candidate: Candidate
     term: Term
     net: float
     penalty: float
@@ -170,7 +169,7 @@ class Search:
             penalty = (count + (value is not None)) * each + once
             penalty += 2 * float(np.log(max(self._trials[key], 1.0)))
             term = candidate.term(value, len(self.fitter.series))
-            return Scanned(candidate, term, float(found.gains[best]) - penalty, penalty)
+            return Scanned(term, float(found.gains[best]) - penalty, penalty)
         # an event comes in each series at its own time, or in none but the first
         fresh: list[tuple[tuple[str, float], ...] | None] = []
         total, penalty, single = 0.0, once, (count + 2) * each
@@ -183,7 +182,7 @@ class Search:
             else:
                 fresh.append(None)
         term = replace(candidate.term(None, len(found.events)), fresh=tuple(fresh))
-        return Scanned(candidate, term, total - penalty, penalty)
+        return Scanned(term, total - penalty, penalty)
 
     # -- growing and shrinking ----------------------------------------------------------------
 
@@ -218,7 +217,7 @@ class Search:
         pairs.sort(key=lambda pair: pair[0].score - pair[1].net)
         grown: dict[frozenset[str], Solution] = {}
         for solution, promise in pairs:
-            names = frozenset((*solution.names, promise.candidate.effect))
+            names = frozenset((*solution.names, promise.term.effect))
             if len(grown) < most and names not in grown:
                 grown[names] = self._with(solution, promise)
         return sorted(grown.values(), key=lambda s: s.score)
@@ -241,14 +240,13 @@ class Search:
         enough = [
             p
             for p in self._scanned[solution.fit]
-            if np.isfinite(p.net)
-            and p.net > (0.0 if p.candidate.kind.is_event else max(least, 0.0))
+            if np.isfinite(p.net) and p.net > (0.0 if p.term.kind.is_event else max(least, 0.0))
         ]
         ordered = sorted(enough, key=lambda p: -p.net)
         out: list[Scanned] = []
         best: dict[str, float] = {}
         for p in ordered:
-            name = p.candidate.effect
+            name = p.term.effect
             if name in best:
                 if p.net > criteria.SET_SHARE * best[name]:
                     out.append(p)

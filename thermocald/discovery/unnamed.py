@@ -24,7 +24,6 @@ from thermocald.thermal.series import COLUMNS, unit_directions
 if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.discovery.examination import Examination
-    from thermocald.discovery.gap import Gap
     from thermocald.discovery.proposal import Proposal
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
@@ -33,12 +32,11 @@ if TYPE_CHECKING:
 _IN_ORDER = (range(3), range(3, 10), range(10, 16), range(16, len(COLUMNS)))
 
 
-def describe_unnamed(x: Examination, gap: Gap) -> EffectFound:
+def describe_unnamed(x: Examination) -> EffectFound:
     """Describe in time, space and correlations what the base model leaves in M1.
 
     Its size is what it moves the image points by, in px, and its parameters are the fewest whose
-    movement of the image is nearly all of it. gap: for now, before and after; the caller knows
-    better.
+    movement of the image is nearly all of it.
     """
     a, e = x.base_adequacy[0], x.fitter.series[0]
     rest = a.trajectories.T @ a.amplitudes  # (E, P), px-scaled
@@ -110,8 +108,6 @@ def describe_unnamed(x: Examination, gap: Gap) -> EffectFound:
             },
         },
         [],
-        gap,
-        gap,
     )
 
 

@@ -65,7 +65,8 @@ def report_html(discovery: Discovery, title: str) -> str:
 def _answer(d: Discovery) -> Answer:
     before, after = d.stages[0], d.stages[-1]
     temperatures = _temperatures(d)
-    closing = sorted(d.effects, key=lambda e: e.gap_after.rms_px - e.gap_before.rms_px)
+    by_gap = sorted(d.effects_with_gaps(), key=lambda e: e[2].rms_px - e[1].rms_px)
+    closing = [e for e, _, _ in by_gap]
     if closing:
         sentence = as_sentence(_statement(closing[0]))
     elif d.examination.mount is not None:

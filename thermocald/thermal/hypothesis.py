@@ -42,6 +42,12 @@ if TYPE_CHECKING:
 
 BASE = ("c", "x0", "y0")
 
+Unknowns = dict[str, tuple[float, "Array"]]
+"""Numbers of a model by their names there: value, and row (K + L,) of the fit's unknowns.
+
+A name ends with `@k` where the number belongs to series k > 0.
+"""
+
 
 @dataclass(frozen=True)
 class Term:
@@ -160,6 +166,46 @@ class Fit:
         x = self.coefficients if coefficients is None else coefficients
         part, (A, c, yy) = x[self.designs[series][2]], self.reduced[series]
         return float(yy - 2 * part @ c + part @ A @ part)
+
+
+def coefficients_of(fit: Fit, blocks: Sequence[Block], scale: Array) -> Unknowns:
+    """Return the coefficients of one term's blocks by their columns, and of an oscillation `phase`.
+
+    scale (19,): px per unit of the columns. All series share the amplitudes of an oscillation, and
+    each has a phase, from its pair of sine and cosine.
+    """
+    size = len(fit.covariance)
+    found, phases = Unknowns(), Unknowns()
+    amplitudes: list[Array] = []
+    rows, weights = [], []
+    for block in blocks:
+        unit = scale[[COLUMNS.index(p) for p in block.parameters]]
+        x = fit.coefficients[block.start : block.stop].reshape(block.trajectories, -1)
+        place = np.arange(block.start, block.stop).reshape(x.shape)
+        suffix = f"@{block.series}" if block.series else ""
+        own = np.zeros((x.shape[1], size))
+        if block.term < 0 or not fit.terms[block.term].kind.is_periodic:
+            own[np.arange(len(own)), place[0]] = 1.0 / unit
+            for parameter, value, row in zip(block.parameters, x[0] / unit, own, strict=True):
+                found[parameter + suffix] = float(value), row
+            continue
+        u, s, v = np.linalg.svd(x, full_matrices=False)
+        side, shape = u[:, 0], v[0]
+        # the amplitude's sign is the first series'; there the phase lies within half a turn
+        if shape @ amplitudes[0] < 0 if amplitudes else side[0] < 0:
+            side, shape = -side, -shape
+        own[np.arange(len(own)), place[0]], own[np.arange(len(own)), place[1]] = side
+        across = np.zeros(size)
+        across[place.ravel()] = np.kron([-side[1], side[0]], shape) / s[0]
+        phases["phase" + suffix] = float(np.arctan2(side[1], side[0])), across
+        amplitudes.append(s[0] * shape)
+        rows.append(own / unit[:, None])
+        weights.append(1.0 / np.trace(own @ fit.covariance @ own.T))
+    if amplitudes:
+        w = np.array(weights) / np.sum(weights)
+        mean, row = np.tensordot(w, amplitudes, 1) / unit, np.tensordot(w, rows, 1)
+        found = dict(zip(blocks[0].parameters, zip(mean.tolist(), row, strict=True), strict=True))
+    return found | phases
 
 
 def make_known_term(name: str, values: Mapping[str, Any], series: int) -> Term:

@@ -39,10 +39,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermocald.analysis.thermal.level import Moved
-    from thermocald.analysis.thermal.terms import Unknowns
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.hypothesis import Fit, Unknowns
     from thermocald.thermal.noise import NoiseGrowth
     from thermocald.thermal.scan import Adequacy
     from thermocald.thermal.series import ReducedSeries

@@ -8,25 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.physics import catalogue
-from thermocald.thermal.hypothesis import BASE, Term, make_candidate
+from thermocald.thermal.hypothesis import BASE, Term, coefficients_of, make_candidate
 from thermocald.thermal.scan import Scanner
-from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.physics.model import ModelEffect
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Block, Fit
+    from thermocald.thermal.hypothesis import Fit, Unknowns
     from thermocald.thermal.series import ReducedSeries
 
 _EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what its search may find by chance
-
-
-Unknowns = dict[str, tuple[float, "Array"]]
-"""Numbers of a model by their names there: value, and row (K + L,) of the fit's unknowns.
-
-A name ends with `@k` where the number belongs to series k > 0.
-"""
 
 
 def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
@@ -88,65 +80,16 @@ def unknowns_of(fit: Fit, scale: Array) -> Unknowns:
 
     scale (19,): px per unit of the columns.
     """
-    found = _linear(fit, fit.blocks[0], scale, {n: f"rates.{n}" for n in BASE})
+    rates = coefficients_of(fit, fit.blocks[:1], scale)
+    found = {f"rates.{name}": number for name, number in rates.items()}
     for number, term in enumerate(fit.terms):
-        kind = term.kind
-        names = {kind.column(n): f"{term.effect}.{n}" for n in kind.linear}
-        blocks = [b for b in fit.blocks if b.term == number]
         for place, (i, key) in enumerate(fit.searched, len(fit.coefficients)):
             if i == number:
-                row = np.zeros(len(fit.covariance))
-                row[place] = 1.0
+                row = np.eye(1, len(fit.covariance), place)[0]
                 found[f"{term.effect}.{key}"] = float(dict(term.nonlinear)[key]), row
-        if kind.is_periodic:
-            found |= _oscillation(fit, blocks, scale, names)
-            continue
-        for block in blocks:
-            suffix = f"@{block.series}" if block.series else ""
-            found |= _linear(fit, block, scale, {k: n + suffix for k, n in names.items()})
+        names = {term.kind.column(n): n for n in term.kind.linear}
+        blocks = [b for b in fit.blocks if b.term == number]
+        for key, one in coefficients_of(fit, blocks, scale).items():
+            column, at, k = key.partition("@")
+            found[f"{term.effect}.{names.get(column, column)}{at}{k}"] = one
     return found
-
-
-def _linear(fit: Fit, block: Block, scale: Array, names: dict[str, str]) -> Unknowns:
-    found: Unknowns = {}
-    for place, parameter in enumerate(block.parameters, block.start):
-        unit = scale[COLUMNS.index(parameter)]
-        row = np.zeros(len(fit.covariance))
-        row[place] = 1.0 / unit
-        found[names[parameter]] = float(fit.coefficients[place] / unit), row
-    return found
-
-
-def _oscillation(fit: Fit, blocks: list[Block], scale: Array, names: dict[str, str]) -> Unknowns:
-    """Amplitudes, which all series share, and a phase of each, from pairs of sine and cosine."""
-    phase_name = names[blocks[0].parameters[0]].split(".")[0] + ".phase"
-    size = len(fit.covariance)
-    P = len(blocks[0].parameters)
-    amplitudes, rows, weights = [], [], []
-    phases: Unknowns = {}
-    first: Array | None = None
-    for block in blocks:
-        pair = fit.coefficients[block.start : block.stop].reshape(2, -1)
-        u, s, v = np.linalg.svd(pair, full_matrices=False)
-        side, shape = u[:, 0], v[0]
-        # the amplitude's sign is the first series'; there the phase lies within half a turn
-        if (side[0] < 0) if first is None else (shape @ first < 0):
-            side, shape = -side, -shape
-        first = shape if first is None else first
-        place = np.arange(block.start, block.stop).reshape(2, -1)
-        own = np.zeros((P, size))
-        own[np.arange(P), place[0]], own[np.arange(P), place[1]] = side
-        across = np.zeros(size)
-        across[place.ravel()] = np.kron([-side[1], side[0]], shape) / s[0]
-        suffix = f"@{block.series}" if block.series else ""
-        phases[phase_name + suffix] = float(np.arctan2(side[1], side[0])), across
-        amplitudes.append(s[0] * shape)
-        rows.append(own)
-        weights.append(1.0 / np.trace(own @ fit.covariance @ own.T))
-    w = np.array(weights) / np.sum(weights)
-    mean, row = np.tensordot(w, amplitudes, 1), np.tensordot(w, rows, 1)
-    out: Unknowns = {}
-    for j, parameter in enumerate(blocks[0].parameters):
-        unit = scale[COLUMNS.index(parameter)]
-        out[names[parameter]] = float(mean[j] / unit), row[j] / unit
-    return out | phases

@@ -241,7 +241,10 @@ class SeriesEstimator:
     def _shortened(
         self, system: SeriesSystem, state: State, step: Step, halvings: int
     ) -> Step | None:
-        """The step, halved until the next one is shorter; None where it never is."""
+        """The step, halved until the next one is shorter; None where it never is.
+
+        Source: the natural monotonicity test, Deuflhard (2004), Newton methods, section 3.3.
+        """
         for _ in range(halvings):
             there = system.design.moved(state, step)
             left = self._residuals(there, planes(2, *system.use.shape))
@@ -308,8 +311,8 @@ class SeriesEstimator:
             )
             keep = settle(history, use, keep)
             previous, variance = variance, self.variance(estimate)
-            settled = not self.has_offsets or abs(variance / previous - 1) < 0.02
-            if settled and np.array_equal(keep, use):
+            steady = not self.has_offsets or abs(variance / previous - 1) < 0.02
+            if steady and np.array_equal(keep, use):
                 break
             again = self.solve(estimate, keep, variance)
             if not again.settled:

@@ -85,6 +85,8 @@ def courses() -> None:
     print("an effect's time course, and its matrix of sensitivity (180 and 8,640 epochs), ms")
     for name in catalogue.names():
         effect = catalogue.get(name)
+        if effect.kind == "image":
+            continue  # nothing of it is a course
         values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
         values.pop("phase", None)
         row = []

@@ -187,7 +187,7 @@ def test_few_targets_of_a_wall(shared, tmp_path):
     """Whole steps of Gauss-Newton lead away from what 14 targets show: `replay` had no epoch of
     any of these parts.
 
-    Of 264 parts of the four walls, of 10 to 19 targets, 223 had a result, and 244 have, with errors
+    Of 264 parts of the four walls, of 10 to 19 targets, 222 had a result, and 244 have, with errors
     of at most 2.5 of the level's sds; those that the result says to be doubtful had up to 3. In
     geometry so weak rounding decides which: of four parts two have to have one.
     """

@@ -110,17 +110,17 @@ def inverse_of_determined(N: Array) -> Array:
     """Inverse of one matrix, restricted to the combinations of unknowns that it determines."""
     if len(N) == 0:
         return N
-    scale = unit_diagonal(N)[1]
+    scaled, scale = unit_diagonal(N)
     both = np.outer(scale, scale)
     try:
-        factor = np.linalg.cholesky(N * both).astype(np.float64, copy=False)
+        factor = np.linalg.cholesky(scaled).astype(np.float64, copy=False)
         if factor.diagonal().min() > 1e-6:
             triangle = _inverse_of_triangle(factor)
             regular: Array = (triangle.T @ triangle) * both
             return regular
     except np.linalg.LinAlgError:
         pass
-    inverse: Array = np.linalg.pinv(N * both, rcond=1e-13, hermitian=True) * both
+    inverse: Array = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * both
     return inverse
 
 

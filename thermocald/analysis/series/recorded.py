@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -20,7 +19,7 @@ from thermocald.analysis.series.epochs import Epochs, calibrate_epochs
 from thermocald.arrays import spread_rows
 from thermocald.errors import DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES, project
-from thermocald.photogrammetry.epoch.adjustment import NO_BOUNDS
+from thermocald.photogrammetry.epoch.adjustment import with_few_free
 from thermocald.photogrammetry.linalg import median_known
 from thermocald.photogrammetry.series.long_series import together_at_most
 from thermocald.photogrammetry.series.normals import ObservationGrid
@@ -98,9 +97,7 @@ def _start(
     results = [calibrator.adjust(points) for points in seen]
     found = [r.values for r in results if r.ok]
     if not found and any(r.status == "weak_geometry" for r in results):
-        few = tuple(name for name in ("c", "A1") if name in calibrator.settings.free)
-        s = replace(calibrator.settings, free=few, bounds=NO_BOUNDS, priors={})
-        firm = Calibrator.of_recording(source, s)
+        firm = Calibrator.of_recording(source, with_few_free(calibrator.settings))
         found = [r.values for r in map(firm.adjust, seen) if r.ok]
     if not found:
         statuses = [r.status for r in results]

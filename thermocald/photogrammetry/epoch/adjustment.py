@@ -285,6 +285,12 @@ _AMBIGUITY = 2.0  # a second pose must fit this much worse to be excluded
 _GROSS = 6.0  # times the median residual: left out at first, may come back
 
 
+def with_few_free(s: AdjustmentSettings) -> AdjustmentSettings:
+    """Free what a start needs, c and A1 (of what is free at all), however badly it is known."""
+    few = tuple(name for name in ("c", "A1") if name in s.free)
+    return replace(s, free=few, bounds=NO_BOUNDS, priors={})
+
+
 def cold_start(
     sensor: Sensor,
     testfield: TestField,
@@ -311,10 +317,9 @@ def cold_start(
         few = len(observations) < 4
         word = "too_few_targets" if few else "no_orientation"
         return failed(word, str(error), observations, s.free)
-    first = tuple(name for name in ("c", "A1") if name in s.free)
-    suspects = ~fits
-    if len(first) < len(s.free):
-        loose = replace(s, free=first, snooping_alpha=0.0, bounds=NO_BOUNDS, priors={})
+    suspects, firm = ~fits, with_few_free(s)
+    if len(firm.free) < len(s.free):
+        loose = replace(firm, snooping_alpha=0.0)
         rough = adjust(
             sensor, testfield, observations, start_interior, start_exterior, loose, suspects
         )

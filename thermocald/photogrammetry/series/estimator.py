@@ -296,9 +296,11 @@ class SeriesEstimator:
 
         An estimate that has not settled tells no gross errors: the last one that has is kept.
         """
+        if not estimate.settled:
+            return estimate
         variance, typical = 1.0, None
         history = np.zeros(offered.shape, dtype=np.int8)
-        for _ in range(_ROUNDS if estimate.settled else 0):
+        for _ in range(_ROUNDS):
             use = estimate.system.use
             tests = point_tests(estimate.system, estimate.residuals)
             if typical is None:

@@ -119,7 +119,7 @@ def test_check_refuses_the_configuration(tmp_path, name, stanza):
         {"skew": ["s"], "air": ["temperature"]},
         {"a": ["b_d"], "a_b": ["d"]},
         {"sd": ["board"], "air": ["temperature"]},
-        {"board": ["inner", "temperature"]},  # `temperature` is what the reference is called
+        {"board": ["inner", "temperature"]},  # `temperature` is reserved for the reference
         {"drift": ["px_per_min"], "x": ["y"]},
     ],
 )

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
 from tests.acquisition.test_pipeline import until
 from tests.commands import call
@@ -145,6 +146,22 @@ def test_an_alert_says_so_and_takes_it_back():
     alerts = [(r["epoch"], a.state, a.text) for r in rows for a in output.changes(r, "cam")]
     assert [(n, state) for n, state, _ in alerts] == [(2, "out"), (3, "in"), (4, "out"), (5, "in")]
     assert alerts[2][2] == "cam: 3 epochs were taken and not kept (limit 1)"
+
+
+def test_a_recording_whose_channels_no_epoch_can_have_is_refused_before_it_is_played(tmp_path):
+    """Its epochs would have been kept without any temperature."""
+    recording, store = make_recording(tmp_path / "small", 20), tmp_path / "t.db"
+    head, epochs = recording / "recording.yaml", recording / "epochs.csv"
+    document = yaml.safe_load(head.read_text())
+    document["temperatures"] = {"board": {"unit": "degC"}, **document["temperatures"]}
+    head.write_text(yaml.safe_dump(document, sort_keys=False))
+    names, *rows = [line.split(",") for line in epochs.read_text().splitlines()]
+    table = [[*names[:3], "board", *names[3:]], *([*r[:3], "20.0", *r[3:]] for r in rows)]
+    epochs.write_text("\n".join(map(",".join, table)) + "\n")
+    done = call("run", "--recording", recording, "--fast", "--store", store)
+    assert (done.returncode, store.exists()) == (1, False)
+    assert "small: cannot be played" in done.stderr
+    assert "make it the first, or rename it" in done.stderr
 
 
 @pytest.mark.parametrize("table", ["epochs.csv", "observations.csv"])

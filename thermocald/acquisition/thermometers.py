@@ -66,8 +66,8 @@ def require_columns(thermometers: Mapping[str, Iterable[str]], error: type[Excep
     require_channels(columns, where, error)
     if "temperature" in columns[1:]:
         raise error(
-            f"{where}: `temperature` is what the reference is called, the first of the channels "
-            f"({', '.join(columns)}); make it the first, or rename it"
+            f"{where}: the name `temperature` is reserved for the reference, which is the first of "
+            f"the channels ({', '.join(columns)}); make it the first, or rename it"
         )
     return columns
 

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator
+from thermocald.acquisition.thermometers import require_columns
 from thermocald.config import parse_config
-from thermocald.errors import ConfigurationError
+from thermocald.errors import ConfigurationError, RecordingError
 from thermocald.hal import open_device
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
@@ -249,6 +250,10 @@ def demo_config(folder: Path, seed: int) -> Config:
 def recording_config(path: Path) -> Config:
     """Return a recording as camera and thermometer; RecordingError where it cannot be played."""
     head = open_recording(path).head
+    try:
+        require_columns({"recorded": head.channels}, ConfigurationError)
+    except ConfigurationError as error:
+        raise RecordingError(f"{path}: cannot be played: {error}") from error
     sensor = head.camera.sensor
     replay = {"driver": "replay", "recording": str(path.absolute())}
     period = max(0.05, head.interval)

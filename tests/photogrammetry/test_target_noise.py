@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from thermocald.photogrammetry.epoch.snooping import limit_2d
-from thermocald.photogrammetry.series.target_noise import noise_ratios
+from thermocald.photogrammetry.series.target_noise import neighbours_variance, noise_ratios
 
 TARGETS = 150
 ALPHA = 0.002
@@ -83,3 +83,17 @@ def test_a_few_jumps_do_not_raise_a_targets_noise():
     residuals[3, :, 0] += 50.0
     after, _ = noise_ratios(residuals, weights, used, 1.0)
     assert np.median(np.abs(after / before - 1.0)) < 0.2
+
+
+def test_the_noise_of_neighbours_follows_what_changes_slowly_and_no_single_epoch():
+    unit = np.concatenate([np.ones(30), np.linspace(1.0, 6.0, 50), np.full(20, 40.0)])
+    unit[[10, 60, 0]] = 500.0
+    all_count = np.ones(100, dtype=bool)
+    about = neighbours_variance(unit, all_count)
+    assert about[10] == about[0] == 1.0
+    assert about[60] == pytest.approx(np.median(unit[53:68]))
+    assert about[-1] == 9.0  # three times the noise: no more is taken for noise
+    some = all_count.copy()
+    some[20:40] = False
+    assert neighbours_variance(unit, some)[30] == 1.0
+    assert (neighbours_variance(np.full(9, 5.0), all_count[:9]) == 1.0).all()

@@ -38,6 +38,7 @@ from thermocald.photogrammetry.series.long_series import KnownSeries
 from thermocald.photogrammetry.series.mount import FEWEST_EPOCHS, drift_period, image_px
 from thermocald.photogrammetry.series.normals import ObservationGrid, misplaced_targets
 from thermocald.photogrammetry.series.result import SeriesSettings
+from thermocald.photogrammetry.series.target_noise import FEW_EPOCHS
 
 if TYPE_CHECKING:
     from thermocald.acquisition.calibrator import CalibratedEpoch
@@ -60,6 +61,7 @@ _TURNED_PX, _STAYS = 30.0, 2  # beyond one linearisation, and for so many epochs
 _USUAL_TREMBLE_PX = 0.08  # the most that mounts of the real cameras do that were looked at
 _LEFT = 0.01  # of the error probability of the series' test of a point, for a second one
 _AGAINST = ("too_many_rejected", "global_test")  # what a series says of an epoch it contradicts
+_CARRIED = ("weak_geometry", "global_test")  # of epochs by themselves that a series may carry
 _MOST_SAID = 6  # targets by name
 _DOUBTED = 5  # epochs in a row that carry a result of their own and have none in the series
 
@@ -224,8 +226,8 @@ class RunningSeries:
         its observations with the sigmas with which they are adjusted; hurried: others wait.
         """
         alone = calibrated.adjustment
-        weak = alone.status == "weak_geometry" and alone.interior is not None
-        if not self.any or not (alone.ok or weak):
+        carried = alone.status in _CARRIED and alone.interior is not None
+        if not self.any or not (alone.ok or carried):
             return alone, {}
         self._hurried = hurried
         columns: dict[str, float] = {}
@@ -237,16 +239,18 @@ class RunningSeries:
             columns["series_restarted"] = 1.0
         self._away = 0
         self.remember(calibrated, seen)
+        if alone.status == "global_test" and len(self._kept) < FEW_EPOCHS:
+            return alone, columns  # too few show whether the noise is larger than stated
         own, whole = self._adjusted()
         columns |= self._columns(whole)
-        if not weak:  # what is weak contradicts nothing
+        if not carried:  # what is weak contradicts nothing
             against = any(e is not None and e.status in _AGAINST for e in (own, whole))
             self._doubts = self._doubts + 1 if against else 0
         refined = alone
         if own is not None and own.status == "ok":
             values = own.values - self._level
             self._kept[-1].reported = values
-        elif weak and whole.status == "ok" and self._series is not None:
+        elif carried and whole.status == "ok" and self._series is not None:
             # too weak by itself, carried by its series: with what the series' level is sure to
             values, level = whole.values, np.diag(self._series.sample.level_sd**2)
             own = replace(whole, covariance=whole.covariance + level)

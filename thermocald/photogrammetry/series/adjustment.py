@@ -72,6 +72,7 @@ from thermocald.photogrammetry.series.system import State
 from thermocald.photogrammetry.series.target_noise import (
     FEW_EPOCHS,
     excess_scatter,
+    neighbours_variance,
     noise_by_radius,
     slow_errors,
 )
@@ -364,11 +365,15 @@ def judged(
         "blurred image",
     )
     say(~estimate.solved, "weak_geometry", "these targets cannot carry the parameters")
+    failing = fails_global_test(unit, redundancy)
+    if failing.any():
+        about = neighbours_variance(unit, estimate.solved)
+        failing = fails_global_test(unit / about, redundancy)
     say(
-        fails_global_test(unit, redundancy),
+        failing,
         "global_test",
-        "the residuals are larger than the series' noise allows, and too few to tell which target "
-        "is wrong: show more targets",
+        "the residuals are larger than the noise of its neighbours allows, and too few to tell "
+        "which target is wrong: show more targets",
     )
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     c, pitch = values[:, 0], sensor.pixel_pitch

@@ -39,6 +39,7 @@ _LEAST_CORRELATION = 0.3
 _SMOOTH = 15  # epochs
 _FEWEST_RADII = 8  # targets
 _LOG_CHI2 = np.pi**2 / 6  # variance of the logarithm of chi-square with two degrees of freedom
+_NOISIEST = 9.0  # times the series' variance of unit weight: three times its noise
 _CLIP = 60.0  # times the median square: beyond it is not scatter but a jump
 
 
@@ -199,6 +200,24 @@ def slow_errors(residuals: Array, used: Mask) -> Array:
     left = np.sqrt(np.maximum(1 - variance / np.maximum(slope**2, 1e-300), 0.0))
     slow: Array = np.where(enough, slope * left, 0.0)
     return slow
+
+
+def neighbours_variance(unit: Array, known: Mask) -> Array:
+    """Return the variance of unit weight (E,) about each epoch, over the series' own, 1 to 9.
+
+    unit (E,): of the epochs, over the series' own; known (E,): which of them count. The median of
+    the 15 epochs around each, 1 where fewer than 10 of them count: the noise of a camera that
+    warms up and defocuses changes slowly, a gross error is of one epoch.
+    """
+    if len(unit) < FEW_EPOCHS:
+        return np.ones(len(unit))
+    size = min(_SMOOTH, len(unit))
+    windows = np.lib.stride_tricks.sliding_window_view(np.where(known, unit, np.nan), size)
+    enough = np.isfinite(windows).sum(axis=1) >= FEW_EPOCHS
+    middle = np.ones(len(windows))
+    middle[enough] = np.nanmedian(windows[enough], axis=1)
+    at = np.clip(np.arange(len(unit)) - size // 2, 0, len(windows) - 1)
+    return np.clip(middle, 1.0, _NOISIEST)[at]
 
 
 def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool = True) -> Array:

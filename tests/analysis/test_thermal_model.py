@@ -76,6 +76,21 @@ def test_two_series_are_better_than_one(fitted):
     assert len(both.model.fitted_on) == 2
 
 
+@pytest.mark.parametrize("seed", [3, *(pytest.param(k, marks=pytest.mark.slow) for k in (4, 5))])
+def test_sixteen_targets_carry_a_fit(seed):
+    """Twelve or more of them are seen in most epochs; fewer than three such epochs are refused."""
+    s = simulated(seed)
+    rows = np.sort(np.random.default_rng(seed).permutation(len(s.field))[:16])
+    few = replace(s, field=s.field.subset(rows))
+    model = fit_thermal_model([reduced(few)], [START]).model
+    for name, rate in s.model.rates.items():
+        assert abs(model.rates[name] - rate) < 3.5 * model.sd(f"rates.{name}")
+    lag = model.effects[0]
+    assert abs(lag.values["tau"] - 70.0) < 3.5 * lag.sds["tau"] < 20.0
+    with pytest.raises(DataError, match="fewer than 3 epochs show 12 targets or more"):
+        reduced(replace(s, field=s.field.subset(rows[:11])))
+
+
 @pytest.mark.slow
 def test_an_event_and_a_phase_belong_to_a_series():
     """A slip at another time in each series, none in the third; a fan at another phase."""

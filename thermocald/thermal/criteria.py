@@ -9,7 +9,6 @@ from __future__ import annotations
 
 MIN_EPOCHS = 20  # with a result: six blocks left out hold three epochs each
 LEAST_EPOCHS = 3  # for a fit of known effects
-ENOUGH_TARGETS = 20  # of an epoch that a fit of known effects can use
 MIN_TARGETS = 12  # for 19 unknowns and five redundant coordinates
 MIN_DURATION = 120.0  # s: heat needs minutes to reach a camera
 LEAST_CHANGE_K = 1.0  # of the temperature, and LEAST_CHANGE times its noise

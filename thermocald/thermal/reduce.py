@@ -72,10 +72,10 @@ def require(source: SeriesInput, strict: bool) -> None:
         )
     seen = source.grid.observed.sum(axis=1)
     if not strict:
-        if np.sum(seen >= criteria.ENOUGH_TARGETS) < criteria.LEAST_EPOCHS:
+        if np.sum(seen >= criteria.MIN_TARGETS) < criteria.LEAST_EPOCHS:
             raise DataError(
                 f"{source.name}: fewer than {criteria.LEAST_EPOCHS} epochs show "
-                f"{criteria.ENOUGH_TARGETS} targets or more"
+                f"{criteria.MIN_TARGETS} targets or more"
             )
         return
     reference = next(iter(source.readings))

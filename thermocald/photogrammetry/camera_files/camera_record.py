@@ -29,10 +29,11 @@ def yaml_mapping(text: str) -> dict[Any, Any]:
     """Return the mapping in a YAML text; ConfigurationError if it is no YAML or no mapping."""
     try:
         document = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError) as cause:
+    except (yaml.YAMLError, ValueError, AttributeError, LookupError, RecursionError) as cause:
+        # the last four by PyYAML itself, such as IndexError for `!!int ''`
         raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
     if not isinstance(document, dict):
-        raise ConfigurationError("the file holds no keys")
+        raise ConfigurationError("the file has no keys")
     return document
 
 
@@ -180,7 +181,7 @@ def _encode_own(record: CameraRecord) -> str:
 def _decode_own(text: str) -> CameraRecord:
     try:
         document = json.loads(text)
-    except json.JSONDecodeError as cause:
+    except (json.JSONDecodeError, RecursionError) as cause:
         raise ConfigurationError(f"no valid JSON: {cause}") from None
     if not isinstance(document, dict) or document.get("format") != _VERSION:
         raise ConfigurationError(f"no camera file: format is not {_VERSION!r}")
@@ -192,9 +193,9 @@ def _decode_own(text: str) -> CameraRecord:
     if "c" not in values:
         raise ConfigurationError("interior.c is missing")
     interior = np.array([number(values.get(name, 0.0), f"interior.{name}") for name in IOP_NAMES])
-    covariance = None
-    if document.get("covariance") is not None:
-        matrix = document["covariance"].get("matrix")
+    covariance = document.get("covariance")
+    if covariance is not None:
+        matrix = covariance.get("matrix") if isinstance(covariance, dict) else None
         covariance = numbers(matrix, "covariance.matrix", (100,)).reshape(10, 10)
     name = str(document.get("name", "camera"))
     return CameraRecord(size, BROWN, interior, name, covariance, pitch)

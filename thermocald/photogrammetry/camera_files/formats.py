@@ -141,11 +141,12 @@ def _encode_ros(record: CameraRecord) -> str:
 def _decode_ros(text: str) -> CameraRecord:
     document = yaml_mapping(text)
     model = document.get("distortion_model")
-    if model not in _ROS_COUNTS:
+    count = _ROS_COUNTS.get(str(model))
+    if count is None:
         raise ConfigurationError(
             f"distortion_model {model!r}: only plumb_bob and rational_polynomial can be read"
         )
-    return _of_matrices(document, (_ROS_COUNTS[model],))
+    return _of_matrices(document, (count,))
 
 
 ROS = Format(
@@ -222,16 +223,16 @@ def _encode_mrcal(record: CameraRecord) -> str:
 def _decode_mrcal(text: str) -> CameraRecord:
     try:
         document = ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError, MemoryError, RecursionError):
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
         raise ConfigurationError("no .cameramodel: not a dictionary in Python's notation") from None
     if not isinstance(document, dict):
         raise ConfigurationError("no .cameramodel: not a dictionary")
     lens = document.get("lensmodel")
-    if lens not in _MRCAL_COUNTS:
+    count = _MRCAL_COUNTS.get(str(lens))
+    if count is None:
         raise ConfigurationError(
             f"lensmodel {lens!r}: only {', '.join(sorted(_MRCAL_COUNTS))} can be read"
         )
-    count = _MRCAL_COUNTS[lens]
     values = numbers(document.get("intrinsics"), "intrinsics", (4 + count,))
     size = numbers(document.get("imagersize"), "imagersize", (2,))
     return CameraRecord(size, opencv(count), values)

@@ -88,7 +88,7 @@ log = logging.getLogger(__name__)
 LinkState = Literal["closed", "open", "out", "failed", "finished"]
 
 _FIRST_PAUSE_S = 0.25
-_LONGEST_PAUSE_S = 2.0  # or the device's period if longer
+_LONGEST_PAUSE_S = 2.0  # or the device's period if that is longer
 _SEARCH_PAUSE_S = 10.0
 
 
@@ -281,7 +281,7 @@ class DeviceLoop:
                     break
                 self._busy_since = self._clock.monotonic()
                 if self._idle():
-                    if self.link.state == "open":  # the state of a device that is away stays
+                    if self.link.state == "open":  # a device that is away stays "out"
                         self.link.close()
                 elif not self.link.do(self._action):
                     self.lost += 1

@@ -112,9 +112,10 @@ class FrameFolder:
             return 0
 
     def enforce(self, now_utc: float | None) -> list[str]:
-        """Delete frames that are too old, then the oldest if space is short; return a text on each.
+        """Delete frames that are too old, then the oldest if space is short.
 
-        now_utc: s; None if the clock is not trusted: then no frame is deleted for its age.
+        Returns a sentence for each reason. now_utc: s; None if the clock is not trusted, so that no
+        frame is deleted for its age.
         """
         config = self.config
         files = sorted(self._files())

@@ -79,7 +79,7 @@ class Keeper(Protocol):
         """Store the calibration of an epoch that was stored uncalibrated."""
 
     def backlog(self, below: int) -> Epoch | None:
-        """Return an uncalibrated epoch with a number below, and the path of its frame in it."""
+        """Return an uncalibrated epoch with a number below `below`, and with its frame's path."""
 
 
 class Pipeline:

@@ -74,7 +74,7 @@ class SteadyClock:
         return self._machine.sleep_until(monotonic, wake)
 
     def check(self) -> ClockStep | None:
-        """Return a step of the machine's clock, or an earlier one that has lasted long enough."""
+        """Return a new step of the machine's clock, or an earlier one that is followed now."""
         now = self._machine.monotonic()
         offset = _offset(self._machine)
         learned = not self._was_synchronised and self._synchronised()
@@ -87,7 +87,7 @@ class SteadyClock:
                 self._leapt_at = now
         ahead = offset - self._offset
         pending = abs(ahead) >= _STEP_S
-        # so has a machine whose clock showed a time before this program existed
+        # a clock that showed a time before this program existed has just learned it, too
         learned |= self.utc() < NOT_BEFORE <= self._machine.utc()
         adopted = pending and (learned or now - self._seen_at >= _CONFIRM_S)
         if adopted:
@@ -112,7 +112,7 @@ class SteadyClock:
         return abs(self.error_s) < _WRONG_S and self._synchronised()
 
     def settled(self) -> bool:
-        """Return whether this clock may tell ages: it is trusted, and has not leapt for a day."""
+        """Return whether ages are certain: the clock is trusted, and has not leapt for a day."""
         since_leap = self._machine.monotonic() - self._leapt_at
         return self.trusted() and since_leap >= _SETTLE_S and self.utc() >= NOT_BEFORE
 

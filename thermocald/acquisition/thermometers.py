@@ -34,8 +34,8 @@ def pair_readings(
 ) -> tuple[float, dict[str, float], float]:
     """Join one reading per thermometer, the reference first, into the temperatures of an epoch.
 
-    Returns the reference's UTC, s; {channel: °C}; and its reading's time minus the frame's, s. The
-    times are those of the first thermometer with a reading, NaN if there is none.
+    Returns the reference's UTC, s; {channel: °C}; and its reading's time minus the frame's, s. If
+    the reference has no reading, the next thermometer with one gives the times; NaN if none has.
 
     A single thermometer's channels keep their names; with several, the channel `temperature` is
     called `<thermometer>`, and others `<thermometer>_<channel>`.
@@ -122,7 +122,7 @@ class Thermometers:
         return reading
 
     def read_now(self, names: Sequence[str]) -> None:
-        """Read some thermometers in the caller's thread: a recording's, with its frames."""
+        """Read some thermometers in the caller's thread, as a recording's with its frames."""
         for name in names:
             self.links[name].do(partial(self.read, name))
 

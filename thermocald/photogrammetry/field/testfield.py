@@ -44,7 +44,7 @@ class TestField:
     without one; kinds, codes: n strings as defined in CONVENTIONS §3; a code may be empty.
     """
 
-    __test__ = False  # pytest collects classes whose names begin so
+    __test__ = False  # pytest would collect a class of this name
 
     names: tuple[str, ...]
     points: Array
@@ -351,7 +351,7 @@ def sheet_normals(points: Array, labels: NDArray[np.int64], nearest: int) -> Arr
 def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array, bool]:
     """Fit a plane to points (n, 3); return its centre (3,), axes (3, 3), and whether it is flat.
 
-    The axes are rows, right-handed, the last one is the normal. Flat: the RMS distance from the
+    The axes are right-handed rows, the last of them the normal. Flat: the RMS distance from the
     plane is below `tolerance` times the RMS extent in it.
     """
     X = np.asarray(points, dtype=float)
@@ -397,9 +397,10 @@ def _sheets(points: Array, least: float) -> NDArray[np.int64]:
 
 
 def _neighbours(points: Array) -> tuple[NDArray[np.int64], float]:
-    """Return each target and its nearest (n, k + 1), and the median distance of the third nearest.
+    """Return the rows (n, k + 1) of each target and its nearest, and the spacing of targets, mm.
 
-    The third, since the corners of one marker are nearer to each other than to the next marker.
+    The spacing is the median distance to the third nearest, which for corners of markers is on the
+    next marker.
     """
     # not SciPy's tree, whose import takes 25 MB of the daemon's memory
     k = min(_SEED, len(points) - 1)
@@ -415,7 +416,7 @@ def _neighbours(points: Array) -> tuple[NDArray[np.int64], float]:
 def _plane(
     points: Array, near: NDArray[np.int64], left: NDArray[np.bool_], tolerance: float
 ) -> NDArray[np.int64]:
-    """Return the remaining targets in the plane of a target and some of its neighbours."""
+    """Return the remaining targets in the plane of `near`: a target and some of its neighbours."""
     inside = near[left[near]]
     found = np.zeros(0, dtype=np.int64)
     # the largest neighbourhood that is flat, since two boards may meet at an edge

@@ -262,7 +262,7 @@ def _track_circles(
     # the noise may have changed since the weights were computed; calm targets show by how much
     factor = float(_median(misfit[calm])) ** 2 if calm.any() else 1.0
     np.multiply(fit.covariances, factor, out=fit.covariances)
-    # the others have moved as the calm ones
+    # assume that the others have moved like the calm ones
     shift = _median(p[calm, :2] - old[calm, :2]) if calm.any() else np.zeros(2)
     if again.any():
         if np.abs(shift).max() > farthest:

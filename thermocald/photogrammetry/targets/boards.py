@@ -154,7 +154,7 @@ def chessboard(
 ) -> TestField:  # fmt: skip
     """Build a plain chessboard of columns × rows inner corners, whose upper left square is black.
 
-    square: side, mm. TestFieldError for a board that looks the same upside down.
+    square, square_y: sides, mm. TestFieldError for a board that looks the same upside down.
     """
     if not (3 <= columns <= 100 and 3 <= rows <= 100 and square > 0):
         raise TestFieldError(

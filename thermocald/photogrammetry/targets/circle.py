@@ -49,7 +49,7 @@ _HALF, _ONE, _FARTHEST = np.float32(0.5), np.float32(1.0), np.float32(6.0)
 
 
 def normal_cdf(z: Single) -> Single:
-    """Return the standard normal distribution function to 2e-5, ten times faster than exactly."""
+    """Return the standard normal distribution function to 2e-5, ten times as fast as exactly."""
     z = np.minimum(np.maximum(z, -_FARTHEST), _FARTHEST)
     square = z * z
     value = square * _CDF[0]

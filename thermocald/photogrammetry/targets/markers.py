@@ -96,7 +96,7 @@ def marker_dictionaries() -> list[str]:
 
 
 def marker_size(name: str, border: int = 1) -> int:
-    """Return the number of cells along a marker's side, its black border of `border` included."""
+    """Return the number of cells along the side of a marker with a border of `border` cells."""
     return int(dictionary(name).markerSize) + 2 * border
 
 
@@ -156,7 +156,7 @@ def parse_marker(code: str) -> tuple[str, int, int | None]:
         )
     known = len(dictionary(parts[0]).bytesList)
     marker = int(numbers[0][:9])
-    corner = int(numbers[1]) if len(numbers) == 2 else None
+    corner = int(numbers[1][:9]) if len(numbers) == 2 else None
     if marker >= known:
         raise TestFieldError(f"{code!r}: {parts[0]} has markers 0 to {known - 1}")
     if corner is not None and corner > 3:
@@ -165,7 +165,7 @@ def parse_marker(code: str) -> tuple[str, int, int | None]:
 
 
 def to_8_bit(image: Image) -> NDArray[np.uint8]:
-    """Return the image, if 16-bit scaled so that its brightest value is 255."""
+    """Return the image; one of 16 bit is scaled so that its brightest value is 255."""
     if image.dtype == np.uint8:
         return image  # type: ignore[return-value]
     return cv2.convertScaleAbs(image, alpha=255.0 / max(int(image.max()), 1))  # type: ignore[return-value]

@@ -291,7 +291,7 @@ _COMPACTNESS = 0.5
 _AREA_TOLERANCE = 0.12
 _RADIUS_TOLERANCE = 0.03
 _SMALLEST_AXIS = 1.5
-_LARGEST_AXIS_RATIO = 3.2  # 60° obliqueness and then some perspective
+_LARGEST_AXIS_RATIO = 3.2  # an obliqueness of 60°, and some perspective
 
 
 def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -> LocalMap:
@@ -316,7 +316,7 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -
     # the reduced image covers the original: (x + ½) scales by the true ratio of the sizes
     ratio = np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]])
     centre = (e[:, :2] + 0.5) * ratio - 0.5
-    # a contour is through pixel centres, half a pixel inside the outline
+    # a contour goes through pixel centres, half a pixel inside the outline
     (a, b), c, s = scale * (e[:, 2:4].T + 0.5), np.cos(e[:, 4]), np.sin(e[:, 4])
     linear = np.stack([a * c, -b * s, a * s, b * c], axis=1).reshape(-1, 2, 2)
     return LocalMap(centre, linear, np.zeros((len(e), 2, 3)))

@@ -103,7 +103,7 @@ def parse(code: str) -> tuple[int, int]:
             f"{code!r} is not a ring code; write RING12:<code> or RING14:<code>, such as RING12:"
             f"{codes(12)[0]}"
         )
-    value = int(number)
+    value = int(number[:9])
     if value >> bits or _code_table(bits)[value] != value:
         raise TestFieldError(
             f"{code!r}: there is no {bits}-bit ring code {value}; a code is the smallest number "
@@ -325,9 +325,9 @@ _LEAST_RELIEF = 0.35  # range of levels in the ring; a plain circle has none
 _SHARE = 0.85  # of the samples on a circle that must agree
 _LEAST_CONTRAST_DN = 10.0
 _SMALLEST_SEMI_AXIS_PX = 2.6  # a smaller gap is not resolved
-_RASTER_PX = 0.5  # tolerance of a transition on the raster, plus that in turns
+_RASTER_PX = 0.5  # tolerance of a transition on the raster: px plus turns
 _RASTER_TURNS = 0.006
-# A closed ring with something across it reads as one arc, a line through a dot as two single bits.
+# A closed ring with a bar across it reads as one arc, a line through a dot as two single bits.
 _MISFIT_OF_FEW = 0.06
 
 
@@ -436,7 +436,7 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
     np.maximum.at(
         off, target, np.abs((phase / (2 * np.pi) - offset[target] * bits + 0.5) % 1 - 0.5) / bits
     )
-    # A pixel is an angle that is larger for small targets: along the minor semi-axis.
+    # a pixel is a larger angle on a smaller target, along the minor semi-axis
     allowed = _RASTER_TURNS + _RASTER_PX / (2 * np.pi * 2.5 * maps.semi_axes[:, 1])
     on_raster = off < np.minimum(allowed, 0.3 / bits)
 

@@ -70,7 +70,7 @@ class ImportedCamera:
 
 def _format(name: str) -> Format:
     if name not in FORMATS:
-        raise UsageError(f"camera file format {name!r} is unknown: there are {', '.join(FORMATS)}")
+        raise UsageError(f"unknown camera file format {name!r}; give one of {', '.join(FORMATS)}")
     return FORMATS[name]
 
 
@@ -199,13 +199,13 @@ def _read_text(path: Path, format_: str | None = None) -> tuple[str, Format]:
     except OSError as cause:
         raise ConfigurationError(f"{path}: cannot be read: {cause.strerror}") from cause
     except UnicodeDecodeError:
-        raise ConfigurationError(f"{path}: no text file, and so no camera file") from None
+        raise ConfigurationError(f"{path}: not a text file, so not a camera file") from None
     if format_ is not None:
         return text, _format(format_)
     for candidate in FORMATS.values():
         if candidate.recognises(text):
             return text, candidate
-    raise ConfigurationError(f"{path}: no camera file of any of the formats {', '.join(FORMATS)}")
+    raise ConfigurationError(f"{path}: not a camera file of any format: {', '.join(FORMATS)}")
 
 
 def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
@@ -216,13 +216,13 @@ def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
     pixel_pitch: mm, for files of other programs that do not state it.
     """
     try:
-        known = _read_text(path)[1].name
+        format_ = _read_text(path)[1].name
     except ConfigurationError:  # none of the formats: our own YAML
         reader = QuantityReader(path, read_yaml(path, ConfigurationError))
         if "camera" in reader.mapping:
             reader = reader.inner("camera")
         return CameraSpec.read(reader, path.stem)
-    camera = read(path, known, pixel_pitch)
+    camera = read(path, format_, pixel_pitch)
     interior = camera.model.interior
     return CameraSpec(camera.name, camera.model.sensor, interior.c, interior)
 

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 
 def yaml_mapping(text: str) -> dict[Any, Any]:
-    """Return the mapping in a YAML text; ConfigurationError if it is no YAML or no mapping."""
+    """Return the mapping in a YAML text; ConfigurationError if it is not YAML or not a mapping."""
     try:
         document = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, AttributeError, LookupError, RecursionError) as cause:
         # the last four by PyYAML itself, such as IndexError for `!!int ''`
-        raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
+        raise ConfigurationError(f"not valid YAML: {str(cause).splitlines()[0]}") from None
     if not isinstance(document, dict):
         raise ConfigurationError("the file has no keys")
     return document
@@ -182,9 +182,9 @@ def _decode_own(text: str) -> CameraRecord:
     try:
         document = json.loads(text)
     except (json.JSONDecodeError, RecursionError) as cause:
-        raise ConfigurationError(f"no valid JSON: {cause}") from None
+        raise ConfigurationError(f"not valid JSON: {cause}") from None
     if not isinstance(document, dict) or document.get("format") != _VERSION:
-        raise ConfigurationError(f"no camera file: format is not {_VERSION!r}")
+        raise ConfigurationError(f"not a camera file: format is not {_VERSION!r}")
     head, values = document.get("sensor"), document.get("interior")
     if not isinstance(head, dict) or not isinstance(values, dict):
         raise ConfigurationError("sensor or interior is missing")

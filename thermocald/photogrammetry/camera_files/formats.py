@@ -174,7 +174,7 @@ def _decode_kalibr(text: str) -> CameraRecord:
     document = yaml_mapping(text)
     camera = document.get("cam0")
     if not isinstance(camera, dict):
-        raise ConfigurationError("no camchain: cam0 is missing")
+        raise ConfigurationError("not a camchain: cam0 is missing")
     if "cam1" in document:
         raise ConfigurationError("the camchain has several cameras: delete all but one")
     kinds = camera.get("camera_model"), camera.get("distortion_model")
@@ -224,9 +224,9 @@ def _decode_mrcal(text: str) -> CameraRecord:
     try:
         document = ast.literal_eval(text.strip())
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-        raise ConfigurationError("no .cameramodel: not a dictionary in Python's notation") from None
+        raise ConfigurationError("not a dictionary in Python's notation") from None
     if not isinstance(document, dict):
-        raise ConfigurationError("no .cameramodel: not a dictionary")
+        raise ConfigurationError("not a dictionary")
     lens = document.get("lensmodel")
     count = _MRCAL_COUNTS.get(str(lens))
     if count is None:
@@ -435,7 +435,7 @@ def _decode_metashape(text: str) -> CameraRecord:
     try:
         root = ET.fromstring(text)
     except ET.ParseError as cause:
-        raise ConfigurationError(f"no valid XML: {cause}") from None
+        raise ConfigurationError(f"not valid XML: {cause}") from None
     found = [root] if root.tag == "calibration" else root.findall(".//sensor/calibration")
     found = [c for c in found if c.get("class") != "initial"]
     if len(found) != 1:

@@ -65,10 +65,10 @@ def predict_circles(
     """
     rows = np.nonzero(testfield.circles & np.isfinite(testfield.diameters))[0]
     points = testfield.points[rows]
-    given = field_normals(testfield) if normals is None else normals
-    known, cosine = facing(exterior.centre, points, given[rows])
+    normals = field_normals(testfield) if normals is None else normals
+    normals, cosine = facing(exterior.centre, points, normals[rows])
     maps = local_maps(
-        camera.sensor, camera.interior.as_array(), exterior.as_array(), points, known,
+        camera.sensor, camera.interior.as_array(), exterior.as_array(), points, normals,
         testfield.diameters[rows] / 2,
     )  # fmt: skip
     visible = (

@@ -125,13 +125,13 @@ def charuco(
             f"a ChArUco board of {columns} × {rows} squares of {square:g} mm with markers of "
             f"{marker:g} mm: it must have 2 to 100 squares, and markers smaller than squares"
         )
-    known = markers_of(dictionary)
+    markers = markers_of(dictionary)
     numbers = np.arange(columns * rows // 2, dtype=np.int32)
-    if numbers[-1] >= len(known.bytesList):
+    if numbers[-1] >= len(markers.bytesList):
         raise TestFieldError(
-            f"{dictionary} has {len(known.bytesList)} markers, but the board needs {len(numbers)}"
+            f"{dictionary} has {len(markers.bytesList)} markers, but the board needs {len(numbers)}"
         )
-    board = cv2.aruco.CharucoBoard((columns, rows), square, marker, known, numbers)
+    board = cv2.aruco.CharucoBoard((columns, rows), square, marker, markers, numbers)
     board.setLegacyPattern(legacy)
     corners = np.asarray(board.getChessboardCorners(), dtype=float)
     names = [f"C{i}" for i in range(len(corners))]
@@ -208,7 +208,7 @@ def chess_code(columns: int, rows: int, number: int) -> str:
 
 
 def parse_chess(code: str) -> tuple[int, int, int]:
-    """Parse `CHESS:9x6:17` to (9, 6, 17); TestFieldError if it is no such code."""
+    """Parse `CHESS:9x6:17` to (9, 6, 17); TestFieldError if it is not such a code."""
     found = _CODE.fullmatch(code)
     if found is None:
         raise TestFieldError(f"{code!r} is not a corner of a chessboard: write CHESS:9x6:17")

@@ -423,8 +423,8 @@ def _directory(entries: Mapping[int, _Value], start: int) -> bytes:
 def _with_segment(jpeg: bytes, kind: int, content: bytes) -> bytes:
     """Insert a segment after those with metadata."""
     place = 2
-    for known, _, end in _segments(jpeg):
-        if known not in _METADATA_JPEG and known != 0xE0:
+    for marker, _, end in _segments(jpeg):
+        if marker not in _METADATA_JPEG and marker != 0xE0:
             break
         place = end
     segment = struct.pack(">BBH", 0xFF, kind, len(content) + 2) + content

@@ -154,11 +154,11 @@ def parse_marker(code: str) -> tuple[str, int, int | None]:
             f"{code!r} is not a marker code; write, for example, DICT_APRILTAG_36h11:17:0 for "
             "corner 0 of marker 17"
         )
-    known = len(dictionary(parts[0]).bytesList)
+    count = len(dictionary(parts[0]).bytesList)
     marker = int(numbers[0][:9])
     corner = int(numbers[1][:9]) if len(numbers) == 2 else None
-    if marker >= known:
-        raise TestFieldError(f"{code!r}: {parts[0]} has markers 0 to {known - 1}")
+    if marker >= count:
+        raise TestFieldError(f"{code!r}: {parts[0]} has markers 0 to {count - 1}")
     if corner is not None and corner > 3:
         raise TestFieldError(f"{code!r}: a marker has corners 0 to 3")
     return parts[0], marker, corner

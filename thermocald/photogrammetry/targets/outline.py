@@ -94,8 +94,8 @@ def facing(centre: Array, points: Array, normals: Array) -> tuple[Array, Array]:
     """
     view = centre - points
     view /= np.linalg.norm(view, axis=1, keepdims=True)
-    known = np.where(np.isfinite(normals), normals, view)
-    return known, np.abs(np.sum(view * known, axis=1))
+    normals = np.where(np.isfinite(normals), normals, view)
+    return normals, np.abs(np.sum(view * normals, axis=1))
 
 
 def local_maps(

@@ -66,8 +66,8 @@ def test_retention_by_age_and_by_size_takes_the_oldest_and_says_so(folder_of):
     left = sorted(p.stem for p in folder.root.rglob("*.jpg"))
     assert left == ["0000005", "0000006"]
     assert deleted == [
-        "1 frames (0.0 MB) were deleted: older than 10 days",
-        "3 frames (0.0 MB) were deleted: more than 2.5e-06 GB",
+        "frames deleted: 1 (0.0 MB), older than 10 days",
+        "frames deleted: 3 (0.0 MB), more than 2.5e-06 GB",
     ]
     assert folder.enforce(now - 1.0) == []
 
@@ -94,7 +94,7 @@ def test_without_a_trusted_clock_nothing_is_deleted_for_its_age(folder_of):
         path = folder.root / folder.keep("cam", "M1", number, frame())
         os.utime(path, (taken, taken))
     assert folder.enforce(None) == []
-    assert folder.enforce(1.76e9)[0].startswith("1 frames ")
+    assert folder.enforce(1.76e9)[0].startswith("frames deleted: 1 ")
     assert folder.enforce(time.time()) == []
     assert path.exists()
 
@@ -112,7 +112,7 @@ def test_frames_taken_before_the_clock_was_set_are_as_old_as_they_are(folder_of)
     os.utime(older, (now - wrong - 7200.0,) * 2)  # of the run before
     folder.restamp(wrong)
     assert [abs(p.stat().st_mtime - (now - 10.0)) < 5.0 for p in paths] == [True, True]
-    assert folder.enforce(now)[0].startswith("1 frames ")
+    assert folder.enforce(now)[0].startswith("frames deleted: 1 ")
     assert not older.exists()
 
 

@@ -161,7 +161,7 @@ def test_a_recording_whose_channels_no_epoch_can_have_is_refused_before_it_is_pl
     done = call("run", "--recording", recording, "--fast", "--store", store)
     assert (done.returncode, store.exists()) == (1, False)
     assert "small: cannot be played" in done.stderr
-    assert "make it the first, or rename it" in done.stderr
+    assert "put this channel first, or rename it" in done.stderr
 
 
 @pytest.mark.parametrize("table", ["epochs.csv", "observations.csv"])

@@ -129,6 +129,7 @@ def test_a_corner_at_the_edge_is_missed_with_a_reason():
     [
         "DICT_NONE:1:0", "DICT_4X4_50:50:0", "DICT_4X4_50:1:4", "DICT_4X4_50", "DICT_4X4_50:a:0",
         "DICT_4X4_50:1:0:0", "DICT_4X4_50:-1:0",
+        pytest.param("DICT_4X4_50:1:" + 5000 * "1", id="5000 digits"),
     ],
 )  # fmt: skip
 def test_what_is_no_marker_code_is_said(code):

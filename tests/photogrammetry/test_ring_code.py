@@ -46,7 +46,11 @@ def test_segments_draw_the_code_from_wherever_one_begins(bits):
         assert ring_code.smallest_rotation(drawn, bits) == number
 
 
-@pytest.mark.parametrize("code", ["RING12:1", "RING13:65", "RING12:", "RING12:x", "RING14:65.0"])
+@pytest.mark.parametrize(
+    "code",
+    ["RING12:1", "RING13:65", "RING12:", "RING12:x", "RING14:65.0",
+     pytest.param("RING12:" + 5000 * "1", id="5000 digits")],
+)  # fmt: skip
 def test_what_is_no_code_is_said(code):
     with pytest.raises(TestFieldError, match="ring code"):
         ring_code.parse(code)

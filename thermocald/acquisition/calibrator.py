@@ -1,9 +1,8 @@
-"""The calibrator of one camera before one test field: epochs in, adjusted epochs out.
+"""The calibrator of one camera and one test field, which measures and adjusts epochs.
 
-It keeps what one epoch knows for the next: where the targets are, and the orientation to start
-from. Without that, or when a start fails (a knock), it begins from nothing by itself. Of a
-recording it begins from nothing every 200 epochs, so that these blocks need nothing of one another
-and give the same bits on any process.
+It passes on from epoch to epoch where the targets are, and the orientation to start from. Without
+these, or if the adjustment fails from them (a knock), it starts anew. In a recording it starts anew
+every 200 epochs, so that these blocks are independent and give the same bits in any process.
 """
 
 from __future__ import annotations
@@ -41,15 +40,15 @@ if TYPE_CHECKING:
     )
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
-_WRONG_START = 5.0  # times the usual sigma0: the camera has been knocked
+_WRONG_START = 5.0  # times the last sigma0; more: the camera has been knocked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedEpoch:
     """An epoch with its observations and its adjustment.
 
-    extra: columns for the store, of `measurement.frame_figures`; searched: why the whole frame was
-    searched, empty where it was not.
+    extra: columns for the store, from `measurement.frame_figures`; searched: why the whole frame
+    was searched, empty if it was not.
     """
 
     epoch: Epoch
@@ -59,14 +58,14 @@ class CalibratedEpoch:
 
 
 class EpochCalibrator(Protocol):
-    """What a pipeline asks: of this module's calibrator, and of one that predicts."""
+    """A calibrator as a pipeline calls it: this module's, or one that predicts the camera."""
 
     testfield: TestField
 
     def calibrate(
         self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
     ) -> CalibratedEpoch:
-        """Make a result of an epoch; never raises for data."""
+        """Calibrate an epoch; never raises for bad data."""
 
     def reset(self) -> None:
         """Forget where the camera was."""
@@ -75,8 +74,8 @@ class EpochCalibrator(Protocol):
 class Calibrator:
     """Measures and adjusts the epochs of one camera, one after the other.
 
-    nominal_c mm: from the data sheet; interior: an earlier calibration, the start and the value of
-    what is held. sigma_floor_px: added in quadrature to the sigmas of image points.
+    nominal_c: mm, from the data sheet; interior: an earlier calibration, for the start and for the
+    parameters held fixed; sigma_floor_px: added in quadrature to the sigmas of image points.
     """
 
     def __init__(
@@ -101,7 +100,7 @@ class Calibrator:
 
     @classmethod
     def of_recording(cls, recording: Any, settings: AdjustmentSettings | None = None) -> Self:
-        """The calibrator of a recording's (store.recording.reader) camera before its test field."""
+        """Return the calibrator of a recording (store.recording.reader)."""
         camera: CameraSpec = recording.head.camera
         return cls(
             camera.sensor,
@@ -120,10 +119,10 @@ class Calibrator:
     def calibrate(
         self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
     ) -> CalibratedEpoch:
-        """Measure the epoch's frame where that is still to be done, and adjust.
+        """Measure the epoch's frame unless it has observations already, and adjust.
 
         image: the frame as grey values or encoded; by default the file that the epoch names. Never
-        raises for data: an epoch without a result has a status and a reason.
+        raises for bad data: an epoch without a result has a status and a reason.
         """
         extra: dict[str, float] = {}
         searched = ""
@@ -149,13 +148,13 @@ class Calibrator:
         return CalibratedEpoch(epoch, self.adjust(observations), extra, searched)
 
     def weighed(self, observations: Observations) -> Observations:
-        """The observations with the sigmas with which they are adjusted."""
+        """Return the observations with the sigmas used in the adjustment."""
         if self._floor == 0:
             return observations
         return replace(observations, sigmas=np.hypot(observations.sigmas, self._floor))
 
     def adjust(self, observations: Observations) -> Adjustment:
-        """Adjust one epoch's observations, warm where the last epoch fits."""
+        """Adjust one epoch's observations, from the last epoch's orientation if it fits."""
         observations = self.weighed(observations)
         last = self._last
         if last is not None and last.interior is not None and last.exterior is not None:
@@ -182,10 +181,10 @@ EPOCHS_OF_A_BLOCK = 200
 def calibrated_epochs(
     calibrator: Calibrator, epochs: Iterable[Epoch], jobs: int = 1
 ) -> Iterator[CalibratedEpoch]:
-    """The epochs as calibrated, in their order.
+    """Yield calibrated epochs in their order.
 
-    calibrator: one that has not seen an epoch; jobs: processes. Never raises for data: an epoch
-    without a result has a status and a reason.
+    calibrator: one that has not calibrated an epoch yet; jobs: number of processes. Never raises
+    for bad data: an epoch without a result has a status and a reason.
     """
     if jobs <= 1:
         for number, epoch in enumerate(epochs):
@@ -195,11 +194,11 @@ def calibrated_epochs(
         return
     source = iter(epochs)
     blocks = iter(lambda: list(islice(source, EPOCHS_OF_A_BLOCK)), [])
-    for block in in_order(_calibrated, calibrator, blocks, jobs):
+    for block in in_order(_calibrate_block, calibrator, blocks, jobs):
         yield from block
 
 
-def _calibrated(calibrator: Calibrator, epochs: list[Epoch]) -> list[CalibratedEpoch]:
-    """A block from nothing; the calibrator is that of a process."""
+def _calibrate_block(calibrator: Calibrator, epochs: list[Epoch]) -> list[CalibratedEpoch]:
+    """Calibrate a block anew with the calibrator of this process."""
     calibrator.reset()
     return [calibrator.calibrate(epoch) for epoch in epochs]

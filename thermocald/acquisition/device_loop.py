@@ -1,13 +1,13 @@
-"""A device in its own thread and with its own schedule: slow or dead, it delays no other.
+"""A device in its own thread with its own schedule: if slow or dead, it delays no other device.
 
-The schedule has absolute deadlines on the monotonic clock: nothing drifts, nothing piles up. Tick k
-is due at begin + k·period. Who asks for the next tick too late for it gets the one after: what was
-missed is counted, never made up for.
+The schedule has absolute deadlines on the monotonic clock, so that it does not drift and ticks do
+not queue up. Tick k is due at begin + k·period. A loop that is late for a tick gets the next one;
+missed ticks are counted and not made up for.
 
-The link opens the device when it is needed, and again after faults with growing pauses. A device
-that goes away is reported once, and once when it is back. A fault that is not recoverable ends the
-link, until the configuration is read again; only a device that was not found is looked for again,
-since it may be plugged in later.
+The link opens the device when it is needed, and again after faults, with growing pauses. It reports
+once that a device goes away, and once that it is back. A permanent fault ends the link until the
+configuration is read again; only a device that was not found is looked for again, since it may be
+plugged in later.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 
     OnEvent = Callable[[float, str, str], None]
 
-_QUEUE = 200  # results that wait for an output
-_LATEST_START = 0.1  # of a period: a tick that would begin later is skipped
+_QUEUE = 200  # results that may wait for an output
+_LATEST_START = 0.1  # of a period; a tick that would begin later is skipped
 _REMEMBERED = 1000
 
 
 class Schedule:
-    """The ticks of one device; one thread waits on it, others may ask for its statistics."""
+    """The ticks of one device; one thread waits for them, others may read the statistics."""
 
     def __init__(self, clock: Clock, period_s: float, begin: float | None = None) -> None:
         self.clock = clock
@@ -52,17 +52,17 @@ class Schedule:
         self._late: deque[float] = deque(maxlen=_REMEMBERED)
 
     def due(self, index: int) -> float:
-        """Return the deadline of a tick; computed, not summed up: no rounding accumulates."""
+        """Return the deadline of a tick; not summed up, so that no rounding accumulates."""
         return self.begin + index * self.period_s
 
     def wait(self, wake: threading.Event | None = None) -> int | None:
-        """Wait for the next tick that is not too late already; None if `wake` was set first.
+        """Wait for the next tick that is not too late, and return its number.
 
-        Returns its number.
+        Returns None if `wake` was set first.
         """
         behind = (self.clock.monotonic() - self.begin) / self.period_s - _LATEST_START
         index = max(self._next, math.ceil(behind))
-        # before the first tick nothing was missed: a device may join a running schedule
+        # before its first tick it missed none: a device may join a running schedule
         skipped = index - self._next if self._ticks else 0
         if not self.clock.sleep_until(self.due(index), wake):
             return None
@@ -88,18 +88,18 @@ log = logging.getLogger(__name__)
 LinkState = Literal["closed", "open", "out", "failed", "finished"]
 
 _FIRST_PAUSE_S = 0.25
-_LONGEST_PAUSE_S = 2.0  # or the device's period, so that no epoch is lost to waiting
+_LONGEST_PAUSE_S = 2.0  # or the device's period if that is longer
 _SEARCH_PAUSE_S = 10.0
 
 
 class Link:
-    """One device and its state; used by one thread, looked at by others.
+    """One device and its state; one thread uses it, others may read its attributes.
 
-    called: kind and name. Attributes for the status: state; why: the last fault; out_since:
-    monotonic s; since: UTC s, when it went away or ended, NaN while it has not; faults: calls that
-    failed.
+    called: kind and name. For the status: state; why: the last fault; out_since: monotonic s;
+    since: UTC s, when the device went away or ended, else NaN; faults: number of failed calls.
     on_event: receives UTC s, a kind and a sentence when the device goes away (`device_out`), comes
-    back (`device_back`), fails for good (`device_failed`), or a recording ends (`device_finished`).
+    back (`device_back`), fails permanently (`device_failed`), or its recording ends
+    (`device_finished`).
     """
 
     def __init__(
@@ -128,11 +128,11 @@ class Link:
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will come of this device."""
+        """Whether the device has failed permanently or its recording has ended."""
         return self.state in ("failed", "finished")
 
     def do(self, action: Callable[[], object]) -> bool:
-        """Do something with the open device; whether it was there."""
+        """Call `action` with the device open; return whether it succeeded."""
         if self.ended or (self.state == "out" and self._clock.monotonic() < self._retry_at):
             return False
         try:
@@ -147,13 +147,13 @@ class Link:
             self.device.close()
             self.since = self._clock.utc()
             self.why = without_secrets(str(error))
-            # a recording that has been played to its end is not a failure
+            # the end of a recording is not a failure
             finished = isinstance(error, DeviceFinished)
             self.state = "finished" if finished else "failed"
             level = logging.INFO if finished else logging.ERROR
-            self._tell(level, f"device_{self.state}", f"{self.called}: {self.why}")
+            self._report(level, f"device_{self.state}", f"{self.called}: {self.why}")
         except Exception as error:
-            # a driver's own mistake must not end the daemon
+            # an error in a driver must not stop the daemon
             if self.state != "out":
                 log.exception("%s: its driver failed", self.called)
             self._out(f"{type(error).__name__}: {error}", max(self._period_s, _LONGEST_PAUSE_S))
@@ -169,17 +169,17 @@ class Link:
             self.state = "closed"
 
     def identity(self) -> dict[str, Any]:
-        """Return what the device says it is; empty if it cannot say."""
+        """Return the device's identity; empty if it cannot be read."""
         try:
             return dict(self.device.identity())
         except Exception:
-            log.exception("%s: does not say what it is", self.called)
+            log.exception("%s: its identity cannot be read", self.called)
             return {}
 
     def _back(self) -> None:
         if self.state == "out":
             away_s = self._clock.monotonic() - self.out_since
-            self._tell(logging.INFO, "device_back", f"{self.called} is back after {away_s:.0f} s")
+            self._report(logging.INFO, "device_back", f"{self.called} is back after {away_s:.0f} s")
         self.state = "open"
         self.since = math.nan
         self.why = ""
@@ -194,13 +194,13 @@ class Link:
             self.state = "out"
             self.out_since = self._clock.monotonic()
             self.since = self._clock.utc()
-            self._tell(logging.WARNING, "device_out", f"{self.called} is out: {why}")
-        # the first retry comes with the next tick, since most faults are of one frame alone
+            self._report(logging.WARNING, "device_out", f"{self.called} is out: {why}")
+        # the first retry is at the next tick, since most faults concern a single frame
         now = self._clock.monotonic()
         self._retry_at = now + 0.9 * self._pause_s
         self._pause_s = min(max(2 * self._pause_s, _FIRST_PAUSE_S), longest_s)
 
-    def _tell(self, level: int, kind: str, text: str) -> None:
+    def _report(self, level: int, kind: str, text: str) -> None:
         log.log(level, "%s", text, extra={"device": self.name, "event": kind})
         self._on_event(self._clock.utc(), kind, text)
 
@@ -221,11 +221,11 @@ class Link:
 
 
 class DeviceLoop:
-    """Calls `action` at every tick while the device is there.
+    """Calls `action` at every tick, with the device open.
 
-    `action` is called with the device open and raises what the device raises. `lost` counts ticks
-    in which the device gave nothing. free_running: without a schedule, as fast as `action` returns.
-    idle: asked at every tick; while it says so, the device is closed and left alone.
+    `action` raises what the device raises; `lost` counts the ticks at which it failed or the device
+    was away. free_running: no schedule, as fast as `action` returns. idle: called at every tick;
+    while it returns true, the device is closed and not used.
     """
 
     def __init__(
@@ -248,30 +248,30 @@ class DeviceLoop:
         self._clock = clock
         self._stop = threading.Event()
         self._busy_since: float | None = None
-        # a hung driver cannot be ended; it must not keep the process from ending either
+        # a hung driver cannot be stopped, and must not keep the process alive
         self._thread = threading.Thread(target=self._run, name=link.called, daemon=True)
 
     def start(self) -> None:
-        """Begin at the next tick."""
+        """Start at the next tick."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask the loop to end after the current call."""
+        """Stop the loop after the current call; returns at once."""
         self._stop.set()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the end; False if the device does not return."""
+        """Wait for the loop to end; False if the device has not returned in time."""
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     def busy_s(self) -> float:
-        """Return for how long the device has not returned from a call; 0 between calls."""
+        """Return how long the current call has taken, s; 0 between calls."""
         since = self._busy_since
         return 0.0 if since is None else self._clock.monotonic() - since
 
     @property
     def alive(self) -> bool:
-        """Whether the loop runs; it also ends by itself when nothing more can come."""
+        """Whether the loop is running; it ends by itself when its link has ended."""
         return self._thread.is_alive()
 
     def _run(self) -> None:
@@ -281,7 +281,7 @@ class DeviceLoop:
                     break
                 self._busy_since = self._clock.monotonic()
                 if self._idle():
-                    if self.link.state == "open":  # one that is away stays so
+                    if self.link.state == "open":  # a device that is away stays "out"
                         self.link.close()
                 elif not self.link.do(self._action):
                     self.lost += 1
@@ -292,7 +292,7 @@ class DeviceLoop:
 
 
 class OutputLoop:
-    """Hands results to one output, in order; one that is slow or gone loses its oldest, no more."""
+    """Hands results to one output, in order; if it is slow or away, it loses the oldest ones."""
 
     def __init__(self, name: str, output: Output, clock: Clock, on_event: OnEvent) -> None:
         self.link = Link("output", name, output, clock, on_event=on_event)
@@ -309,7 +309,7 @@ class OutputLoop:
         self._thread.start()
 
     def put(self, result: Mapping[str, Any]) -> None:
-        """Hand over a result; returns at once."""
+        """Queue a result; returns at once."""
         with self._changed:
             if len(self._queue) >= _QUEUE:
                 self._queue.popleft()
@@ -318,7 +318,7 @@ class OutputLoop:
             self._changed.notify_all()
 
     def stop(self, grace_s: float) -> bool:
-        """Emit what waits, within the grace, and close."""
+        """Emit the waiting results within the grace and close; False if that took too long."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
@@ -340,7 +340,7 @@ class OutputLoop:
                 self.lost += 1
             else:
                 with self._changed:
-                    self._changed.wait(0.5)  # what waits is emitted once the output is back
+                    self._changed.wait(0.5)  # the result is kept until the output is back
                 continue
             with self._changed:
                 if self._queue and self._queue[0] is result:

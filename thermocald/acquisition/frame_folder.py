@@ -1,8 +1,8 @@
-"""Frames on disk: which are kept, for how long, and what goes first when the disk fills up.
+"""Frames on disk: which are kept, for how long, and which are deleted when the disk fills up.
 
-`<folder>/<camera>/<series>/<thousands>/<epoch>.jpg` or `.png`. A JPEG is kept as the camera gave
-it, grey values as PNG; `<epoch>-corrected.jpg` may stand beside it. A file appears as a whole or
-not at all.
+A frame is `<folder>/<camera>/<series>/<thousands>/<epoch>.jpg` or `.png`: a JPEG as the camera gave
+it, grey values as PNG. `<epoch>-corrected.jpg` may be beside it. A file appears as a whole or not
+at all.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ _GB = 1e9
 _PER_FOLDER = 1000
 _NUMBER = re.compile(r"\d{4,}")
 _OURS = re.compile(r"\d{7,}(-corrected)?\.(jpg|png)(\.partial)?")
-_FAST_PNG = 1  # of 9: what takes longer makes it hardly smaller
+_FAST_PNG = 1  # of 9: higher levels take longer, and the file is hardly smaller
 
 
 class FrameFolder:
-    """Writes frames of all cameras, and deletes the oldest; threads may share it."""
+    """The folder with the frames of all cameras; threads may share it."""
 
     def __init__(self, config: FramesConfig) -> None:
         self.config = config
         self.root = config.folder
-        self.paused = ""  # why no frame is written just now
+        self.paused = ""  # why frames are not written at present
         self._since = time.time()
         self._mount = mount_point(self.root)
 
     def wanted(self, number: int, eventful: bool) -> bool:
-        """Return whether the configuration wants the frame of an epoch."""
+        """Return whether the frame of an epoch is to be kept by the configuration."""
         match self.config.keep:
             case "all":
                 return True
@@ -59,9 +59,9 @@ class FrameFolder:
         return False
 
     def keep(self, camera: str, series: str, number: int, frame: Frame) -> Path | None:
-        """Write a frame; its path relative to the folder, None if the disk does not take it.
+        """Write a frame; return its path relative to the folder, None if it cannot be written.
 
-        `paused` then says why; it is cleared by the next frame that can be written.
+        `paused` is then the reason; the next frame that can be written clears it.
         """
         if frame.image is None and frame.encoded is None:
             return None
@@ -83,7 +83,7 @@ class FrameFolder:
             data = png.tobytes()
         suffix = ".jpg" if data[:2] == b"\xff\xd8" else ".png"
         relative = Path(camera, series, f"{number // _PER_FOLDER:04d}", f"{number:07d}{suffix}")
-        if not self._written(relative, data):
+        if not self._write(relative, data):
             return None
         if self.paused:
             log.info("%s: frames are kept again", self.root)
@@ -91,18 +91,18 @@ class FrameFolder:
         return relative
 
     def keep_corrected(self, relative: Path, jpeg: bytes) -> Path | None:
-        """Write a corrected frame beside the one that was kept; as `keep`."""
+        """Write a corrected frame beside the original; return as `keep`."""
         beside = _beside(relative)
-        return beside if self._written(beside, jpeg) else None
+        return beside if self._write(beside, jpeg) else None
 
     def delete(self, relative: Path) -> None:
-        """Delete one frame, and the corrected one; it is not an error if it is not there."""
+        """Delete a frame and its corrected frame, if they exist."""
         for path in (relative, _beside(relative)):
             with contextlib.suppress(OSError):
                 (self.root / path).unlink()
 
     def free_bytes(self) -> int:
-        """Return the free space of the disk; nothing where it cannot be asked."""
+        """Return the free space of the disk, bytes; 0 if it cannot be read."""
         folder = self.root
         while not folder.exists() and folder != folder.parent:
             folder = folder.parent
@@ -112,16 +112,17 @@ class FrameFolder:
             return 0
 
     def enforce(self, now_utc: float | None) -> list[str]:
-        """Delete what is too old, then the oldest of what is too much; return what was, in words.
+        """Delete frames that are too old, then the oldest if space is short.
 
-        now_utc: None where the time is not known for sure: then nothing is deleted for its age.
+        Returns a sentence for each reason. now_utc: s; None if the clock is not trusted, so that no
+        frame is deleted for its age.
         """
         config = self.config
         files = sorted(self._files())
         deleted: list[str] = []
         if config.max_age_days is not None and now_utc is not None:
             limit = now_utc - config.max_age_days * _DAY_S
-            # of before the program existed: taken while the clock was not set, of unknown age
+            # a time before this program existed: the clock was not set, the age is unknown
             old = [f for f in files if _NOT_BEFORE <= f[0] < limit]
             files = [f for f in files if not _NOT_BEFORE <= f[0] < limit]
             deleted += self._delete(old, f"older than {config.max_age_days:g} days")
@@ -141,13 +142,13 @@ class FrameFolder:
         return [*deleted, *self._delete(victims, why)]
 
     def restamp(self, seconds: float) -> None:
-        """Move the times of what this process wrote before the clock was set by so many seconds.
+        """Correct the times of files written by this process, after the clock was set by `seconds`.
 
-        A frame that was taken before NTP was heard must not look as old as the clock was wrong.
+        Otherwise a frame taken before NTP set the clock would look too old by the clock's error.
         """
-        after = time.time() - seconds  # the clock as it was, now
+        now = time.time() - seconds  # by the clock before it was set
         for modified, _, path in self._files():
-            if self._since - 1.0 <= modified <= after + 1.0:
+            if self._since - 1.0 <= modified <= now + 1.0:
                 with contextlib.suppress(OSError):
                     os.utime(path, (modified + seconds,) * 2)
         self._since += seconds
@@ -161,23 +162,23 @@ class FrameFolder:
                 size += bytes_
         if not count:
             return []
-        text = f"{count} frames ({size / 1e6:.1f} MB) were deleted: {why}"
+        text = f"frames deleted: {count} ({size / 1e6:.1f} MB), {why}"
         log.info(text, extra={"event": "frames_deleted"})
         return [text]
 
     def _files(self) -> Iterator[tuple[float, int, str]]:
-        """Yield (time of change s, bytes, path) of all frames, and of pieces left by a crash."""
+        """Yield (modification time s, bytes, path) of frames, and partial files after a crash."""
         for folder, _, names in os.walk(self.root):
             for name in names:
                 if not _OURS.fullmatch(name) or not _NUMBER.fullmatch(os.path.basename(folder)):
-                    continue  # photographs of somebody else are not ours to delete
+                    continue  # not written by this program
                 path = os.path.join(folder, name)
                 with contextlib.suppress(OSError):
-                    found = os.stat(path)
-                    yield found.st_mtime, found.st_size, path
+                    status = os.stat(path)
+                    yield status.st_mtime, status.st_size, path
 
-    def _written(self, relative: Path, data: bytes) -> bool:
-        """Write a file; whether the disk has taken it, `paused` says why not."""
+    def _write(self, relative: Path, data: bytes) -> bool:
+        """Write a file; return whether it was written. If not, `paused` is the reason."""
         path = self.root / relative
         partial = path.with_name(path.name + ".partial")
         try:

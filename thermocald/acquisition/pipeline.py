@@ -1,12 +1,12 @@
-"""One camera's frames on their way to the store, in bounded memory: calibration may be dropped,
-acquisition not.
+"""One camera's frames on their way to the store, in bounded memory.
 
-    submit (the camera's thread) ─► waiting ─► calibrated ─► kept, in the order of their numbers
-                                      └─► too many wait: kept uncalibrated, with the frame, and
+    submit (the camera's thread) ─► waiting ─► calibrated ─► stored, in the order of their numbers
+                                      └─► too many wait: stored uncalibrated, with the frame, and
                                           calibrated when there is time
 
-Two threads, one calibrates and one keeps, so that a slow disk or a slow adjustment never holds the
-camera up. `check_frame` looks at one frame before a series begins.
+Calibration may be deferred, acquisition may not. One thread calibrates and another one stores, so
+that a slow disk or a slow adjustment never delays the camera. `check_frame` measures one frame
+before a series begins.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _DEPTH = 3
-_MOST_BYTES = 64_000_000  # of frames that wait to be kept
+_MOST_BYTES = 64_000_000  # of the frames that wait to be stored
 _MOST_WAITING = 200
 _PATIENCE_S = 2.0
 _IDLE_S = 0.5
 
 
 def calibrate_frame(calibrator: EpochCalibrator, epoch: Epoch, frame: Frame) -> CalibratedEpoch:
-    """Measure and adjust; a frame that is not an image gives the status `bad_frame`, no error."""
+    """Measure and adjust a frame; one that is not an image gives the status `bad_frame`."""
     try:
         if frame.observations is not None:
             seen = observations_from_lists(frame.observations, calibrator.testfield)
@@ -55,9 +55,9 @@ def calibrate_frame(calibrator: EpochCalibrator, epoch: Epoch, frame: Frame) -> 
 
 @dataclass(eq=False)
 class AcquiredEpoch:
-    """An epoch on its way: the frame, and what became of it so far.
+    """An epoch in the pipeline: its frame, and the results so far.
 
-    calibrated: None while it waits, and for good if calibration was dropped.
+    calibrated: None until the epoch is calibrated, and if its calibration was deferred.
     """
 
     number: int
@@ -70,25 +70,26 @@ class AcquiredEpoch:
 
 
 class Keeper(Protocol):
-    """Who keeps epochs; called by one thread, in the order of their numbers."""
+    """The store of a pipeline; one thread calls it, in the order of the epochs' numbers."""
 
     def keep(self, acquired: AcquiredEpoch) -> None:
-        """Keep an epoch; `acquired.epoch` is set."""
+        """Store an epoch; `acquired.epoch` is set."""
 
     def amend(self, calibrated: CalibratedEpoch) -> None:
-        """Keep the calibration of an epoch that was kept without."""
+        """Store the calibration of an epoch that was stored uncalibrated."""
 
     def backlog(self, below: int) -> Epoch | None:
-        """Return an epoch numbered below, kept without calibration, with the path of its frame."""
+        """Return an uncalibrated epoch with a number below `below`, and with its frame's path."""
 
 
 class Pipeline:
-    """The queue, the calibrating and the keeping thread of one camera.
+    """The queue of one camera, with a thread that calibrates and one that stores.
 
-    names: of its thermometers, the reference first; calibrator: None if epochs are only acquired.
-    observe: (a calibrated epoch, whether it comes in order) → the epoch as it is kept. depth:
-    epochs that may wait. patience_s: to wait for a reading that is being taken, at most half a
-    period. on_lost: receives why an epoch that was taken is not kept.
+    calibrator: None if epochs are only acquired; names: of the camera's thermometers, the reference
+    first; depth: number of epochs that may wait for their calibration; patience_s: how long to wait
+    for a reading that is being taken, by default 2 s, at most half a period; observe: (a calibrated
+    epoch, whether it comes in order) → the epoch to be stored; on_lost: receives why an acquired
+    epoch was not stored.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class Pipeline:
         self.calibrator = calibrator
         self.dropped = 0  # epochs whose calibration was deferred
         self.caught_up = 0
-        self.lost = 0  # epochs that were taken and not handed over to be kept
+        self.lost = 0  # epochs that were acquired and not handed to the store
         self.next_number = first
         self._thermometers = thermometers
         self._names = list(names)
@@ -130,7 +131,7 @@ class Pipeline:
         self._busy_since: dict[str, float] = {}
         self._threads = [
             threading.Thread(target=self._calibrate_all, name=f"calibrate {name}", daemon=True),
-            threading.Thread(target=self._keep_all, name=f"keep {name}", daemon=True),
+            threading.Thread(target=self._store_all, name=f"store {name}", daemon=True),
         ]
 
     def start(self) -> None:
@@ -139,17 +140,17 @@ class Pipeline:
             thread.start()
 
     def submit(self, frame: Frame) -> None:
-        """Take a frame over; returns at once."""
+        """Queue a frame; returns at once."""
         with self._changed:
             if len(self._items) > 2 * self._depth and self._is_full():
-                self._lose("it cannot be kept fast enough")
+                self._lose("frames cannot be stored fast enough")
                 return
             self._items.append(AcquiredEpoch(self.next_number, frame, self._trusted()))
             self.next_number += 1
             self._changed.notify_all()
 
     def _is_full(self) -> bool:
-        """Return whether no frame more may wait: a machine that stalls for seconds costs none."""
+        """Return whether no further frame may wait; a machine may stall for seconds before that."""
         frames = [i.frame for i in self._items]
         held = sum(
             len(f.encoded or b"") + (0 if f.image is None else f.image.nbytes) for f in frames
@@ -161,17 +162,17 @@ class Pipeline:
         self._on_lost(f"camera {self.name}: {why}")
 
     def wait_for_room(self, timeout_s: float) -> bool:
-        """Wait until nothing need be deferred for one more epoch: for what can be replayed."""
+        """Wait until one more epoch defers no calibration: for replays; False after the timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: len(self._items) < self._depth, timeout_s)
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until all that was submitted is calibrated and handed over to be kept."""
+        """Wait until all frames are calibrated and handed to the store; False after the timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._items and not self._amended, timeout_s)
 
     def stop(self, grace_s: float) -> bool:
-        """Finish the current epoch, keep the others as they are; False if that took too long."""
+        """Finish the current epoch, store the others as they are; False if that took too long."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
@@ -181,15 +182,15 @@ class Pipeline:
         with self._changed:
             while self._items:
                 self._items.popleft()
-                self._lose("it was still waiting to be kept at the end")
+                self._lose("a frame was still waiting to be stored when the camera was stopped")
         return not any(thread.is_alive() for thread in self._threads)
 
     def waiting(self) -> int:
-        """Return how many epochs are on their way."""
+        """Return the number of epochs in the queue."""
         return len(self._items)
 
     def busy_s(self) -> float:
-        """Return for how long a thread has not finished one thing; 0 if none is busy."""
+        """Return how long a thread has been busy with one epoch, s; 0 if none is busy."""
         now = self._clock.monotonic()
         return max((now - since for since in list(self._busy_since.values())), default=0.0)
 
@@ -205,12 +206,12 @@ class Pipeline:
                     self.caught_up += 1
                     self._changed.notify_all()
             self._busy_since.pop("calibrate", None)
-        with self._changed:  # nothing more is amended
+        with self._changed:
             self._all_calibrated = True
             self._changed.notify_all()
 
     def _next_to_calibrate(self) -> AcquiredEpoch | Epoch | None:
-        """The oldest that waits; if there is none, one that was deferred; None at the end."""
+        """Return the oldest waiting epoch, else one with a deferred calibration; None to stop."""
         while True:
             with self._changed:
                 if self._stopping:
@@ -236,7 +237,7 @@ class Pipeline:
         if item.skew_s == item.skew_s:
             result = replace(result, extra={**result.extra, "skew_s": item.skew_s})
         with self._changed:
-            if item.state == "dropped":  # it took so long that it was kept without
+            if item.state == "dropped":  # already stored uncalibrated, it took too long
                 self._amended.append(result)
                 self.caught_up += 1
             else:
@@ -245,7 +246,7 @@ class Pipeline:
             self._changed.notify_all()
 
     def _safely(self, epoch: Epoch, frame: Frame | None) -> CalibratedEpoch:
-        """Calibrate from the frame, or from the file that the epoch names."""
+        """Calibrate an epoch from its frame, or from the file that it names; never raises."""
         if self.calibrator is None:
             why = failed("not_measured", "no test field is configured for this camera")
             return CalibratedEpoch(epoch, why, {})
@@ -254,7 +255,7 @@ class Pipeline:
                 return self._observe(self.calibrator.calibrate(epoch), False)
             return self._observe(calibrate_frame(self.calibrator, epoch, frame), True)
         except Exception as error:
-            # one epoch that breaks the program must not end months of acquisition
+            # an epoch with an unexpected error must not stop months of acquisition
             log.exception("camera %s: epoch %d was not calibrated", self.name, epoch.number)
             self.calibrator.reset()
             return CalibratedEpoch(epoch, failed("program_error", str(error)), {})
@@ -266,9 +267,9 @@ class Pipeline:
         )
         item.epoch = Epoch(item.number, frame.utc, utc, temperatures)
 
-    def _keep_all(self) -> None:
-        while (item := self._next_to_keep()) is not None:
-            self._busy_since["keep"] = self._clock.monotonic()
+    def _store_all(self) -> None:
+        while (item := self._next_to_store()) is not None:
+            self._busy_since["store"] = self._clock.monotonic()
             try:
                 if isinstance(item, CalibratedEpoch):
                     self._keeper.amend(item)
@@ -277,12 +278,12 @@ class Pipeline:
                         self._pair(item, 0.0)
                     self._keeper.keep(item)
             except Exception as error:
-                log.exception("camera %s: an epoch was not kept", self.name)
+                log.exception("camera %s: an epoch was not stored", self.name)
                 if isinstance(item, AcquiredEpoch):
                     self._lose(f"epoch {item.number}: {error}")
-            self._busy_since.pop("keep", None)
+            self._busy_since.pop("store", None)
 
-    def _next_to_keep(self) -> AcquiredEpoch | CalibratedEpoch | None:
+    def _next_to_store(self) -> AcquiredEpoch | CalibratedEpoch | None:
         with self._changed:
             while True:
                 if self._amended:
@@ -306,35 +307,35 @@ class Pipeline:
 _BLURRED_PX = 3.0
 _SATURATED = 0.02
 _LOW_CONTRAST = 30.0
-_NAMED = 5
+_MOST_NAMES = 5
 
 _RULES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
-    ("saturation", lambda v: v > _SATURATED, "saturated: less light, or a shorter exposure"),
-    ("blur", lambda v: v > _BLURRED_PX, "blurred: focus, or hold the camera still"),
-    ("contrast", lambda v: abs(v) < _LOW_CONTRAST, "of low contrast: more light"),
+    ("saturation", lambda v: v > _SATURATED, "saturated; use less light or a shorter exposure"),
+    ("blur", lambda v: v > _BLURRED_PX, "blurred; focus, or hold the camera still"),
+    ("contrast", lambda v: abs(v) < _LOW_CONTRAST, "low contrast; use more light"),
 )
 
 
 def check_frame(name: str, calibrator: EpochCalibrator, frame: Frame) -> tuple[list[str], str]:
     """Measure and adjust a frame before a series begins.
 
-    Returns what was found, sentence by sentence, with what a person can mend; and why no series
-    can begin, empty if one can.
+    Returns lines on the targets and the adjustment, with what the user can improve; and why no
+    series can begin, empty if one can.
     """
     calibrated = calibrate_frame(calibrator, Epoch(1, frame.utc, math.nan, {}), frame)
     result, seen = calibrated.adjustment, calibrated.epoch.observations
-    names, found = calibrator.testfield.names, []
+    names, lines = calibrator.testfield.names, []
     if seen is not None and len(seen):
         blur = calibrated.extra.get("blur_px")
         blurred = "" if blur is None else f", blur {blur:.2f} px"
-        found.append(f"{name}: {len(seen)} of {len(names)} targets{blurred}")
+        lines.append(f"{name}: {len(seen)} of {len(names)} targets{blurred}")
         for key, bad, words in _RULES:
             values = zip(seen.targets, seen.quality.get(key, ()), strict=False)
             if rows := [int(target) for target, value in values if bad(value)]:
-                shown = ", ".join(names[row] for row in rows[:_NAMED])
-                more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
-                found.append(f"  target {shown}{more}: {words}")
+                shown = ", ".join(names[row] for row in rows[:_MOST_NAMES])
+                more = f" and {len(rows) - _MOST_NAMES} more" if len(rows) > _MOST_NAMES else ""
+                lines.append(f"  target {shown}{more}: {words}")
     if not result.ok:
-        return found, f"{result.status}: {result.reason}"
+        return lines, f"{result.status}: {result.reason}"
     c, sd = result.values[0], result.sd[0]
-    return [*found, f"{name}: sigma0 {result.sigma0:.2f}, c {c:.5f} ± {sd:.5f} mm"], ""
+    return [*lines, f"{name}: sigma0 {result.sigma0:.2f}, c {c:.5f} ± {sd:.5f} mm"], ""

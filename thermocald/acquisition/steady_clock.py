@@ -1,11 +1,11 @@
-"""One clock for all time stamps of a daemon, that a glitch of the machine's clock does not move.
+"""One clock for all time stamps of a daemon, unaffected by glitches of the machine's clock.
 
-The machine's UTC may be stepped, by NTP or by hand, and at boot a Raspberry Pi without a battery
-does not know it at all. Intervals are measured on the monotonic clock, which never steps; UTC is
-that plus an offset. The offset follows a step of the machine's clock in either direction, at once
-where the machine just learned the time (it was not synchronised, and is now), else when the new
-time has stood for a while: what is back after some seconds was a glitch, and moves nothing. Every
-step is reported.
+The machine's UTC may be stepped, by NTP or by hand, and a Raspberry Pi without a battery does not
+know it at all after booting. Intervals are measured on the monotonic clock, which never steps; UTC
+is the monotonic time plus an offset. The offset follows a step of the machine's clock in either
+direction: at once if the machine has just learned the time (it was not synchronised, and is now),
+else after the new time has lasted for a while. A step that is undone within seconds is a glitch and
+is not followed. Every step is reported.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ log = logging.getLogger(__name__)
 
 _STEP_S = 0.5
 _WRONG_S = 1.0
-_CONFIRM_S = 60.0  # for which a new time must stand before it is followed
+_CONFIRM_S = 60.0  # how long a new time must last before it is followed
 _LEAP_S = 3600.0
-_SETTLE_S = 86400.0  # after a leap, before anything is deleted for its age
+_SETTLE_S = 86400.0  # after a leap, before ages are trusted
 
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """The machine's UTC was stepped by `seconds`, which `text` says in a sentence.
+    """A step of the machine's UTC by `seconds`; `text` describes it in a sentence.
 
-    utc: as stamped from now on; adopted: whether time stamps followed.
+    utc: the time stamp at the step; adopted: whether time stamps follow the step.
     """
 
     utc: float
@@ -47,7 +47,7 @@ class ClockStep:
 class SteadyClock:
     """A clock for devices and the store; threads may share it.
 
-    synchronised: whether the machine knows the time.
+    synchronised: returns whether the machine's clock is synchronised.
     """
 
     def __init__(
@@ -62,19 +62,19 @@ class SteadyClock:
         self._leapt_at = float("-inf")
 
     def monotonic(self) -> float:
-        """Seconds that never step."""
+        """Return seconds that never step."""
         return self._machine.monotonic()
 
     def utc(self) -> float:
-        """Seconds since 1970."""
+        """Return UTC, seconds since 1970."""
         return self._machine.monotonic() + self._offset
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
-        """As the machine's clock."""
+        """Sleep as `Clock.sleep_until` of the machine's clock."""
         return self._machine.sleep_until(monotonic, wake)
 
     def check(self) -> ClockStep | None:
-        """Look whether the machine's clock was stepped, or a step has stood for long enough."""
+        """Return a new step of the machine's clock, or an earlier one that is followed now."""
         now = self._machine.monotonic()
         offset = _offset(self._machine)
         learned = not self._was_synchronised and self._synchronised()
@@ -87,13 +87,13 @@ class SteadyClock:
                 self._leapt_at = now
         ahead = offset - self._offset
         pending = abs(ahead) >= _STEP_S
-        # a clock that shows a time before this program existed has just learned the time, too
+        # a clock that showed a time before this program existed has just learned it, too
         learned |= self.utc() < NOT_BEFORE <= self._machine.utc()
         adopted = pending and (learned or now - self._seen_at >= _CONFIRM_S)
         if adopted:
             self._offset, step, then = offset, ahead, "time stamps follow"
         elif stepped:
-            waits = f" until that has stood for {_CONFIRM_S:.0f} s" if pending else ""
+            waits = f" until the new time has lasted {_CONFIRM_S:.0f} s" if pending else ""
             then = f"time stamps go on as before{waits}"
         else:
             return None
@@ -104,20 +104,20 @@ class SteadyClock:
 
     @property
     def error_s(self) -> float:
-        """The machine's UTC minus ours: not 0 while a step is not followed."""
+        """The machine's UTC minus ours, s; not 0 while a step is not followed."""
         return self._machine.utc() - self.utc()
 
     def trusted(self) -> bool:
-        """Return whether a time stamp taken now is known to be right to a second."""
+        """Return whether a time stamp taken now is certainly right to a second."""
         return abs(self.error_s) < _WRONG_S and self._synchronised()
 
     def settled(self) -> bool:
-        """Whether ages may be judged by this clock: it is trusted, and has not leapt for a day."""
+        """Return whether ages are certain: the clock is trusted, and has not leapt for a day."""
         since_leap = self._machine.monotonic() - self._leapt_at
         return self.trusted() and since_leap >= _SETTLE_S and self.utc() >= NOT_BEFORE
 
 
 def _offset(machine: Clock) -> float:
-    """UTC minus monotonic time, s."""
+    """Return UTC minus monotonic time, s."""
     monotonic, utc = read_together(machine.monotonic, machine.utc)
     return utc - monotonic

@@ -1,7 +1,7 @@
-"""The thermometers of a configuration: read at their own pace, and paired with frames.
+"""The thermometers of a configuration: each is read at its own period, and paired with frames.
 
-Frame and readings keep their own times when they are paired; nothing is interpolated here. Who
-needs the temperature at the frame's time interpolates between neighbouring epochs' readings.
+Paired frames and readings keep their own times; nothing is interpolated here. For the temperature
+at a frame's time, interpolate between the readings of neighbouring epochs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 _REMEMBERED = 16
-_OLDEST_IN_PERIODS = 1.5
+_FARTHEST_IN_PERIODS = 1.5
 
 
 def pair_readings(
@@ -34,11 +34,11 @@ def pair_readings(
 ) -> tuple[float, dict[str, float], float]:
     """Join one reading per thermometer, the reference first, into the temperatures of an epoch.
 
-    Returns UTC s, of the reference; {channel: °C}; s, reading minus frame; NaN if there is none.
+    Returns the reference's UTC, s; {channel: °C}; and its reading's time minus the frame's, s. If
+    the reference has no reading, the next thermometer with one gives the times; NaN if none has.
 
-    Channels keep the thermometer's own names where there is one thermometer; with several they are
-    `<thermometer>` for its channel `temperature` and `<thermometer>_<channel>` for others. Without
-    the reference the next thermometer that answered gives the time.
+    A single thermometer's channels keep their names; with several, the channel `temperature` is
+    called `<thermometer>`, and others `<thermometer>_<channel>`.
     """
     temperatures = {
         _column(name, channel, len(readings)): value
@@ -55,7 +55,7 @@ def pair_readings(
 def require_columns(thermometers: Mapping[str, Iterable[str]], error: type[Exception]) -> list[str]:
     """Return the columns of an epoch for {thermometer: its channels}, the reference first.
 
-    Raises `error` where one has the name of another, or of a column of this program.
+    Raises `error` if two columns, or a column and one of this program, have the same name.
     """
     columns = [
         _column(name, channel, len(thermometers))
@@ -66,8 +66,8 @@ def require_columns(thermometers: Mapping[str, Iterable[str]], error: type[Excep
     require_channels(columns, where, error)
     if "temperature" in columns[1:]:
         raise error(
-            f"{where}: the name `temperature` is reserved for the reference, which is the first of "
-            f"the channels ({', '.join(columns)}); make it the first, or rename it"
+            f"{where}: `temperature` is the name of the reference, the first of the channels "
+            f"({', '.join(columns)}); put this channel first, or rename it"
         )
     return columns
 
@@ -79,17 +79,17 @@ def _column(thermometer: str, channel: str, thermometers: int) -> str:
 
 
 class Thermometers:
-    """All thermometers of a configuration, and their last readings; threads may share it.
+    """All thermometers of a configuration, and their last readings; threads may share them.
 
-    Raises ConfigurationError for options that are wrong, and where the channels cannot all be
-    columns of a camera's epochs.
+    Raises ConfigurationError if options are wrong, or if the channels cannot all be columns of a
+    camera's epochs.
     """
 
     def __init__(self, config: Config, clock: Clock, on_event: OnEvent = lambda *_: None) -> None:
         self.links: dict[str, Link] = {}
         self._cameras = config.cameras
         self._devices: dict[str, Thermometer] = {}
-        self._channels: dict[str, tuple[str, ...]] = {}  # as named, then as read
+        self._channels: dict[str, tuple[str, ...]] = {}  # as declared, then as read
         self._periods_s = {one.name: one.period_s for one in config.thermometers}
         self._kept: dict[str, deque[Reading]] = {}
         self._changed = threading.Condition()
@@ -108,26 +108,26 @@ class Thermometers:
             require_columns({name: channels[name] for name in camera.thermometers}, error)
 
     def columns(self, names: Sequence[str]) -> list[str]:
-        """Return the columns of the temperatures of some, the reference first, as far as known."""
+        """Return some thermometers' temperature columns known so far, the reference first."""
         return require_columns({name: self._channels[name] for name in names}, ConfigurationError)
 
     def identity(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
-        """Return what they say they are."""
+        """Return the identities of some thermometers, by name."""
         return {name: self.links[name].identity() for name in names}
 
     def read(self, name: str) -> Reading:
-        """Read one that is open, and keep what it says; raises a DeviceError."""
+        """Read a thermometer that is open, and store the reading; raises DeviceError."""
         reading = self._devices[name].read()
         self.add(name, reading)
         return reading
 
     def read_now(self, names: Sequence[str]) -> None:
-        """Read some in the caller's thread: a recording's come with its frames."""
+        """Read some thermometers in the caller's thread, as a recording's with its frames."""
         for name in names:
             self.links[name].do(partial(self.read, name))
 
     def add(self, name: str, reading: Reading) -> None:
-        """Keep a reading; WrongDevice where one of its channels cannot be a column."""
+        """Store a reading; WrongDevice if one of its channels cannot be a column."""
         if new := [c for c in reading.values if c not in self._channels[name]]:
             channels = {**self._channels, name: (*self._channels[name], *new)}
             self._require(channels, WrongDevice)
@@ -137,37 +137,35 @@ class Thermometers:
             self._changed.notify_all()
 
     def last(self, name: str) -> Mapping[str, float]:
-        """Return the last values of one, {channel: °C}."""
+        """Return a thermometer's last values, {channel: °C}."""
         kept = self._kept[name]
         return kept[-1].values if kept else {}
 
     def nearest(self, name: str, monotonic: float) -> Reading | None:
-        """Return the reading nearest to a time; None if all are more than 1.5 periods away."""
+        """Return a thermometer's reading nearest to a time; None if it is over 1.5 periods away."""
         with self._changed:
-            found = min(self._kept[name], key=lambda r: abs(r.monotonic - monotonic), default=None)
-        limit = _OLDEST_IN_PERIODS * self._periods_s[name]
-        if found is None or abs(found.monotonic - monotonic) > limit:
-            return None
-        return found
+            near = min(self._kept[name], key=lambda r: abs(r.monotonic - monotonic), default=None)
+        limit = _FARTHEST_IN_PERIODS * self._periods_s[name]
+        return near if near is not None and abs(near.monotonic - monotonic) <= limit else None
 
     def around(
         self, names: Sequence[str], monotonic: float, patience_s: float
     ) -> tuple[float, dict[str, float], float]:
-        """Return as `pair_readings` those around a frame; a channel that was not read is NaN.
+        """Pair the readings nearest to a frame as `pair_readings`; an unread channel is NaN.
 
-        patience_s: of wall time to wait for a reading that is being taken just now; none is waited
-        for that cannot come nearer.
+        patience_s: how long to wait, in wall time, for a reading that is being taken; a thermometer
+        whose next reading would be no nearer is not waited for.
         """
         with self._changed:
             self._changed.wait_for(
-                lambda: all(self._answered(name, monotonic) for name in names), patience_s
+                lambda: all(self._is_near(name, monotonic) for name in names), patience_s
             )
         nearest = {name: self.nearest(name, monotonic) for name in names}
         utc, temperatures, skew_s = pair_readings(nearest, monotonic)
-        # a reference that was not read leaves its place empty: no other takes it
+        # a reference that was not read stays NaN, no other channel replaces it
         columns = dict.fromkeys(self.columns(names), math.nan)
         return utc, {**columns, **temperatures}, skew_s
 
-    def _answered(self, name: str, monotonic: float) -> bool:
+    def _is_near(self, name: str, monotonic: float) -> bool:
         kept = self._kept[name]
         return bool(kept) and kept[-1].monotonic >= monotonic - 0.5 * self._periods_s[name]

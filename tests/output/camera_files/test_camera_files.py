@@ -423,8 +423,8 @@ def test_aicon_states_standard_deviations(tmp_path, plain):
 @pytest.mark.parametrize(
     ("name", "text", "reason"),
     [
-        ("a.yaml", "%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "no valid YAML"),
-        ("b.yaml", "hello: 1\n", "no camera file of any"),
+        ("a.yaml", "%YAML:1.0\n---\ncamera_matrix: [1, 2\n", "not valid YAML"),
+        ("b.yaml", "hello: 1\n", "not a camera file of any"),
         ("c.yaml", "image_width: 10\ndistortion_model: equidistant\n", "equidistant"),
         ("d.yaml", "cam0:\n  camera_model: omni\n", "omni"),
         ("e.txt", "1 OPENCV_FISHEYE 100 100 1 2 3 4 5 6 7 8\n", "OPENCV_FISHEYE"),
@@ -441,6 +441,13 @@ def test_aicon_states_standard_deviations(tmp_path, plain):
         ("s.ior", "1 1 -8 0 0 1e-3 0 0 0 0 0 0 0 8 6 2000 1500", "R0 is 0"),
         ("t.ior", "1 1 -8 0 0 0 0 2 0 0 0 0 0 8 6 0 1500", "columns"),
         ("o.json", '{"format": "thermocald-camera/1"}', "sensor or interior"),
+        ("u.json", """{"format": "thermocald-camera/1", "interior": {"c": 0.1}, "covariance": [],
+         "sensor": {"width": 100, "height": 100, "pixel_pitch": 0.001}}""", "covariance.matrix"),
+        ("v.yaml", "image_width: 10\ndistortion_model: []\n", "distortion_model"),
+        ("w.cameramodel", "{'lensmodel': [], 'imagersize': 1}", "lensmodel"),
+        ("x.cameramodel", "{[]: 'lensmodel imagersize'}", "Python's notation"),
+        ("y.yaml", "%YAML:1.0\n---\ncamera_matrix: !!int ''\n", "not valid YAML"),
+        ("z.yaml", "%YAML:1.0\n---\ncamera_matrix: !!timestamp x\n", "not valid YAML"),
         ("p.txt", "1 PINHOLE 100 100 -90 90 50 50\n", "principal distance of -90"),
         ("q.txt", "1 RADIAL 4000 3000 3500 2000 1500 -3 0\n", "folds back"),
         ("r.txt", "1 PINHOLE 100 0 90 90 50 50\n", "100 × 0"),
@@ -458,9 +465,9 @@ def test_absent_binary_and_unknown(tmp_path, plain):
     with pytest.raises(ConfigurationError, match=r"nowhere\.xml"):
         camera_files.read(tmp_path / "nowhere.xml")
     (tmp_path / "x.jpg").write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(ConfigurationError, match="no text"):
+    with pytest.raises(ConfigurationError, match="not a text file"):
         camera_files.read(tmp_path / "x.jpg")
-    with pytest.raises(UsageError, match="there are opencv"):
+    with pytest.raises(UsageError, match="give one of opencv"):
         camera_files.write(plain, tmp_path / "x", "vision9000")
     with pytest.raises(UsageError, match="cannot be written"):
         camera_files.write(plain, tmp_path / "x.jpg" / "folder.yaml", "opencv")

@@ -1,10 +1,11 @@
-"""Camera files, our own and those of other programs: one entry to write and one to read.
+"""Camera files, ours and those of other programs: one function writes them, one reads them.
 
-    write(model, path, "mrcal")         → the statement of how exact the file is
-    read(path) → ImportedCamera         format recognised by its content
+    write(model, path, "mrcal")         → a statement of how exact the file is
+    read(path) → ImportedCamera         the format is recognised by the content
 
-Conventions and what is exact: docs/reference/camera_files.md and `photogrammetry.conversions`.
-`read_camera` takes what `--camera` names: our own YAML, or a file of another program.
+Which conversions are exact, and the conventions: docs/reference/camera_files.md and
+`camera.conversions`. `read_camera` reads the file given with `--camera`: our YAML, or a file of
+another program.
 """
 
 from __future__ import annotations
@@ -47,7 +48,11 @@ _LARGEST_FILE = 10_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImportedCamera:
-    """A camera as read: our model, how well it reproduces the file's own over the image area."""
+    """A camera read from a file, as our model.
+
+    exact: whether our model is the file's; else largest_px and rms_px: how far the two differ over
+    the image area; covariance: (10, 10), None if the file has none.
+    """
 
     model: CameraModel
     format: str
@@ -59,13 +64,13 @@ class ImportedCamera:
 
     @property
     def how_read(self) -> str:
-        """How well our model is the file's, in words."""
+        """How well our model reproduces the file's, in words."""
         return "exact" if self.exact else f"fitted, largest residual {self.largest_px:.3g} px"
 
 
 def _format(name: str) -> Format:
     if name not in FORMATS:
-        raise UsageError(f"camera file format {name!r}: there are {', '.join(FORMATS)}")
+        raise UsageError(f"unknown camera file format {name!r}; give one of {', '.join(FORMATS)}")
     return FORMATS[name]
 
 
@@ -77,10 +82,10 @@ def write(
     comment: str = "",
     name: str = "camera",
 ) -> str:
-    """Write a camera; returns the statement of how exact it is, which also stands in the file.
+    """Write a camera; return a statement of how exact the file is, which the file also contains.
 
-    covariance: (10, 10) in the order of `IOP_NAMES`, goes into the formats that have room for it.
-    An existing file is replaced as a whole or not at all. Raises UsageError for an unknown format,
+    covariance: (10, 10) in the order of `IOP_NAMES`; written if the format has room for it. An
+    existing file is replaced as a whole or not at all. Raises UsageError for an unknown format,
     GeometryError if the model has no rays for part of its image.
     """
     text, statement = encode(model, format, covariance, comment, name)
@@ -95,9 +100,9 @@ def encode(
     comment: str = "",
     name: str = "camera",
 ) -> tuple[str, str]:
-    """Return the text that `write` writes, and its statement."""
+    """Return the text that `write` writes, and the statement that it returns."""
     if covariance is not None and np.shape(covariance) != (10, 10):
-        raise UsageError(f"a covariance of shape {np.shape(covariance)}, not (10, 10)")
+        raise UsageError(f"the covariance has shape {np.shape(covariance)}, not (10, 10)")
     chosen, sensor = _format(format), model.sensor
     family = chosen.family(model)
     values, covariance, exact, largest, rms = conversions.convert(
@@ -119,11 +124,11 @@ def read(
     format: str | None = None,  # noqa: A002
     pixel_pitch: float | None = None,
 ) -> ImportedCamera:
-    """Read a camera file; without a format it is told by the content.
+    """Read a camera file; if no format is given, recognise it by the content.
 
-    pixel_pitch: mm, for files that do not say it. Raises ConfigurationError that names the file.
+    pixel_pitch: mm, for files that do not state it. A ConfigurationError names the file.
     """
-    text, chosen = _opened(path, format)
+    text, chosen = _read_text(path, format)
     try:
         record = chosen.decode(text)
         sensor = record.sensor(text, pixel_pitch)
@@ -138,7 +143,7 @@ def read(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conversion:
-    """A camera file written in another format; statement: how exact what was written is."""
+    """A camera file written in another format; statement: how exact the written file is."""
 
     source: Path
     camera: ImportedCamera
@@ -178,15 +183,15 @@ def convert(
     format: str | None = None,  # noqa: A002
     pixel_pitch: float | None = None,
 ) -> Conversion:
-    """Read a camera file and write it in another format; errors as of `read` and `write`."""
+    """Read a camera file and write it in another format; raises as `read` and `write` do."""
     camera = read(source, format, pixel_pitch)
     comment = f"converted from {source.name} ({camera.format}, {camera.how_read})"
     statement = write(camera.model, out, to, camera.covariance, comment, camera.name)
     return Conversion(source, camera, out, to, statement)
 
 
-def _opened(path: Path, format_: str | None = None) -> tuple[str, Format]:
-    """The text of a camera file, and its format; without a name it is told by the content."""
+def _read_text(path: Path, format_: str | None = None) -> tuple[str, Format]:
+    """Return the text of a camera file, and its format: the one given, or by the content."""
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise ConfigurationError(f"{path}: too large for a camera file")
@@ -194,38 +199,39 @@ def _opened(path: Path, format_: str | None = None) -> tuple[str, Format]:
     except OSError as cause:
         raise ConfigurationError(f"{path}: cannot be read: {cause.strerror}") from cause
     except UnicodeDecodeError:
-        raise ConfigurationError(f"{path}: no text, and so no camera file") from None
+        raise ConfigurationError(f"{path}: not a text file, so not a camera file") from None
     if format_ is not None:
         return text, _format(format_)
     for candidate in FORMATS.values():
         if candidate.recognises(text):
             return text, candidate
-    raise ConfigurationError(f"{path}: no camera file of any of {', '.join(FORMATS)}")
+    raise ConfigurationError(f"{path}: not a camera file of any format: {', '.join(FORMATS)}")
 
 
 def read_camera(path: Path, pixel_pitch: float | None = None) -> CameraSpec:
-    """Read a camera file: name, width, height, pixel_pitch, principal_distance, interior.
+    """Read a camera file: our YAML, or a file of another program (OpenCV, ROS, Metashape, …).
 
-    With `interior:` (c, x0, y0 mm, A1 … C2; CONVENTIONS §2) the camera counts as calibrated. A file
-    of another program (OpenCV, ROS, Metashape, …) is read as what it is; pixel_pitch: mm, where it
-    does not say it.
+    Our YAML has the keys name, width, height, pixel_pitch, principal_distance, and interior. With
+    `interior:` (c, x0, y0 mm, A1 … C2; CONVENTIONS §2) the camera counts as calibrated.
+    pixel_pitch: mm, for files of other programs that do not state it.
     """
     try:
-        known = _opened(path)[1].name
-    except ConfigurationError:  # of none of the formats: our own YAML
+        format_ = _read_text(path)[1].name
+    except ConfigurationError:  # none of the formats: our own YAML
         reader = QuantityReader(path, read_yaml(path, ConfigurationError))
-        camera = reader.inner("camera") if "camera" in reader.mapping else reader
-        return CameraSpec.read(camera, path.stem)
-    found = read(path, known, pixel_pitch)
-    interior = found.model.interior
-    return CameraSpec(found.name, found.model.sensor, interior.c, interior)
+        if "camera" in reader.mapping:
+            reader = reader.inner("camera")
+        return CameraSpec.read(reader, path.stem)
+    camera = read(path, format_, pixel_pitch)
+    interior = camera.model.interior
+    return CameraSpec(camera.name, camera.model.sensor, interior.c, interior)
 
 
 def write_camera(path: Path, camera: CameraSpec, covariance: Array, comment: str) -> None:
-    """Write a camera whose interior orientation is known, as our own file.
+    """Write a camera with an interior orientation to a file of ours.
 
-    path: `.json` with covariance (10, 10), which every `--camera` takes, or `.yaml`; comment: one
-    line for its head. Raises UsageError for another suffix.
+    path: `.json`, with the covariance (10, 10), or `.yaml`; both can be given with `--camera`.
+    comment: one line for the head of the file. Raises UsageError for another suffix.
     """
     suffix, sensor, interior = path.suffix.lower(), camera.sensor, camera.interior
     assert interior is not None
@@ -233,7 +239,7 @@ def write_camera(path: Path, camera: CameraSpec, covariance: Array, comment: str
         write(CameraModel(sensor, interior), path, "json", covariance, comment, camera.name)
         return
     if suffix not in (".yaml", ".yml"):
-        raise UsageError(f"{path}: .json and .yaml are written; for another program convert it")
+        raise UsageError(f"{path}: not .json or .yaml; convert one of these for another program")
     document = {
         "name": camera.name,
         **asdict(sensor),

@@ -1,6 +1,6 @@
-"""What every camera file works on: the camera that is written or was read; our own JSON.
+"""The camera as every file format writes and reads it, and our own JSON format.
 
-Numbers and YAML in the text of a file are read here; what is wrong there is an error that names it.
+Also reads the numbers and the YAML in a file's text; an error names the value that is wrong.
 """
 
 from __future__ import annotations
@@ -26,23 +26,24 @@ if TYPE_CHECKING:
 
 
 def yaml_mapping(text: str) -> dict[Any, Any]:
-    """What a YAML text holds; ConfigurationError for a text that is not YAML, or holds no keys."""
+    """Return the mapping in a YAML text; ConfigurationError if it is not YAML or not a mapping."""
     try:
         document = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError) as cause:
-        raise ConfigurationError(f"no valid YAML: {str(cause).splitlines()[0]}") from None
+    except (yaml.YAMLError, ValueError, AttributeError, LookupError, RecursionError) as cause:
+        # the last four by PyYAML itself, such as IndexError for `!!int ''`
+        raise ConfigurationError(f"not valid YAML: {str(cause).splitlines()[0]}") from None
     if not isinstance(document, dict):
-        raise ConfigurationError("the file holds no keys")
+        raise ConfigurationError("the file has no keys")
     return document
 
 
 def yaml_text(document: dict[str, Any]) -> str:
-    """A document as YAML, one line for each list of numbers."""
+    """Return a document as YAML, each list of numbers on one line."""
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
 
 
 def number(value: Any, what: str) -> float:
-    """A finite number, or an error that names it."""
+    """Return a finite number; `what` names it in the error."""
     try:
         result = float(value)
     except (TypeError, ValueError):
@@ -55,9 +56,9 @@ def number(value: Any, what: str) -> float:
 
 
 def numbers(values: Any, what: str, counts: tuple[int, ...]) -> Array:
-    """A list of finite numbers of one of some lengths, or an error that names it."""
+    """Return a list of finite numbers whose length is in counts; `what` names it in the error."""
     if not isinstance(values, list | tuple | np.ndarray):
-        raise ConfigurationError(f"{what} is missing or no list")
+        raise ConfigurationError(f"{what} is missing or is not a list")
     result = np.array([number(v, what) for v in np.ravel(np.asarray(values, dtype=object))])
     if len(result) not in counts:
         wanted = " or ".join(map(str, counts))
@@ -71,11 +72,11 @@ _PITCH = re.compile(r"pixel_pitch_mm[\"']?\s*[:=]\s*([0-9.eE+-]+)")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraRecord:
-    """A camera as a program's file holds it, to be written or as read.
+    """A camera in the terms of a file format, as it is written or was read.
 
-    size: (width, height) px; values: in the order of the family's parameters, covariance theirs or
-    None; pixel_pitch: mm, None where the record itself does not hold it; statement: how exact the
-    values are; comment: free text for the file's head.
+    size: (width, height) px; values: in the order of the family's parameters, with their covariance
+    or None; pixel_pitch: mm, None if the format does not have it; statement: how exact the values
+    are; comment: free text for the head of the file.
     """
 
     size: Sequence[float] | Array
@@ -88,20 +89,20 @@ class CameraRecord:
     comment: str = ""
 
     def head(self, mark: str = "# ") -> str:
-        """The head of a text file, each line after a mark."""
+        """Return the comment at the head of a text file, each line after a mark."""
         lines = [
             "written by thermocald",
             f"conversion: {self.statement}",
-            # other programs do without it, reading the file back into millimetres does not
+            # not for other programs, but to read the file back into millimetres
             f"pixel_pitch_mm: {self.pixel_pitch!r}",
             *self.comment.splitlines(),
         ]
         return "".join(f"{mark}{line}\n" for line in lines)
 
     def sensor(self, text: str, given: float | None) -> Sensor:
-        """The sensor; its pitch as the user gave it, else as the file's text states it.
+        """Return the sensor, with the pixel pitch `given` by the user, else that of the file.
 
-        Raises ConfigurationError where no camera has such values.
+        text: that of the file. Raises ConfigurationError if no camera has such values.
         """
         width, height = (int(side) for side in self.size)
         if not (0 < width <= 100_000 and 0 < height <= 100_000):
@@ -111,27 +112,27 @@ class CameraRecord:
         own = self.pixel_pitch
         if self.family is BROWN and own and given and not np.isclose(given, own, rtol=1e-9):
             raise ConfigurationError(
-                f"pixel pitch {given:g} mm was given, the file says {own:g} mm"
+                f"pixel pitch {given:g} mm was given, but the file states {own:g} mm"
             )
         pitch = own if given is None else given
         if pitch is None:
-            stated = _PITCH.search(text)  # by a comment of ours
+            stated = _PITCH.search(text)  # in the comment of `head`
             if stated is None:
                 raise ConfigurationError(
-                    "the file does not say how large a pixel is: give it, in mm (--pixel-pitch "
+                    "the file does not state the pixel pitch: give it, in mm (--pixel-pitch "
                     "0.00112 for a Raspberry Pi camera v2.1)"
                 )
             pitch = float(stated.group(1))
         if not (math.isfinite(pitch) and 1e-5 < pitch < 1):
             raise ConfigurationError(
-                f"pixel pitch {pitch:g} mm: between 0.00001 and 1 mm are possible"
+                f"pixel pitch {pitch:g} mm: it must be between 0.00001 and 1 mm"
             )
         sensor = Sensor(width, height, pitch)
-        # a focal length of zero or less would only fail later, and in other words
+        # a focal length of zero or less would fail later, with a message less clear
         focal = self.values[0] / (pitch if self.family.parameters[0] == "c" else 1.0)
         if not 0.05 * max(self.size) < focal < 1000 * max(self.size):
             raise ConfigurationError(
-                f"a principal distance of {focal:g} px does not belong to an image of {width} × "
+                f"a principal distance of {focal:g} px is impossible for an image of {width} × "
                 f"{height} px"
             )
         return sensor
@@ -139,8 +140,10 @@ class CameraRecord:
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A file format: its name, usual suffix, what it is for; the family in which a camera is
-    written; its writer and reader of text; whether a text is of it, from the content alone.
+    """A file format.
+
+    about: what it is; family: returns the family of models in which a camera is written; encode,
+    decode: write and read the text; recognises: whether a text is in this format, by its content.
     """
 
     name: str
@@ -178,10 +181,10 @@ def _encode_own(record: CameraRecord) -> str:
 def _decode_own(text: str) -> CameraRecord:
     try:
         document = json.loads(text)
-    except json.JSONDecodeError as cause:
-        raise ConfigurationError(f"no valid JSON: {cause}") from None
+    except (json.JSONDecodeError, RecursionError) as cause:
+        raise ConfigurationError(f"not valid JSON: {cause}") from None
     if not isinstance(document, dict) or document.get("format") != _VERSION:
-        raise ConfigurationError(f"no camera file: format is not {_VERSION!r}")
+        raise ConfigurationError(f"not a camera file: format is not {_VERSION!r}")
     head, values = document.get("sensor"), document.get("interior")
     if not isinstance(head, dict) or not isinstance(values, dict):
         raise ConfigurationError("sensor or interior is missing")
@@ -190,9 +193,9 @@ def _decode_own(text: str) -> CameraRecord:
     if "c" not in values:
         raise ConfigurationError("interior.c is missing")
     interior = np.array([number(values.get(name, 0.0), f"interior.{name}") for name in IOP_NAMES])
-    covariance = None
-    if document.get("covariance") is not None:
-        matrix = document["covariance"].get("matrix")
+    covariance = document.get("covariance")
+    if covariance is not None:
+        matrix = covariance.get("matrix") if isinstance(covariance, dict) else None
         covariance = numbers(matrix, "covariance.matrix", (100,)).reshape(10, 10)
     name = str(document.get("name", "camera"))
     return CameraRecord(size, BROWN, interior, name, covariance, pitch)

@@ -1,37 +1,36 @@
-"""Files of other programs: OpenCV, ROS, Kalibr, mrcal, COLMAP; AICON and Agisoft Metashape.
+"""Camera files of OpenCV, ROS, Kalibr, mrcal, COLMAP, AICON, and Agisoft Metashape.
 
 OpenCV: YAML as cv2.FileStorage reads it and `calibration` in OpenCV's samples writes it, with
 camera_matrix (3, 3), distortion_coefficients (1, 4 … 12) in OpenCV's order, image_width,
-image_height. A covariance goes into nodes of our own, which OpenCV's readers pass over:
+image_height. A covariance goes into nodes of our own, which OpenCV's readers ignore:
 intrinsics_covariance in the order fx fy cx cy k1 k2 p1 p2 k3, and std_deviation_intrinsics.
 
-ROS: camera_info YAML as camera_calibration_parsers reads it, model plumb_bob, or rational.
+ROS: camera_info YAML as camera_calibration_parsers reads it, plumb_bob or rational_polynomial.
 
-Kalibr: camchain YAML, pinhole with radtan, which has no sixth-order radial term.
+Kalibr: camchain YAML, pinhole with radtan, which has no radial term of sixth order.
 
 mrcal: .cameramodel, a Python dictionary literal; LENSMODEL_OPENCV4 or 5, pixel centres at 0.
 
-COLMAP: cameras.txt, `CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]`, pixel centres at 0.5. Written as
-FULL_OPENCV, or as OPENCV where there is no k3; read from these and the simpler models.
+COLMAP: cameras.txt, `CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]`, pixel centres at 0.5. We write
+FULL_OPENCV, or OPENCV if k3 is zero; we read these and the simpler models.
 
-AICON's .ior holds photogrammetric terms in mm, radial ones balanced by R0.
-
-Written is the record that TU Dresden's FlowVeloTool (github.com/AnetteEltner/FlowVeloTool,
-photogrammetry_functions.py) reads as an AICON .ior, the one public reader there is: one line of
-numbers between single blanks,
+AICON: .ior with photogrammetric terms in mm, the radial ones balanced by R0. We write the record
+that TU Dresden's FlowVeloTool (github.com/AnetteEltner/FlowVeloTool, photogrammetry_functions.py)
+reads as an AICON .ior; it is the only public reader. The record is one line of numbers separated by
+single blanks,
 
     camera type Ck Xh Yh A1 A2 R0 A3 B1 B2 C1 C2 width height columns rows
 
-with Ck < 0 and mm; the first two are skipped by it. With R0 ≠ 0 it has, ideal points (x̂, ŷ) of
-principal distance -Ck, x' = Xh + (1 + C1)(x̂ + Δx) + C2 (ŷ + Δy), y' = Yh + ŷ + Δy: exact without
-affinity and shear. (With R0 = 0 it takes the terms as numbers without unit: never written here,
-and refused.) Comments follow the record, where its reader does not look.
+with Ck < 0, in mm; FlowVeloTool ignores the first two. If R0 ≠ 0, it maps ideal points (x̂, ŷ) of
+principal distance -Ck to x' = Xh + (1 + C1)(x̂ + Δx) + C2 (ŷ + Δy), y' = Yh + ŷ + Δy, which is exact
+without affinity and shear. If R0 = 0, it takes the terms as numbers without unit: we never write
+that, and refuse to read it. Comments follow the record, where FlowVeloTool does not read.
 
-Read are both this record and `name value [sd]` per line, as calibration sheets are typed over;
-there the terms are those of the measured point (Luhmann et al. 2014, section 3.3.2).
+We read this record, and `name value [sd]` on each line, as people type calibration sheets; there
+the terms are those of the measured point (Luhmann et al. 2014, section 3.3.2).
 
-Metashape's camera calibration is XML with the frame projection; a document of exported cameras with
-one sensor is read too, its covariance included.
+Metashape: XML of a camera calibration with the frame projection. An XML of exported cameras with
+one sensor is read too, with its covariance.
 """
 
 from __future__ import annotations
@@ -81,13 +80,13 @@ def _encode_opencv(record: CameraRecord) -> str:
 
 
 def _decode_opencv(text: str) -> CameraRecord:
-    # not with cv2.FileStorage: a damaged file makes it crash the process (OpenCV 5.0.0)
-    plain = re.sub("!!opencv-(nd-)?matrix", "", text.partition("\n")[2])  # the second by OpenCV 5
+    # not with cv2.FileStorage, which crashes the process if a file is damaged (OpenCV 5.0.0)
+    plain = re.sub("!!opencv-(nd-)?matrix", "", text.partition("\n")[2])  # nd: OpenCV 5
     return _of_matrices(yaml_mapping(plain), (0, 4, 5, 8, 12, 14))
 
 
 def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRecord:
-    """Read a camera in OpenCV's matrices, with so many distortion coefficients."""
+    """Read a camera from OpenCV's matrices; counts: possible numbers of distortion coefficients."""
 
     def matrix(key: str, counts: tuple[int, ...]) -> Array:
         node = document.get(key, {"data": []})
@@ -97,7 +96,7 @@ def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRec
     if np.any(d[12:]):
         raise ConfigurationError("a tilted sensor (tau) has no counterpart in this model")
     if K[1] != 0:
-        raise ConfigurationError("a skewed camera_matrix is nothing that OpenCV itself uses")
+        raise ConfigurationError("camera_matrix has a skew, which OpenCV itself ignores")
     values = np.concatenate([K[[0, 4, 2, 5]], d[:12]])
     covariance = None
     if "intrinsics_covariance" in document:
@@ -142,11 +141,12 @@ def _encode_ros(record: CameraRecord) -> str:
 def _decode_ros(text: str) -> CameraRecord:
     document = yaml_mapping(text)
     model = document.get("distortion_model")
-    if model not in _ROS_COUNTS:
+    count = _ROS_COUNTS.get(str(model))
+    if count is None:
         raise ConfigurationError(
-            f"distortion_model {model!r}: plumb_bob and rational_polynomial can be read"
+            f"distortion_model {model!r}: only plumb_bob and rational_polynomial can be read"
         )
-    return _of_matrices(document, (_ROS_COUNTS[model],))
+    return _of_matrices(document, (count,))
 
 
 ROS = Format(
@@ -174,14 +174,14 @@ def _decode_kalibr(text: str) -> CameraRecord:
     document = yaml_mapping(text)
     camera = document.get("cam0")
     if not isinstance(camera, dict):
-        raise ConfigurationError("no camchain: there is no cam0")
+        raise ConfigurationError("not a camchain: cam0 is missing")
     if "cam1" in document:
-        raise ConfigurationError("the chain holds several cameras: leave the one that is wanted")
+        raise ConfigurationError("the camchain has several cameras: delete all but one")
     kinds = camera.get("camera_model"), camera.get("distortion_model")
     if kinds[0] != "pinhole" or kinds[1] not in ("radtan", "none", None):
         raise ConfigurationError(
-            f"camera_model {kinds[0]!r} with distortion_model {kinds[1]!r}: pinhole with radtan "
-            "can be read"
+            f"camera_model {kinds[0]!r} with distortion_model {kinds[1]!r}: only pinhole "
+            "with radtan can be read"
         )
     f = numbers(camera.get("intrinsics"), "intrinsics", (4,))
     d = numbers(camera.get("distortion_coeffs") or [], "distortion_coeffs", (0, 4))
@@ -199,7 +199,7 @@ _MRCAL_COUNTS = {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)} | {"LENSMODEL
 
 
 def _four_or_five(model: CameraModel) -> Family:
-    """Without k3 where there is no such term."""
+    """Return OpenCV's family with four coefficients, or with five if k3 is not zero."""
     return opencv(4 if model.interior.A3 == 0 else 5)
 
 
@@ -223,16 +223,16 @@ def _encode_mrcal(record: CameraRecord) -> str:
 def _decode_mrcal(text: str) -> CameraRecord:
     try:
         document = ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError, MemoryError, RecursionError):
-        raise ConfigurationError("no .cameramodel: not a dictionary in Python's notation") from None
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        raise ConfigurationError("not a dictionary in Python's notation") from None
     if not isinstance(document, dict):
-        raise ConfigurationError("no .cameramodel: not a dictionary")
+        raise ConfigurationError("not a dictionary")
     lens = document.get("lensmodel")
-    if lens not in _MRCAL_COUNTS:
+    count = _MRCAL_COUNTS.get(str(lens))
+    if count is None:
         raise ConfigurationError(
-            f"lensmodel {lens!r}: {', '.join(sorted(_MRCAL_COUNTS))} can be read"
+            f"lensmodel {lens!r}: only {', '.join(sorted(_MRCAL_COUNTS))} can be read"
         )
-    count = _MRCAL_COUNTS[lens]
     values = numbers(document.get("intrinsics"), "intrinsics", (4 + count,))
     size = numbers(document.get("imagersize"), "imagersize", (2,))
     return CameraRecord(size, opencv(count), values)
@@ -244,7 +244,7 @@ MRCAL = Format(
 )  # fmt: skip
 
 
-# Where each model's parameters stand in fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6.
+# places of each model's parameters in fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6
 _COLMAP_SLOTS: dict[str, tuple[tuple[int, ...], ...]] = {
     "SIMPLE_PINHOLE": ((0, 1), (2,), (3,)),
     "PINHOLE": ((0,), (1,), (2,), (3,)),
@@ -273,13 +273,13 @@ def _colmap_cameras(text: str) -> list[list[str]]:
 def _decode_colmap(text: str) -> CameraRecord:
     cameras = _colmap_cameras(text)
     if len(cameras) != 1:
-        raise ConfigurationError(
-            f"the file holds {len(cameras)} cameras: leave the line of the one that is wanted"
-        )
+        raise ConfigurationError(f"the file has {len(cameras)} cameras: keep the line of one")
     fields = cameras[0]
     if len(fields) < 5 or fields[1] not in _COLMAP_SLOTS:
         shown = fields[1] if len(fields) > 1 else ""
-        raise ConfigurationError(f"camera model {shown!r}: {', '.join(_COLMAP_SLOTS)} can be read")
+        raise ConfigurationError(
+            f"camera model {shown!r}: only {', '.join(_COLMAP_SLOTS)} can be read"
+        )
     slots = _COLMAP_SLOTS[fields[1]]
     given = [number(f, f"parameter {i + 1}") for i, f in enumerate(fields[4:])]
     if len(given) != len(slots):
@@ -298,7 +298,7 @@ COLMAP = Format(
 )  # fmt: skip
 
 
-# In the order of our ten: c x0 y0 A1 A2 A3 B1 B2 C1 C2.
+# in the order of our ten: c x0 y0 A1 A2 A3 B1 B2 C1 C2
 _AICON_NAMES = ("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
 _AICON_LINES = ("Ck", "Xh", "Yh", "A1", "A2", "R0", "A3", "B1", "B2", "C1", "C2")
 _AICON_SIZES = ("sensor_width_mm", "sensor_height_mm", "pixels_x", "pixels_y")
@@ -307,7 +307,7 @@ _TAGS = METASHAPE_FRAME.parameters
 
 
 def _usual_r0(size: Sequence[float] | Array, pitch: float) -> float:
-    """The radial correction vanishes at two thirds of the way to the corner, as is usual."""
+    """Return the usual R0, mm: two thirds of the way from the centre to a corner."""
     half_diagonal = 0.5 * float(np.hypot(*size)) * pitch
     return float(f"{2 / 3 * half_diagonal:.4g}")
 
@@ -328,27 +328,27 @@ def _encode_aicon(record: CameraRecord) -> str:
 
 def _decode_aicon(text: str) -> CameraRecord:
     fields = _aicon_record(text)
-    found, spread, name = _typed(text) if fields is None else _commented(text, fields)
+    found, spread, name = _read_sheet(text) if fields is None else _read_record(text, fields)
     r0 = number(found.get("R0", 0.0), "R0")
     values = np.array([number(found.get(key, 0.0), key) for key in _AICON_NAMES])
     if fields is not None and r0 == 0 and values[3:8].any():
         raise ConfigurationError(
-            "R0 is 0: programs differ in the unit of such terms; type the numbers over, one name "
-            "and value per line"
+            "R0 is 0: programs differ in the unit of the terms then; write one name and value per "
+            "line instead"
         )
     values[0] = abs(values[0])
     width, _, *pixels = [number(found[key], key) for key in _AICON_SIZES]
     if not 0 <= r0 < 1000:
-        raise ConfigurationError(f"R0 is {r0:g} mm; it is a radius in the image")
+        raise ConfigurationError(f"R0 is {r0:g} mm: it must be a radius in the image, 0 to 1000 mm")
     if not 1 <= pixels[0] < 1e6:
-        raise ConfigurationError(f"{pixels[0]:g} columns of pixels are impossible")
+        raise ConfigurationError(f"pixels_x: {pixels[0]:g} columns of pixels are impossible")
     covariance = np.diag([spread.get(key, 0.0) ** 2 for key in _AICON_NAMES]) if spread else None
     family = measured_point(r0) if fields is None else aicon(r0)
     return CameraRecord(pixels, family, values, name, covariance, width / pixels[0])
 
 
 def _aicon_record(text: str) -> list[str] | None:
-    """The fields of a record, or None where the text is none."""
+    """Return the fields of a record; None if the text is not a record."""
     words = [w for line in text.splitlines() for w in line.split("#")[0].split()]
     if len(words) != len(_AICON_FIELDS):
         return None
@@ -359,8 +359,8 @@ def _aicon_record(text: str) -> list[str] | None:
     return words if values[2] < 0 else None
 
 
-def _commented(text: str, fields: list[str]) -> tuple[dict[str, str], dict[str, float], str]:
-    """The values of a record; standard deviations and name as comments of ours state them."""
+def _read_record(text: str, fields: list[str]) -> tuple[dict[str, str], dict[str, float], str]:
+    """Return the values of a record; standard deviations and name from the comments we write."""
     spread, name = {}, "camera"
     for line in text.splitlines():
         words = line.split()
@@ -371,8 +371,8 @@ def _commented(text: str, fields: list[str]) -> tuple[dict[str, str], dict[str, 
     return dict(zip(_AICON_FIELDS, fields, strict=True)), spread, name
 
 
-def _typed(text: str) -> tuple[dict[str, str], dict[str, float], str]:
-    """The same of one `name value [sd]` per line."""
+def _read_sheet(text: str) -> tuple[dict[str, str], dict[str, float], str]:
+    """Return values, standard deviations, and name from lines `name value [sd]`."""
     found: dict[str, str] = {}
     spread: dict[str, float] = {}
     name = "camera"
@@ -397,7 +397,7 @@ def _typed(text: str) -> tuple[dict[str, str], dict[str, float], str]:
                 spread[key] = number(rest[1], f"line {i}: standard deviation of {key}")
     missing = [key for key in ("Ck", *_AICON_SIZES) if key not in found]
     if missing:
-        raise ConfigurationError(f"{', '.join(missing)} missing")
+        raise ConfigurationError(f"missing: {', '.join(missing)}")
     return found, spread, name
 
 
@@ -431,17 +431,17 @@ def _encode_metashape(record: CameraRecord) -> str:
 
 def _decode_metashape(text: str) -> CameraRecord:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ConfigurationError("a calibration needs no DOCTYPE and no entities")
+        raise ConfigurationError("a DOCTYPE and entities are not read: delete them")
     try:
         root = ET.fromstring(text)
     except ET.ParseError as cause:
-        raise ConfigurationError(f"no valid XML: {cause}") from None
+        raise ConfigurationError(f"not valid XML: {cause}") from None
     found = [root] if root.tag == "calibration" else root.findall(".//sensor/calibration")
     found = [c for c in found if c.get("class") != "initial"]
     if len(found) != 1:
         raise ConfigurationError(
-            f"the file holds {len(found)} calibrations: one is wanted (Tools, Camera Calibration, "
-            "save as XML)"
+            f"the file has {len(found)} calibrations instead of one: export it with Tools, Camera "
+            "Calibration, save as XML"
         )
     calibration = found[0]
     projection = calibration.findtext("projection") or calibration.get("type") or "frame"
@@ -461,7 +461,7 @@ def _decode_metashape(text: str) -> CameraRecord:
 
 
 def _metashape_covariance(root: ET.Element) -> Array | None:
-    """The covariance of a sensor in the order of the family, zero for what was held."""
+    """Return the covariance in the order of the family, zero for parameters held fixed."""
     node = root.find(".//sensor/covariance")
     if node is None:
         return None

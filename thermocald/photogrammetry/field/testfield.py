@@ -1,18 +1,18 @@
-"""The test field: known targets with their covariance, what of them one image shows, their planes.
+"""The test field: its targets with their standard deviations, image observations, and planes.
 
-A camera that replays measurements instead of pictures gives a Frame whose metadata hold, under
-`observations`, {"target": [name …], "x": [px …], "y": […], "sx": […], "sy": […]} and, where it is
-known, "sxy" px². Names, not rows: the receiver has a test field of its own.
+A camera that replays observations instead of images gives a Frame whose metadata has, under
+`observations`, {"target": [name …], "x": [px …], "y": […], "sx": […], "sy": […]} and, if known,
+"sxy" px². Targets are given by name, not by row, because the receiver has a test field of its own.
 
-A test field's file says neither its boards nor its targets' normals. Planes are looked for that
-hold most targets, with the tolerance that the field's spacing and its coordinates' errors ask for;
-what lies in one plane but far apart is taken for two boards. Boards that touch in one plane count
-as one. The normal of a target is that of the plane through its nearest on its own board, so that a
-board may be bent a little. A target on no board and no small plate has no normal: its eccentricity
-cannot be known, and is left out.
+A test field's file states neither its boards nor its targets' normals. We search for the planes
+with the most targets, with a tolerance from the field's spacing and the errors of its coordinates.
+Groups far apart in one plane are different boards; boards that touch in one plane count as one. A
+target's normal is that of the plane through its nearest neighbours on the same board, so that a
+board may be slightly bent. A target on no board and no small plate has no normal; its eccentricity
+cannot be computed and is neglected.
 
-Source: planes one after the other as Fischler, Bolles (1981), Comm. ACM 24, 381-395 (RANSAC), with
-targets as seeds instead of random ones.
+Source: planes are found one after the other as by Fischler, Bolles (1981), Comm. ACM 24, 381-395
+(RANSAC), but with targets as seeds instead of random samples.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ KINDS = ("circle", "marker_corner", "chess_corner")
 
 @dataclass(frozen=True, eq=False)
 class TestField:
-    """Known points: names, coordinates and standard deviations, what they look like.
+    """A test field's targets: names, coordinates with standard deviations, and appearance.
 
-    names: n unique strings; points (n, 3) mm; sigmas (n, 3) mm; diameters (n,) mm, NaN where it
-    has none; kinds, codes: n strings as CONVENTIONS §3 defines them, a code may be empty.
+    names: n unique strings; points (n, 3) mm; sigmas (n, 3) mm; diameters (n,) mm, NaN for targets
+    without one; kinds, codes: n strings as defined in CONVENTIONS §3; a code may be empty.
     """
 
-    __test__ = False  # pytest collects classes by their name
+    __test__ = False  # pytest would collect a class of this name
 
     names: tuple[str, ...]
     points: Array
@@ -74,7 +74,7 @@ class TestField:
         kinds: Sequence[str] | str = "circle",
         codes: Sequence[str] | str = "",
     ) -> TestField:
-        """Build from columns; a scalar stands for all targets."""
+        """Build a test field from columns; a scalar holds for all targets."""
         n = len(names)
         return cls(
             tuple(names),
@@ -90,7 +90,7 @@ class TestField:
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """Row of each target by its name."""
+        """The row of each target by its name."""
         return {name: i for i, name in enumerate(self.names)}
 
     @cached_property
@@ -100,9 +100,10 @@ class TestField:
 
     @cached_property
     def groups(self) -> NDArray[np.int64]:
-        """Label (n,) of what each target belongs to: the corners of one marker err together.
+        """Group label (n,) of each target: the corners of one marker have common errors.
 
-        By the code without its corner number, or the name without what follows its last point.
+        Corners are grouped by their code without the corner number, or else by their name up to
+        its last dot.
         """
         labels: dict[str, int] = {}
         out = np.empty(len(self), dtype=np.int64)
@@ -116,7 +117,7 @@ class TestField:
         return out
 
     def subset(self, rows: ArrayLike) -> TestField:
-        """The targets of some rows (indices)."""
+        """Return the test field of some rows (indices)."""
         r = np.asarray(rows, dtype=int)
         return TestField(
             tuple(self.names[i] for i in r),
@@ -130,7 +131,7 @@ class TestField:
 
 @dataclass(frozen=True, slots=True)
 class Distance:
-    """A measured distance between two targets, mm, with its standard deviation."""
+    """A measured distance between two targets, with its standard deviation, mm."""
 
     a: str
     b: str
@@ -140,11 +141,11 @@ class Distance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Image points of one epoch.
+    """The observed image points of one epoch.
 
-    targets: n row numbers in the test field, unique; points (n, 2) px; sigmas (n, 2) px;
-    covariances (n,) px² between x and y, None where none is known; quality: per-target extras by
-    name, (n,) each, such as `blur` px.
+    targets: n unique rows of the test field; points (n, 2) px; sigmas (n, 2) px; covariances (n,)
+    px², between x and y, None if unknown; quality: further values per target, (n,) each, by name,
+    such as `blur` px.
     """
 
     targets: NDArray[np.int64]
@@ -164,7 +165,7 @@ class Observations:
         return len(self.targets)
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Observations:
-        """Some of the observations, by mask or rows."""
+        """Return some of the observations, by mask or rows."""
         return Observations(
             self.targets[keep],
             self.points[keep],
@@ -181,8 +182,8 @@ class Observations:
         covariances: Array,
         quality: Mapping[str, Array],
     ) -> Observations:
-        """Build from covariances (n, 2, 2) px², in the order of the test field."""
-        found = cls(
+        """Build observations from covariances (n, 2, 2) px², in the order of the test field."""
+        built = cls(
             rows,
             points,
             np.sqrt(np.stack([covariances[:, 0, 0], covariances[:, 1, 1]], axis=-1)),
@@ -190,19 +191,19 @@ class Observations:
             dict(quality),
         )
         if (rows[1:] < rows[:-1]).any():
-            return found.select(np.argsort(rows, kind="stable"))
-        return found
+            return built.select(np.argsort(rows, kind="stable"))
+        return built
 
     @classmethod
     def none(cls) -> Observations:
-        """Return no observations, with covariances of none."""
+        """Return empty observations, with empty covariances."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
 
     def joined(self, other: Observations) -> Observations:
-        """Join another measurement of the frame; both are in the order of the test field.
+        """Return these observations and others of the same frame, in the order of the test field.
 
-        No target may be in both, and both have covariances. A quality that one does not have is
-        NaN there.
+        Both must be in this order and have covariances, and no target may be in both. A quality
+        that only one of them has is NaN for the other.
         """
         if len(other) == 0:
             return self
@@ -227,7 +228,7 @@ class Observations:
 
 
 def observations_to_lists(seen: Observations, field: TestField) -> dict[str, Any]:
-    """Observations → lists by name, JSON-able."""
+    """Return observations as lists for JSON, by target name."""
     lists: dict[str, Any] = {
         "target": [field.names[row] for row in seen.targets.tolist()],
         "x": seen.points[:, 0].tolist(),
@@ -241,7 +242,7 @@ def observations_to_lists(seen: Observations, field: TestField) -> dict[str, Any
 
 
 def observations_from_lists(lists: Mapping[str, Any], field: TestField) -> Observations:
-    """The inverse of `observations_to_lists`; TestFieldError for a foreign target."""
+    """Invert `observations_to_lists`; TestFieldError for a target that is not in the field."""
     rows = [field.index.get(name, -1) for name in lists["target"]]
     if -1 in rows:
         name = lists["target"][rows.index(-1)]
@@ -257,52 +258,51 @@ def observations_from_lists(lists: Mapping[str, Any], field: TestField) -> Obser
     )
 
 
-ELSEWHERE = 0.0025  # of the principal distance, from an adjusted camera
-FAR_ELSEWHERE = 0.01  # from one that is known roughly, and may err by more in the image's corners
-_UNUSUAL = 10.0  # times what all targets are off
+ELSEWHERE = 0.0025  # of the principal distance, if the camera is adjusted
+FAR_ELSEWHERE = 0.01  # if it is only approximate, with larger errors in the image's corners
+_UNUSUAL = 10.0  # times the median offset of all targets
 
 
 def find_misplaced(offsets: Array, c_px: float, least: float = ELSEWHERE) -> NDArray[np.bool_]:
-    """Find targets that lie elsewhere than the test field says.
+    """Return which targets (T,) are not where the test field has them.
 
-    Two whose names are exchanged reach all residuals that are adjusted together, and the partial
-    derivatives at their places in the field are those of other points. offsets (T, 2) px: seen
-    minus expected, NaN where none was seen; c_px: principal distance, px; least: share of it.
+    Two targets with exchanged names affect all residuals of an adjustment, and their partial
+    derivatives are those of other points. offsets (T, 2) px: observed minus predicted, NaN for
+    targets not observed; c_px: principal distance, px; least: smallest offset, as a share of it.
     """
     size = np.hypot(*np.asarray(offsets).T)
-    known = size[np.isfinite(size)]
-    usual = float(np.median(known)) if len(known) else 0.0
+    observed = size[np.isfinite(size)]
+    usual = float(np.median(observed)) if len(observed) else 0.0
     return np.asarray(size > max(least * c_px, _UNUSUAL * usual))
 
 
 FEWEST_ON_A_SHEET = 6
-"""Targets on a board; three always are in a plane, five sometimes by chance."""
+"""Fewest targets of a board: three are always in a plane, five sometimes by chance."""
 
-_SEED = 12  # nearest targets that give a first plane
+_SEED = 12  # nearest targets, for a first plane
 _FLATNESS = 0.05  # of the distance between neighbours
-_SIGMAS = 4.0  # of the coordinates
-_APART = 2.5  # times the distance between neighbours: another board
+_SIGMAS = 4.0  # tolerance, in standard deviations of the coordinates
+_APART = 2.5  # times the distance between neighbours; farther is another board
 _SEEDS = 60
-_LOCAL = 8  # nearest targets on a board that give a normal
+_LOCAL = 8  # nearest targets on a board, for a normal
 _PLATE = 4  # targets of a small plate, or at the rim of a board
-_LOOSE = 0.03  # flatness of a target with its nearest where no board was found
-_COMPACT = 1.6  # how much farther than the nearest the others may be for that
+_LOOSE = 0.03  # flatness of a target and its nearest, as a share of the spacing, without a board
+_COMPACT = 1.6  # for that, the largest ratio of their distances
 
 
 @lru_cache(maxsize=16)
 def field_normals(testfield: TestField) -> Array:
-    """`target_normals` of a field's circles, by row; NaN for what is not a circle."""
+    """Return the `target_normals` (n, 3) of a field's circles; NaN for other targets."""
     circles = testfield.circles
     normals = np.full((len(testfield), 3), np.nan)
-    # Marker corners lie on the sheets too and help where circles are few.
-    everything = target_normals(testfield.points)
-    normals[circles] = everything[circles]
+    # Marker corners are on the sheets too, and help if circles are few.
+    normals[circles] = target_normals(testfield.points)[circles]
     normals.setflags(write=False)
     return normals
 
 
 def target_normals(points: Array) -> Array:
-    """Return unit normals (n, 3), of either sign, of targets at (n, 3) mm; NaN for no plane."""
+    """Return unit normals (n, 3), of either sign, of targets at (n, 3) mm; NaN without a plane."""
     if len(points) < _PLATE:
         return np.full((len(points), 3), np.nan)
     near, _ = _neighbours(points)
@@ -323,9 +323,11 @@ def target_normals(points: Array) -> Array:
 
 
 def sheet_normals(points: Array, labels: NDArray[np.int64], nearest: int) -> Array:
-    """Return unit normals (n, 3), of either sign, of targets by the nearest on the same sheet, so
-    many with the target itself; NaN for those on none (label -1), or on one that is a single row:
-    it does not say how its board is turned about it.
+    """Return unit normals (n, 3), of either sign, of targets.
+
+    A normal is that of the plane through the `nearest` targets on the same sheet, the target
+    itself included. NaN for targets on no sheet (label -1), or on a sheet that is a single row,
+    about which its board could be turned.
     """
     normals = np.full((len(points), 3), np.nan)
     for label in np.unique(labels[labels >= 0]):
@@ -347,9 +349,10 @@ def sheet_normals(points: Array, labels: NDArray[np.int64], nearest: int) -> Arr
 
 
 def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array, bool]:
-    """Centre (3,), axes (3, 3; rows, right-handed, the last the normal), and whether it is flat.
+    """Fit a plane to points (n, 3); return its centre (3,), axes (3, 3), and whether it is flat.
 
-    Flat: the RMS distance from the plane is below `tolerance` of the RMS extent in it.
+    The axes are right-handed rows, the last of them the normal. Flat: the RMS distance from the
+    plane is below `tolerance` times the RMS extent in it.
     """
     X = np.asarray(points, dtype=float)
     centre = X.mean(axis=0)
@@ -363,14 +366,14 @@ def plane_fit(points: ArrayLike, tolerance: float = 0.002) -> tuple[Array, Array
 
 @lru_cache(maxsize=16)
 def field_sheets(testfield: TestField) -> NDArray[np.int64]:
-    """Label (n,) of the board of each target, -1 where it is on none."""
+    """Return the label (n,) of each target's board, -1 for targets on none."""
     labels = _sheets(testfield.points, _SIGMAS * float(np.median(testfield.sigmas)))
     labels.setflags(write=False)
     return labels
 
 
 def _sheets(points: Array, least: float) -> NDArray[np.int64]:
-    """Label (n,) of the board of each point, -1 where it is on none; least: tolerance, mm."""
+    """Return the label (n,) of each point's board, -1 for none; least: smallest tolerance, mm."""
     labels = np.full(len(points), -1, dtype=np.int64)
     if len(points) < FEWEST_ON_A_SHEET:
         return labels
@@ -394,8 +397,12 @@ def _sheets(points: Array, least: float) -> NDArray[np.int64]:
 
 
 def _neighbours(points: Array) -> tuple[NDArray[np.int64], float]:
-    """The nearest targets of each, and the usual distance of the third: of the next marker."""
-    # not SciPy's tree, whose import costs the daemon 25 MB
+    """Return the rows (n, k + 1) of each target and its nearest, and the spacing of targets, mm.
+
+    The spacing is the median distance to the third nearest, which for corners of markers is on the
+    next marker.
+    """
+    # not SciPy's tree, whose import takes 25 MB of the daemon's memory
     k = min(_SEED, len(points) - 1)
     near = np.empty((len(points), k + 1), dtype=np.int64)
     third = np.empty(len(points))
@@ -409,10 +416,10 @@ def _neighbours(points: Array) -> tuple[NDArray[np.int64], float]:
 def _plane(
     points: Array, near: NDArray[np.int64], left: NDArray[np.bool_], tolerance: float
 ) -> NDArray[np.int64]:
-    """The remaining targets in the plane of a target and some of its neighbours."""
+    """Return the remaining targets in the plane of `near`: a target and some of its neighbours."""
     inside = near[left[near]]
     found = np.zeros(0, dtype=np.int64)
-    # of growing neighbourhoods the largest that is flat: at an edge two boards meet
+    # the largest neighbourhood that is flat, since two boards may meet at an edge
     for size in (4, 6, _SEED + 1):
         some = inside[:size]
         if len(some) < 4:
@@ -433,7 +440,7 @@ def _plane(
 
 
 def _apart(points: Array, rows: NDArray[np.int64], distance: float) -> list[NDArray[np.int64]]:
-    """Targets of one plane that hang together by steps up to a distance."""
+    """Return the groups of targets in a plane that are connected by steps of at most `distance`."""
     left, groups = np.ones(len(rows), dtype=bool), []
     while left.any():
         group, ends = np.zeros(len(rows), dtype=bool), [int(np.argmax(left))]

@@ -1,12 +1,12 @@
-"""Measure a frame: everything of a test field that it shows, what was missed, focus and light.
+"""Measure a test field in a frame: its targets, the missed ones, focus and light.
 
     image ─► status ─► markers and ring codes ─► orientation ─► all circles ─► centres, covariances
 
-Coded targets only tell where the camera stands; from there every circle in view has a predicted
-outline, coded or plain, and is fitted there. So a code ring in a reflection costs nothing but
-itself, and plain circles need no search. The fits improve the orientation; where that changes the
-outlines, they are fitted once more. The edge width of each target is known; its trend over the
-image tells a tilted or shifting lens from plain defocus, and heat does both.
+Coded targets only give the orientation. It predicts the outline of every circle in view, coded or
+plain, which is fitted there. So a wrong code, as in a reflection, affects no other target, and
+plain circles need no search. The fits improve the orientation; if this changes the outlines, they
+are fitted once more. The blur of each target is estimated. Its trend over the image distinguishes a
+tilted or shifted lens from defocus; heat causes both.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array, Image
 
-_LARGEST_TILT_COSINE = 0.2  # 78°: beyond, a sheet is seen edge-on
+_LARGEST_TILT_COSINE = 0.2  # 78°; beyond, a sheet is nearly edge-on
 _GROSS_SD = 8.0
 _GROSS_PX = 3.0
 _USUAL_BLUR_PX = 0.9
@@ -60,16 +60,15 @@ def predict_circles(
 ) -> tuple[NDArray[np.int64], LocalMap]:
     """Predict the outlines of the field's circles that face the camera and lie in the image.
 
-    Returns their rows and maps. normals (n, 3): of the targets, by default those of the planes of
-    the field; a circle whose plane is not known is taken as facing the camera, and has no
-    eccentricity.
+    normals (n, 3): of the targets, by default from the planes of the field. A circle without a
+    normal is assumed to face the camera, and has no eccentricity. Returns rows and maps.
     """
     rows = np.nonzero(testfield.circles & np.isfinite(testfield.diameters))[0]
     points = testfield.points[rows]
-    given = field_normals(testfield) if normals is None else normals
-    known, cosine = facing(exterior.centre, points, given[rows])
+    normals = field_normals(testfield) if normals is None else normals
+    normals, cosine = facing(exterior.centre, points, normals[rows])
     maps = local_maps(
-        camera.sensor, camera.interior.as_array(), exterior.as_array(), points, known,
+        camera.sensor, camera.interior.as_array(), exterior.as_array(), points, normals,
         testfield.diameters[rows] / 2,
     )  # fmt: skip
     visible = (
@@ -83,17 +82,17 @@ def predict_circles(
 
 _FEWEST = 4
 _TURNED = (
-    "the corners of the markers are numbered in another order in the test field: turned by {}°. "
-    "Corner 0 is OpenCV's first, in an upright AprilTag the bottom right one, then clockwise; "
-    "`thermocald testfield import` writes it so"
+    "the test field numbers the corners of the markers in another order: turned by {}°. Corner 0 "
+    "is OpenCV's first, in an upright AprilTag the bottom right one, and the others follow "
+    "clockwise; `thermocald testfield import` writes this order"
 )
 _WORTH_A_SECOND_LOOK = {
     "not found", "no corner where the marker has one", "the fit does not converge"
 }  # fmt: skip
 _FEW_CORNERS = 12
 _REMEDIES = {
-    "saturated": "expose less, paper should be at three quarters of full scale",
-    "too little contrast": "more light, or expose longer",
+    "saturated": "expose less, so that paper is at three quarters of full scale",
+    "too little contrast": "use more light, or expose longer",
     "too blurred for its size": "focus, then fix the focus",
     "too small": "go nearer, or print larger targets",
 }
@@ -101,10 +100,12 @@ _REMEDIES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """What a frame gave: observations (none where the status is not ok), {row: reason} for targets
-    of the field that are in view and not measured, the approximate orientation (None where the
-    targets did not carry one), and where the marker corners are. Where targets are tracked,
-    `searched` says why the whole frame was searched, empty where only windows were read.
+    """The measurement of a frame.
+
+    observations: none if the status is not ok; missed: {row: reason} for targets of the field that
+    are in view and not measured; orientation: approximate, None if the targets do not determine
+    it; markers: places of the marker corners; searched: why a tracker searched the whole frame,
+    empty if it measured in windows only.
     """
 
     observations: Observations
@@ -120,11 +121,10 @@ def measure(
 ) -> Measurement:
     """Measure a test field in a frame (H, W), grey, 8 or 16 bit.
 
-    camera: what is known of it beforehand; the targets are found by their codes.
-    Never raises for what a camera may deliver: the status says what is wrong with the frame.
-    Quality per target: `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` and
-    `misfit` (residuals over noise; markers have none: NaN).
-    Raises TestFieldError where the field's codes are wrong.
+    camera: what is known of it beforehand. The targets are found by their codes. The qualities of
+    a target are `blur` px, `contrast`, `grey` (background), `noise` DN, `saturation` and `misfit`
+    (residual sd over noise; NaN for markers). Never raises for a bad frame, whose status is the
+    reason; TestFieldError if the field's codes are wrong.
     """
     size = None if camera is None else (camera.sensor.width, camera.sensor.height)
     status = inspect_frame(image, size)
@@ -135,7 +135,7 @@ def measure(
 
 
 class _Frame:
-    """One frame while it is measured; `missed` grows and shrinks."""
+    """A frame while it is measured; a second look may remove targets from `missed`."""
 
     def __init__(self, image: Image, testfield: TestField, camera: CameraSpec) -> None:
         self._image, self._field, self._camera = image, testfield, camera
@@ -145,19 +145,20 @@ class _Frame:
     def measure(self) -> Measurement:
         """Measure markers and squares, then the circles."""
         if turned := corners_turned_deg(self._markers, self._field):
-            return self._another_field(_TURNED.format(turned))
+            return self._other_field(_TURNED.format(turned))
         corners = measure_corners(self._image, self._markers, self._missed)
         if "chess_corner" in self._field.kinds:
             corners = corners.joined(find_chessboards(self._image, self._field, self._missed))
         corners = corners.joined(self._second_look(corners))
         if not self._field.circles.any():
-            return self._finished(corners)
-        return self._by_codes(corners)
+            return self._finish(corners)
+        return self._measure_circles(corners)
 
     def _second_look(self, corners: Observations) -> Observations:
-        """Measure corners that detection does not give where the orientation from the others has
-        them: those of markers and chessboards that it placed wrongly, and of the squares of ChArUco
-        boards.
+        """Measure further corners at the places predicted by the orientation from the others.
+
+        These are corners of markers and chessboards that were not detected or badly placed, and
+        the corners of squares of ChArUco boards.
         """
         again = {row for row, why in self._missed.items() if why in _WORTH_A_SECOND_LOOK}
         if len(corners) < max(_FEW_CORNERS, len(again)):
@@ -173,50 +174,50 @@ class _Frame:
         if len(corners) < _FEWEST or not rows:
             return Observations.none()
         try:
-            known = self._orient(corners.targets, corners.points)
+            orientation = self._orient(corners.targets, corners.points)
         except GeometryError:
             return Observations.none()
-        places = predict_corners(self._field, rows, known, self._markers)
+        places = predict_corners(self._field, rows, orientation, self._markers)
         found = measure_corners(self._image, places, self._missed)
         for row in found.targets.tolist():
             self._missed.pop(row, None)
         return found
 
     def _orient(self, rows: NDArray[np.int64], points: Array) -> Orientation:
-        known = self._camera
+        camera = self._camera
         return orient(
-            known.sensor, self._field.points[rows], points, known.principal_distance, known.interior
-        )
+            camera.sensor, self._field.points[rows], points, camera.principal_distance,
+            camera.interior,
+        )  # fmt: skip
 
-    def _by_codes(self, corners: Observations) -> Measurement:
-        """Find the circles by their codes and the corners."""
+    def _measure_circles(self, corners: Observations) -> Measurement:
+        """Orient the frame with the codes and the corners, and measure the circles."""
         rows, maps, foreign = find_coded(
             self._image, self._field, _FEWEST, needed=len(corners) < _FEWEST
         )
         pairs = np.concatenate([corners.targets, rows])
-        if len(pairs) < _FEWEST:  # too few for an orientation: those that there are, as ellipses
+        if len(pairs) < _FEWEST:  # too few for an orientation; the circles found, as ellipses
             fit = fit_circles(self._image, maps, have_rings(self._field, rows))
             self._missed.update(fit.missed(rows))
             circles = fit.observations(rows, fit.good)
-            return self._finished(corners.joined(circles), foreign=foreign)
+            return self._finish(corners.joined(circles), foreign=foreign)
         try:
             orientation = self._orient(pairs, np.concatenate([corners.points, maps.centre]))
         except GeometryError as error:
-            return self._another_field(
-                f"{len(pairs)} codes of the test field are seen, but not where it has them "
-                f"({error})"
+            return self._other_field(
+                f"{len(pairs)} codes of the test field are seen, but not where it has them: {error}"
             )
-        measured, missed, orientation = self._circles(orientation, corners)
+        measured, missed, orientation = self._fit_circles(orientation, corners)
         self._missed.update(missed)
-        return self._finished(corners.joined(measured), orientation, foreign)
+        return self._finish(corners.joined(measured), orientation, foreign)
 
-    def _circles(
+    def _fit_circles(
         self, orientation: Orientation, corners: Observations
     ) -> tuple[Observations, dict[int, str], Orientation]:
         """Fit every circle in view, improve the orientation with them, and fit once more if needed.
 
-        corners: what was measured before. Returns the observations, {row: reason} for circles that
-        were not measured, and the orientation.
+        corners: already measured. Returns the observations, {row: reason} for circles that were
+        not measured, and the orientation.
         """
         image, field = self._image, self._field
         rows, maps = predict_circles(field, orientation.camera, orientation.exterior)
@@ -224,7 +225,7 @@ class _Frame:
         fit = fit_circles(image, maps, coded, _USUAL_BLUR_PX)
         blur = float(np.median(fit.parameters[:, 5])) if len(rows) else _USUAL_BLUR_PX
         if blur > _WIDE_BLUR_PX:
-            # The windows were too narrow for this frame.
+            # the windows were too narrow for this blur
             fit = fit_circles(image, maps, coded, blur)
         good = fit.good
         if good.sum() + len(corners) < _FEWEST:
@@ -238,7 +239,7 @@ class _Frame:
         )  # fmt: skip
         new_rows, new_maps = predict_circles(field, better.camera, better.exterior)
         same = np.array_equal(new_rows, rows)
-        # The outlines' asymmetry decides about the centres, the rest is estimated anyway.
+        # the second derivatives shift the centres; the rest of the outline is estimated anyway
         settled = (
             same
             and good.all()
@@ -251,20 +252,20 @@ class _Frame:
                 start = fit.parameters if good.all() else None
             rows = new_rows
             fit = fit_circles(image, new_maps, have_rings(field, rows), blur, None, start)
-        # A circle far from where its target must be is another circle.
+        # a circle far from the predicted place is not the target
         predicted = better.camera.project(better.exterior, field.points[rows])
         off = np.abs(fit.points - predicted).max(axis=1, initial=0.0)
         limit = max(_GROSS_PX, _GROSS_SD * min(better.scatter, 1.0))
         fit.reasons[fit.good & (off > limit)] = "not where the target must be"
         return fit.observations(rows, fit.good), fit.missed(rows), better
 
-    def _finished(
+    def _finish(
         self,
         observations: Observations,
         orientation: Orientation | None = None,
         foreign: bool = False,
     ) -> Measurement:
-        """Return the result; foreign: whether codes of another field were seen."""
+        """Return the measurement with its status; foreign: codes of another field were seen."""
         word: Word = "ok"
         n, why = len(observations), ""
         if n < _FEWEST and foreign:
@@ -276,28 +277,28 @@ class _Frame:
             word, why = "nothing_found", _why_nothing(self._missed)
             if not any(self._field.codes):
                 why = (
-                    "the test field has no coded target and the camera's orientation is not known: "
-                    "plain circles alone cannot be separated"
+                    "the test field has no coded target and the camera's orientation is unknown: "
+                    "plain circles alone cannot be identified"
                 )
         elif n < _FEWEST:
             word, why = "too_few", f"only {n} targets are found in the frame"
         status = FrameStatus(word, why)
         return Measurement(observations, status, self._missed, orientation, self._markers)
 
-    def _another_field(self, why: str) -> Measurement:
+    def _other_field(self, why: str) -> Measurement:
         status = FrameStatus("other_field", why)
         return Measurement(Observations.none(), status, self._missed, None, self._markers)
 
 
 def _why_nothing(missed: dict[int, str]) -> str:
-    """What keeps the targets that are seen from being measured, by the most frequent reason."""
+    """Return why no target can be measured, by the most frequent reason."""
     reasons = [why for why in missed.values() if why != "not found"]
     if not reasons:
         return "no target of the test field is found in the frame"
     word, count = Counter(reasons).most_common(1)[0]
     remedy = _REMEDIES.get(word)
-    return f"{len(reasons)} targets are seen and none can be measured; {count} are {word}" + (
-        f": {remedy}" if remedy else ""
+    return f"{len(reasons)} targets are seen and none can be measured: {word} ({count})" + (
+        f"; {remedy}" if remedy else ""
     )
 
 
@@ -307,12 +308,13 @@ _BLUR_ROUNDS = 3
 
 
 def frame_figures(observations: Observations, sensor: Sensor) -> dict[str, float]:
-    """Figures of one frame for the store.
+    """Return the figures of a frame for the store.
 
     `blur_px` (in the middle of the image), `blur_trend_x`, `blur_trend_y` (px from the left to the
     right edge, from top to bottom), `blur_curvature` (px from the middle to the corners), each with
     `sd_…`; medians over the targets of `contrast` (DN, negative for dark targets), `grey` (DN of
-    the background), `noise` (DN), `saturation` (share of pixels). What cannot be told is absent.
+    the background), `noise` (DN), `saturation` (share of pixels). A figure that cannot be estimated
+    is absent.
     """
     figures: dict[str, float] = {}
     for name in ("contrast", "grey", "noise", "saturation"):
@@ -332,11 +334,11 @@ def frame_figures(observations: Observations, sensor: Sensor) -> dict[str, float
 
 
 def blur_trend(points: Array, blur: Array, sensor: Sensor) -> tuple[Array, Array]:
-    """Blur as b + tx·x + ty·y + k·r² of points (n, 2) px: (b, tx, ty, k) and their sd (4,), px.
+    """Fit b + tx·x + ty·y + k·r² to the blur at points (n, 2) px.
 
-    x and y run from -½ to ½ over the image, r from 0 in its middle to 1 in its corners. Robust: a
-    target that is disturbed does not count. The terms that the targets' spread does not carry get
-    large standard deviations.
+    x and y are -½ to ½ over the image, r is 0 in its middle and 1 in its corners. Returns
+    (b, tx, ty, k) and their sd (4,), px. The fit is robust against disturbed targets. Terms that
+    the distribution of the targets does not determine have large standard deviations.
     """
     x, y = ((points - sensor.centre) / (sensor.width, sensor.height)).T
     design = np.column_stack([np.ones(len(x)), x, y, 2 * (x * x + y * y)])

@@ -1,9 +1,9 @@
 """Natural control points, measured by least-squares matching with patches of a reference frame.
 
-Somebody clicked the points in the reference frame once. Where what is there is symmetric about a
-point (a cross, a checkered board) that point is measured and stands for the click; elsewhere, such
-as at the corner of a wall, the click defines the point and keeps its standard deviation. In a frame
-the patch is searched by correlation, then fitted with shift, affinity, brightness and contrast.
+The user has clicked the points in the reference frame. If the image around a click is symmetric
+about a point (a cross, a checkered board), this point is measured and replaces the click; if not,
+as at the corner of a wall, the click with its standard deviation defines the point. In a frame, a
+patch is searched by correlation, then fitted with shift, affinity, brightness and contrast.
 
 Source: Gruen, A. (1985): Adaptive least squares correlation, S. Afr. J. of Photogrammetry 14(3);
 Luhmann et al. (2014), section 5.4.5.
@@ -32,29 +32,28 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 MATCHING_SD = "matching_px"
-"""Quality of an observation: its sd without that of the click, which all frames share."""
+"""The quality of an observation that is its sd without that of the click, common to all frames."""
 
 _HALF = 12  # px of a patch to either side of its point
-_SEARCH_PX = 30  # a point is looked for so far from where it should be
-_TRACKED_PX = 8  # and first so far from where the last frame had it
+_SEARCH_PX = 30  # how far from its expected place a point is searched
+_TRACKED_PX = 8  # the same, first, if the last frame gives the place
 _SYMMETRIC = (5, 8, 12)  # px, the windows in which a centre of symmetry is sought
 _SYMMETRY = 0.75  # correlation of a window with itself turned by 180°
-_FARTHEST_CLICK = 2.5  # its standard deviations
-_AWAY_PX = 5  # a fit ends so near to where the search has found its patch
-_REACH = _HALF + _AWAY_PX + 6  # px to either side of a start that a fit looks at
-_ALIKE = 0.75  # correlation of a patch with the frame
+_FARTHEST_CLICK = 2.5  # standard deviations of a click
+_AWAY_PX = 5  # how far a fit may be from the place found by the search
+_REACH = _HALF + _AWAY_PX + 6  # px to either side of a start that a fit uses
+_ALIKE = 0.75  # least correlation of a patch with the frame
 _FEWEST = 3
 _ITERATIONS = 15
 _CONVERGED_PX = 1e-3
-_INTERPOLATED_PX = 0.01  # what a spline through pixels makes of edges that are as sharp as these
+_INTERPOLATED_PX = 0.01  # sd of the interpolation by splines at sharp edges
 _LEAST_CONTRAST = 3.0  # DN, root mean square
 
 
 class Templates:
     """Measures control points (rows of `field`) in frames, from a reference frame and clicks.
 
-    What does not change from frame to frame is kept: how a patch reacts to shift, affinity,
-    brightness and contrast.
+    The derivatives of the patches by shift, affinity, brightness and contrast are computed once.
     """
 
     def __init__(self, reference: NDArray[Any], field: TestField, clicks: Observations) -> None:
@@ -65,7 +64,7 @@ class Templates:
         inside = ((clicks.points >= low) & (clicks.points < high)).all(axis=1)
         self._rows = clicks.targets[inside]
         pairs = zip(clicks.points[inside], clicks.sigmas[inside], strict=True)
-        meant = [_meant(reference, point, sigma) for point, sigma in pairs]
+        meant = [_define(reference, point, sigma) for point, sigma in pairs]
         self._points = np.array([point for point, _ in meant]).reshape(-1, 2)
         self._defined = np.array([C for _, C in meant]).reshape(-1, 2, 2)
         self._prepare(reference)
@@ -73,7 +72,7 @@ class Templates:
 
     @classmethod
     def read(cls, path: Path, field: TestField, clicks: Observations) -> Self:
-        """Read the reference frame; ConfigurationError where it shows too few of the points."""
+        """Read the reference frame; ConfigurationError if too few of the points are in it."""
         try:
             made = cls(decode_grey(path), field, clicks)
         except ImageError as error:
@@ -87,12 +86,12 @@ class Templates:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Width and height px of the reference frame."""
+        """The width and height of the reference frame, px."""
         return self._shape[1], self._shape[0]
 
     @property
     def reference(self) -> Observations:
-        """The points in the reference frame, as measured."""
+        """The measured points in the reference frame."""
         none = np.zeros(len(self._rows))
         return Observations.build(self._rows, self._points, self._defined, {MATCHING_SD: none})
 
@@ -101,9 +100,9 @@ class Templates:
         self._shift, self._reach = np.zeros(2), _SEARCH_PX
 
     def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement:
-        """Measure a frame; raises ImageError where it cannot be decoded."""
+        """Measure a frame; raises ImageError if it cannot be decoded."""
         if isinstance(image, EncodedImage):
-            image = image.whole()  # it is given back: a gauge waits a minute for the next
+            image = image.whole()  # not reused, since a gauge takes a frame a minute
         status = inspect_frame(image, self.image_size)
         if not status.ok:
             return Measurement(Observations.none(), status)
@@ -114,7 +113,7 @@ class Templates:
         return found
 
     def _search(self, image: NDArray[Any]) -> Measurement:
-        """Match all patches: near where the last frame had them, then farther away."""
+        """Match all patches, first near their places in the last frame, then farther away."""
         places, covariance, reasons = found = self._match(image, self._reach, slice(None))
         if self._reach < _SEARCH_PX and (lost := np.flatnonzero(reasons != "")).size:
             for column, again in zip(found, self._match(image, _SEARCH_PX, lost), strict=True):
@@ -135,7 +134,7 @@ class Templates:
         return Measurement(seen, OK, missed)
 
     def _prepare(self, reference: NDArray[Any]) -> None:
-        """Cut out the patches, and calculate how they react."""
+        """Cut out the patches, and compute their steps of least squares."""
         v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1].astype(np.float64)
         spline = _spline(reference, self._points, _HALF + 8)
         unturned = np.tile([1.0, 0.0, 0.0, 1.0], (len(self._points), 1))
@@ -154,14 +153,14 @@ class Templates:
     def _match(
         self, image: NDArray[Any], reach: int, rows: NDArray[np.int64] | slice
     ) -> tuple[Array, Array, NDArray[Any]]:
-        """Search patches (rows of them) within `reach` px of where they should be, and fit them.
+        """Search some patches within `reach` px of their expected places, and fit them.
 
-        Returns places (n, 2) px, covariances (n, 2, 2) px², and why a patch is nowhere (n,).
+        Returns places (n, 2) px, covariances (n, 2, 2) px², and why a patch was not found (n,).
         """
         places = self._points[rows] + self._shift
         patches, reasons = self._grey[rows], np.full(len(places), "", dtype=object)
         for k, patch in enumerate(patches):
-            place = _searched(image, patch, places[k], reach)
+            place = _search_patch(image, patch, places[k], reach)
             if place is None:
                 reasons[k] = "outside the frame, or in the dark"
             else:
@@ -175,10 +174,10 @@ class Templates:
     def _fit(
         self, image: NDArray[Any], start: Array, rows: NDArray[np.int64]
     ) -> tuple[Array, Array, NDArray[Any]]:
-        """Fit patches (rows of them) to an image from their starts (n, 2) px; returns as `_match`.
+        """Fit some patches to an image from their starts (n, 2) px; return as `_match`.
 
-        The covariance is that of the residuals, enlarged by their correlation between neighbours. A
-        patch whose fit does not converge, or that is unlike, has a reason.
+        The covariance is from the residuals, enlarged for the correlation between neighbours. A
+        patch has a reason if its fit does not converge, or if it is not similar.
         """
         n, (u, v) = len(rows), self._grid
         grey, weight = self._grey[rows].reshape(n, -1), self._weight.ravel() / self._weight.sum()
@@ -193,7 +192,7 @@ class Templates:
             if not todo.size:
                 break
             sampled = _sampled(spline, todo, p[todo], u, v)
-            # brightness and contrast first, then how the frame's patch lies against the template
+            # brightness and contrast first, then the shift and affinity of the frame's patch
             common = (sampled * (grey[todo] - mean[todo, None])) @ weight
             gain = np.where(common > 0, common / np.maximum(variance[todo], 1e-12), 1.0)
             middle = sampled @ weight
@@ -202,7 +201,7 @@ class Templates:
             alike[todo] = common / np.sqrt(np.maximum(spread, 1e-12))
             r[todo] = (sampled - level[:, None]) / gain[:, None] - grey[todo]
             step = (self._step[rows[todo]] @ r[todo][:, :, None])[:, :, 0]
-            # inverse compositional: the step is the template's, and is undone in the frame
+            # inverse compositional: the step moves the template, and is inverted for the frame
             a, b, c, d = step[:, 2:6].T + np.array([[1.0], [0.0], [0.0], [1.0]])
             inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
             A = p[todo, 2:].reshape(-1, 2, 2) @ inverse.transpose(2, 0, 1)
@@ -227,10 +226,10 @@ class Templates:
 
 
 def _spline(image: NDArray[Any], middle: Array, reach: int) -> tuple[Array, NDArray[np.int64]]:
-    """Cubic splines through windows of an image, `reach` px to each side of places (n, 2); the
-    image's edge goes on. Returns coefficients (n, m, m) and first pixels (n, 2).
+    """Fit cubic splines to windows of an image, `reach` px to each side of places (n, 2).
 
-    OpenCV's remap interpolates on 1/32 px only, and SciPy's package takes a daemon 20 MB.
+    Beyond the image its edge pixels are repeated. Returns coefficients (n, m, m) and first pixels
+    (n, 2). OpenCV's remap interpolates at 1/32 px only, and SciPy takes 20 MB of a daemon's memory.
 
     Source: Unser, M., Aldroubi, A., Eden, M. (1993): B-spline signal processing, IEEE Transactions
     on Signal Processing 41(2).
@@ -246,7 +245,7 @@ def _spline(image: NDArray[Any], middle: Array, reach: int) -> tuple[Array, NDAr
 def _sampled(
     spline: tuple[Array, NDArray[np.int64]], rows: NDArray[np.int64], p: Array, u: Array, v: Array
 ) -> Array:
-    """Values (k, …) of splines (rows of them) at x = p0 + p2 u + p3 v, y = p1 + p4 u + p5 v.
+    """Return values (k, …) of the splines `rows` at x = p0 + p2 u + p3 v, y = p1 + p4 u + p5 v.
 
     p (k, 6).
     """
@@ -266,14 +265,14 @@ def _sampled(
 
 @lru_cache(maxsize=16)
 def _spline_inverse(size: int) -> Array:
-    """Matrix from samples to coefficients of a cubic spline that is mirrored at its ends."""
+    """Return the matrix from samples to coefficients of a cubic spline mirrored at its ends."""
     M = (4.0 * np.eye(size) + np.eye(size, k=1) + np.eye(size, k=-1)) / 6.0
     M[0, 1] = M[-1, -2] = 2.0 / 6.0
     return np.asarray(np.linalg.inv(M), dtype=float)
 
 
 def _basis(x: Array, size: int) -> tuple[NDArray[np.int64], list[Array]]:
-    """The first of the four coefficients at positions, and their weights."""
+    """Return the first of the four coefficients at positions, and their weights."""
     whole = np.clip(np.floor(x), 1, size - 3)
     t = np.clip(x - whole, 0.0, 1.0)
     s = 1.0 - t
@@ -283,22 +282,23 @@ def _basis(x: Array, size: int) -> tuple[NDArray[np.int64], list[Array]]:
     return whole.astype(np.int64) - 1, weights
 
 
-def _meant(image: NDArray[Any], click: Array, sigma: Array) -> tuple[Array, Array]:
-    """The point that a click means, and its covariance px²: that about which the image is
-    symmetric, where there is one, else the click itself.
+def _define(image: NDArray[Any], click: Array, sigma: Array) -> tuple[Array, Array]:
+    """Return the point that a click defines, and its covariance, px²: a centre of symmetry of the
+    image near the click, or else the click itself.
     """
     farthest = _FARTHEST_CLICK * float(sigma.max())
-    centres = [_centre(image, click, half, farthest) for half in _SYMMETRIC]
-    found = [centre for centre in centres if centre is not None]
-    return max(found, key=lambda centre: centre[2])[:2] if found else (click, np.diag(sigma**2))
+    found = (_find_centre(image, click, half, farthest) for half in _SYMMETRIC)
+    centres = [centre for centre in found if centre is not None]
+    return max(centres, key=lambda c: c[2])[:2] if centres else (click, np.diag(sigma**2))
 
 
-def _centre(
+def _find_centre(
     image: NDArray[Any], click: Array, half: int, farthest: float
 ) -> tuple[Array, Array, float] | None:
+    """Return a centre of symmetry near a click, its covariance px², and the symmetry; or None."""
     v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
     weight = np.exp(-0.5 * (u**2 + v**2) / (half / 1.5) ** 2)
-    # a click is a pixel or two off: the best start first
+    # a click may be off by pixels: start at the most symmetric one
     offsets = np.arange(-np.floor(farthest), farthest + 0.5)
     starts = [click + np.array([dx, dy]) for dy in offsets for dx in offsets]
     spline = _spline(image, click[None], half + 2 * math.ceil(farthest) + 4)
@@ -331,13 +331,13 @@ def _centre(
         return None
     inverse = np.linalg.inv(N)
     M = (J * (weight**2).reshape(-1, 1)).T @ J
-    # each pair of pixels stands there twice
+    # each pair of pixels is counted twice
     variance = 2.0 * float((weight * r**2).sum() / weight.sum())
     return p, inverse @ M @ inverse * variance * _correlated(r), symmetric
 
 
-def _searched(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Array | None:
-    """The pixel where a patch correlates best; None outside the image."""
+def _search_patch(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Array | None:
+    """Return the pixel where a patch correlates best; None if out of the image or in the dark."""
     half = patch.shape[0] // 2
     x, y = (round(float(c)) for c in near)
     left, top = max(x - reach - half, 0), max(y - reach - half, 0)
@@ -352,20 +352,20 @@ def _searched(image: NDArray[Any], patch: Array, near: Array, reach: int) -> Arr
 
 
 def _symmetry(window: Array, weight: Array) -> float:
-    """Weighted correlation of a window with itself turned by 180°; 0 without contrast."""
-    # the weights are symmetric too: both have one mean and one variance
+    """Return a window's weighted correlation with itself turned by 180°; 0 without contrast."""
+    # the weights are symmetric too, so that mean and variance of both are equal
     off = window - (weight * window).sum() / weight.sum()
     variance = float((weight * off**2).sum())
     return float((weight * off * off[::-1, ::-1]).sum()) / variance if variance > 0 else 0.0
 
 
 def _correlated(r: Array) -> Array:
-    """How much larger a mean's variance is than of independent residuals (…, m, m), by their
-    neighbours.
+    """Return by what factor correlation between neighbouring residuals (…, m, m) enlarges the
+    variance of their mean.
     """
     square = np.maximum(np.square(r).mean(axis=(-2, -1)), 1e-300)
     along = (r[..., 1:] * r[..., :-1]).mean(axis=(-2, -1)) / square
     down = (r[..., 1:, :] * r[..., :-1, :]).mean(axis=(-2, -1)) / square
     rho = np.clip([along, down], 0.0, 0.9)
-    found: Array = np.prod((1 + rho) / (1 - rho), axis=0)
-    return found
+    factor: Array = np.prod((1 + rho) / (1 - rho), axis=0)
+    return factor

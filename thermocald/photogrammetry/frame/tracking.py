@@ -2,18 +2,18 @@
 
     first frame ─► measure (full search) ─► weights
     next frames ─► fixed weights in windows ─► moved or disturbed ones fitted again ─► observations
-                        └─► too many lost ─► full search, and the measurement says so
+                        └─► too many lost ─► full search, with the reason in the measurement
 
-A tracker is the only thing here with a state: what the last epoch knew. It holds no images. Of an
-encoded image only what lies around the targets is decoded, where its format allows it.
+A tracker stores where the targets were in the last frame, and no image. Of an encoded image only
+the parts around the targets are decoded, if its format allows it.
 
 Fixed gradient weights give the next epoch's centres as weighted sums of grey values: between epochs
-a centre moves by hundredths of a pixel, and the blurred disc of the last fit is still the right one
-to the first order. One step of Gauss-Newton from there is a sum over pixels whose weights can be
-kept: δ = N⁻¹ Jᵀ W (g − model). It is as precise as the fit itself, at the Cramér-Rao bound. Errors
-of second order are even about the centre and drop out; those of third order reach a thousandth of a
-pixel at 0.15 px, where the weights have to be renewed. A change of light scales the partials; it is
-estimated with the rest and taken out of the step.
+a centre moves by hundredths of a pixel, so that the blurred disc of the last fit is still right to
+first order. One step of Gauss-Newton from it is a sum over pixels with constant weights:
+δ = N⁻¹ Jᵀ W (g − model). It is as precise as the fit itself, at the Cramér-Rao bound. Errors of
+second order are even about the centre and cancel; those of third order reach a thousandth of a
+pixel at 0.15 px, where the weights must be renewed. A change of light scales the partials; it is
+estimated with the other parameters and removed from the step.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradientWeights:
-    """Weights for n targets, made from their parameters (n, 10) and the frame's noise.
+    """The weights of n targets, from their parameters (n, 10) and the frame's noise.
 
-    maps, coded (n,): the targets' outlines, and which have a code ring; parts: of targets in like
-    windows their rows, pixels, values, weights and weighted partials; inverse (n, 10, 10): of the
-    normal matrices; freedom (n,): pixels beyond the parameters.
+    maps, coded (n,): the targets' outlines, and which have a code ring; parts: for targets with
+    windows of the same size, their rows, pixels, values, weights and weighted partials; inverse
+    (n, 10, 10): of the normal matrices; freedom (n,): redundancy of the pixels.
     """
 
     maps: LocalMap
@@ -67,7 +67,7 @@ class GradientWeights:
         parameters: Array,
         noise: NoiseModel,
     ) -> Self:
-        """Build from fitted parameters (n, 10); of the image only the size counts."""
+        """Build weights from fitted parameters (n, 10); only the size of the image matters."""
         parts = []
         inverse = np.zeros((len(parameters), 10, 10))
         freedom = np.ones(len(parameters))
@@ -86,9 +86,9 @@ class GradientWeights:
         return cls(maps, coded, parameters, noise, tuple(parts), inverse, freedom)
 
     def apply(self, image: Image) -> CircleFit:
-        """Step from the weights' own epoch to this image, which must be of the same size.
+        """Return the fit in an image of the same size, by one step from the epoch of the weights.
 
-        Covariances and misfit are with the noise as it was then.
+        Covariances and misfit are for the noise of that epoch.
         """
         n = len(self.parameters)
         rhs, square = np.zeros((n, 10)), np.zeros(n)
@@ -103,7 +103,7 @@ class GradientWeights:
         delta = (self.inverse @ rhs[..., None])[..., 0]
         square -= np.sum(rhs * delta, axis=1)
         contrast = self.parameters[:, 7]
-        # Position, shape and blur act in proportion to the contrast there is now.
+        # position, shape and blur act in proportion to the present contrast
         gain = contrast / np.where(np.abs(contrast + delta[:, 7]) > 0.1 * np.abs(contrast),
                                    contrast + delta[:, 7], np.inf)  # fmt: skip
         delta[:, :6] *= gain[:, None]
@@ -118,20 +118,20 @@ class GradientWeights:
 
 
 RENEWED_AT_PX = 0.15
-"""A target that has moved by more since its weights were made gets new ones."""
+"""A target that has moved farther since its weights were computed gets new ones."""
 _LARGEST_BLUR_CHANGE = 0.1
 _LARGEST_LIGHT_CHANGE = 0.2  # of the contrast
 _NEARLY_SATURATED = 0.97
 _ITERATIONS = 6
-_MISFIT = 1.5  # of the epoch's median: something happens at this target, look closely
+_MISFIT = 1.5  # of the epoch's median; a target with more is fitted again
 _LOST_SHARE = 0.3
 _RENEW_SHARE = 0.1
 _FEWEST = 4
-_MARGIN_PX = 3.0  # around the windows: how far the camera may move until all of a frame is decoded
+_MARGIN_PX = 3.0  # around the windows; if targets move farther, the whole frame is decoded
 
 
 _Circles: TypeAlias = "tuple[NDArray[np.int64], GradientWeights, NDArray[np.bool_]]"
-"""Those that are tracked: rows of the field, their weights, and which are seen."""
+"""The tracked circles: rows of the field, their weights, and which are seen."""
 
 
 class Tracker:
@@ -142,14 +142,13 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was tracked: the next frame is searched."""
+        """Forget the tracked targets; the next frame is searched."""
         self._shape: tuple[int, ...] | None = None  # of the frames, while something is tracked
 
     def measure(self, image: NDArray[Any] | EncodedImage) -> Measurement:
         """Measure a frame (H, W), grey, 8 or 16 bit.
 
-        Never raises for what a camera delivers, but ImageError where `image` is encoded and cannot
-        be decoded.
+        Never raises for a bad frame, except ImageError if an encoded image cannot be decoded.
         """
         if isinstance(image, EncodedImage):
             if self._shape is not None and self._dtype == np.uint8:
@@ -171,14 +170,14 @@ class Tracker:
 
     def _search(self, image: NDArray[Any], why: str) -> Measurement:
         found = measure(image, self._testfield, self._camera)
-        # A frame that shows nothing says nothing about where the targets are: keep what is known.
+        # after a bad frame the targets may still be at their last places
         if found.status.ok:
             self._shape, self._dtype, self._seen = image.shape, image.dtype, len(found.observations)
             self._circles, self._markers = self._begin(image, found), found.markers or None
         return replace(found, searched=why)
 
     def _begin(self, image: Image, found: Measurement) -> _Circles | None:
-        """Predict and weigh every circle in view, measured or not."""
+        """Predict every circle in view, measured or not, and compute the weights."""
         if found.orientation is None:
             return None
         rows, maps = predict_circles(
@@ -197,15 +196,13 @@ class Tracker:
         seen &= fit.good
         if seen.sum() < _FEWEST:
             return None
-        # A target that is hidden now keeps typical values for the time when it comes back.
+        # a hidden target gets typical values, so that it is found when it reappears
         p = np.where(seen[:, None], fit.parameters, np.median(fit.parameters[seen], axis=0))
         p[~seen, :2] = maps.centre[~seen]
         return rows, GradientWeights.build(image, maps, coded, p, fit.noise), seen
 
     def _track(self, image: Image, farthest: float = np.inf) -> Measurement | None:
-        """Measure in windows; None where too many targets are lost or moved by more than
-        `farthest` px.
-        """
+        """Measure in windows; None if too many targets are lost or moved beyond `farthest` px."""
         missed: dict[int, str] = {}
         found, circles = Observations.none(), self._circles
         markers = self._markers
@@ -224,7 +221,7 @@ class Tracker:
 
 
 def _boxes(circles: _Circles | None, markers: Corners | None) -> NDArray[np.int64]:
-    """What is looked at in the next frame (n, 4) px: left, top, right and bottom (exclusive)."""
+    """Return the boxes (n, 4) px used in the next frame: left, top, right, bottom (exclusive)."""
     centres, halves = [np.zeros((0, 2))], [np.zeros((0, 2))]
     if circles is not None:
         weights = circles[1]
@@ -242,8 +239,10 @@ def _boxes(circles: _Circles | None, markers: Corners | None) -> NDArray[np.int6
 def _track_circles(
     image: Image, circles: _Circles, missed: dict[int, str], farthest: float
 ) -> tuple[Observations, _Circles] | None:
-    """Return observations and the new state; None where all is lost, or where targets that have to
-    be fitted again moved by more than `farthest` px.
+    """Return observations and the new state.
+
+    Returns None if too many targets are lost, or if targets to be fitted again have moved by more
+    than `farthest` px.
     """
     rows, weights, seen = circles
     fit = weights.apply(image)
@@ -260,10 +259,10 @@ def _track_circles(
     )
     again = disturbed | ~seen
     calm = ~again
-    # The noise may have changed since the weights were made; the calm targets tell by how much.
+    # the noise may have changed since the weights were computed; calm targets show by how much
     factor = float(_median(misfit[calm])) ** 2 if calm.any() else 1.0
     np.multiply(fit.covariances, factor, out=fit.covariances)
-    # Where the calm ones went, the others went too.
+    # assume that the others have moved like the calm ones
     shift = _median(p[calm, :2] - old[calm, :2]) if calm.any() else np.zeros(2)
     if again.any():
         if np.abs(shift).max() > farthest:
@@ -289,7 +288,7 @@ def _track_circles(
 
 
 def _median(values: Array) -> Array:
-    """Median along the first axis: for so few values NumPy's own takes five times as long."""
+    """Return the median along the first axis; np.median takes five times as long for few values."""
     ordered = np.sort(values, axis=0)
     n = len(ordered)
     middle: Array = (ordered[(n - 1) // 2] + ordered[n // 2]) / 2

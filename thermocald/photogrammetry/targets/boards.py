@@ -1,14 +1,12 @@
-"""Boards that people own: ChArUco boards, chessboards, AprilGrids, rings of other programs.
+"""Standard boards: ChArUco boards, chessboards, AprilGrids, ring codes of other programs.
 
-Coordinates are mm on the board, X right, Y up, Z towards the viewer. A print is worth what its
-printer is worth: 0.1 mm, 1 mm in a metre, and paper that lies flat to half a millimetre, unless a
-better standard deviation is stated.
+Coordinates are mm on the board, X right, Y up, Z towards the viewer. Unless a standard deviation is
+given, that of a print is assumed: 0.1 mm, 1 mm per metre, and half a millimetre of flatness.
 
-The corners where four squares meet are measured on a ChArUco board where the orientation from its
-markers says they are; a plain chessboard is found as a whole by OpenCV, and numbered from the
-corner at a black outer square. The positions are our own fit of a saddle (`corner`). A test field
-names corner 17 of a plain board of 9 × 6 inner corners `CHESS:9x6:17`, row by row from the upper
-left, whose outer square is black.
+The corners where four squares meet are measured by fitting a saddle (`corner`). On a ChArUco board
+the orientation from its markers predicts their places. A plain chessboard is found as a whole by
+OpenCV. A test field names corner 17 of a plain board of 9 × 6 inner corners `CHESS:9x6:17`, counted
+row by row from the upper left one, whose outer square is black.
 """
 
 from __future__ import annotations
@@ -54,11 +52,12 @@ def board_of(
     sigma: float | Array | None = None,
     diameter: float = np.nan,
 ) -> TestField:
-    """Build a board of targets at points (n, 3) mm; sigma: mm, of each coordinate, None for a
-    print; diameter: of discs, mm.
+    """Build a board of targets at points (n, 3) mm.
+
+    sigma: of each coordinate, mm, None for a print; diameter: of discs, mm.
     """
     if not 4 <= len(names) <= _MOST_TARGETS:
-        raise TestFieldError(f"a board of {len(names)} targets: 4 to {_MOST_TARGETS} are possible")
+        raise TestFieldError(f"a board of {len(names)} targets: it must have 4 to {_MOST_TARGETS}")
     if sigma is None:
         local = points - points.mean(axis=0)
         spread = np.hypot(_SIGMA_PRINT, _SIGMA_SCALE * local)
@@ -76,18 +75,21 @@ def aprilgrid(
     first: int = 0,
     sigma: float | None = None,
 ) -> TestField:
-    """Kalibr's AprilGrid: size mm of a tag with its black border, spacing as a ratio of it.
+    """Build Kalibr's AprilGrid.
 
-    Tag `first` is at the lower left; numbers grow to the right, then upwards. The corners of an
-    upright tag are numbered from its bottom right, clockwise (`targets.markers`).
+    size: mm, of a tag with its black border; spacing: between tags, as a ratio of the size. Tag
+    `first` is at the lower left; numbers increase to the right, then upwards. The corners of an
+    upright tag are numbered clockwise from the bottom right one (`targets.markers`).
     """
     if not (columns > 0 and rows > 0 and size > 0 and 0 <= spacing <= 1):
         raise TestFieldError(
-            f"an AprilGrid of {columns} × {rows} tags of {size:g} mm, spacing {spacing:g} of it: "
+            f"an AprilGrid of {columns} × {rows} tags of {size:g} mm, spacing {spacing:g}: "
             "counts and size must be above 0, the spacing (a ratio) between 0 and 1"
         )
     if columns * rows * 4 > _MOST_TARGETS:
-        raise TestFieldError(f"{columns} × {rows} tags: at most {_MOST_TARGETS // 4} are possible")
+        raise TestFieldError(
+            f"an AprilGrid of {columns} × {rows} tags: it may have {_MOST_TARGETS // 4} at most"
+        )
     step = size * (1 + spacing)
     square = np.array([[size, 0.0], [0.0, 0.0], [0.0, size], [size, size]])
     names, points, codes = [], [], []
@@ -112,24 +114,24 @@ def charuco(
     legacy: bool = False,
     sigma: float | None = None,
 ) -> TestField:
-    """A ChArUco board of columns × rows squares as OpenCV and calib.io draw it.
+    """Build a ChArUco board of columns × rows squares as OpenCV and calib.io draw it.
 
-    square, marker: sides mm; legacy: the pattern of OpenCV before 4.6, whose upper left square is
-    another where the number of rows is even. Targets are the corners of squares (C0, C1 …, OpenCV's
-    numbers) and of markers (M0.0 …).
+    square, marker: sides, mm; legacy: the pattern of OpenCV before 4.6, with the other colour of
+    the upper left square if the number of rows is even. Targets are the corners of squares
+    (C0, C1 …, OpenCV's numbers) and of markers (M0.0 …).
     """
     if not (2 <= columns <= 100 and 2 <= rows <= 100 and 0 < marker < square):
         raise TestFieldError(
             f"a ChArUco board of {columns} × {rows} squares of {square:g} mm with markers of "
-            f"{marker:g} mm: 2 to 100 squares, and markers smaller than squares"
+            f"{marker:g} mm: it must have 2 to 100 squares, and markers smaller than squares"
         )
-    known = markers_of(dictionary)
+    markers = markers_of(dictionary)
     numbers = np.arange(columns * rows // 2, dtype=np.int32)
-    if numbers[-1] >= len(known.bytesList):
+    if numbers[-1] >= len(markers.bytesList):
         raise TestFieldError(
-            f"{dictionary} has {len(known.bytesList)} markers, the board needs up to {numbers[-1]}"
+            f"{dictionary} has {len(markers.bytesList)} markers, but the board needs {len(numbers)}"
         )
-    board = cv2.aruco.CharucoBoard((columns, rows), square, marker, known, numbers)
+    board = cv2.aruco.CharucoBoard((columns, rows), square, marker, markers, numbers)
     board.setLegacyPattern(legacy)
     corners = np.asarray(board.getChessboardCorners(), dtype=float)
     names = [f"C{i}" for i in range(len(corners))]
@@ -141,7 +143,7 @@ def charuco(
         names += [f"M{number}.{k}" for k in range(4)]
         kinds += ["marker_corner"] * 4
         codes += [f"{dictionary}:{number}:{k}" for k in range(4)]
-    # OpenCV's board has y down
+    # y of OpenCV's board is down
     upright = np.concatenate(points) * np.array([1.0, -1.0, 0.0]) + np.array([0, rows * square, 0])
     return board_of(names, upright, kinds, codes, sigma)
 
@@ -150,16 +152,17 @@ def chessboard(
     columns: int, rows: int, square: float, square_y: float | None = None,
     *, sigma: float | None = None,
 ) -> TestField:  # fmt: skip
-    """A plain chessboard of columns × rows inner corners, squares in mm; its upper left square is
-    black. TestFieldError for one that looks the same upside down.
+    """Build a plain chessboard of columns × rows inner corners, whose upper left square is black.
+
+    square, square_y: sides, mm. TestFieldError for a board that looks the same upside down.
     """
     if not (3 <= columns <= 100 and 3 <= rows <= 100 and square > 0):
         raise TestFieldError(
-            f"a chessboard of {columns} × {rows} inner corners of {square:g} mm: 3 to 100 are "
-            "possible, and a square above 0"
+            f"a chessboard of {columns} × {rows} inner corners, squares of {square:g} mm: it must "
+            "have 3 to 100 corners each way, and squares above 0 mm"
         )
-    high = square if square_y is None else square_y
-    x, y = np.meshgrid(np.arange(1, columns + 1) * square, np.arange(rows, 0, -1) * high)
+    height = square if square_y is None else square_y
+    x, y = np.meshgrid(np.arange(1, columns + 1) * square, np.arange(rows, 0, -1) * height)
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     names = [f"C{i}" for i in range(len(points))]
     codes = [chess_code(columns, rows, i) for i in range(len(points))]
@@ -174,14 +177,16 @@ def numbered_rings(
     *,
     sigmas: Array | None = None,
 ) -> TestField:
-    """Ring-coded targets as Metashape and AICON number them: the n-th code of so many bits.
+    """Build ring-coded targets numbered as by Metashape and AICON: the n-th code of `bits` bits.
 
-    numbers (n) from 1 on; points (n, 3), diameter of the inner disc and sigmas mm.
+    numbers: n, from 1; points (n, 3) mm; diameter: of the inner disc, mm; sigmas (n, 3) mm.
     """
     codes = ring_code.codes(bits)
     for number in numbers:
         if not 1 <= number <= len(codes):
-            raise TestFieldError(f"target {number}: there are {len(codes)} codes of {bits} bits")
+            raise TestFieldError(
+                f"target {number}: there are {len(codes)} codes of {bits} bits, from 1"
+            )
     return board_of(
         [str(n) for n in numbers], points, ["circle"] * len(numbers),
         [ring_code.write(bits, codes[n - 1]) for n in numbers], sigmas, diameter,
@@ -189,27 +194,27 @@ def numbered_rings(
 
 
 _CODE = re.compile(r"CHESS:(\d{1,3})x(\d{1,3}):(\d{1,5})")
-_QUIET_SHARE = 0.45  # of the distance between corners, where no marker stands nearer
+_QUIET_SHARE = 0.45  # of the distance between corners, if no marker is nearer
 
 
 def chess_code(columns: int, rows: int, number: int) -> str:
-    """The code of an inner corner; TestFieldError for boards that look the same upside down."""
+    """Return an inner corner's code; TestFieldError for a board that looks the same upside down."""
     if (columns + rows) % 2 == 0:
         raise TestFieldError(
-            f"a chessboard of {columns} × {rows} inner corners looks the same turned by 180°: its "
-            "corners cannot be numbered. Take one with an even and an odd count, or a ChArUco board"
+            f"a chessboard of {columns} × {rows} inner corners looks the same turned by 180°, and "
+            "cannot be numbered; use one with an even and an odd count, or a ChArUco board"
         )
     return f"CHESS:{columns}x{rows}:{number}"
 
 
 def parse_chess(code: str) -> tuple[int, int, int]:
-    """`CHESS:9x6:17` → (9, 6, 17); TestFieldError for what is not such a code."""
+    """Parse `CHESS:9x6:17` to (9, 6, 17); TestFieldError if it is not such a code."""
     found = _CODE.fullmatch(code)
     if found is None:
         raise TestFieldError(f"{code!r} is not a corner of a chessboard: write CHESS:9x6:17")
     columns, rows, number = (int(n) for n in found.groups())
     if not (columns >= 3 and rows >= 3 and number < columns * rows):
-        raise TestFieldError(f"{code!r}: a board has 3 × 3 inner corners at least, the first is 0")
+        raise TestFieldError(f"{code!r}: a board has at least 3 × 3 inner corners, numbered from 0")
     chess_code(columns, rows, number)
     return columns, rows, number
 
@@ -226,7 +231,7 @@ def find_chessboards(
     found = Observations.none()
     grey = to_8_bit(image)
     for (columns, rows), row_of in boards.items():
-        grid = _find(grey, columns, rows)
+        grid = _find_board(grey, columns, rows)
         if grid is None:
             missed.update(dict.fromkeys(row_of.values(), "not found"))
             continue
@@ -241,13 +246,13 @@ def find_chessboards(
     return found
 
 
-def _find(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
-    """The inner corners (rows, columns, 2) px of one board, right-handed, from its black corner."""
+def _find_board(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
+    """Return a board's inner corners (rows, columns, 2) px, right-handed, from its black corner."""
     scale = 2 if grey.size > LARGE_PIXELS else 1
     small = halved(grey) if scale > 1 else grey
     size = (columns, rows)
     done, corners = cv2.findChessboardCornersSB(small, size, flags=0)
-    if not done:  # oblique or soft boards: by the quadrangles
+    if not done:  # an oblique or blurred board: by its quadrangles
         done, corners = cv2.findChessboardCorners(small, size)
     if not done:
         return None
@@ -259,7 +264,7 @@ def _find(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
 
 
 def _begins_black(grey: NDArray[np.uint8], grid: Array) -> bool:
-    """Whether the square outside of the first corner is darker than its neighbours."""
+    """Return whether the square outside the first corner is darker than its neighbours."""
     right, down = grid[0, 1] - grid[0, 0], grid[1, 0] - grid[0, 0]
     diagonal = [grid[0, 0] - 0.4 * (right + down), grid[0, 0] + 0.4 * (right + down)]
     beside = [grid[0, 0] + 0.4 * (right - down), grid[0, 0] - 0.4 * (right - down)]
@@ -275,17 +280,17 @@ def _begins_black(grey: NDArray[np.uint8], grid: Array) -> bool:
 def predict_corners(
     testfield: TestField, rows: Sequence[int], orientation: Orientation, found: Corners
 ) -> Corners:
-    """Predict where corners (rows of the field) are by an orientation, those in the image.
+    """Predict the corners (rows of the field) in the image from an orientation.
 
-    found: the markers that were detected, for the width of their border. A marker's corner of which
-    a neighbour is not in the field, or that is seen small, is left out.
+    found: the detected markers, for the width of their border. A marker's corner is left out if a
+    neighbour is not in the field, or if the marker is too small in the image.
     """
     at = np.array(rows, dtype=np.int64)
     chess = np.array([testfield.kinds[row] == "chess_corner" for row in at], dtype=bool)
     sides = np.full((2, len(at), 3), np.nan)
     side = np.linalg.norm(found.before - found.places, axis=1)
     border = float(np.median(found.quiet / np.maximum(side, 1e-9))) if len(found) else 0.1
-    quiet = np.full(len(at), border)  # over the shorter side
+    quiet = np.full(len(at), border)  # as a share of the shorter side
     sides[:, chess], quiet[chess] = _squares(testfield, at[chess])
     points = testfield.points[at]
     row_of = {(n, *key): row for n, m in marker_rows(testfield).items() for key, row in m.items()}
@@ -307,8 +312,8 @@ def predict_corners(
 
 
 def _squares(testfield: TestField, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-    """For each corner two directions (2, n, 3) mm along its edges, to neighbours, and how far (n,)
-    from the edges nothing but squares is, over the first of them.
+    """Return for each corner two vectors (2, n, 3) mm along its edges to its neighbours, and the
+    width (n,) around the edges with only squares, as a share of the first vector.
     """
     points = testfield.points[rows]
     kinds = np.array(testfield.kinds)
@@ -327,7 +332,7 @@ def _squares(testfield: TestField, rows: NDArray[np.int64]) -> tuple[Array, Arra
                 sides[1, i] = offset[other]
                 break
         if len(markers):
-            # a marker's corner lies on the diagonal of its square
+            # a marker's corner is on the diagonal of its square
             nearest = float(np.linalg.norm(markers - point, axis=1).min())
             quiet[i] = min(quiet[i], nearest / np.sqrt(2) / length)
     return sides, quiet

@@ -7,22 +7,19 @@ inwards by κs²/2, which gives
 
     I(p) = (b + a Φ(z)) (1 + g·(p − c)),   z = (d − κs²/2)/s,   s² = blur² + 1/12
 
-with background b, contrast a, and the gradient g of the light. All that is left out is symmetrical
-about the centre, and moves it not.
+with background b, contrast a, and the gradient g of the light. Neglected terms are symmetric about
+the centre, and do not move it.
 
-Everything runs in single precision on coordinates relative to a pixel near the target: 1e-5 px, and
-half the time.
+The parameters are, in this order, x, y (px), m11, m12, m22 (correction of the shape,
+q := (I + m) q), blur (px), b, a (DN), gx, gy (1/px). Coordinates are relative to a pixel near the
+target, so that single precision is good to 1e-5 px; it takes half the time of double.
 
-Parameters, in this order: x, y (px), m11, m12, m22 (correction of the shape, q := (I + m) q), blur
-(px), b, a (DN), gx, gy (1/px).
+All ten are fitted by Gauss-Newton, many targets at once, with the pixels near the outline only. The
+covariance of a centre is that of its own fit with the noise of the frame: the precision reaches the
+Cramér-Rao bound, and the covariance is realistic. The local map (`outline`) defines the measured
+centre: with a camera it is the projected 3D centre, without one the centre of the ellipse.
 
-Gauss-Newton on the ten parameters of `blurred_disc`, many targets at once, only pixels near the
-outline; each centre gets the covariance of its own fit with the noise of the frame (`noise`), so
-that it stands at the Cramér-Rao bound and says so truthfully. What the measured centre means is
-the local map's affair (`outline`): with a camera the projected 3D centre, without one the centre
-of the ellipse.
-
-Targets that cannot be measured get a reason instead of a number.
+A target that cannot be measured gets a reason instead.
 """
 
 from __future__ import annotations
@@ -52,7 +49,7 @@ _HALF, _ONE, _FARTHEST = np.float32(0.5), np.float32(1.0), np.float32(6.0)
 
 
 def normal_cdf(z: Single) -> Single:
-    """The standard normal distribution function to 2e-5, ten times faster than exactly."""
+    """Return the standard normal distribution function to 2e-5, ten times as fast as exactly."""
     z = np.minimum(np.maximum(z, -_FARTHEST), _FARTHEST)
     square = z * z
     value = square * _CDF[0]
@@ -67,7 +64,7 @@ def normal_cdf(z: Single) -> Single:
 
 
 def first_reasons(tests: Sequence[tuple[NDArray[np.bool_], str]]) -> NDArray[Any]:
-    """Return the word (n,) of the first test that says no (n,), empty where none does."""
+    """Return the text (n,) of the first test (n,) that is true, empty if none is."""
     reasons = np.full(len(tests[0][0]), "", dtype=object)
     for bad, word in reversed(tests):
         reasons[bad] = word
@@ -75,13 +72,12 @@ def first_reasons(tests: Sequence[tuple[NDArray[np.bool_], str]]) -> NDArray[Any
 
 
 def _in_plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single, ...]:
-    """Pixels in their targets' planes (n, k): radius ρ, |∇ρ|, unit normal in the image (x, y),
-    det ∂q/∂p, the plane coordinates s, t before the shape's correction, and the unit radius vector
-    u, v.
+    """Map pixels ex, ey (n, k), relative to the centres, into their targets' planes.
 
-    For corrections m (n, 3) of the shapes, at pixels relative to the centres (n, k).
-    q = (I + m)(J⁻¹e − ½ J⁻¹ H[J⁻¹e, J⁻¹e]) = L e − P[e, e]; what is left out is of third order,
-    and moves no centre. A = ∂q/∂e = L − 2 P[e, ·], and q = ½ (L + A) e.
+    m (n, 3): corrections of the shapes. Returns, (n, k) each, the radius ρ, |∇ρ|, the unit normal
+    x, y in the image, det ∂q/∂p, the plane coordinates s, t before the shape's correction, and the
+    unit radius vector u, v. q = (I + m)(J⁻¹e − ½ J⁻¹ H[J⁻¹e, J⁻¹e]) = L e − P[e, e]; neglected
+    terms are of third order, and move no centre. A = ∂q/∂e = L − 2 P[e, ·], and q = ½ (L + A) e.
     """
     inverse = maps.inverse
     shape = m[:, [[0, 1], [1, 2]]]
@@ -89,7 +85,7 @@ def _in_plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single,
     L = shape @ inverse
     bend = (L @ maps.second)[:, :, [[0, 1], [1, 2]]]
     twice = np.swapaxes(inverse, 1, 2)[:, None] @ bend @ inverse[:, None]  # 2 P
-    # A and ½ (L + A) by their elements, linear in 1, ex, ey
+    # the elements of A and ½ (L + A), linear in 1, ex, ey
     linear = np.empty((len(m), 2, 2, 2, 3), dtype=np.float32)
     linear[..., 0] = L[:, None]
     linear[:, 0, ..., 1:] = -twice
@@ -136,19 +132,20 @@ def _in_plane(maps: LocalMap, m: Array, ex: Single, ey: Single) -> tuple[Single,
 def blurred_disc(
     maps: LocalMap, parameters: Array, x: Single, y: Single, out: Single | None = None
 ) -> tuple[Single, Single]:
-    """Grey values (n, k) and derivatives (10, n, k) of n discs at their pixels x, y (n, k) px.
+    """Return grey values (n, k) and derivatives (10, n, k) of n discs at pixels x, y (n, k) px.
 
-    Only shape and curvature are taken from `maps`; the centres are the parameters (n, 10), in the
-    coordinates of x and y, which should be small. The derivatives by centre and shape leave out
-    how |∇ρ| and κ change: they vanish on the outline. out: where to put the derivatives.
+    Only shape and curvature are taken from `maps`; the centres are those of the parameters (n, 10),
+    in the coordinates of x and y, which should be small. The derivatives with respect to centre and
+    shape neglect the change of |∇ρ| and κ, whose effect is zero on the outline. out: array for the
+    derivatives.
     """
     p = parameters.astype(np.float32)
     ex, ey = x - p[:, 0, None], y - p[:, 1, None]
     rho, slope, nx, ny, determinant, s, t, u, v = _in_plane(maps, parameters[:, 2:5], ex, ey)
     blur = p[:, 5, None]
     width = np.sqrt(blur * blur + np.float32(_PIXEL_VARIANCE))
-    # Curvature of the outline: tangentᵀ AᵀA tangent/|∇ρ| = (det A)²/|∇ρ|³, the tangent being what
-    # A maps to a vector of length det A/|∇ρ| across the radius; here half of it.
+    # half the outline's curvature tangentᵀ AᵀA tangent/|∇ρ| = (det A)²/|∇ρ|³, since A maps the
+    # tangent to a vector of length det A/|∇ρ| across the radius
     other = np.divide(determinant, slope)
     kappa = np.multiply(other, other, out=determinant)
     kappa /= slope
@@ -170,7 +167,7 @@ def blurred_disc(
     edge = np.exp(z, out=z)
     edge *= np.float32(_NORM) * a
     edge *= light
-    # by the blur: edge (d/s² + κ/2) (−blur/s)
+    # with respect to the blur: edge (d/s² + κ/2) (−blur/s)
     d /= width * width
     d += kappa
     d *= edge
@@ -203,10 +200,10 @@ _BLUR_SETTLED_PX = 0.1
 _FLAT = 0.003  # of the contrast per px of movement
 _FEWEST_FOR_LEVEL = 8
 _ITERATIONS = 12
-_MISFIT = 2.0  # residual sd over the frame's noise beyond which something covers the target
+_MISFIT = 2.0  # largest residual sd, in the frame's noise, of a target that is not covered
 _MISFIT_CONTRAST = 0.015
-# An image sharper than any lens makes it (reduced, or drawn) shows the pixels' squares, which the
-# model rounds off: up to so much of the contrast at no blur, nothing from half a pixel on.
+# An image sharper than any lens makes it (reduced, or drawn) shows the squares of the pixels, which
+# the model smooths: by this share of the contrast at zero blur, by nothing from half a pixel on.
 _MISFIT_SQUARES, _ROUND_FROM_PX = 0.035, 0.5
 _FEWEST_PIXELS = 24
 _STEP_LIMITS = np.array([1.0, 1.0, 0.15, 0.15, 0.15, 0.5, np.inf, np.inf, 0.02, 0.02])
@@ -214,9 +211,11 @@ _STEP_LIMITS = np.array([1.0, 1.0, 0.15, 0.15, 0.15, 0.5, np.inf, np.inf, 0.02, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleFit:
-    """n circles as fitted: parameters (n, 10) as `blurred_disc`, covariances (n, 2, 2) px² of the
-    centres, misfit (n,) residual sd over the frame's noise, saturation (n,) share of the pixels
-    used; reasons (n,): words, empty where the fit is good; noise: of the frame.
+    """The fits of n circles.
+
+    parameters (n, 10): of `blurred_disc`; covariances (n, 2, 2) px²: of the centres; misfit (n,):
+    residual sd over the frame's noise; saturation (n,): share of the pixels used; reasons (n,): why
+    a fit failed, empty if it is good; noise: of the frame.
     """
 
     parameters: Array
@@ -228,7 +227,7 @@ class CircleFit:
 
     @property
     def points(self) -> Array:
-        """Centres (n, 2) px."""
+        """The centres (n, 2) px."""
         return self.parameters[:, :2]
 
     @property
@@ -237,7 +236,7 @@ class CircleFit:
         return np.asarray(self.reasons == "", dtype=bool)
 
     def missed(self, rows: NDArray[np.int64]) -> dict[int, str]:
-        """Return {row: reason} of the fits that are no good, of the test field's rows (n,)."""
+        """Return {row: reason} of the failed fits; rows (n,): those of the test field."""
         bad = ~self.good
         return dict(zip(rows[bad].tolist(), self.reasons[bad], strict=True))
 
@@ -247,7 +246,7 @@ class CircleFit:
             getattr(self, name)[which] = getattr(others, name)
 
     def observations(self, rows: NDArray[np.int64], keep: NDArray[np.bool_]) -> Observations:
-        """Return some of the fits (mask) as observations of the test field's rows (n,)."""
+        """Return some of the fits (mask) as observations; rows (n,): those of the test field."""
         p = self.parameters[keep]
         quality = {
             "blur": p[:, 5],
@@ -269,11 +268,11 @@ def fit_circles(
     start: Array | None = None,
     iterations: int = _ITERATIONS,
 ) -> CircleFit:
-    """Fit circles whose outlines are about where `maps` says.
+    """Fit circles whose approximate outlines are `maps`.
 
-    image (H, W) grey, 8 or 16 bit; coded (n,): which have a code ring; blur: px, to begin with;
-    noise: as known from earlier frames, else estimated from this one; start (n, 10): parameters
-    to begin with.
+    image (H, W): grey, 8 or 16 bit; coded (n,): which have a code ring; blur: approximate value,
+    px; noise: that of earlier frames, by default estimated from this frame; start (n, 10):
+    approximate parameters.
     """
     n = len(maps)
     coded = np.zeros(n, dtype=bool) if coded is None else coded
@@ -281,8 +280,8 @@ def fit_circles(
     parameters = np.zeros((n, 10))
     work = scratch("partials", (2, 10 * max((w.x.size for w in parts), default=0)), np.float32)
     greys, residuals = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.float32)]
-    # One step with a third of the pixels brings the fit near, and its residuals where the image is
-    # flat tell how the noise grows with the light; all pixels then finish it.
+    # The first step is with a third of the pixels; its residuals where the image is flat show how
+    # the noise grows with the light.
     for w in parts:
         begin = w.begin if start is None else start[w.rows]
         thin = w.thinned()
@@ -302,11 +301,11 @@ def fit_circles(
     top = np.iinfo(image.dtype).max
     for w in parts:
         mine = maps.select(w.rows)
-        p, value, residual, N, step, stands, _ = fitted = _step(
+        p, value, residual, N, step, settled, _ = fitted = _step(
             w, mine, parameters[w.rows], noise, work
         )
-        for _ in range(iterations - 1):  # only what does not stand yet goes on
-            left = np.flatnonzero(~stands)
+        for _ in range(iterations - 1):  # only fits that have not converged
+            left = np.flatnonzero(~settled)
             if not len(left):
                 break
             again = _step(w.select(left), mine.select(left), p[left], noise, work)
@@ -321,13 +320,13 @@ def fit_circles(
     saturation /= np.maximum(pixels, 1)
     variance = square / np.maximum(pixels - 10, 1)
     if not given and n >= _FEWEST_FOR_LEVEL:
-        # Its level is that of all residuals: paper and compression make noise at edges too.
+        # Its level is that of all residuals, since paper and compression cause noise at edges too.
         level = float(np.median(variance))
         noise, variance, normal = noise.scaled(level), variance / level, normal / level
-    # A target that is noisier than the frame by more than chance has its own noise.
+    # A target that is significantly noisier than the frame has its own noise.
     own = np.where(variance > 1 + 4 * np.sqrt(2 / np.maximum(pixels, 1)), variance, 1.0)
     cofactors = scaled_solve(normal, np.eye(10)[None, :, :2], 1e-12)[:, :2]
-    covariances = cofactors * np.maximum(own, 1.0)[:, None, None]
+    covariances = cofactors * own[:, None, None]
     none = np.full(n, "", dtype=object)
     fit = CircleFit(parameters, covariances, np.sqrt(variance), saturation, none, noise)
     return replace(fit, reasons=_reasons(fit, maps, cut, pixels, last_step))
@@ -339,12 +338,14 @@ def _step(
     begin: Array,
     noise: NoiseModel | None,
     work: Single,
-    tells_noise: bool = False,
+    find_flat: bool = False,
 ) -> tuple[Array, Single, Single, Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """One step of Gauss-Newton: parameters (n, 10), values and residuals (n, k) after it, normal
-    matrices (n, 10, 10), steps (n,) px, which stand now (n,), and which pixels tell the noise.
+    """Take one step of Gauss-Newton.
 
-    work (2, m): memory for the partials; asking the system for it again costs more than the sums.
+    Returns the parameters (n, 10), values and residuals (n, k) after it, the normal matrices
+    (n, 10, 10), the steps (n,) px, which fits have converged (n,), and with `find_flat` which
+    pixels (n, k) are in flat parts of the image. work (2, m): memory for the partials, which would
+    take longer to allocate than to fill.
     """
     p = begin.copy()
     p[:, :2] -= w.origin
@@ -364,13 +365,13 @@ def _step(
     p[:, :2] += w.origin
     change = (j.transpose(1, 2, 0) @ delta[..., None].astype(np.float32))[..., 0]
     flat = np.zeros(len(p), dtype=bool)
-    if tells_noise:
-        # Where a px of movement would change the grey value by next to nothing.
+    if find_flat:
+        # where a movement of a px hardly changes the grey value
         slope = np.maximum(np.abs(j[0]), np.abs(j[1]))
         flat = (w.weight > 0) & (slope < _FLAT * np.abs(p[:, 7, None]))
     step = np.abs(delta[:, :2]).max(axis=1)
-    stands = (step < _CONVERGED_PX) & (np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)
-    return p, value + change, residual - change, N, step, stands, flat
+    settled = (step < _CONVERGED_PX) & (np.abs(delta[:, 5]) < _BLUR_SETTLED_PX)
+    return p, value + change, residual - change, N, step, settled, flat
 
 
 def _reasons(

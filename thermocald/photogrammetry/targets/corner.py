@@ -1,14 +1,14 @@
-"""Corners of markers, measured by fitting a blurred wedge to the grey values around each.
+"""Corners of markers and squares, measured by fitting a blurred wedge to the grey values around.
 
-A corner is where two straight edges meet; blurred by the optics it is the probability that a
-bivariate normal variate lies in a quadrant, with the cosine between the edges' normals as its
-correlation. Position, both edge directions, blur, background, and contrast are estimated by
-Levenberg's method for all corners at once; the covariance is that of least squares with the
-variance of the fit's own residuals, so that it is true where the noise is white. A JPEG's noise is
-not: there the standard deviations are too small by a factor that this module cannot know.
+At a corner two straight edges meet. Blurred by the optics, its grey values follow the probability
+that a bivariate normal variate lies in a quadrant, with the cosine between the edges' normals as
+the correlation. Position, both edge directions, blur, background, and contrast are estimated by
+Levenberg's method for many corners at once. The covariance is that of least squares with the
+variance of the fit's own residuals, which is correct if the noise is white. The noise of a JPEG is
+not, so that its standard deviations are too small, by a factor that cannot be known here.
 
-Where squares touch at a corner (chessboards, AprilGrids) the opposite quadrant is dark as well: the
-same model with both quadrants added, chosen by the grey values.
+If squares touch at a corner (chessboards, AprilGrids), the opposite quadrant is dark as well. The
+grey values decide whether it is added to the model.
 
 Source: the quadrant probability as Mehler's tetrachoric series; the idea of fitting a parametric
 grey-value corner, Deriche, R. and Giraudon, G. (1993): A computational approach for corner and
@@ -33,24 +33,26 @@ if TYPE_CHECKING:
 
 
 REACH_PX = 10.0
-"""Farther along the edges no pixels are used."""
+"""How far along the edges pixels are used."""
 
 _CHUNK = 256  # corners that are fitted together
 _SERIES_TERMS = 9
 _ITERATIONS = 20
 _CONVERGED_PX = 2e-4
 _LARGEST_MOVE_PX = 1.5
-_LARGEST_MOVE_SHARE = 0.015  # of the marker's side: an outline cut short in a reduced image
+_LARGEST_MOVE_SHARE = 0.015  # of the side, in addition: reduced images cut outlines short
 _BLUR_LIMITS_PX = (0.3, 4.0)
 _SADDLE_REACH = 0.25  # of the marker's side
-_SLOWEST_CORRELATION = 0.93  # the series is not good enough for edges that meet at less than 22°
+_LARGEST_CORRELATION = 0.93  # the series converges too slowly for edges at less than 22°
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corners:
-    """Where corners are about: rows (n,) of the test field, places (n, 2) px and their neighbours
-    along the outline, before and after (n, 2) px; quiet (n,) px: width of the marker's border and
-    of the quiet zone about it, beyond which nothing is looked at.
+    """The approximate places of corners.
+
+    rows (n,): of the test field; places (n, 2) px; before, after (n, 2) px: their neighbours along
+    the outline; quiet (n,) px: width of the marker's border and of the quiet zone around it, beyond
+    which no pixels are used.
     """
 
     rows: NDArray[np.int64]
@@ -67,7 +69,7 @@ class Corners:
         return Corners(*(getattr(self, f.name)[some] for f in fields(self)))
 
     def moved(self, found: Observations) -> Corners:
-        """Move places and neighbours by what `found` says of these corners."""
+        """Move places and neighbours to the observed corners, those not observed by the median."""
         _, here, there = np.intersect1d(self.rows, found.targets, return_indices=True)
         own = found.points[there] - self.places[here]
         shift = np.zeros_like(self.places) + (np.median(own, axis=0) if len(own) else 0.0)
@@ -82,9 +84,9 @@ def measure_corners(
 ) -> Observations:
     """Measure corners in an image (H, W), grey, 8 or 16 bit.
 
-    Returns them with standard deviation and covariance, and as quality `blur` px, `contrast`,
-    `grey` (background), `noise` DN, `saturation` (share of pixels). `missed` receives
-    {row: reason} for those that cannot be measured.
+    Returns observations with the quality `blur` px, `contrast`, `grey` (background), `noise` DN,
+    `saturation` (share of pixels). `missed` receives {row: reason} for corners that cannot be
+    measured.
     """
     found = Observations.none()
     for i in range(0, len(corners), _CHUNK):
@@ -96,7 +98,7 @@ def measure_corners(
 
 
 def _wedge(h: Single, k: Single, rho: Single) -> Single:
-    """P(H < h, K < k) of standard normals with correlation rho; h, k (n, m), rho (n, 1)."""
+    """Return P(H < h, K < k) of standard normals with correlation rho; h, k (n, m), rho (n, 1)."""
     value: Single = normal_cdf(h) * normal_cdf(k)
     density = np.exp(-0.5 * (h * h + k * k)) / (2 * np.pi)
     he_h, he_k = np.ones_like(h), np.ones_like(k)
@@ -111,18 +113,18 @@ def _wedge(h: Single, k: Single, rho: Single) -> Single:
 
 
 def _model(p: Array, x: Array, y: Array, saddle: NDArray[np.bool_]) -> tuple[Single, Single]:
-    """Grey values (n, m) and derivatives (n, m, 7) by x, y, angle1, angle2, blur, b, a.
+    """Return grey values (n, m) and derivatives (n, m, 7) at pixels x, y (n, m) px.
 
-    saddle (n,): where the opposite quadrant is dark too. p (n, 7); the angles are those of the
-    inward normals of the two edges; x, y (n, m) px. Float32: its rounding is a thousandth of a grey
-    value's.
+    p (n, 7): x, y, angle1, angle2, blur, b, a, with the angles of the inward normals of the two
+    edges; saddle (n,): whether the opposite quadrant is dark too. Single precision is enough: its
+    rounding is a thousandth of that of grey values.
     """
     t1, t2, s, b, a = (p[:, i, None].astype(np.float32) for i in range(2, 7))
     c1, s1, c2, s2 = np.cos(t1), np.sin(t1), np.cos(t2), np.sin(t2)
     dx, dy = ((v - p[:, i, None]).astype(np.float32) for i, v in enumerate((x, y)))
     h: Single = ((c1 * dx + s1 * dy) / s).astype(np.float32, copy=False)
     k: Single = ((c2 * dx + s2 * dy) / s).astype(np.float32, copy=False)
-    rho = np.clip(c1 * c2 + s1 * s2, -_SLOWEST_CORRELATION, _SLOWEST_CORRELATION)
+    rho = np.clip(c1 * c2 + s1 * s2, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
     root = np.sqrt(1 - rho * rho)
     w = _wedge(h, k, rho)
     norm = np.float32(1 / np.sqrt(2 * np.pi))
@@ -149,7 +151,7 @@ def _model(p: Array, x: Array, y: Array, saddle: NDArray[np.bool_]) -> tuple[Sin
 
 
 def _is_saddle(grey: Array, d1: Array, d2: Array, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Where the quadrant opposite to a corner's own is as dark as that: squares that touch (n,)."""
+    """Return where (n,) squares touch: the opposite quadrant is as dark as the corner's own."""
 
     def mean(mask: NDArray[np.bool_]) -> Array:
         count = np.maximum((near & mask).sum(axis=1), 1)
@@ -159,12 +161,12 @@ def _is_saddle(grey: Array, d1: Array, d2: Array, near: NDArray[np.bool_]) -> ND
     clear = (np.abs(d1) > 1.5) & (np.abs(d2) > 1.5)
     own, beside = mean(clear & (d1 > 0) & (d2 > 0)), mean(clear & (d1 * d2 < 0))
     opposite = mean(clear & (d1 < 0) & (d2 < 0))
-    found: NDArray[np.bool_] = np.abs(opposite - own) < np.abs(opposite - beside)
-    return found & (clear & near & (d1 < 0) & (d2 < 0)).any(axis=1)
+    dark: NDArray[np.bool_] = np.abs(opposite - own) < np.abs(opposite - beside)
+    return dark & (clear & near & (d1 < 0) & (d2 < 0)).any(axis=1)
 
 
 def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
-    """Fit corners together; {row: reason} for those whose fit is no good."""
+    """Fit corners together; return the observations, and {row: reason} of failed fits."""
     corners, n = found.places, len(found)
     height, width = image.shape
     sides = np.stack([found.before - corners, found.after - corners])
@@ -178,7 +180,7 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
 
-    # Inward normals of the two edges: perpendicular to one side, towards the other.
+    # inward normals of the two edges: perpendicular to one side, towards the other
     normals = []
     for edge, other in ((sides[0], sides[1]), (sides[1], sides[0])):
         across = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
@@ -189,7 +191,7 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     dx, dy = px - corners[:, 0, None], py - corners[:, 1, None]
     d1, d2 = (m[:, 0, None] * dx + m[:, 1, None] * dy for m in normals)
     depth = np.minimum(d1, d2)
-    # A margin of two px keeps the blurred bits and neighbours out, but an edge needs two px itself.
+    # Two px less, to keep blurred bits and neighbours out; but an edge itself needs two px.
     margin = np.maximum(found.quiet - 2.0, 2.0)[:, None]
     saddle = _is_saddle(grey, d1, d2, inside & (np.hypot(dx, dy) <= along[:, None]))
     # the square opposite to a marker of an AprilGrid is a third as large as the marker
@@ -199,7 +201,7 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     depth = np.where(saddle[:, None], np.sign(d1 * d2) * near, depth)
     cut_off = np.any(~inside & (np.hypot(dx, dy) < 3), axis=1)
     m = use.sum(axis=1)
-    # the pixels of each corner that are used come first: the others are not calculated with
+    # each corner's used pixels first, so that the others can be left out
     first = np.argsort(~use, axis=1, kind="stable")[:, : max(int(m.max()), 1)]
     px, py, grey, depth, use = (np.take_along_axis(v, first, 1) for v in (px, py, grey, depth, use))
     weight = use.astype(float)
@@ -278,7 +280,7 @@ def _fit(image: Image, found: Corners) -> tuple[Observations, dict[int, str]]:
     reasons = first_reasons(tests)
     good = reasons == ""
     quality = {
-        # The fitted width holds the pixel's own.
+        # without the width of the pixel
         "blur": np.sqrt(np.maximum(p[:, 4] ** 2 - 1 / 12, 0.0)),
         "contrast": p[:, 6],
         "grey": p[:, 5],

@@ -1,11 +1,11 @@
-"""What a frame is worth: its noise, and whether its targets can be measured.
+"""A frame's noise, and its status: whether its targets can be measured.
 
-A sensor's variance grows with the light (photon noise) over a floor (reading and quantisation):
-var(g) = floor + gain·g. Both are estimated from the residuals of a frame's own fits.
+A sensor's noise variance grows with the light (photon noise) from a floor (readout and
+quantisation): var(g) = floor + gain·g. Both are estimated from the residuals of the frame's fits.
 
 Source: EMVA standard 1288, release 4.0, section 2.
 
-A status is for an epoch's record: one word to count by and one sentence for a person.
+A status is recorded with its epoch: a word to count, and a sentence for the user.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 _QUANTISATION = 1 / 12
-_CUT = 4.0  # robust standard deviations beyond which a residual is not noise
-_CUT_LOSS = 0.9989  # variance left of a normal distribution cut at 4 sd
+_CUT = 4.0  # robust standard deviations; larger residuals are not noise
+_CUT_LOSS = 0.9989  # variance of a normal distribution cut at 4 sd
 _FEWEST = 200
 _ENOUGH = 8_000
 _BINS = 6
@@ -32,7 +32,7 @@ _BINS = 6
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """var(g) = floor + gain·g, DN² and DN."""
+    """The noise model var(g) = floor + gain·g, with floor DN² and gain DN."""
 
     floor: float
     gain: float = 0.0
@@ -40,22 +40,22 @@ class NoiseModel:
     def variance(
         self, grey: NDArray[np.floating[Any]] | np.floating[Any]
     ) -> NDArray[np.floating[Any]]:
-        """Variance in DN² at grey values, never below what quantisation leaves."""
+        """Return the variance at grey values, DN², at least that of quantisation."""
         v: NDArray[np.floating[Any]] = np.maximum(self.floor + self.gain * grey, _QUANTISATION)
         return v
 
     def scaled(self, factor: float) -> NoiseModel:
-        """The same with every variance times a factor."""
+        """Return the noise model with all variances times a factor."""
         return NoiseModel(self.floor * factor, self.gain * factor)
 
 
 def estimate_noise(
     grey: NDArray[np.floating[Any]], residuals: NDArray[np.floating[Any]], unknowns: int = 0
 ) -> NoiseModel:
-    """From grey values and residuals (n,) DN of fits that had so many unknowns in all.
+    """Estimate the noise from grey values and residuals (n,) DN of fits with `unknowns` in all.
 
-    Gross residuals are cut. The line goes through the variances of bins of equal count, weighted
-    by their own precision, twice; a constant where the grey values say no more.
+    Gross residuals are cut. A line is fitted twice to the variances of bins of equal count, with
+    weights from their precision; if the grey values do not determine a line, the noise is constant.
     """
     freedom = np.sqrt(max(len(residuals) - unknowns, 1) / max(len(residuals), 1))
     thin = max(len(residuals) // _ENOUGH, 1)
@@ -71,7 +71,7 @@ def estimate_noise(
     x = np.array([g[b].mean() for b in bins])
     v = np.empty(_BINS)
     for i, b in enumerate(bins):
-        scale = 2.1981 * np.median(r2[b])  # median of chi-square with one degree of freedom
+        scale = 2.1981 * np.median(r2[b])  # 1 / median of chi-square, one degree of freedom
         kept = r2[b][r2[b] < _CUT**2 * max(scale, _QUANTISATION)]
         v[i] = kept.mean() / _CUT_LOSS
     if np.ptp(x) < 20:
@@ -92,7 +92,7 @@ Word = Literal[
 ]  # fmt: skip
 
 _LEAST_CONTRAST = 8.0  # DN of 255 between the darkest and the brightest
-_PERCENTILES = (0.02, 99.98)  # a single target must be enough, a hot pixel must not
+_PERCENTILES = (0.02, 99.98)  # a single target must count, a hot pixel must not
 _HALF_SHARE = 0.15
 _STRIDE = 4
 _HALVINGS = 2
@@ -100,14 +100,14 @@ _HALVINGS = 2
 
 @dataclass(frozen=True, slots=True)
 class FrameStatus:
-    """`word` to count by, `reason` for a person (empty where the word is ok)."""
+    """A frame's status: `word` to count, `reason` for the user (empty if the word is ok)."""
 
     word: Word
     reason: str = ""
 
     @property
     def ok(self) -> bool:
-        """Whether the frame was measured."""
+        """Whether the frame can be measured."""
         return self.word == "ok"
 
 
@@ -115,9 +115,9 @@ OK = FrameStatus("ok")
 
 
 def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> FrameStatus:
-    """Look for what makes a frame useless before anything is searched in it.
+    """Check whether a frame can be used at all, before targets are searched in it.
 
-    image: what a camera or a decoder gave; size: width and height px that are expected.
+    image: from a camera or a decoder; size: expected width and height, px.
     """
     if image.size == 0:
         return FrameStatus("no_image", "the frame is empty")
@@ -135,7 +135,7 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
             f"the frame has {width}×{height} px, the camera is set up for "
             f"{size[0]}×{size[1]} px{turned}",
         )
-    # Averaged, so that the noise of a dark frame does not pass for contrast.
+    # averaged, so that the noise of a dark frame does not count as contrast
     sample = image[::_STRIDE]
     for _ in range(_HALVINGS):
         if min(sample.shape) >= 2:
@@ -154,17 +154,17 @@ def inspect_frame(image: NDArray[Any], size: tuple[int, int] | None = None) -> F
     broken = _constant_rows(image)
     if broken >= _HALF_SHARE * height:
         rest = image[: height - broken : 4, ::4].astype(np.int32)
-        # in a drawing neighbours are alike, and it may have constant rows
+        # a drawing, with equal neighbours, may have constant rows
         if len(rest) < 2 or np.median(np.abs(np.diff(rest, axis=1))) > 0:
             return FrameStatus(
                 "half",
-                f"the frame is incomplete: its last {broken} of {height} rows hold one grey value",
+                f"the frame is incomplete: its last {broken} of {height} rows have one grey value",
             )
     return OK
 
 
 def _constant_rows(image: NDArray[Any]) -> int:
-    """How many rows at the bottom hold one grey value; a decoder fills so what it did not get."""
+    """Return how many rows at the bottom have one grey value, as a decoder fills missing data."""
     last = image[-1, 0]
     rows = 0
     for start in range(image.shape[0] - 16, -1, -16):

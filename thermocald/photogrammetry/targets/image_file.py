@@ -1,19 +1,19 @@
-"""Image files: their size from the header, their grey values, parts of a JPEG alone, metadata.
+"""Image files: size from the header, grey values, parts of a JPEG, metadata.
 
 Source: PNG (ISO/IEC 15948), 11.2.2 IHDR; JPEG (ITU T.81), B.2.2 frame header; TIFF 6.0, section 2.
 
-The bits of a JPEG can be read only from its start. Restart markers, which many phones and some
-webcams write, divide it into segments that can be read alone: those around the targets are joined
-to a smaller JPEG, which any decoder reads. Without them decoding stops after the last row that is
-needed. The grey values are exactly those of the whole image, since every block of 8 × 8 px is
-transformed by itself and the luminance is not interpolated.
+A JPEG can only be decoded from its start. Restart markers, which many phones and some webcams
+write, divide it into segments that can be decoded separately: those around the targets are joined
+to a smaller JPEG, which any decoder reads. Without them, decoding stops after the last row needed.
+The grey values are exactly those of the whole image, since each block of 8 × 8 px is transformed
+separately and the luminance is not interpolated.
 
 Source: ITU-T Recommendation T.81, B.2 (markers and headers) and A.2 (order of the blocks).
 
-JPEGs are decoded by libjpeg-turbo through simplejpeg, to the luminance alone: two thirds of the
-time of OpenCV, which decodes all others and those that simplejpeg refuses. The pixels are the same.
+JPEGs are decoded by libjpeg-turbo through simplejpeg, to the luminance only, in two thirds of the
+time of OpenCV. OpenCV decodes other files and those that simplejpeg refuses, to the same pixels.
 
-EXIF and comments are written, and carried to another file: CIPA DC-008 (Exif 2.32), 4.5.4 (segments
+EXIF and comments are written, or copied to another file: CIPA DC-008 (Exif 2.32), 4.5.4 (segments
 of a JPEG) and 4.6 (tags); PNG specification (third edition), 11.3.
 """
 
@@ -48,13 +48,13 @@ _MOST_TAGS = 500
 
 
 def _segments(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Marker, begin and end of each segment of a JPEG, the head of its first scan the last."""
+    """Yield marker, begin and end of each segment of a JPEG, up to the header of its first scan."""
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
-        if marker == 0xFF:  # fills up
+        if marker == 0xFF:  # a fill byte
             at += 1
-        elif marker == 0x01 or 0xD0 <= marker <= 0xD8:  # stands alone
+        elif marker == 0x01 or 0xD0 <= marker <= 0xD8:  # without content
             at += 2
         else:
             begin, at = at, at + 2 + max(int.from_bytes(data[at + 2 : at + 4], "big"), 2)
@@ -64,7 +64,7 @@ def _segments(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height px of PNG, JPEG, TIFF, BMP and PGM bytes; None for others and for damage."""
+    """Return width and height, px, of a PNG, JPEG, TIFF, BMP or PGM; None for other bytes."""
     try:
         if data[:8] == _PNG:
             return struct.unpack(">II", data[16:24])
@@ -100,14 +100,16 @@ def _tiff(data: bytes, order: str) -> tuple[int, int] | None:
     return (size[0], size[1]) if all(size) else None
 
 
-_WORTH_IT = 0.98  # of the image: beyond, the whole is decoded
+_WORTH_IT = 0.98  # of the image; beyond, it is decoded as a whole
 
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """width, height px; size_at, scan: where the frame header states them, and where the coded
-    bits start; unit: width and height px of the units that the bits are ordered in; interval:
-    units between two restart markers, 0 without them.
+    """The layout of a JPEG.
+
+    width, height: px; size_at: where the frame header states them; scan: where the coded bits
+    start; unit: width and height, px, of a minimum coded unit; interval: units between two restart
+    markers, 0 without them.
     """
 
     width: int
@@ -119,13 +121,14 @@ class _Layout:
 
     @property
     def units(self) -> tuple[int, int]:
-        """Units in a row, and rows of them."""
+        """The number of units in a row, and of rows of them."""
         return -(-self.width // self.unit[0]), -(-self.height // self.unit[1])
 
     @property
     def tiles(self) -> tuple[int, int, int, int] | None:
-        """Width and height px of what one segment covers, and columns and rows of such tiles; None
-        for segments that neither divide a row of units nor hold whole ones.
+        """Width and height, px, of the tile that a segment covers, and columns and rows of tiles.
+
+        None if segments are neither equal parts of a row of units nor whole rows.
         """
         across, down = self.units
         if across % self.interval == 0:
@@ -138,10 +141,11 @@ class _Layout:
 
 
 def decode_parts(data: bytes, boxes: NDArray[np.int64]) -> NDArray[np.uint8] | None:
-    """Grey values (H, W) of a JPEG that hold within boxes (n, 4) px: left, top, right, bottom.
+    """Return grey values (H, W) of a JPEG that are valid in boxes (n, 4) px.
 
-    Right and bottom are exclusive. Elsewhere the values are undefined, and the memory is used again
-    by the next call in this thread. None where the file does not allow it or it would not pay.
+    A box is left, top, right and bottom, the last two exclusive. Elsewhere the values are
+    undefined. The next call in this thread reuses the memory. None if the file cannot be decoded in
+    parts or this would save no time.
     """
     try:
         layout = _layout(data)
@@ -157,11 +161,11 @@ def decode_parts(data: bytes, boxes: NDArray[np.int64]) -> NDArray[np.uint8] | N
         grey = _by_segments(data, layout, low, high) if layout.interval else None
         return _upper_rows(data, layout, int(high[:, 1].max())) if grey is None else grey
     except (IndexError, ValueError):
-        return None  # damaged: decoding the whole file says how
+        return None  # damaged; decoding the whole file reports how
 
 
 def _layout(data: bytes) -> _Layout | None:
-    """The layout of a sequential JPEG with one scan; None for all others."""
+    """Return the layout of a sequential JPEG with one scan; None for others."""
     at = {marker: begin for marker, begin, _ in _segments(data)}
     frame = next((at[marker] for marker in _BASELINE if marker in at), None)
     if frame is None or _SOS not in at or (_FRAMES - _BASELINE) & at.keys():
@@ -177,7 +181,7 @@ def _layout(data: bytes) -> _Layout | None:
     across, down = ([s >> 4 for s in sampling], [s & 15 for s in sampling])
     if max(across) != across[0] or max(down) != down[0]:
         return None
-    # The blocks of a single component follow one another, however it is sampled.
+    # the blocks of a single component are in order, whatever its sampling
     unit = (8, 8) if components == 1 else (8 * across[0], 8 * down[0])
     height, width = (int.from_bytes(data[frame + k : frame + k + 2], "big") for k in (5, 7))
     if not height or not width:
@@ -186,7 +190,7 @@ def _layout(data: bytes) -> _Layout | None:
 
 
 def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> NDArray[np.uint8] | None:
-    """The image down to a row; below it is undefined."""
+    """Return the image down to the row `bottom`, undefined below; None if that saves no time."""
     height = -(-bottom // layout.unit[1]) * layout.unit[1]
     if height > _WORTH_IT * layout.height:
         return None
@@ -194,7 +198,7 @@ def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> NDArray[np.uint8] 
     file = scratch("file", (len(data),), np.uint8)
     file[:] = np.frombuffer(data, np.uint8)
     file[layout.size_at : layout.size_at + 2] = divmod(height, 256)
-    # What follows the last row is reported as superfluous, which is why warnings are no errors.
+    # not strict, since the data after the last row cause a warning
     simplejpeg.decode_jpeg(file.data, colorspace="GRAY", buffer=grey[:height], strict=False)
     return grey
 
@@ -202,11 +206,11 @@ def _upper_rows(data: bytes, layout: _Layout, bottom: int) -> NDArray[np.uint8] 
 def _by_segments(
     data: bytes, layout: _Layout, low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> NDArray[np.uint8] | None:
-    """The image where its segments meet the boxes."""
+    """Return the image, valid where segments meet boxes; None if that saves no time."""
     if layout.tiles is None:
         return None
     tile_width, tile_height, columns, rows = layout.tiles
-    # which tiles meet a box, by the sums of the boxes' corners
+    # which tiles meet a box, by cumulative sums of the boxes' corners
     left, top = (low // (tile_width, tile_height)).T
     right, bottom = ((high - 1) // (tile_width, tile_height) + 1).T
     count = np.zeros((rows + 1, columns + 1), dtype=np.int64)
@@ -221,7 +225,7 @@ def _by_segments(
     # the last line is filled up
     filled = np.r_[chosen, np.repeat(chosen[-1:], lines * columns - len(chosen))]
     width, height = columns * tile_width, lines * tile_height
-    if row[-1] == rows - 1:  # whose tile may have fewer rows of units than the others
+    if row[-1] == rows - 1:  # the last tiles may have fewer rows of units
         height -= rows * tile_height - layout.units[1] * layout.unit[1]
     size = height.to_bytes(2, "big") + width.to_bytes(2, "big")
     parts = [data[: layout.size_at] + size + data[layout.size_at + 4 : layout.scan]]
@@ -240,7 +244,7 @@ def _by_segments(
 
 
 def _bits(data: bytes, layout: _Layout, count: int) -> NDArray[np.int64] | None:
-    """Start and end (count, 2) in `data` of each segment's bits; None where some are missing."""
+    """Return start and end (count, 2) of all segments' bits in `data`; None if some are missing."""
     bits = np.frombuffer(data, np.uint8)[layout.scan :]
     at = np.flatnonzero(bits[:-1] == 0xFF)
     after = bits[at + 1]
@@ -260,9 +264,9 @@ _MOST_BYTES = 1_000_000_000
 
 
 class EncodedImage:
-    """An image file or encoded bytes (H, W), decoded as far as they are looked at.
+    """An image file, or its encoded bytes (H, W); only the parts needed are decoded.
 
-    Raises ImageError saying what is wrong with the file, at the latest when it is decoded.
+    Raises ImageError if something is wrong with the file, at the latest when it is decoded.
     """
 
     def __init__(self, source: Path | bytes) -> None:
@@ -273,35 +277,35 @@ class EncodedImage:
         self._size = image_size(data)
         if self._size is not None and self._size[0] * self._size[1] > _MOST_PIXELS:
             raise ImageError(
-                f"{self.name}: says that it has {self._size[0]} × {self._size[1]} px; at most "
+                f"{self.name}: has {self._size[0]} × {self._size[1]} px by its header; at most "
                 f"{_MOST_PIXELS // 10**6} million are decoded"
             )
         self._is_jpeg = data[:2] == _JPEG
         if self._is_jpeg and b"\xff\xd9" not in data[-64:]:
-            raise ImageError(f"{self.name}: the JPEG is cut off: its end is missing")
+            raise ImageError(f"{self.name}: the JPEG is cut off, its end is missing")
 
     def whole(self) -> NDArray[Any]:
-        """Grey values (H, W), 8 or 16 bit.
+        """Return grey values (H, W), 8 or 16 bit.
 
-        The orientation flag of EXIF is not obeyed: the sensor does not turn with it.
+        EXIF's orientation flag is ignored, since the interior orientation is that of the sensor.
         """
         if self._is_jpeg:
             try:
                 grey: NDArray[Any] = simplejpeg.decode_jpeg(self._data, colorspace="GRAY")[..., 0]
                 return grey
             except ValueError:
-                pass  # another colour space, or damage that OpenCV bears with or names
+                pass  # another colour space, or damage that OpenCV tolerates or reports
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-        image = self._decoded(flags)
+        image = self._decode(flags)
         if image.dtype not in (np.uint8, np.uint16):
             raise ImageError(f"{self.name}: {image.dtype} grey values; 8 or 16 bit are read")
         return image
 
     def as_it_is(self) -> NDArray[Any]:
-        """Values (H, W), or with channels (H, W, 3 or 4), of the file's own type, not turned."""
-        return self._decoded(cv2.IMREAD_UNCHANGED)
+        """Return values (H, W) or (H, W, 3 or 4) of the file's own type, not rotated."""
+        return self._decode(cv2.IMREAD_UNCHANGED)
 
-    def _decoded(self, flags: int) -> NDArray[Any]:
+    def _decode(self, flags: int) -> NDArray[Any]:
         try:
             image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(self._data, np.uint8), flags)
         except cv2.error as error:
@@ -313,10 +317,9 @@ class EncodedImage:
         return image
 
     def around(self, boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
-        """Grey values (H, W) that hold within boxes (n, 4) px (left, top, right, bottom).
+        """Return grey values (H, W) that are valid in boxes (n, 4) px, as `decode_parts`.
 
-        None where the file cannot be decoded in parts or has not the shape (H, W). The memory is
-        used again by the next call in this thread.
+        None if the file cannot be decoded in parts or does not have the shape (H, W).
         """
         if not self._is_jpeg or self._size is None or self._size[::-1] != tuple(shape):
             return None
@@ -324,10 +327,9 @@ class EncodedImage:
 
 
 def decode_grey(source: Path | bytes) -> NDArray[Any]:
-    """Grey values (H, W), 8 or 16 bit, of an image file or of encoded bytes.
+    """Return grey values (H, W), 8 or 16 bit, of an image file or of encoded bytes.
 
-    The orientation flag of EXIF is not obeyed: the sensor does not turn with it.
-    Raises ImageError saying what is wrong with the file.
+    EXIF's orientation flag is ignored. Raises ImageError if something is wrong with the file.
     """
     return EncodedImage(source).whole()
 
@@ -346,30 +348,30 @@ def _read(path: Path, name: str) -> bytes:
 _Value = str | int | float
 _APP1, _COMMENT = 0xE1, 0xFE
 _EXIF = b"Exif\0\0"
-_TOLD_JPEG = {_APP1, 0xE2, 0xED, _COMMENT}
+_METADATA_JPEG = {_APP1, 0xE2, 0xED, _COMMENT}
 """EXIF and XMP, colour profile, IPTC, comment."""
-_TOLD_PNG = {b"eXIf", b"iCCP", b"tEXt", b"zTXt", b"iTXt", b"pHYs"}
+_METADATA_PNG = {b"eXIf", b"iCCP", b"tEXt", b"zTXt", b"iTXt", b"pHYs"}
 _DETAILS = 0x8769  # the tag that points to EXIF's own directory
 _PER_MM = 4  # EXIF's unit of a focal plane's resolution
 _FRACTION = 10_000  # denominator of rational numbers
 
 
 def with_metadata(image: bytes, source: bytes) -> bytes:
-    """Return an encoded image with the metadata of another; both JPEG or PNG, else as it is."""
+    """Return an encoded image with another's metadata; unchanged unless both are JPEG or PNG."""
     if image.startswith(_JPEG) and source.startswith(_JPEG):
-        told = b"".join(
-            source[begin:end] for kind, begin, end in _segments(source) if kind in _TOLD_JPEG
+        metadata = b"".join(
+            source[begin:end] for kind, begin, end in _segments(source) if kind in _METADATA_JPEG
         )
-        return image[:2] + told + image[2:]
+        return image[:2] + metadata + image[2:]
     if image.startswith(_PNG) and source.startswith(_PNG):
         head, *rest = _chunks(image)
-        told_png = [chunk for chunk in _chunks(source) if chunk[4:8] in _TOLD_PNG]
-        return _PNG + b"".join(chain([head], told_png, rest))
+        chunks = [chunk for chunk in _chunks(source) if chunk[4:8] in _METADATA_PNG]
+        return _PNG + b"".join(chain([head], chunks, rest))
     return image
 
 
 def has_exif(image: bytes) -> bool:
-    """Whether an encoded image is a JPEG with EXIF."""
+    """Return whether an encoded image is a JPEG with EXIF."""
     return image.startswith(_JPEG) and any(
         kind == _APP1 and image[begin + 4 : begin + 10] == _EXIF
         for kind, begin, _ in _segments(image)
@@ -377,7 +379,7 @@ def has_exif(image: bytes) -> bool:
 
 
 def with_exif(jpeg: bytes, camera: str, utc: float, focal_mm: float, pixels_per_mm: float) -> bytes:
-    """Return a JPEG with EXIF: camera, time, upright, focal length and pixels; utc: s."""
+    """Return a JPEG with EXIF: camera, time (utc, s), upright orientation, focal length, pixels."""
     moment = datetime.fromtimestamp(utc, UTC)
     base: dict[int, _Value] = {0x0110: camera, 0x0112: 1, 0x0131: "thermocald", _DETAILS: 0}
     details: dict[int, _Value] = {
@@ -391,12 +393,14 @@ def with_exif(jpeg: bytes, camera: str, utc: float, focal_mm: float, pixels_per_
 
 
 def with_comment(jpeg: bytes, text: str) -> bytes:
-    """Return a JPEG with a comment behind what it says already; text: below 65 kB."""
+    """Return a JPEG with a comment after its other metadata; text: below 65 kB."""
     return _with_segment(jpeg, _COMMENT, text.encode())
 
 
 def _directory(entries: Mapping[int, _Value], start: int) -> bytes:
-    """A directory of TIFF, little-endian, whose first byte is at `start`: ASCII, long, rational."""
+    """Return a TIFF directory, little-endian, at the offset `start`: str is ASCII, int long,
+    float rational.
+    """
     head, tail = struct.pack("<H", len(entries)), b""
     behind = start + 2 + 12 * len(entries) + 4
     for tag, value in sorted(entries.items()):
@@ -417,10 +421,10 @@ def _directory(entries: Mapping[int, _Value], start: int) -> bytes:
 
 
 def _with_segment(jpeg: bytes, kind: int, content: bytes) -> bytes:
-    """Insert a segment behind those that say something of the image."""
+    """Insert a segment after those with metadata."""
     place = 2
-    for known, _, end in _segments(jpeg):
-        if known not in _TOLD_JPEG and known != 0xE0:
+    for marker, _, end in _segments(jpeg):
+        if marker not in _METADATA_JPEG and marker != 0xE0:
             break
         place = end
     segment = struct.pack(">BBH", 0xFF, kind, len(content) + 2) + content
@@ -428,9 +432,9 @@ def _with_segment(jpeg: bytes, kind: int, content: bytes) -> bytes:
 
 
 def _chunks(data: bytes) -> list[bytes]:
-    found, place = [], len(_PNG)
+    chunks, place = [], len(_PNG)
     while place + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, place)
-        found.append(data[place : place + 12 + length])
+        chunks.append(data[place : place + 12 + length])
         place += 12 + length
-    return found
+    return chunks

@@ -1,21 +1,20 @@
-"""Square coded markers: dictionaries, the order of their corners, and where they are in a frame.
+"""Square coded markers: their dictionaries, the order of their corners, and detection in a frame.
 
-Programs number the corners of one marker in different orders (`dictionary`). A field with another
-order gives every marker a turn of its own, and a single one even a pose that fits. Among several
-markers the turn shows: what their corners say of the image's directions is not what their places
-say.
-
-Corner 0 of a marker is the top left one of the marker as OpenCV 4 draws it, and the order runs
+Corner 0 of a marker is the top left one of the marker as OpenCV 4 draws it, and the order is
 clockwise as seen. OpenCV 4 draws AprilTags turned by 180° against the printed originals, later
-versions do not; here the order of OpenCV 4 stays: in an AprilTag that stands upright (as its makers
-and Kalibr print it) corners 0, 1, 2, 3 are bottom right, bottom left, top left, top right.
+versions do not; we keep the order of OpenCV 4: in an upright AprilTag (as its makers and Kalibr
+print it) corners 0, 1, 2, 3 are bottom right, bottom left, top left, top right.
+
+Programs number the corners of a marker in different orders. If a test field has another order,
+every marker is rotated about its own centre, and a single marker even gives a pose that fits. With
+several markers the error is found: their corners and their places disagree about the image's
+directions.
 
 A test field names marker corners in its `code` column as `DICT_APRILTAG_36h11:17:0`: dictionary,
-marker, corner in the order that `dictionary` defines (clockwise as seen; in an upright AprilTag
-from its bottom right). Detection is OpenCV's, in a reduced image where the frame is large, with a
-black border of one cell, or of two as Kalibr prints it; the corners are our own fit (`corner`).
+marker, corner. Markers are detected by OpenCV, in a reduced image if the frame is large, with a
+black border of one cell, or of two as Kalibr prints it; the corners are measured by `corner`.
 
-A marker that is seen twice in an image is dropped: one of the two is not what it says.
+A marker that is detected twice in an image is dropped, since one of the detections is false.
 """
 
 from __future__ import annotations
@@ -43,9 +42,9 @@ _AGREEMENT = 0.6
 
 
 def corners_turned_deg(found: Corners, testfield: TestField) -> int:
-    """By how many degrees (0, 90, 180, 270) the field's corners are turned against the image's.
+    """Return by how many degrees (0, 90, 180, 270) the field's corners are turned to the image's.
 
-    0 too where fewer than three markers with four corners each are seen: one alone cannot tell.
+    Also returns 0 with fewer than three markers with four corners, since one alone is ambiguous.
     """
     corners: dict[tuple[str, int], list[tuple[int, Array]]] = {}
     for row, at in zip(found.rows.tolist(), found.places, strict=True):
@@ -59,15 +58,15 @@ def corners_turned_deg(found: Corners, testfield: TestField) -> int:
     centre, seen = field.mean(axis=1), image.mean(axis=1)
     cosines, sines = [], []
     for k in range(len(whole)):
-        # the marker's own map of the field's directions into the image
+        # the map of the field's directions into the image by this marker
         linear = np.linalg.lstsq(field[k] - centre[k], image[k] - seen[k], rcond=None)[0]
         near = np.argsort(np.linalg.norm(centre - centre[k], axis=1), kind="stable")
         for other in near[1 : _NEIGHBOURS + 1].tolist():
-            told, true = (centre[other] - centre[k]) @ linear, seen[other] - seen[k]
-            size = float(np.linalg.norm(told) * np.linalg.norm(true))
+            mapped, true = (centre[other] - centre[k]) @ linear, seen[other] - seen[k]
+            size = float(np.linalg.norm(mapped) * np.linalg.norm(true))
             if size > 0:
-                cosines.append(float(told @ true) / size)
-                sines.append(float(told[0] * true[1] - told[1] * true[0]) / size)
+                cosines.append(float(mapped @ true) / size)
+                sines.append(float(mapped[0] * true[1] - mapped[1] * true[0]) / size)
     cosine, sine = float(np.median(cosines)), float(np.median(sines))
     if cosine < -_AGREEMENT:
         return 180
@@ -76,17 +75,17 @@ def corners_turned_deg(found: Corners, testfield: TestField) -> int:
     return 0
 
 
-_TAG_0_UPRIGHT = "110101"  # the first row of tag 0 of the family 36h11, 1 is white
+_TAG_0_UPRIGHT = "110101"  # first row of tag 0 of the family 36h11; 1 is white
 
 
 @cache
 def dictionary(name: str) -> Any:
-    """OpenCV's dictionary of a name; TestFieldError where it has none."""
+    """Return OpenCV's dictionary of a name; TestFieldError if there is none."""
     number = getattr(cv2.aruco, name, None)
     if not name.startswith("DICT_") or not isinstance(number, int):
         raise TestFieldError(
-            f"{name!r} is not a dictionary of OpenCV's; DICT_4X4_50, DICT_5X5_1000, or "
-            "DICT_APRILTAG_36h11 are"
+            f"{name!r} is not a dictionary of OpenCV's, such as DICT_4X4_50, DICT_5X5_1000, or "
+            "DICT_APRILTAG_36h11"
         )
     return cv2.aruco.getPredefinedDictionary(number)
 
@@ -97,24 +96,23 @@ def marker_dictionaries() -> list[str]:
 
 
 def marker_size(name: str, border: int = 1) -> int:
-    """Cells along the side of a marker with a black border of so many cells."""
+    """Return the number of cells along the side of a marker with a border of `border` cells."""
     return int(dictionary(name).markerSize) + 2 * border
 
 
 @cache
 def detector(name: str, border: int = 1) -> Any:
-    """OpenCV's detector of a dictionary's markers; corners are measured by our own fit later."""
+    """Return OpenCV's detector of a dictionary's markers, which does not refine the corners."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.minMarkerPerimeterRate = 0.01
     parameters.markerBorderBits = border
-    # A bit is read from a third of its cell: the default of eight px a cell gives blur a chance.
     return cv2.aruco.ArucoDetector(dictionary(name), parameters)
 
 
 @cache
 def corner_shift(name: str) -> int:
-    """By how many places OpenCV's order of corners precedes ours: 2 where it turns AprilTags."""
+    """Return by how many places OpenCV's corners precede ours: 2 if it draws AprilTags upright."""
     if not name.startswith("DICT_APRILTAG"):
         return 0
     tags = dictionary("DICT_APRILTAG_36h11")
@@ -124,7 +122,7 @@ def corner_shift(name: str) -> int:
 
 @cache
 def marker_cells(name: str, number: int, border: int = 1) -> NDArray[np.bool_]:
-    """The cells of a marker, its border included, True where black; corner 0 is the upper left."""
+    """Return a marker's cells with its border, True for black; corner 0 is the upper left one."""
     size = marker_size(name, border)
     image = cv2.aruco.generateImageMarker(dictionary(name), number, size, borderBits=border)
     cells: NDArray[np.bool_] = np.rot90(np.asarray(image) < 128, k=corner_shift(name)).copy()
@@ -133,60 +131,60 @@ def marker_cells(name: str, number: int, border: int = 1) -> NDArray[np.bool_]:
 
 
 LARGE_PIXELS = 3_000_000
-"""An image with more is searched at half its size first."""
+"""A larger image is searched at half its size first."""
 SMALLEST_SIDE_PX = 16.0
-"""A marker that is seen smaller is not measured."""
+"""A marker with a shorter side in the image is not measured."""
 _LEAST_STEP_DN = 5.0
 
 
 def is_marker(code: str) -> bool:
-    """Whether a test field's code names a marker or one of its corners."""
+    """Return whether a test field's code names a marker or one of its corners."""
     return code.startswith("DICT_")
 
 
 def parse_marker(code: str) -> tuple[str, int, int | None]:
-    """`DICT_5X5_50:17:0` → ("DICT_5X5_50", 17, 0); the corner is None for `DICT_5X5_50:17`.
+    """Parse `DICT_5X5_50:17:0` to ("DICT_5X5_50", 17, 0); the corner is None in `DICT_5X5_50:17`.
 
-    TestFieldError where OpenCV has no such dictionary, or the dictionary no such marker.
+    TestFieldError if OpenCV has no such dictionary, or the dictionary has no such marker.
     """
     parts = code.split(":")
     numbers = parts[1:]
     if len(parts) not in (2, 3) or not all(n.isascii() and n.isdigit() for n in numbers):
         raise TestFieldError(
-            f"{code!r} is not a marker code: write, for example, DICT_APRILTAG_36h11:17:0 for "
+            f"{code!r} is not a marker code; write, for example, DICT_APRILTAG_36h11:17:0 for "
             "corner 0 of marker 17"
         )
-    known = len(dictionary(parts[0]).bytesList)
+    count = len(dictionary(parts[0]).bytesList)
     marker = int(numbers[0][:9])
-    corner = int(numbers[1]) if len(numbers) == 2 else None
-    if marker >= known:
-        raise TestFieldError(f"{code!r}: {parts[0]} has markers 0 to {known - 1}")
+    corner = int(numbers[1][:9]) if len(numbers) == 2 else None
+    if marker >= count:
+        raise TestFieldError(f"{code!r}: {parts[0]} has markers 0 to {count - 1}")
     if corner is not None and corner > 3:
         raise TestFieldError(f"{code!r}: a marker has corners 0 to 3")
     return parts[0], marker, corner
 
 
 def to_8_bit(image: Image) -> NDArray[np.uint8]:
-    """The image itself, or a 16-bit one scaled so that its brightest value is 255."""
+    """Return the image; one of 16 bit is scaled so that its brightest value is 255."""
     if image.dtype == np.uint8:
         return image  # type: ignore[return-value]
     return cv2.convertScaleAbs(image, alpha=255.0 / max(int(image.max()), 1))  # type: ignore[return-value]
 
 
 def halved(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the image at half its size: x there is 2·x + ½ here."""
+    """Return the image at half its size: x in it is 2·x + ½ in the original."""
     return cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
 def detect_markers(
     image: Image, name: str, expected: frozenset[int]
 ) -> tuple[dict[int, Array], int]:
-    """Find the markers of one dictionary in an image; `expected` numbers, others are ignored.
+    """Detect the markers of one dictionary with `expected` numbers in an image.
 
-    Returns the corners (4, 2) px by number, good to about a pixel, and how many cells the black
-    border has. A number that is found twice is dropped. A large image is searched at half its size
-    first, and at full size where that found less than half of what is expected; then with the wide
-    border of Kalibr's AprilGrids, where there may be some.
+    Returns the corners (4, 2) px by number, good to about a pixel, and the width of the black
+    border in cells. A number that is found twice is dropped. A large image is searched at half its
+    size first, at full size if half of the markers or fewer were found, and then, for AprilTags,
+    with the wide border of Kalibr's AprilGrids.
     """
     grey = to_8_bit(image)
     searches = [(scale, 1) for scale in ((2, 1) if grey.size > LARGE_PIXELS else (1,))]
@@ -195,19 +193,19 @@ def detect_markers(
     best: dict[int, Array] = {}
     best_border = 1
     for scale, border in searches:
-        looked_at = halved(grey) if scale > 1 else grey
-        found, numbers, _ = detector(name, border).detectMarkers(looked_at)
+        searched = halved(grey) if scale > 1 else grey
+        found, numbers, _ = detector(name, border).detectMarkers(searched)
         seen: defaultdict[int, list[Array]] = defaultdict(list)
         if numbers is not None:
             for number, corners in zip(numbers.ravel().tolist(), found, strict=True):
                 if number in expected:
                     at = scale * corners.reshape(4, 2).astype(float) + (scale - 1) / 2
-                    if _outlined(grey, at):
+                    if _is_outline(grey, at):
                         seen[number].append(np.roll(at, corner_shift(name), axis=0))
         single = {}
         for number, quads in sorted(seen.items()):
             off = np.linalg.norm(np.mean(quads, axis=1) - quads[0].mean(axis=0), axis=1)
-            # OpenCV may report the inner and the outer outline of one marker
+            # OpenCV may detect the inner and the outer outline of one marker
             if off.max() < 0.1 * np.linalg.norm(quads[0][0] - quads[0][2]):
                 single[number] = quads[0]
         if len(single) > len(best):
@@ -217,9 +215,10 @@ def detect_markers(
     return best, best_border
 
 
-def _outlined(grey: NDArray[np.uint8], quad: Array) -> bool:
-    """Whether the image gets lighter across the sides of a marker: OpenCV takes a tag with a border
-    of two cells for one with a border of one, a cell too small.
+def _is_outline(grey: NDArray[np.uint8], quad: Array) -> bool:
+    """Return whether the image gets lighter outwards across the sides of a marker.
+
+    OpenCV may take a tag with a border of two cells for one with a border of one, a cell too small.
     """
     following = np.roll(quad, -1, axis=0)
     middle = quad.mean(axis=0)
@@ -238,7 +237,7 @@ def _outlined(grey: NDArray[np.uint8], quad: Array) -> bool:
 
 
 def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
-    """{dictionary: {(marker, corner): row of the test field}}."""
+    """Return {dictionary: {(marker, corner): row of the test field}}."""
     rows: dict[str, dict[tuple[int, int], int]] = {}
     for row, code in enumerate(testfield.codes):
         if is_marker(code):
@@ -258,7 +257,7 @@ def marker_rows(testfield: TestField) -> dict[str, dict[tuple[int, int], int]]:
 def locate_markers(
     image: Image, testfield: TestField, missed: dict[int, str] | None = None
 ) -> Corners:
-    """Find a test field's markers; `missed` receives {row: reason} for corners not found."""
+    """Detect a test field's markers; `missed` receives {row: reason} for corners not found."""
     missed = {} if missed is None else missed
     found: list[tuple[int, float, Array]] = []  # row, border, corner with its neighbours
     for name, known in marker_rows(testfield).items():

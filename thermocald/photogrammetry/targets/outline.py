@@ -1,19 +1,19 @@
-"""The outline of a circular target in the image, and the window of pixels that shows it.
+"""The outline of a circular target in the image, and the window of pixels around it.
 
-The map takes the unit disc in the target's plane to pixels and is a polynomial of second order
-about the projected centre, F(q) = c + J q + ½ H[q, q] with q = (s, t). J makes the ellipse; H holds
-what makes the centre of the outline another point than the projected centre: the perspective's
-foreshortening and the bend of the distortion across the target. Terms of third order are odd, they
-change the outline symmetrically and move no centre.
+A local map takes the unit disc in the target's plane to pixels. It is a polynomial of second order
+about the projected centre, F(q) = c + J q + ½ H[q, q] with q = (s, t). J gives the ellipse. H gives
+the eccentricity, by which the centre of the outline differs from the projected centre, from the
+perspective and from the variation of the distortion across the target. Terms of third order are
+odd: they change the outline symmetrically and do not move the centre.
 
-Only pixels near the outline say where the centre is; those near a code ring are kept out. Circles
-are found without prior knowledge in a frame thresholded against its local mean, so that uneven
-light does no harm; contours that are ellipses are candidates, and `ring_code` or `orientation` say
-what they are.
+Only pixels near the outline determine the centre; those near a code ring are excluded. To find
+circles without prior knowledge, the frame is thresholded against its local mean, so that uneven
+light does no harm. Contours that are ellipses are candidates, which `ring_code` or `orientation`
+identify.
 
 Source: the eccentricity as Luhmann, T. (2014): Eccentricity in images of circular and spherical
 targets and its impact on spatial intersection, Photogrammetric Record 29(148), 417–433; here it is
-not a correction to an ellipse but part of the outline, so that the distortion is in it.
+not a correction to an ellipse but part of the outline, and thus includes the distortion.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ if TYPE_CHECKING:
 RING_INNER = 2.0
 """Inner radius of the ring of a coded target, in radii of its disc."""
 RING_OUTER = 3.0
-"""Outer radius of the ring, in radii of the disc; outside, as much again must be background."""
+"""Outer radius of the ring, in radii of the disc; around it is background."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalMap:
-    """n maps of the unit disc: centre (n, 2) px, linear (n, 2, 2) px, second (n, 2, 3) px: the
-    second derivatives by ss, st, tt.
+    """n maps of the unit disc.
+
+    centre (n, 2) px; linear (n, 2, 2) px; second (n, 2, 3) px: second derivatives by ss, st, tt.
     """
 
     centre: Array
@@ -54,7 +55,7 @@ class LocalMap:
         return len(self.centre)
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> LocalMap:
-        """Some of the maps, by mask or rows."""
+        """Return some of the maps, by mask or rows."""
         return LocalMap(self.centre[keep], self.linear[keep], self.second[keep])
 
     @classmethod
@@ -63,17 +64,17 @@ class LocalMap:
         return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 3)))
 
     def at(self, centre: Array) -> LocalMap:
-        """The same shapes about other centres (n, 2) px."""
+        """Return maps of the same shapes about other centres (n, 2) px."""
         return LocalMap(centre, self.linear, self.second)
 
     @property
     def inverse(self) -> Array:
-        """The inverses of the linear parts (n, 2, 2) 1/px."""
+        """The inverses (n, 2, 2) of the linear parts, 1/px."""
         return inverse_2x2(self.linear)
 
     @property
     def semi_axes(self) -> Array:
-        """Semi-axes of the ellipses (n, 2) px, the major one first."""
+        """The semi-axes (n, 2) of the ellipses, px, the major one first."""
         # in closed form, as `inverse_2x2`
         a, b, c, d = (self.linear[:, i, k] for i in (0, 1) for k in (0, 1))
         mean, difference = np.hypot(a + d, b - c) / 2, np.hypot(a - d, b + c) / 2
@@ -81,28 +82,29 @@ class LocalMap:
 
     @property
     def half_extent(self) -> Array:
-        """Half width and height (n, 2) px of the ellipses' bounding boxes."""
+        """Half the width and height (n, 2) of the ellipses' bounding boxes, px."""
         extent: Array = np.linalg.norm(self.linear, axis=2)
         return extent
 
 
 def facing(centre: Array, points: Array, normals: Array) -> tuple[Array, Array]:
-    """Return the normals (n, 3) of targets at points (n, 3), and the cosines (n,) under which a
-    camera at `centre` sees them. A normal that is not known (NaN) is taken to face the camera.
+    """Return normals (n, 3) of targets at points (n, 3), and cosines (n,) to the lines of sight.
+
+    centre (3,): of the camera. An unknown normal (NaN) is replaced by one that faces the camera.
     """
     view = centre - points
     view /= np.linalg.norm(view, axis=1, keepdims=True)
-    known = np.where(np.isfinite(normals), normals, view)
-    return known, np.abs(np.sum(view * known, axis=1))
+    normals = np.where(np.isfinite(normals), normals, view)
+    return normals, np.abs(np.sum(view * normals, axis=1))
 
 
 def local_maps(
     sensor: Sensor, iop: Array, eop: Array, points: Array, normals: Array, radii: Array
 ) -> LocalMap:
-    """The maps of targets at points (n, 3) mm with normals (n, 3) and radii (n,) mm.
+    """Return the maps of targets at points (n, 3) mm with normals (n, 3) and radii (n,) mm.
 
     iop (10,), eop (6,). NaN for targets not in front of the camera. Derivatives are differences
-    over the target's own radius, so that they hold for its outline and not only for its centre.
+    over the target's radius, so that they hold for its outline and not only for its centre.
     """
     # two radii that span each target's plane
     across = np.cross(np.eye(3)[np.argmin(np.abs(normals), axis=1)], normals)
@@ -119,20 +121,20 @@ def local_maps(
 
 
 REACH_PX = 4.0
-"""Pixels farther from the outline carry nothing about the centre."""
+"""Pixels farther from the outline do not depend on the centre."""
 _THIN = 3
-_CHUNK_PIXELS = 120_000  # of the windows that are looked at together
-_CUT_PX = 2.0  # pixels so near to the outline have to be in the image
+_CHUNK_PIXELS = 120_000  # of the windows that are processed together
+_CUT_PX = 2.0  # pixels this near to the outline must be in the image
 _RING_CLEARANCE = 2.6  # standard deviations of the blur between a used pixel and the code ring
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
-    """The pixels about some targets.
+    """The pixels around some targets.
 
-    rows (n,) of the targets; pixel (n, k): place in the flat image; origin (n, 2) px; x, y relative
-    to it, grey, weight (n, k); k is padded, the padding has weight 0. begin (n, 10): parameters to
-    begin with; cut (n,): whether the image's edge cuts the target.
+    rows (n,): of the targets; pixel (n, k): index in the flat image; origin (n, 2) px; x, y
+    (relative to the origin), grey, weight (n, k), padded with weight 0; begin (n, 10): approximate
+    parameters; cut (n,): whether the image's edge cuts the target.
     """
 
     rows: NDArray[np.int64]
@@ -146,11 +148,11 @@ class Windows:
     cut: NDArray[np.bool_]
 
     def select(self, keep: NDArray[np.int64]) -> Windows:
-        """Some of the targets."""
+        """Return the windows of some of the targets."""
         return Windows(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def thinned(self) -> Windows:
-        """The same with every third pixel."""
+        """Return the windows with every third pixel only."""
         x, y, grey, weight = (
             np.ascontiguousarray(a[:, ::_THIN]) for a in (self.x, self.y, self.grey, self.weight)
         )
@@ -158,7 +160,7 @@ class Windows:
 
 
 def window_reach(blur: float) -> float:
-    """How far from the outline pixels are used, px, at a blur of so many px."""
+    """Return how far from the outline pixels are used, px; blur: px."""
     return max(REACH_PX, 4.0 * blur)
 
 
@@ -168,14 +170,14 @@ def windows(
     coded: NDArray[np.bool_],
     blur: float = 0.9,
 ) -> Iterator[Windows]:
-    """The pixels near each outline, targets of like size together.
+    """Yield the windows of targets of similar size, with the pixels near each outline.
 
-    coded (n,): targets with a code ring, which is kept out at `blur` px.
+    coded (n,): targets with a code ring, whose pixels are excluded for a blur of `blur` px.
     """
     height, width = image.shape
     reach_px = window_reach(blur)
     half = np.ceil(maps.half_extent + reach_px).astype(int)
-    # Targets of like size and like shape share a window.
+    # Targets of similar size and shape have windows of the same size.
     order = np.lexsort((half[:, 0], half.max(axis=1) // 3))
     levels = _background_and_contrast(image, maps)
     beyond = np.full((len(maps), 2), reach_px)
@@ -214,7 +216,7 @@ def windows(
             cut = np.any(~inside & (_squared_radius(near, centre, powers) < 1.0), axis=1)
             use &= inside
         count = np.count_nonzero(use, axis=1)
-        # The pixels used, moved to the front of each row.
+        # the pixels used, moved to the front of each row
         filled = np.arange(max(int(count.max()), 1)) < count[:, None]
         at = np.zeros(filled.shape, dtype=np.int64)
         at[filled] = np.flatnonzero(use) - np.repeat(np.arange(len(rows)) * use.shape[1], count)
@@ -234,14 +236,16 @@ def windows(
 
 
 def _grown_ellipses(maps: LocalMap, beyond: Array) -> Array:
-    """Matrices (n, 2, 2) of ellipses with semi-axes longer by (n, 2) px: eᵀ M e = 1 on the outline,
-    zero where nothing is left. The ellipse alone is good enough to choose pixels by.
+    """Return matrices M (n, 2, 2) of ellipses with semi-axes longer by (n, 2) px.
+
+    eᵀ M e is 1 on the outline; M is zero if an axis vanishes. To choose pixels, the ellipse without
+    the eccentricity is good enough.
     """
     axes = maps.semi_axes
     grown = axes + beyond
     left = grown[:, 1] > 0
     value = left[:, None] / np.where(left[:, None], grown, 1.0) ** 2
-    # M has the axes of J Jᵀ, so that it is a combination of it and of the identity.
+    # M has the axes of J Jᵀ, and so is a combination of J Jᵀ and the identity.
     square = axes * axes
     spread = square[:, 0] - square[:, 1]
     circle = spread < 1e-6 * square[:, 0]
@@ -252,19 +256,19 @@ def _grown_ellipses(maps: LocalMap, beyond: Array) -> Array:
 
 
 def _squared_radius(M: Array, centre: Array, powers: Single) -> Single:
-    """eᵀ M e (n, k) at pixels with powers xx, xy, yy, x, y, 1 (6, k), 2 everywhere where M is zero.
+    """Return eᵀ M e (n, k), e relative to the centres (n, 2) px, or 2 if M is zero.
 
-    centre (n, 2) px: what e is relative to.
+    powers (6, k): xx, xy, yy, x, y, 1 of the pixels.
     """
     shift = (M @ centre[:, :, None])[:, :, 0]
     constant = np.where(M[:, 0, 0] > 0, np.sum(shift * centre, axis=1), 2.0)
     by_power = [M[:, 0, 0], 2 * M[:, 0, 1], M[:, 1, 1], *(-2 * shift.T), constant]
-    found: Single = np.stack(by_power, axis=1).astype(np.float32) @ powers
-    return found
+    squared: Single = np.stack(by_power, axis=1).astype(np.float32) @ powers
+    return squared
 
 
 def _background_and_contrast(image: Image, maps: LocalMap) -> Array:
-    """Both (n, 2) DN, from the centre and from eight points a little outside of the outline."""
+    """Return both (n, 2) DN, from the centre and eight points a little outside the outline."""
     turn = np.arange(8) * (np.pi / 4)
     out = 1 + np.minimum(2.5 / maps.semi_axes[:, 1], 0.5)
     around = (maps.linear @ np.stack([np.cos(turn), np.sin(turn)])) * out[:, None, None]
@@ -278,7 +282,7 @@ def _background_and_contrast(image: Image, maps: LocalMap) -> Array:
     return np.stack([background, contrast], axis=1)
 
 
-_BLOCK_SHARE = 1 / 40  # of the image's width: the neighbourhood of the local mean, full size
+_BLOCK_SHARE = 1 / 40  # of the image's width: the window of the local mean
 _SMALLEST_BLOCK = 25
 _OFFSET_DN = 6.0
 _FEWEST_CONTOUR_POINTS = 8
@@ -287,16 +291,14 @@ _COMPACTNESS = 0.5
 _AREA_TOLERANCE = 0.12
 _RADIUS_TOLERANCE = 0.03
 _SMALLEST_AXIS = 1.5
-_LARGEST_AXIS_RATIO = 3.2  # 60° obliqueness and then some perspective
+_LARGEST_AXIS_RATIO = 3.2  # an obliqueness of 60°, and some perspective
 
 
 def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -> LocalMap:
-    """Find ellipses of one kind (dark on light -1, light on dark 1) in an image (H, W).
+    """Find ellipses of one polarity (-1 dark on light, 1 light on dark) in an image (H, W).
 
-    Their centres are good to some 0.1 px.
-
-    scale: the image is searched at 1/scale of its size; ellipses with less than some six px across
-    there are not found.
+    Their centres are good to about 0.1 px. scale: the image is searched at 1/scale of its size;
+    ellipses less than about six px across at this size are not found.
     """
     small = image
     if scale > 1:
@@ -311,18 +313,20 @@ def find_circles(image: NDArray[np.uint8], scale: int = 1, polarity: int = -1) -
     cv2.threshold(mask, _OFFSET_DN, 255, cv2.THRESH_BINARY, dst=mask)
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     e = _ellipses(contours, 4 * _LARGEST_SHARE * small.shape[1])
-    # The reduced image covers the whole one: (x + ½) grows with the true ratio of the sizes.
+    # the reduced image covers the original: (x + ½) scales by the true ratio of the sizes
     ratio = np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]])
     centre = (e[:, :2] + 0.5) * ratio - 0.5
-    # A contour runs through pixel centres, half a pixel inside of the outline.
+    # a contour goes through pixel centres, half a pixel inside the outline
     (a, b), c, s = scale * (e[:, 2:4].T + 0.5), np.cos(e[:, 4]), np.sin(e[:, 4])
     linear = np.stack([a * c, -b * s, a * s, b * c], axis=1).reshape(-1, 2, 2)
     return LocalMap(centre, linear, np.zeros((len(e), 2, 3)))
 
 
 def _ellipses(contours: Sequence[Any], longest: float) -> Array:
-    """Ellipses x, y, a, b, angle (n, 5) of those contours that are ellipses, to a pixel's raster
-    and 3 %: with the contour's own moments. longest: most pixels of a contour.
+    """Return ellipses x, y, a, b, angle (n, 5) of the contours that are ellipses.
+
+    An ellipse has the contour's moments; it must fit to the raster of pixels and 3 %. longest:
+    most pixels of a contour.
     """
     used = [c for c in contours if _FEWEST_CONTOUR_POINTS <= len(c) <= longest]
     if not used:
@@ -335,7 +339,7 @@ def _ellipses(contours: Sequence[Any], longest: float) -> Array:
     points -= begin[:, which]
     area, length, centre, (xx, xy, yy) = _moments(points, first, count)
     mean, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-    # The semi-axes of an ellipse are twice the roots of its principal moments.
+    # the semi-axes of an ellipse are twice the roots of its principal moments
     a, b = (2 * np.sqrt(np.maximum(mean + sign * difference, 1e-6)) for sign in (1, -1))
     angle = np.arctan2(2 * xy, xx - yy) / 2
     ellipse = np.pi * a * b
@@ -345,24 +349,25 @@ def _ellipses(contours: Sequence[Any], longest: float) -> Array:
         & (2 * b >= _SMALLEST_AXIS)
         & (2 * a + 1 <= _LARGEST_AXIS_RATIO * (2 * b + 1))
     )
-    # How far the contour is from the ellipse, in the plane where that is the unit circle
+    # distance of the contour from the ellipse, in the plane where that is the unit circle
     c, s = np.cos(angle), np.sin(angle)
     axes = np.stack([c / a, s / a, -s / b, c / b])[:, which]
     dx, dy = points - centre[:, which]
     u, v = axes[0] * dx + axes[1] * dy, axes[2] * dx + axes[3] * dy
     off = np.bincount(which, np.abs(np.sqrt(u * u + v * v) - 1)) / count
     keep &= off < _RADIUS_TOLERANCE + 0.35 / b
-    found: Array = np.stack([*(centre + begin), a, b, angle], axis=1)[keep]
-    return found
+    ellipses: Array = np.stack([*(centre + begin), a, b, angle], axis=1)[keep]
+    return ellipses
 
 
 def _moments(
     points: Array, first: NDArray[np.int64], count: NDArray[np.int64]
 ) -> tuple[Array, Array, Array, tuple[Array, Array, Array]]:
-    """Of n polygons: area (positive for outlines, negative for holes), length, centre (2, n), and
-    second moments xx, xy, yy about it, each divided by the area (Green's theorem).
+    """Return area, length, centre (2, n), and central second moments xx, xy, yy of n polygons.
 
-    points (2, k): one polygon after the other, from `first` on, `count` of each.
+    The area is positive for outlines, negative for holes; moments are divided by it (Green's
+    theorem). points (2, k): of all polygons; first, count (n,): where each begins, and its number
+    of points.
     """
     after = np.arange(1, points.shape[1] + 1)
     after[first + count - 1] = first

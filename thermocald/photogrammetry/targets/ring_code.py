@@ -1,31 +1,29 @@
-"""Ring codes around circular targets: words, drawing, and how they are read in a frame.
+"""Ring codes around circular targets: the codes, their drawing, and their reading in a frame.
 
-A target is a disc of radius 1 and a concentric ring between radius 2 and 3 that is cut into N equal
-segments. A segment in the disc's colour is a 1, one in the background's colour a 0. Read clockwise
-(as seen by the viewer), the most significant bit first, every starting segment gives another
-number: the code is the smallest of them. Of all N-bit numbers those are codes that have an even
-number of ones, at least one pair of opposite segments that are both ones, and a gap; that leaves
-147 codes of 12 bit and 516 of 14 bit. `number` in this module and in a test field's code
-(`RING12:<code>`, `RING14:<code>`) is the code itself, not its place in somebody's list; the lists
-that programs print are in increasing order of the code.
+A target is a disc of radius 1 and a concentric ring between radius 2 and 3, which is divided into N
+equal segments. A segment in the disc's colour is a 1, one in the background's colour a 0. Read
+clockwise (as seen by the viewer) with the most significant bit first, each starting segment gives a
+number, of which the smallest is the code. Codes must have an even number of ones, at least one pair
+of opposite ones, and a gap; there are 147 codes of 12 bits and 516 of 14 bits. `number` in this
+module and in a test field's code (`RING12:<code>`, `RING14:<code>`) is the code itself, not its
+place in the list of a program; such lists are in increasing order of the code.
 
 Source: Schneider, C. T. (1991): 3-D Vermessung von Oberflächen und Bauteilen durch Photogrammetrie
 und Bildverarbeitung, IDENT/VISION '91; rule and geometry as the expired patent DE 197 33 466 A1,
 read by M. Petroff, "Photogrammetry targets" (2018), who compared them with Scanreference's targets.
 
-A contour gives a disc to a pixel; its size is taken from the grey values, and so is the perspective
-in which its ring is seen.
+A contour gives a disc to about a pixel; its size and the perspective of its ring are estimated from
+the grey values.
 
-A ring is trusted only where the drawing fits after it may shift, turn and grow a little.
+Around each candidate, grey values are sampled on circles in the coordinates of the ellipse. A coded
+target has its disc in one grey, a gap around it in the other, background outside its ring, and all
+transitions in the ring on a raster of 12 or 14 bits. The code that was read is then drawn, blurred,
+and compared with the samples, after a small shift, rotation and scaling. Only a ring that passes
+all these checks and has an existing code is accepted, since the codes have little redundancy, but
+their shape has much.
 
-About each candidate the grey values are sampled on circles in the ellipse's own frame. A coded
-target has its disc in one grey, a gap about it in the other, background outside of its ring, and
-in the ring transitions that all lie on a raster of 12 or of 14 bits. What is read is then drawn,
-blurred, and compared with the samples. Only a ring that passes all of it and whose code exists is
-a coded target: the codes have little redundancy of their own (`ring_code`), their shape has much.
-
-Searched from the likely to the rare: dark on light in a reduced image first, light on dark at full
-size last, until enough are found for an orientation.
+The search is from the frequent to the rare: dark on light in a reduced image first, light on dark
+at full size last, until enough codes are found for an orientation.
 """
 
 from __future__ import annotations
@@ -66,20 +64,20 @@ BITS = (12, 14)
 
 
 def smallest_rotation(number: int, bits: int) -> int:
-    """The smallest among the cyclic rotations of a number of so many bits."""
+    """Return the smallest of the cyclic rotations of a number of `bits` bits."""
     mask = (1 << bits) - 1
     return min(((number << k) & mask) | (number >> (bits - k)) for k in range(bits))
 
 
 @cache
 def codes(bits: int) -> tuple[int, ...]:
-    """All codes of so many bits (12 or 14), increasing; ValueError for other numbers of bits."""
+    """Return all codes of 12 or 14 bits in increasing order; ValueError for other bits."""
     if bits not in BITS:
         raise ValueError(f"ring codes have {' or '.join(map(str, BITS))} bits, not {bits}")
     half = bits // 2
     return tuple(
         number
-        for number in range(1, 1 << (bits - 1), 2)  # begins with a 0: the closed ring is not a code
+        for number in range(1, 1 << (bits - 1), 2)  # starts with a 0: a closed ring is not a code
         if number.bit_count() % 2 == 0
         and number & (number >> half) & ((1 << half) - 1)
         and number == smallest_rotation(number, bits)
@@ -87,25 +85,25 @@ def codes(bits: int) -> tuple[int, ...]:
 
 
 def is_ring(code: str) -> bool:
-    """Whether a test field's code names a ring code."""
+    """Return whether a test field's code is a ring code."""
     return code.startswith("RING")
 
 
 def have_rings(testfield: TestField, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which targets in some rows (n,) of a test field have a code ring."""
+    """Return which targets (n,) of some rows (n,) of a test field have a code ring."""
     return np.array([is_ring(testfield.codes[row]) for row in rows], dtype=bool)
 
 
 def parse(code: str) -> tuple[int, int]:
-    """`RING12:47` → (12, 47); TestFieldError where no such code exists."""
+    """Parse `RING12:47` to (12, 47); TestFieldError if no such code exists."""
     family, _, number = code.partition(":")
     bits = {f"RING{n}": n for n in BITS}.get(family)
     if bits is None or not number.isascii() or not number.isdigit():
         raise TestFieldError(
-            f"{code!r} is not a ring code: write RING12:<code> or RING14:<code>, such as RING12:"
+            f"{code!r} is not a ring code; write RING12:<code> or RING14:<code>, such as RING12:"
             f"{codes(12)[0]}"
         )
-    value = int(number)
+    value = int(number[:9])
     if value >> bits or _code_table(bits)[value] != value:
         raise TestFieldError(
             f"{code!r}: there is no {bits}-bit ring code {value}; a code is the smallest number "
@@ -115,15 +113,15 @@ def parse(code: str) -> tuple[int, int]:
 
 
 def write(bits: int, number: int) -> str:
-    """The inverse of `parse`."""
+    """Return the text of a code: the inverse of `parse`."""
     return f"RING{bits}:{number}"
 
 
 def segments(bits: int, number: int) -> tuple[tuple[float, float], ...]:
-    """The arcs of a code as (begin, end) in turns, clockwise from +x as the viewer sees the target.
+    """Return the arcs of a code as (begin, end) in turns, clockwise from +x as the viewer sees it.
 
-    Neighbouring ones are one arc; an arc may end beyond 1.0. Drawn with y down, the angle 2π·turns
-    goes from x to y; with y up, negate it.
+    Neighbouring ones are one arc; an arc may end beyond 1.0. With y down, the angle 2π·turns is
+    from x to y; with y up, negate it.
     """
     ones = [bool(number >> (bits - 1 - i) & 1) for i in range(bits)]
     arcs = []
@@ -143,7 +141,7 @@ _INSIDE = 0.6  # level of a sample, 0 background, 1 ink
 
 
 def _circle(angles: int) -> Array:
-    """Unit vectors (2, angles) all around."""
+    """Return unit vectors (2, angles), evenly around a circle."""
     turn = 2 * np.pi * np.arange(angles) / angles
     return np.stack([np.cos(turn), np.sin(turn)])
 
@@ -155,15 +153,15 @@ def sample(
     angles: int,
     ink: tuple[Single, Single] | None = None,
 ) -> Single:
-    """Grey values (n, radii, angles) on circles about discs, clockwise from the first axis.
+    """Return grey values (n, radii, angles) on circles around discs, clockwise from the first axis.
 
-    radii: of the circles, in radii of the disc; angles: how many samples a circle has; ink: grey
-    value of the gap, and contrast (n,) of the disc: levels are returned then, 0 as the background,
-    1 as the disc.
+    radii: of the circles, in radii of the disc; angles: samples per circle; ink: grey value (n,) of
+    the gap and contrast (n,) of the disc; if given, levels are returned: 0 for the background, 1
+    for the disc.
     """
     circle = _circle(angles)
     grey = np.empty((len(maps), len(radii), angles), dtype=np.float32)
-    chunk = 32_000 // len(radii)  # cv2.remap takes no more rows
+    chunk = 32_000 // len(radii)  # cv2.remap is limited to 32,767 rows
     rho = np.array(radii, dtype=np.float32)[:, None, None]
     bend = np.stack([circle[0] ** 2, 2 * circle[0] * circle[1], circle[1] ** 2]) / 2
     bent = bool(np.any(maps.second))
@@ -179,12 +177,12 @@ def sample(
 
 
 def sized(image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]) -> LocalMap:
-    """The maps with the size that the discs have at half of their contrast; ink as of `sample`.
+    """Return the maps with the size of the discs at half their contrast; ink: as in `sample`.
 
-    A contour lies where its threshold does, which may be a pixel off.
+    The size from a contour depends on its threshold, and may be wrong by a pixel.
     """
     level = sample(image, maps, _EDGE_RADII, COARSE_ANGLES, ink)
-    # The disc reaches as far as ink goes: its level, summed outwards.
+    # the radius is where the ink ends: the sum of the levels outwards
     step = _EDGE_RADII[1] - _EDGE_RADII[0]
     radius = _EDGE_RADII[0] - step / 2 + np.clip(level, 0, 1).sum(axis=1) * step
     across = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ _circle(COARSE_ANGLES), axis=1)
@@ -197,17 +195,16 @@ def sized(image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]) 
 def in_perspective(
     image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]
 ) -> LocalMap:
-    """The maps (n,) of discs with the perspective in which their rings are seen.
+    """Return the maps (n,) of discs with the perspective of their rings, whatever their codes.
 
-    ink: as of `sample`. The edges of disc and ring are looked for along each radius; those of a
-    target seen in perspective w about a centre that is e off lie at R − e·u − uᵀA u R − (w·u) R²
-    instead of at R = 1, 2, 3, with u the direction and A the ellipse's error. What the ring says is
-    of no matter here.
+    ink: as in `sample`. The edges of disc and ring are measured along each radius. With perspective
+    w, an error e of the centre, and an error A of the ellipse they are at R − e·u − uᵀA u R −
+    (w·u) R² in the direction u, instead of at R = 1, 2, 3.
     """
     rho = np.arange(_PROFILE[0], _PROFILE[1], _PROFILE_STEP)
     level = sample(image, maps, rho.tolist(), ANGLES, ink)
     u = _circle(ANGLES)
-    # away from the ends of an arc, whose corners are rounded by blur
+    # away from the ends of an arc, whose corners blur rounds
     ring = level[:, np.argmin(np.abs(rho - 2.5))] > _INSIDE
     ring &= np.roll(ring, 2, axis=1) & np.roll(ring, -2, axis=1)
     normal, rhs = np.zeros((len(maps), 7, 7)), np.zeros((len(maps), 7))
@@ -223,7 +220,7 @@ def in_perspective(
         above = np.take_along_axis(part, first + 1, 1)[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             place = rho[window][first[:, 0]] + _PROFILE_STEP * (0.5 - below) / (above - below)
-        short = np.where(known, radius - place, 0.0)
+        inwards = np.where(known, radius - place, 0.0)
         design = np.stack(
             [
                 u[0], u[1], radius * u[0] ** 2, 2 * radius * u[0] * u[1], radius * u[1] ** 2,
@@ -231,7 +228,7 @@ def in_perspective(
             ]
         )  # fmt: skip
         normal += (design * known[:, None]) @ design.T
-        rhs += short @ design.T
+        rhs += inwards @ design.T
     ex, ey, a, b, d, *w = np.linalg.solve(normal + 1e-3 * np.eye(7), rhs[..., None])[..., 0].T
     e, shape = np.stack([ex, ey], axis=-1), np.stack([a, b, b, d], axis=-1).reshape(-1, 2, 2)
     linear = maps.linear @ (np.eye(2) - shape)
@@ -243,15 +240,15 @@ def in_perspective(
 
 RADII = (1.75, 2.05, 2.25, 2.5, 2.75, 2.95, 3.25)
 _BLURS_PX = (0.8, 1.4)
-_LARGEST_SHIFT = 0.2  # radii, by which perspective and distortion move a ring against its disc
-# RMS of samples against what was read, in levels: at most, and for large targets, whose edges fill
-# less of the ring, less.
+_LARGEST_SHIFT = 0.2  # radii, of a ring against its disc, by perspective and distortion
+# Largest RMS of the samples against the drawn code, in levels; less for large targets, whose edges
+# are a smaller part of the ring.
 _MISFIT = 0.13
 _MISFIT_LARGE, _MISFIT_EDGE_PX = 0.03, 0.45
 
 
 def allowed_misfit(maps: LocalMap) -> Array:
-    """Largest misfit (n,) in levels with which a ring about each disc is trusted."""
+    """Return the largest misfit (n,), in levels, with which a ring around each disc is accepted."""
     allowed: Array = _MISFIT_LARGE + _MISFIT_EDGE_PX / maps.semi_axes[:, 1]
     return np.minimum(allowed, _MISFIT)
 
@@ -263,20 +260,20 @@ def ring_misfit(
     which: NDArray[np.int64],
     within: Array,
 ) -> Array:
-    """RMS (n,) of the samples against the ring that was read, drawn with one of two blurs.
+    """Return the RMS (n,) of samples against the ring that was read, drawn with one of two blurs.
 
-    level (n, radii, angles): samples at `RADII`, 0 background, 1 ink; ones (n, bits): what was
-    read; which, within (n, angles): the segment in which each angle lies, and where in it, 0 to 1.
+    level (n, radii, angles): samples at `RADII`, 0 background, 1 ink; ones (n, bits): the code that
+    was read; which, within (n, angles): the segment of each angle, and its place in it, 0 to 1.
     """
     bits = ones.shape[1]
     mine = np.take_along_axis(ones, which, 1)
     left = np.take_along_axis(ones, (which - 1) % bits, 1) != mine
     right = np.take_along_axis(ones, (which + 1) % bits, 1) != mine
-    # Angle to the nearest transition in rad, positive on ink; a bit farther off will do for far.
+    # angle to the nearest transition, rad, positive on ink; the neighbouring segments are enough
     angle = np.minimum(np.where(left, within, within + 1), np.where(right, 1 - within, 2 - within))
     angle = np.where(mine, angle, -angle) * (2 * np.pi / bits)
     u = _circle(ANGLES)
-    # How many px a radius is: across the circles, and across a radial edge at that radius.
+    # px per radius: across the circles, and across a radial edge at this radius
     px = 1 / np.linalg.norm(np.swapaxes(maps.inverse, 1, 2) @ u, axis=1)
     along = np.abs(np.linalg.det(maps.linear))[:, None] / np.linalg.norm(maps.linear @ u, axis=1)
     across, side = px.astype(np.float32), (angle * along).astype(np.float32)
@@ -296,7 +293,7 @@ def ring_misfit(
 
 
 def _rms_after_shift(level: Single, drawn: Single) -> Array:
-    """RMS (n,) of level minus drawn (n, radii, angles) after the ring may shift, turn, and grow."""
+    """Return the RMS (n,) of level minus drawn (n, radii, angles), fitted by shift, turn, scale."""
     n = len(level)
     radii = np.array(RADII, dtype=np.float32)
     rho, (cosine, sine) = radii[:, None], _circle(ANGLES).astype(np.float32)
@@ -324,13 +321,13 @@ def _rms_after_shift(level: Single, drawn: Single) -> Array:
 _COARSE_RADII = (0.5, 1.5, 2.5, 3.4)
 _MIDDLE = slice(2, 5)
 _OUTSIDE = 0.4  # level of a sample, 0 background, 1 ink
-_LEAST_RELIEF = 0.35  # of the ring, against none about a plain circle
+_LEAST_RELIEF = 0.35  # range of levels in the ring; a plain circle has none
 _SHARE = 0.85  # of the samples on a circle that must agree
 _LEAST_CONTRAST_DN = 10.0
-_SMALLEST_SEMI_AXIS_PX = 2.6  # a gap of less cannot be seen
-_RASTER_PX = 0.5  # by how much a transition may miss the raster, and by how many turns
+_SMALLEST_SEMI_AXIS_PX = 2.6  # a smaller gap is not resolved
+_RASTER_PX = 0.5  # tolerance of a transition on the raster: px plus turns
 _RASTER_TURNS = 0.006
-# A closed ring with something across is read as one arc, a line through a dot as two single bits.
+# A closed ring with a bar across it reads as one arc, a line through a dot as two single bits.
 _MISFIT_OF_FEW = 0.06
 
 
@@ -340,18 +337,18 @@ def read_codes(
     polarity: int,
     wanted: tuple[Collection[tuple[int, int]], float] = ((), inf),
 ) -> dict[tuple[int, int], int]:
-    """Read the ring codes about discs (dark on light -1, light on dark 1): the row of each code
-    (bits, number) among the candidates.
+    """Read the ring codes around discs; return the candidate's index of each code (bits, number).
 
-    Both families are always read, since a ring of one may be mistaken for one of the other. A code
-    that is read at two places is dropped: one of the two is wrong. wanted: codes, and how many of
-    them are enough: discs about which no code was found are then not looked at in perspective.
+    polarity: -1 dark on light, 1 light on dark. Both families are read, since a ring of one may be
+    mistaken for one of the other. A code that is read twice is dropped, since one is wrong. wanted:
+    codes, and how many of them are enough; with fewer, discs without a code are read again in
+    perspective.
     """
     rows, gap, contrast = _disc_and_gap(image, candidates, polarity)
     ink = gap, contrast
     maps = sized(image, candidates.select(rows), ink)
     found = _read(image, maps, ink)
-    # Seen from near and aslant, a ring is not concentric with its disc: by pixels if it is large.
+    # Seen from near and obliquely, a large ring is eccentric to its disc by pixels.
     left = np.nonzero(found[:, 0] == 0)[0]
     codes, enough = wanted
     if len(left) and sum(tuple(c) in codes for c in found.tolist()) < enough:
@@ -367,7 +364,7 @@ def read_codes(
 def _read(
     image: NDArray[np.uint8], maps: LocalMap, ink: tuple[Single, Single]
 ) -> NDArray[np.int64]:
-    """Bits, 0 where no code can be trusted, and numbers (n, 2) of the codes about discs."""
+    """Return bits and numbers (n, 2) of the codes around discs; bits are 0 if none is certain."""
     level = sample(image, maps, RADII, ANGLES, ink)
     families = np.array(BITS, dtype=np.int64)
     readings = zip(*(_read_family(level, maps, n) for n in BITS), strict=True)
@@ -375,7 +372,7 @@ def _read(
     best, at = np.argmin(misfits, axis=0), np.arange(len(maps))
     misfit = misfits[best, at]
     misfits[best, at] = np.inf
-    # A ring that fits both families can be trusted with neither.
+    # a ring that fits both families is ambiguous
     good = np.isfinite(misfit) & (
         misfits.min(axis=0, initial=np.inf) > 1.2 * np.where(np.isfinite(misfit), misfit, 0)
     )
@@ -385,9 +382,9 @@ def _read(
 def _disc_and_gap(
     image: NDArray[np.uint8], candidates: LocalMap, polarity: int
 ) -> tuple[NDArray[np.int64], Single, Single]:
-    """Candidates with disc, gap, something in the ring, background outside, and all in the image.
+    """Select candidates in the image with a disc, gap, marks in the ring, and background outside.
 
-    Returns their rows, the grey value of the gap, and the contrast.
+    Returns their rows, the grey values of the gaps, and the contrasts.
     """
     height, width = image.shape
     reach = candidates.half_extent * RING_OUTER
@@ -412,7 +409,7 @@ def _disc_and_gap(
 
 @cache
 def _code_table(bits: int) -> NDArray[np.int64]:
-    """The code of each number of so many bits, -1 where it is none."""
+    """Return the code of each number of `bits` bits, -1 if there is none."""
     table = np.full(1 << bits, -1, dtype=np.int64)
     words = np.array(codes(bits))
     for k in range(bits):
@@ -421,8 +418,9 @@ def _code_table(bits: int) -> NDArray[np.int64]:
 
 
 def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.int64], Array]:
-    """Codes (n,) read with a raster of so many bits, -1 for none, and the misfit (n,) of what was
-    read, infinite where nothing was.
+    """Read codes with a raster of `bits` bits.
+
+    Returns the codes (n,), -1 for none, and their misfits (n,), infinite for rings not read.
     """
     n = len(level)
     ring = level[:, _MIDDLE].mean(axis=1)
@@ -433,12 +431,12 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
     place = at + (0.5 - level_at) / (after[target, at] - level_at)
     phase = 2 * np.pi * place * bits / ANGLES
     cosine, sine = np.bincount(target, np.cos(phase), n), np.bincount(target, np.sin(phase), n)
-    offset = np.arctan2(sine, cosine) / (2 * np.pi * bits)  # in turns: where the raster begins
+    offset = np.arctan2(sine, cosine) / (2 * np.pi * bits)  # beginning of the raster, in turns
     off = np.zeros(n)
     np.maximum.at(
         off, target, np.abs((phase / (2 * np.pi) - offset[target] * bits + 0.5) % 1 - 0.5) / bits
     )
-    # A pixel is the larger an angle the smaller the target: along its shortest semi-axis.
+    # a pixel is a larger angle on a smaller target, along the minor semi-axis
     allowed = _RASTER_TURNS + _RASTER_PX / (2 * np.pi * 2.5 * maps.semi_axes[:, 1])
     on_raster = off < np.minimum(allowed, 0.3 / bits)
 
@@ -466,18 +464,19 @@ def _read_family(level: Single, maps: LocalMap, bits: int) -> tuple[NDArray[np.i
 
 
 SEARCHES = ((2, -1), (2, 1), (1, -1), (1, 1))
-"""Scale and polarity (-1 dark on light) in which codes are looked for, until there are enough."""
+"""Scale and polarity (-1 dark on light) of the searches, until there are enough codes."""
 _ENOUGH_CODES = 0.5
 _LARGE_WIDTH = 1200
-_MARKER_NEIGHBOURHOOD = 2.0  # sides of the marker that names a circle
+_MARKER_NEIGHBOURHOOD = 2.0  # of the sides of the marker that names a circle
 
 
 def find_coded(
     image: Image, testfield: TestField, fewest: int, needed: bool
 ) -> tuple[NDArray[np.int64], LocalMap, bool]:
-    """Find ring-coded and marker-named circles: rows, maps, and whether codes were seen that are
-    not of this field. fewest: targets that carry an orientation; needed: search on until enough are
-    found.
+    """Find circles with ring codes and circles named by markers.
+
+    fewest: targets that determine an orientation; needed: whether to search for more than these,
+    until enough are found. Returns rows, maps, and whether codes of another field were seen.
     """
     row_of: dict[tuple[int, int], int] = {}
     named: dict[str, dict[int, int]] = {}
@@ -512,7 +511,7 @@ def find_coded(
 def _circles_by_marker(
     grey: NDArray[np.uint8], candidates: LocalMap, named: dict[str, dict[int, int]]
 ) -> list[tuple[int, int]]:
-    """(row, candidate) of circles that a marker names: the one circle nearest to its centre."""
+    """Return (row, candidate) of the circles named by markers: those nearest to their centres."""
     pairs: list[tuple[int, int]] = []
     for dictionary, row_of in named.items():
         for number, quad in detect_markers(grey, dictionary, frozenset(row_of))[0].items():

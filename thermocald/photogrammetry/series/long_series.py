@@ -29,11 +29,16 @@ import numpy as np
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
-from thermocald.photogrammetry.series.adjustment import adjusted, epoch_variance, judged, result
+from thermocald.photogrammetry.series.adjustment import (
+    adjusted,
+    epoch_variance,
+    judge_epochs,
+    result,
+)
 from thermocald.photogrammetry.series.covariances import (
+    correlated_error_cofactors,
     line_weights,
-    of_correlated,
-    of_priors,
+    prior_cofactors,
     stillness,
 )
 from thermocald.photogrammetry.series.normals import (
@@ -285,7 +290,7 @@ class KnownSeries:
             score = stillness(replace(system, N=N), estimate.residuals)
             still = score / np.where(redundancy > 0, unit, 1.0)
         relative_unit = unit / pooled
-        return estimate, judged(
+        return estimate, judge_epochs(
             held, estimate, covariance, relative_unit, sigma0, redundancy, still
         )
 
@@ -301,11 +306,13 @@ class KnownSeries:
             away = G - self.mean
             mine[rows] += away @ self.cofactors @ away.T
             if self.pairs is not None:
-                mine[rows] += of_correlated(one, self.pairs, pooled)[0][np.ix_(own, own)]
+                mine[rows] += correlated_error_cofactors(one, self.pairs, pooled)[0][
+                    np.ix_(own, own)
+                ]
             if swayed.any():
                 added[rows] = G[:, :6] @ swayed @ G[:, :6].T
         # What priors contribute is known as well as they are, not as the epoch.
-        bound = of_priors(system) if system.design.own_prior.any() else 0.0
+        bound = prior_cofactors(system) if system.design.own_prior.any() else 0.0
         mine -= bound
         mine *= unit[:, None, None]
         mine += pooled * bound

@@ -6,7 +6,8 @@ principal point or distance; only the perspective separates the two, with a hund
 accuracy. S is therefore estimated from the *trajectory*: the pose of each epoch with the interior
 orientation held. There a camera that warms up follows an integrated random walk, while a mount
 trembles (white) or sways and settles (with memory, first-order autoregressive). The variance
-components maximise the likelihood in the cosine domain, for each direction of movement.
+components maximise the likelihood in the cosine domain, direction by direction; directions that the
+field shows well are separate from the others.
 
 Limit: a change of the interior orientation as abrupt as a tremble is attributed to the mount, which
 makes the standard deviations too large, not too small.
@@ -306,8 +307,8 @@ def find_jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array,
     """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
     M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free. Returns
-    the first epoch after each jump, the sum of the steps (E, k), and its covariance (k, k) about
-    the mean.
+    the first epoch after each jump, the sum of the steps (E, k), and the covariance (k, k) of the
+    pose about its mean that the steps cause.
     """
     E = len(trajectory)
     rows: list[int] = []

@@ -15,7 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 
 MAD_TO_SD = 1.4826
@@ -83,7 +83,7 @@ def eliminate(N: Array, b: Array, kept: int) -> tuple[Array, Array]:
     return N[:kept, :kept] - beside @ X[:, :kept], b[:kept] - beside @ X[:, kept]
 
 
-def orthonormal_combinations(N: Array, least: float = 1e-6) -> tuple[Array, NDArray[np.bool_]]:
+def orthonormal_combinations(N: Array, least: float = 1e-6) -> tuple[Array, Mask]:
     """Find combinations W (p, p) of unknowns that are orthonormal under a normal matrix N (p, p).
 
     Returns W and a mask (p,) of the columns that N determines: those whose eigenvalue exceeds
@@ -144,7 +144,7 @@ def inverse_2x2(M: Array) -> Array:
     return inverse
 
 
-def stacked_inverses(N: Array) -> tuple[Array, NDArray[np.bool_]]:
+def stacked_inverses(N: Array) -> tuple[Array, Mask]:
     """Invert symmetric matrices (E, p, p); return the inverses and a mask (E,) of the regular ones.
 
     A singular matrix has the unit matrix as its inverse.

@@ -31,12 +31,12 @@ from thermocald.photogrammetry.camera.camera_model import (
     rays,
 )
 from thermocald.photogrammetry.field.testfield import plane_fit
-from thermocald.photogrammetry.linalg import mad_sd
+from thermocald.photogrammetry.linalg import mad_sd, scaled_solve
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
@@ -52,7 +52,7 @@ def approximate_orientation(
     image_points: ArrayLike,
     nominal_c: float | None = None,
     interior: InteriorOrientation | None = None,
-) -> tuple[InteriorOrientation, ExteriorOrientation, NDArray[np.bool_]]:
+) -> tuple[InteriorOrientation, ExteriorOrientation, Mask]:
     """Estimate an interior and exterior orientation good enough to start an adjustment.
 
     field_points (n, 3) mm and image_points (n, 2) px: pairs, gross errors allowed; nominal_c mm:
@@ -66,7 +66,7 @@ def approximate_orientation(
         raise GeometryError(
             f"too few targets for an orientation: {len(X)}, at least {_MINIMUM} are needed"
         )
-    best: tuple[float, InteriorOrientation, ExteriorOrientation, NDArray[np.bool_]] | None = None
+    best: tuple[float, InteriorOrientation, ExteriorOrientation, Mask] | None = None
     for candidate in _interiors(sensor, X, uv, nominal_c, interior):
         found = _robust_resection(sensor, candidate, X, uv)
         if found is None:
@@ -196,9 +196,9 @@ def _ideal(sensor: Sensor, interior: InteriorOrientation, uv: Array) -> Array:
 def _residuals(
     sensor: Sensor, interior: InteriorOrientation, pose: ExteriorOrientation, X: Array, uv: Array
 ) -> Array:
-    """Return predicted minus measured image points (n, 2) px; 1e6 for points behind the camera."""
+    """Return measured minus predicted image points (n, 2) px; 1e6 for points behind the camera."""
     predicted = project(sensor, interior.as_array(), pose.as_array(), X)
-    return np.nan_to_num(predicted - uv, nan=1e6)
+    return np.nan_to_num(uv - predicted, nan=1e6)
 
 
 def _exterior(R: NDArray[Any], t: NDArray[Any]) -> ExteriorOrientation:
@@ -294,8 +294,8 @@ def orient(
             return found
     i, e, inliers = approximate_orientation(sensor, points, image_points, nominal_c, interior)
     part = refine(sensor, i, e, points[inliers], image_points[inliers], interior is not None)
-    uv, _, _ = partials(sensor, part.camera.interior.as_array(), part.exterior.as_array(), points)
-    return Orientation(part.camera, part.exterior, np.nan_to_num(image_points - uv, nan=1e6))
+    residuals = _residuals(sensor, part.camera.interior, part.exterior, points, image_points)
+    return Orientation(part.camera, part.exterior, residuals)
 
 
 def _quick_start(
@@ -356,8 +356,7 @@ def refine(
         weighted = design * np.repeat(weight, 2)[:, None]
         N = design.T @ weighted + np.diag(prior)
         b = weighted.T @ r.ravel() - prior * (p - nominal)[free]
-        d = np.sqrt(np.maximum(np.diag(N), 1e-30))
-        step = np.linalg.solve(N / np.outer(d, d) + 1e-6 * np.eye(len(free)), b / d) / d
+        step = scaled_solve(N, b, ridge=1e-6)
         p[free] += step
         if p[0] <= 0 or not np.isfinite(p).all():
             p = nominal.copy()
@@ -365,7 +364,8 @@ def refine(
             break
         uv, A, _ = partials(sensor, p[:10], p[10:], points)
         # Within one standard deviation of the solution is close enough for a prediction.
-        if abs(last - scale) < 0.1 * scale and float(np.abs(step * d).max()) < 1.0:
+        in_sds = np.abs(step) * np.sqrt(np.diag(N))
+        if abs(last - scale) < 0.1 * scale and in_sds.max() < 1.0:
             break
         last = scale
     return Orientation(

@@ -30,9 +30,9 @@ from thermocald.errors import GeometryError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
     from thermocald.files import QuantityReader
 
 IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
@@ -95,11 +95,11 @@ class Sensor:
         """The image centre in px, (2,)."""
         return np.array([(self.width - 1) / 2, (self.height - 1) / 2])
 
-    def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
+    def contains(self, points: ArrayLike, margin: float = 0.0) -> Mask:
         """Return which image points (..., 2) are inside the image by at least `margin` px."""
         p = np.asarray(points, dtype=float)
         low, high_x, high_y = margin - 0.5, self.width - 0.5 - margin, self.height - 0.5 - margin
-        inside: NDArray[np.bool_] = (
+        inside: Mask = (
             (p[..., 0] >= low) & (p[..., 0] <= high_x) & (p[..., 1] >= low) & (p[..., 1] <= high_y)
         )
         return inside

@@ -55,9 +55,7 @@ from thermocald.photogrammetry.orientation import approximate_orientation, resec
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ROUNDS = 12  # of data snooping; each may reject several targets
@@ -86,23 +84,17 @@ class AdjustmentSettings:
                 )
 
     @property
-    def unknowns(self) -> NDArray[np.int64]:
+    def unknowns(self) -> Index:
         """Positions of the unknowns in `PARAMETER_NAMES`."""
         return _positions(self.free)
 
 
 @lru_cache(maxsize=64)
-def _positions(free: tuple[str, ...]) -> NDArray[np.int64]:
+def _positions(free: tuple[str, ...]) -> Index:
     names = {*free, *EOP_NAMES}
     rows = np.array([i for i, n in enumerate(PARAMETER_NAMES) if n in names], dtype=np.int64)
     rows.flags.writeable = False
     return rows
-
-
-@lru_cache(maxsize=64)
-def _estimated(free: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the IOP among these names, in the order of `IOP_NAMES`."""
-    return tuple(n for n in IOP_NAMES if n in free)
 
 
 _USUAL = AdjustmentSettings()
@@ -125,7 +117,7 @@ class Adjustment:
     free: tuple[str, ...]
     sigma0: float
     redundancy: int
-    targets: NDArray[np.int64]
+    targets: Index
     residuals: Array
     rejected: tuple[int, ...]
 
@@ -241,13 +233,11 @@ def _result(
         v, points, observed = v[:, use], points[use], observed[use]
         rejected = tuple(problem.observations.targets[~use].tolist())
     sigma0 = sqrt(problem.cost(v, solution.values) / redundancy) if redundancy else 0.0
-    factor = sigma0**2
-    if redundancy < TRUSTED_REDUNDANCY:
-        factor = max(1.0, factor)  # a few residuals may be small by chance
+    few = redundancy < TRUSTED_REDUNDANCY
     root = np.zeros((16, len(u)))
     root[u] = solution.root
     covariance = root @ root.T
-    covariance *= factor
+    covariance *= max(1.0, sigma0**2) if few else sigma0**2  # few may be small by chance
     values = solution.values.tolist()
     result = Adjustment(
         "ok",
@@ -255,16 +245,14 @@ def _result(
         InteriorOrientation(*values[IOP]),
         ExteriorOrientation(*values[EOP]),
         covariance,
-        _estimated(s.free),
+        tuple(name for name in IOP_NAMES if name in s.free),
         sigma0,
         redundancy,
         problem.observations.targets,
         solution.residuals.T,
         rejected,
     )
-    few = redundancy < TRUSTED_REDUNDANCY
-    gross = n < len(use)
-    if few and s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy, gross):
+    if few and s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy, n < len(use)):
         why = (
             f"the residuals are {sigma0:.1f} times their stated sigmas, and a redundancy of "
             f"{redundancy} does not show whether a target is wrong or the noise larger than "

@@ -27,9 +27,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
@@ -105,7 +103,7 @@ class Problem:
     points: Array
     observations: Observations
     target_variances: Array | None
-    unknowns: NDArray[np.int64]
+    unknowns: Index
     prior_weight: Array
     prior_value: Array
 
@@ -115,7 +113,7 @@ class Problem:
         sensor: Sensor,
         field: TestField,
         observations: Observations,
-        unknowns: NDArray[np.int64],
+        unknowns: Index,
         priors: Mapping[str, tuple[float, float]],
         known: tuple[Array, Array] | None = None,
     ) -> Problem:
@@ -212,7 +210,7 @@ class Solution:
         return coloured
 
 
-def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -> Array:
+def cofactor_root(N: Array, unknowns: Index, damping: float = 0.0) -> Array:
     """Return a root (u, u) of the inverse of a normal matrix: N⁻¹ = root · rootᵀ.
 
     N is scaled to a unit diagonal before its Cholesky factorisation, as the parameters differ by
@@ -295,9 +293,7 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     raise NoConvergenceError(f"the adjustment did not converge in {_ITERATIONS} iterations")
 
 
-def _whole_step(
-    N: Array, gradient: Array, u: NDArray[np.int64], root: Array | None
-) -> tuple[Array, float]:
+def _whole_step(N: Array, gradient: Array, u: Index, root: Array | None) -> tuple[Array, float]:
     """Return the Gauss-Newton step (u,) and its size in standard deviations.
 
     From the cofactors' root if given; otherwise the equations are solved, in half the time. Raises
@@ -319,7 +315,7 @@ def _whole_step(
     return root @ half, sqrt(half @ half)
 
 
-def _trial_steps(N: Array, u: NDArray[np.int64], gradient: Array) -> Iterator[Array]:
+def _trial_steps(N: Array, u: Index, gradient: Array) -> Iterator[Array]:
     """Yield steps to try in turn.
 
     First shortened Gauss-Newton steps, which follow the narrow valleys of correlated parameters,
@@ -346,7 +342,7 @@ def resolve(problem: Problem, solution: Solution, use: Mask) -> Solution:
     return _apply_step(renewed, problem.unknowns, step)
 
 
-def _apply_step(s: Solution, unknowns: NDArray[np.int64], step: Array) -> Solution:
+def _apply_step(s: Solution, unknowns: Index, step: Array) -> Solution:
     """Apply a small step to a solution; its residuals are changed in place, by the partials."""
     values = s.values.copy()
     values[unknowns] += step

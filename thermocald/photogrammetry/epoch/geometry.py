@@ -76,19 +76,15 @@ def weaknesses(
     sd = np.sqrt(covariance.diagonal())
     free = set(free)
     reasons = uncertain(sensor, values, sd, free, bounds)
-    if "c" in free:
-        if _has_depth(points):
-            flat = False
-        else:
-            _, axes, flat = plane_fit(points)
-        if flat:
-            angle = obliqueness_deg(values[EOP], axes[2])
-            if angle < bounds.plane_obliqueness_deg:
-                reasons.append(
-                    f"one plane seen at {angle:.0f}° from frontal (at least "
-                    f"{bounds.plane_obliqueness_deg:.0f}° are needed): principal distance and "
-                    "distance to the field cannot be separated"
-                )
+    if "c" in free and not _has_depth(points):
+        _, axes, flat = plane_fit(points)
+        angle = obliqueness_deg(values[EOP], axes[2])
+        if flat and angle < bounds.plane_obliqueness_deg:
+            reasons.append(
+                f"one plane seen at {angle:.0f}° from frontal (at least "
+                f"{bounds.plane_obliqueness_deg:.0f}° are needed): principal distance and "
+                "distance to the field cannot be separated"
+            )
     if free & {"x0", "y0", "A1", "A2", "A3", "B1", "B2"}:
         coverage = image_coverage(sensor, image_points)
         if coverage < bounds.coverage:

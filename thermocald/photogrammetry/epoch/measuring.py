@@ -39,9 +39,9 @@ from thermocald.photogrammetry.epoch.adjustment import (
 from thermocald.photogrammetry.orientation import approximate_orientation
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _FEWEST = 4  # control points: three have up to four poses
@@ -145,7 +145,7 @@ def place_on(
     sigmas: ArrayLike,
     surface: Plane | Line | Profile,
     own: Array | None = None,
-    member: NDArray[np.int64] | None = None,
+    member: Index | None = None,
 ) -> tuple[Array, Array]:
     """Intersect image rays with a surface; return points (n, 3) mm and covariance (3n, 3n).
 

@@ -41,7 +41,7 @@ def limit_2d(alpha: float, uncertainty: Array) -> Array:
 
 def fails_global_test(
     unit: ArrayLike, redundancy: ArrayLike, after_rejection: bool = False
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return whether residuals, too few to estimate the noise, are too large for their sigmas.
 
     unit: variance of unit weight; redundancy: its degrees of freedom. χ² at 0.1 %, by Wilson and

@@ -45,9 +45,7 @@ from thermocald.photogrammetry.network.start import approximate
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Distance, Observations
 
 
@@ -230,7 +228,7 @@ _ROUNDS = 30
 
 def snoop(
     sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index
-) -> tuple[Bundle, NDArray[np.bool_], Array]:
+) -> tuple[Bundle, Mask, Array]:
     """Adjust a bundle and reject gross errors, some per round, until none is left.
 
     A target or a photograph with too few rays left is rejected with them. Returns the bundle, the
@@ -270,7 +268,7 @@ def snoop(
     return bundle, rejected, tests
 
 
-def _drop_uncontrolled(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
+def _drop_uncontrolled(rejected: Mask, rays: ImageRays) -> None:
     """Reject all rays of targets and photographs with too few rays left, in place."""
     shown = np.bincount(rays.photo)
     before = -1
@@ -288,9 +286,7 @@ def _drop_uncontrolled(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
         )
 
 
-def _in_use(
-    bundle: Bundle, rays: ImageRays, good: NDArray[np.bool_]
-) -> tuple[Bundle, ImageRays, Index, Index]:
+def _in_use(bundle: Bundle, rays: ImageRays, good: Mask) -> tuple[Bundle, ImageRays, Index, Index]:
     """Return the photographs and targets of good rays, renumbered, and their rows before."""
     photos, photo = np.unique(rays.photo[good], return_inverse=True)
     targets, target = np.unique(rays.target[good], return_inverse=True)
@@ -348,11 +344,9 @@ def adjust_network(
     angles = _intersection_angles(bundle, final)
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle < MIN_ANGLE:
-        reason = (
-            f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° are "
-            "the least: take photographs from further to the left, right, above, and below"
-        )
-        _refuse([reason])
+        meet, least = f"{np.degrees(angle):.0f}°", f"{np.degrees(MIN_ANGLE):.0f}°"
+        where = "take photographs from further to the left, right, above, and below"
+        _refuse([f"the rays meet at {meet} (median), at least {least} are needed: {where}"])
     adjustment = BundleAdjustment(sensor, final, free_rows)
     unknowns = len(free_rows) + 6 * len(in_use) + 3 * len(kept_names) - 7
     redundancy = 2 * len(final) - unknowns

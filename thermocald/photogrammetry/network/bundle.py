@@ -35,9 +35,7 @@ from thermocald.photogrammetry.linalg import MEDIAN_CHI2, scaled_inverse, unit_d
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations
 
     _Normals = tuple[Array, Array, Array, Array, Array]
@@ -62,7 +60,7 @@ class KnownTargets(NamedTuple):
 
     places: Array
     weights: Array
-    uncertain: NDArray[np.bool_]
+    uncertain: Mask
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +95,7 @@ class ImageRays:
             np.linalg.inv(np.linalg.cholesky(C)),
         )
 
-    def select(self, keep: NDArray[np.bool_]) -> ImageRays:
+    def select(self, keep: Mask) -> ImageRays:
         """Return the rays of a mask."""
         return ImageRays(
             self.photo[keep], self.target[keep], self.points[keep], self.whitening[keep]
@@ -443,8 +441,7 @@ def null_space(centres: Array, points: Array, n_interior: int) -> tuple[Array, A
 
 def _regularise(S: Array, null: Array) -> tuple[Array, Array, Array]:
     """Scale S to a unit diagonal and add the projector on its null space; return all three."""
-    scales = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
+    scaled, scales = unit_diagonal(S)
     basis, _ = np.linalg.qr(null / scales[:, None])
     projector = basis @ basis.T
-    scaled: Array = S * scales[:, None] * scales + projector
-    return scaled, scales, projector
+    return scaled + projector, scales, projector

@@ -223,10 +223,8 @@ def result(
     relative[block] -= bound
     many = s.target_noise and len(use) >= FEW_EPOCHS
     pairs = series.pairs(estimate) if many else None
-    if pairs is not None and len(pairs):
+    if pairs:
         relative += correlated_error_cofactors(system, pairs, pooled)
-    else:
-        pairs = None
     relative *= epoch_variance(least, redundancy, pooled)[:, None, None]
     relative[block] += pooled * bound
     level *= pooled
@@ -277,7 +275,7 @@ def result(
         movement=movement,
         choice=series.choice,
         slow=slow,
-        pairs=pairs,
+        pairs=pairs or None,
     )
 
 

@@ -256,8 +256,9 @@ class SeriesEstimator:
 
     def snoop(self, estimate: Estimate, offered: Mask) -> Estimate:
         """Estimate without gross errors; offered (E, T): points that may be taken back."""
-        shared = estimate.system.design.width > 0
-        return (self._snoop_together if shared else self._snoop_apart)(estimate, offered)
+        if estimate.system.design.width:
+            return self._snoop_together(estimate, offered)
+        return self._snoop_apart(estimate, offered)
 
     def _with_target_noise(self, estimate: Estimate) -> SeriesEstimator:
         """Return the series with each target's weights from the scatter of its own residuals."""

@@ -25,11 +25,8 @@ from thermocald.photogrammetry.series.normals import ObservationGrid
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from thermocald.arrays import Array, Index, Mask
 
-    from thermocald.arrays import Array
-
-    Rows = NDArray[np.int64]
 
 FEWEST_EPOCHS = 20
 """Epochs needed to show a movement of the field."""
@@ -68,15 +65,15 @@ class FieldSeries:
     A: Array
     B: Array
     points: Array
-    boards: Rows
+    boards: Index
     names: tuple[str, ...]
-    numbers: Rows
+    numbers: Index
     cameras: Array | None = None
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """Mask (E, T) of the image points with a residual and a weight."""
-        out: NDArray[np.bool_] = np.isfinite(self.residuals[..., 0]) & (self.weights[..., 0] > 0)
+        out: Mask = np.isfinite(self.residuals[..., 0]) & (self.weights[..., 0] > 0)
         return out
 
     @property
@@ -96,7 +93,7 @@ class FieldMovement:
     """
 
     kind: str
-    rows: Rows
+    rows: Index
     targets: tuple[str, ...]
     epoch: int
     time: float
@@ -134,7 +131,7 @@ class FieldMovement:
         }
 
 
-def without(s: FieldSeries, rows: Rows) -> FieldSeries:
+def without(s: FieldSeries, rows: Index) -> FieldSeries:
     """Return the series as if some targets had not been observed."""
     weights = s.weights.copy()
     weights[:, rows] = 0.0
@@ -214,9 +211,9 @@ def _find_masked(s: FieldSeries, most: int) -> list[int]:
     return found
 
 
-def _often_seen(s: FieldSeries) -> NDArray[np.bool_]:
+def _often_seen(s: FieldSeries) -> Mask:
     """Return a mask (T,) of the targets seen in enough epochs to show a wander."""
-    out: NDArray[np.bool_] = s.used.sum(axis=0) >= max(FEWEST_EPOCHS, _SEEN * len(s.times))
+    out: Mask = s.used.sum(axis=0) >= max(FEWEST_EPOCHS, _SEEN * len(s.times))
     return out
 
 
@@ -247,7 +244,7 @@ def _own_power(s: FieldSeries, w: Array, included: bool) -> Array:
     return out
 
 
-def _usual_limits(s: FieldSeries, power: Array, there: NDArray[np.bool_]) -> Array:
+def _usual_limits(s: FieldSeries, power: Array, there: Mask) -> Array:
     """Return the limits (T,) of χ² beyond which targets wander, from the others on their boards."""
     limits = np.full(len(power), float(np.percentile(power[there], _MOST)))
     for board in np.unique(s.boards[there & (s.boards >= 0)]):
@@ -363,7 +360,7 @@ def board_movements(s: FieldSeries, wandering: Sequence[FieldMovement]) -> list[
     return found
 
 
-def _usual(s: FieldSeries, boards: list[Rows]) -> float:
+def _usual(s: FieldSeries, boards: list[Index]) -> float:
     """Return the median χ² that a movement of boards which stand still would explain."""
     trajectories, _ = _trajectories(s.times)
     gains = [_gains(*_board_equations(s, r, _rigid(s, r)), trajectories)[0].max() for r in boards]
@@ -384,7 +381,7 @@ def refined(s: FieldSeries, movement: FieldMovement) -> FieldMovement:
     return replace(movement, image=image, size_mm=size, sd_mm=sd, size_px=size_px)
 
 
-def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
+def _board(s: FieldSeries, rows: Index) -> FieldMovement | None:
     """Return one board's movement along the best trajectory; None if it stands still."""
     rigid = _rigid(s, rows)
     M, r = _board_equations(s, rows, rigid)
@@ -422,7 +419,7 @@ def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
     )  # fmt: skip
 
 
-def _rigid(s: FieldSeries, rows: Rows) -> Array:
+def _rigid(s: FieldSeries, rows: Index) -> Array:
     """Return ∂ image points / ∂ shifts, rotations (2k, 6), px/mm; rotations at the board's size."""
     X = s.points[rows] - s.points[rows].mean(axis=0)
     size = max(float(np.sqrt((X**2).sum(axis=1).mean())), 1e-9)
@@ -436,7 +433,7 @@ def _rigid(s: FieldSeries, rows: Rows) -> Array:
     return out
 
 
-def _board_equations(s: FieldSeries, rows: Rows, rigid: Array) -> tuple[Array, Array]:
+def _board_equations(s: FieldSeries, rows: Index, rigid: Array) -> tuple[Array, Array]:
     """Return normal equations (E, 6, 6), (E, 6) of a board's movement, the cameras eliminated."""
     assert s.cameras is not None
     w = s.w[:, rows].reshape(len(s.times), -1)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
@@ -76,8 +76,8 @@ class ObservationGrid:
     def from_rows(
         cls,
         shape: tuple[int, int],
-        epochs: NDArray[np.int64],
-        targets: NDArray[np.int64],
+        epochs: Index,
+        targets: Index,
         measured: Array,
         sigmas: Array,
         covariances: Array | None = None,
@@ -121,17 +121,17 @@ class ObservationGrid:
         return _of_planes, tuple(parts)
 
     @property
-    def observed(self) -> NDArray[np.bool_]:
+    def observed(self) -> Mask:
         """Mask (E, T) of the points with a weight."""
         return self.weights[..., 0] > 0
 
-    def targets(self, columns: NDArray[np.int64]) -> ObservationGrid:
+    def targets(self, columns: Index) -> ObservationGrid:
         """Return the grid of some targets."""
         if len(columns) == self.points.shape[1]:
             return self
         return ObservationGrid(self.points[:, columns], self.weights[:, columns])
 
-    def reject(self, mask: NDArray[np.bool_]) -> ObservationGrid:
+    def reject(self, mask: Mask) -> ObservationGrid:
         """Return the grid with the observations of a mask (E, T) without weight."""
         if not mask.any():
             return self
@@ -217,7 +217,7 @@ def chunks(epochs: int, targets: int) -> Iterator[slice]:
     return runs(epochs, max(_CHUNK_POINTS // max(targets, 1), 1))
 
 
-def same_rows(*arrays: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def same_rows(*arrays: NDArray[Any]) -> tuple[Index, Index]:
     """Find equal rows of arrays (E, ...); return representatives (M,) and the one of each row (E,).
 
     Epochs that see the same targets with the same weights have the same normal matrix.
@@ -236,9 +236,7 @@ def same_rows(*arrays: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int6
     return first, of
 
 
-def right_hand_sides(
-    weights: Array, residuals: Array, A: Array, use: NDArray[np.bool_] | None = None
-) -> Array:
+def right_hand_sides(weights: Array, residuals: Array, A: Array, use: Mask | None = None) -> Array:
     """Return Aᵀ P l (E, k) of every epoch.
 
     use (E, T): mask of points, by default all with a weight; their residuals must not be NaN.
@@ -252,9 +250,7 @@ def right_hand_sides(
     return b
 
 
-def sums_of_squares(
-    weights: Array, residuals: Array, use: NDArray[np.bool_] | None = None
-) -> Array:
+def sums_of_squares(weights: Array, residuals: Array, use: Mask | None = None) -> Array:
     """Return vᵀ P v (E,) of every epoch; use: as in `right_hand_sides`."""
     E, T = residuals.shape[:2]
     total = np.empty(E)
@@ -271,7 +267,7 @@ def sums_of_squares(
     return total
 
 
-def sums_of_targets(weights: Array, residuals: Array, use: NDArray[np.bool_]) -> Array:
+def sums_of_targets(weights: Array, residuals: Array, use: Mask) -> Array:
     """Return P v (T, 2) of every target, summed over the epochs of a mask `use` (E, T)."""
     total = np.zeros((residuals.shape[1], 2))
     for part in chunks(*residuals.shape[:2]):
@@ -279,7 +275,7 @@ def sums_of_targets(weights: Array, residuals: Array, use: NDArray[np.bool_]) ->
     return total
 
 
-def _weighted(weights: Array, residuals: Array, use: NDArray[np.bool_] | None) -> Array:
+def _weighted(weights: Array, residuals: Array, use: Mask | None) -> Array:
     """Return P v (2, E, T) of every point, 0 if it is not in use."""
     out = np.empty((2, *residuals.shape[:2]))
     correlated = weights[..., 2].any()
@@ -293,7 +289,7 @@ def _weighted(weights: Array, residuals: Array, use: NDArray[np.bool_] | None) -
     return out
 
 
-def cofactors(N: Array) -> tuple[Array, NDArray[np.bool_]]:
+def cofactors(N: Array) -> tuple[Array, Mask]:
     """Invert matrices (E, p, p) in chunks, as `stacked_inverses` does."""
     inverse, good = np.empty(N.shape), np.empty(len(N), dtype=bool)
     for part in chunks(len(N), N.shape[-1] ** 2):
@@ -301,7 +297,7 @@ def cofactors(N: Array) -> tuple[Array, NDArray[np.bool_]]:
     return inverse, good
 
 
-def among_all(Q: Array, own: NDArray[np.int64]) -> Array:
+def among_all(Q: Array, own: Index) -> Array:
     """Expand matrices (E, p, p) of some parameters to all (E, 16, 16), 0 for the others."""
     whole = np.zeros((len(Q), 16, 16))
     runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1)
@@ -361,7 +357,7 @@ def often_shown(misclosure: Array) -> Array:
 
 def misplaced_targets(
     sensor: Sensor, testfield: TestField, grid: ObservationGrid, cameras: Array
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return a mask (T,) of targets far from their places as predicted by the epochs' cameras.
 
     cameras (E, 16): NaN for an unknown one.

@@ -15,11 +15,7 @@ from thermocald.photogrammetry.series.normals import chunks, products
 from thermocald.photogrammetry.series.system import SeriesSystem, alike
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
-
-    Columns = NDArray[np.int64]
+    from thermocald.arrays import Array, Index, Mask
 
 
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:
@@ -48,7 +44,7 @@ def point_tests(system: SeriesSystem, residuals: Array) -> Array:
 
 
 def _test_weights(
-    system: SeriesSystem, epochs: slice | Columns, products: tuple[Array, Array, Array]
+    system: SeriesSystem, epochs: slice | Index, products: tuple[Array, Array, Array]
 ) -> Array:
     """Return the residuals' inverse covariance (3, M, T): xx, yy, twice xy; 0 without a test."""
     weights = system.weights[epochs]

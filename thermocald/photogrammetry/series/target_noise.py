@@ -18,9 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
 
 MEDIAN_WORTH = 0.37
 """Efficiency of the median of squares: degrees of freedom per square."""
@@ -90,8 +88,8 @@ class CorrelatedPairs:
     i, j (m,): coordinates, 2·target + axis; covariance (m,) px².
     """
 
-    i: NDArray[np.int64]
-    j: NDArray[np.int64]
+    i: Index
+    j: Index
     covariance: Array
 
     def __len__(self) -> int:
@@ -113,7 +111,7 @@ class CorrelatedPairs:
 
 
 def correlated_pairs(
-    residuals: Array, used: Mask, group: NDArray[np.int64], redundancy_share: float
+    residuals: Array, used: Mask, group: Index, redundancy_share: float
 ) -> CorrelatedPairs:
     """Find pairs of coordinates within a group whose residuals correlate over a series.
 

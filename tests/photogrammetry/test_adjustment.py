@@ -101,6 +101,16 @@ def test_priors_and_held_parameters():
     assert a.sd[0] / a.sigma0 == pytest.approx(1e-7, rel=0.01)
 
 
+def test_a_prior_of_a_held_parameter_adds_no_redundancy():
+    field = scene.corner_field()
+    obs = scene.observe(field, np.random.default_rng(4))
+    plain = scene.adjusted(field, obs, free=("c", "x0", "y0"))
+    held = scene.adjusted(field, obs, free=("c", "x0", "y0"), priors={"A1": (0.0, 1e-3)})
+    free = scene.adjusted(field, obs, free=("c", "x0", "y0"), priors={"X0": (0.0, 1e6)})
+    assert held.redundancy == plain.redundancy == free.redundancy - 1
+    assert held.sigma0 == plain.sigma0
+
+
 def test_object_sigmas_count():
     """Noise of the coordinates in the draws, and their sigmas in the field: sds stay true."""
     rng = np.random.default_rng(5)

@@ -176,7 +176,8 @@ def adjust(
     s = settings or _USUAL
     unknowns = s.unknowns
     n = len(observations)
-    priors = len(s.priors) if known is None else len(s.free)
+    # priors of held parameters are no observations
+    priors = len(s.priors.keys() & {*s.free, *EOP_NAMES}) if known is None else len(s.free)
     if 2 * n + priors - len(unknowns) < s.bounds.minimum_redundancy:
         return failed(
             "too_few_targets",

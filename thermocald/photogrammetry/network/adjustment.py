@@ -236,7 +236,7 @@ def snoop(
     """
     whole = BundleAdjustment(sensor, rays, free)
     bundle = whole.solve(bundle, robust=True)
-    limit = -2.0 * np.log(_FAMILY_ERROR / len(rays))  # chi² with 2 degrees of freedom
+    limit = -2.0 * np.log(_FAMILY_ERROR / len(rays))  # χ² with 2 degrees of freedom
     v2 = np.sum(whole.residuals(bundle) ** 2, axis=1)
     rejected = v2 > _COARSE * limit * max(float(np.median(v2)) / MEDIAN_CHI2, 1e-12)
     tests = np.zeros(len(rays))

@@ -159,7 +159,7 @@ def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
     """Return the mask of image points to keep; only the worst ray of a target goes at a time."""
     if alpha <= 0:
         return used
-    # chi² with 2 degrees of freedom
+    # χ² with 2 degrees of freedom
     limit = -2.0 * np.log(alpha) * max(float(np.median(tests[used])) / MEDIAN_CHI2, 1e-12)
     worst = np.zeros(1 + int(target.max(initial=0)))
     np.maximum.at(worst, target[used], tests[used])

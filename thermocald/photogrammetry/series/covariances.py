@@ -96,7 +96,7 @@ def slow_target_covariance(system: SeriesSystem, errors: Array, group: Index) ->
         Jg = J[rows].reshape(len(e), -1)
         left = np.eye(len(e)) - Jg @ inverse[0] @ Jg.T
         values, vectors = np.linalg.eigh(left)
-        # Its residuals show nothing of what a group alone determines.
+        # A group's residuals do not show what the group alone determines.
         back = vectors @ ((vectors.T @ e) / np.maximum(values, 0.1))
         pull = inverse[0] @ (Jg.T @ back)
         total += np.outer(pull, pull)

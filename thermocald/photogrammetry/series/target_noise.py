@@ -36,7 +36,7 @@ _FEWEST_PAIRS = 40
 _LEAST_CORRELATION = 0.3
 _SMOOTH = 15  # epochs
 _FEWEST_RADII = 8  # targets
-_LOG_CHI2 = np.pi**2 / 6  # variance of the logarithm of chi-square with two degrees of freedom
+_LOG_CHI2 = np.pi**2 / 6  # variance of the logarithm of χ² with two degrees of freedom
 _CLIP = 60.0  # times the median square, beyond which a square is a jump
 
 

@@ -26,6 +26,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
+from thermocald.photogrammetry.epoch.snooping import settle
 from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.linalg import MEDIAN_CHI2
 from thermocald.photogrammetry.network.bundle import (
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ITERATIONS = 60
-_ROUNDS = 10
+_ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
 
@@ -102,7 +103,8 @@ def adjust_common_interior(
     if fitting is not None and s.snooping_alpha > 0:
         used = np.concatenate(list(fitting))
     every = BundleAdjustment(sensor, rays, free, known)
-    for _ in range(_ROUNDS):
+    history = np.zeros(len(rays), dtype=np.int8)
+    for _ in range(_ROUNDS + int(np.bincount(rays.target).max())):
         if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
             raise GeometryError("targets came to lie behind the camera during the iteration")
         part = BundleAdjustment(sensor, rays.select(used), free, known)
@@ -112,8 +114,8 @@ def adjust_common_interior(
         # variance of a residual: less than the noise's if the ray was used, more if it was not
         signs = np.where(used, -1.0, 1.0)[:, None, None]
         tests = point_tests(v, np.eye(2) + signs * every.explained(bundle, found))
-        kept = snoop_rays(tests, rays.target, used, s.snooping_alpha)
-        if np.array_equal(kept, used):
+        kept = settle(history, used, snoop_rays(tests, rays.target, used, s.snooping_alpha))
+        if kept is used:
             break
         used = kept
     n = int(np.count_nonzero(used))

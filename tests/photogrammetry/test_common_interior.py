@@ -23,7 +23,7 @@ STATIONS = [
 
 
 def photographs(rng, sigma_mm: float, gross: int = 0, stations=STATIONS):
-    """The field as it is known, and image points of the field as it is."""
+    """The field as surveyed, and image points of the true field."""
     known = scene.corner_field(sigma_mm)
     rows = np.arange(0, len(known), 2)
     known = known.subset(rows)
@@ -39,8 +39,8 @@ def photographs(rng, sigma_mm: float, gross: int = 0, stations=STATIONS):
     return known, measured
 
 
-def test_the_camera_is_as_sure_as_stated():
-    """Draws of field and image noise: error over sd of c, x0, y0, and no draw without end.
+def test_the_camera_is_as_accurate_as_stated():
+    """Error over sd of c, x0, y0 in draws of field and image noise, all of which converge.
 
     More of them: the section `calibrate` of benchmarks.audit.
     """
@@ -80,7 +80,7 @@ def test_a_moved_target_is_left_out_of_all_photographs():
     assert r.sigma0 == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_field_without_sigmas_is_taken_as_it_is():
+def test_a_field_without_sigmas_is_held():
     known, measured = photographs(np.random.default_rng(9), 0.02)
     exact = TestField.build(known.names, known.points)
     r = adjust_common_interior(scene.SENSOR, exact, measured, InteriorOrientation(3.0), STATIONS)

@@ -141,7 +141,7 @@ def refuse_before(
         _refuse([f"{photos} photographs show targets; take at least {MIN_PHOTOS}, better 8 to 12"])
     if targets < MIN_TARGETS:
         reasons.append(
-            f"{targets} targets are seen in {MIN_RAYS} photographs, at least {MIN_TARGETS} must be"
+            f"{targets} targets are in at least {MIN_RAYS} photographs, {MIN_TARGETS} are needed"
         )
     if not distances:
         reasons.append("no distance gives the scale: measure one and give --scale A B MM")

@@ -134,7 +134,7 @@ def prior_cofactors(system: SeriesSystem) -> Array:
 
 
 def typical_sensitivity(system: SeriesSystem) -> Array:
-    """Return the derivatives (p, 6) of the own parameters by an error of the pose, typically."""
+    """Return the derivatives (p, 6) of a typical epoch's own parameters by an error of the pose."""
     design = system.design
     N = system.N[system.good].mean(axis=0)
     Q, _ = cofactors((N[design.own[:, None], design.own] + design.own_prior)[None])
@@ -159,8 +159,8 @@ def perspective_cofactor_roots(system: SeriesSystem) -> Array:
 
 @dataclass(frozen=True)
 class HeldAffinity:
-    """The k of C1 and C2 that are held: their estimated differences (k,) from the held values, with
-    sds (k,), and the change of the level (k, 16) for a difference of 1.
+    """Estimated differences (k,) of the held ones of C1 and C2 from their held values, their sds
+    (k,), and the change of the level (k, 16) for a difference of 1.
     """
 
     names: tuple[str, ...]

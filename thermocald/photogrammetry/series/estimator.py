@@ -1,6 +1,6 @@
 """The estimator of a series: Gauss-Newton with reduced common unknowns, and data snooping.
 
-It works on arrays of a whole series, or of one block of a long series. The common unknowns of a
+The arrays are those of a whole series, or of one block of a long series. The common unknowns of a
 block are held at their known values.
 """
 
@@ -180,8 +180,8 @@ class SeriesEstimator:
     def _screen(self, start: State, use: Mask) -> Mask:
         """Select points (E, T) for a series of which most epochs do not converge.
 
-        They fit a pose per epoch with the initial interior orientation; an epoch without a pose has
-        none.
+        The selected points fit a pose per epoch with the initial interior orientation. An epoch
+        whose pose does not converge keeps none.
         """
         middle = np.median(start.values, axis=0)
         s = replace(self.s, exterior="per_epoch", free=(), target_offsets=False, priors={})

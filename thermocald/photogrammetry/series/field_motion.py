@@ -1,12 +1,12 @@
 """Movements of the test field: targets that wander, and boards that move as rigid bodies.
 
-They are estimated from the residuals of a free camera per epoch, which contain no movement of the
-camera. A single target wanders if its slow residuals are far larger than those of the others on its
-board; in a real field residuals are never quite constant. For a board two trajectories are tested
-in its six degrees of freedom, reduced by the free cameras: a step at an unknown time (it was
-knocked) and slow settling (it creeps). A board has moved if this explains most of its targets' slow
-movement, most of what single movements of its targets would explain, and far more than the same
-explains for boards that stand still.
+Movements are estimated from the residuals of a free camera per epoch, which contain no movement of
+the camera. A single target wanders if its slow residuals are far larger than those of the others on
+its board; in a real field residuals are never quite constant. For a board two trajectories are
+tested in its six degrees of freedom, reduced by the free cameras: a step at an unknown time (a
+knock) and slow settling (creep). A board has moved if a trajectory explains most of its targets'
+slow movement, most of what single movements of its targets would explain, and far more than the
+same explains for boards that stand still.
 
 Source: a step at an unknown time as Page (1955), Biometrika 42, 523-527.
 """

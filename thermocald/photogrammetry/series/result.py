@@ -1,9 +1,9 @@
 """The result of a series' adjustment: parameters per epoch and common ones, with status.
 
-It has two standard deviations. That of a difference within the series includes the epoch's noise
-and the effect of changing visibility. That of the *level*, the errors common to all epochs (of the
-EOP and the targets), is separate and cancels in every drift. An epoch without a result has a reason
-in a sentence.
+There are two kinds of standard deviations. That of a difference within the series includes the
+epoch's noise and the effect of changing visibility. That of the *level*, the errors common to all
+epochs (of the EOP and the targets), is separate and cancels in every drift. An epoch without a
+result has a reason in a sentence.
 """
 
 from __future__ import annotations

@@ -227,7 +227,7 @@ def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool) ->
     if kinks:
         ratio, worth = np.median(normed, axis=0) / _MEDIAN_CHI2_1, MEDIAN_WORTH * left
     else:
-        # A mean, as epochs count in which a passer-by hides half of the targets: they scatter more.
+        # The mean counts epochs that scatter more, as when a passer-by hides half of the targets.
         ratio, worth = np.minimum(normed, _CLIP * np.median(normed, axis=0)).mean(axis=0), left
     significant = ratio > 1 + 1.65 * np.sqrt(2 / (worth * n))
     excess: Array = np.where(significant, (ratio - 1) * variances.mean(axis=0), 0.0)

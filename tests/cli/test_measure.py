@@ -229,7 +229,7 @@ def beyond_the_camera(_, row):
      (lambda _, r: {"x": 4 * float(r["x"])}, "px, outside the camera's 3280 × 2464 px"),
      (lambda _, r: {"x": r["y"], "y": r["x"]}, "X and Y, or x and y, are exchanged"),
      (beyond_the_camera, "or a sign is wrong"),
-     (lambda i, _: {"X": 192_000 + i, "Y": 313_020, "Z": 138}, "lie in one line"),
+     (lambda i, _: {"X": 192_000 + i, "Y": 313_020, "Z": 138}, "lie on one line"),
      (lambda i, r: {} if i < 3 else {"x": "", "y": ""}, "3 control points; a pose needs at least"),
      (lambda i, r: {"y": float(r["y"]) + (0, 90, -50, 0, 70, -30)[i % 6]}, "contradict the ot")],
 )  # fmt: skip

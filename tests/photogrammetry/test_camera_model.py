@@ -30,7 +30,7 @@ def points():
 
 
 def test_partials_are_differences(points):
-    """To 1e-7 of the column; says nothing about the model itself, which OpenCV does below."""
+    """To 1e-7 of the column; the model itself is tested against OpenCV below."""
 
     def seen(values):
         return project(SENSOR, values[:10], values[10:16], points + values[16:])

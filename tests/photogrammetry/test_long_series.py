@@ -18,7 +18,7 @@ EPOCHS = 480
 
 
 def scenery(epochs=EPOCHS):
-    """A drifting camera before every third target of the corner, a board hidden for a while."""
+    """A drifting camera that sees every third target of the corner; a board is hidden at times."""
     rng = np.random.default_rng(40)
     whole = scene.corner_field(0.02)
     known = whole.subset(np.arange(0, len(whole), 3))
@@ -60,7 +60,7 @@ def test_the_blocks_do_not_matter(case, exterior):
     apart = (many.rows.values - one.rows.values)[:, OWN]
     assert np.abs(apart / one.rows.sd[:, OWN]).max() < 1e-5
     assert np.abs(apart[:, 0] / one.rows.values[:, 0]).max() < 1e-9
-    # how offsets reach rare kinds of epochs is taken from the mean of a block's
+    # the effect of offsets on rare kinds of epochs is the mean one of a block
     np.testing.assert_allclose(many.rows.sd[:, OWN], one.rows.sd[:, OWN], rtol=2e-3)
     np.testing.assert_allclose(many.rows.sigma0, one.rows.sigma0, rtol=1e-7)
     np.testing.assert_allclose(many.level_sd, one.level_sd, rtol=1e-5)
@@ -68,27 +68,27 @@ def test_the_blocks_do_not_matter(case, exterior):
 
 
 def test_it_is_the_adjustment_of_all_at_once(case):
-    """But for what a sample of 120 epochs knows less of the noise than all 480."""
+    """Except that a sample of 120 epochs gives the noise less well than all 480."""
     field, truth, grid = case
     whole = scene.adjusted_series(field, grid, exterior="series", target_noise=False)
     parts = blocked(case, 50, target_noise=False)
     apart = (parts.rows.values - whole.values)[:, OWN]
     level = apart.mean(axis=0)
     assert np.abs(level / whole.level_sd[OWN]).max() < 0.05
-    # a borderline point that one of the two rejects moves its epoch by half a standard deviation
+    # a borderline point that only one of the two rejects moves its epoch by half an sd
     assert np.quantile(np.abs(apart - level) / whole.sd[:, OWN], 0.95) < 0.1
     assert np.quantile(np.abs(parts.rows.sd[:, OWN] / whole.sd[:, OWN] - 1), 0.95) < 0.05
     np.testing.assert_allclose(parts.level_sd[OWN], whole.level_sd[OWN], rtol=0.05)
     assert parts.rows.n_rejected[200] == 1
     error = (parts.rows.values - truth)[:, OWN]
     ratio = np.sqrt(np.mean(((error - error.mean(axis=0)) / parts.rows.sd[:, OWN]) ** 2, axis=0))
-    # 480 epochs know a standard deviation to 3.2 %: four of them, for eight parameters
+    # 480 epochs give a standard deviation to 3.2 %: four times that, for eight parameters
     assert ratio.min() > 0.87
     assert ratio.max() < 1.13
 
 
 def test_what_the_sample_never_saw_is_still_adjusted(case):
-    """A board that is there only between two windows of the sample: its offsets from the sums."""
+    """A board seen only between two windows of the sample gets its offsets from the sums."""
     field, truth, grid = case
     windows = spread_windows(EPOCHS, 120)
     hidden = np.zeros(grid.observed.shape, dtype=bool)
@@ -103,7 +103,7 @@ def test_what_the_sample_never_saw_is_still_adjusted(case):
 
 
 def test_processes_do_not_matter(case):
-    """Blocks on two processes give the bits of one."""
+    """Blocks on two processes give the same bits as on one."""
     one, two = (blocked(case, 60, "mount", jobs) for jobs in (1, 2))
     np.testing.assert_array_equal(two.rows.values, one.rows.values)
     np.testing.assert_array_equal(two.rows.sd, one.rows.sd)

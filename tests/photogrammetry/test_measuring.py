@@ -1,4 +1,4 @@
-"""Pose from control points with a known camera, and places on planes: standard deviations hold."""
+"""Pose from control points with a known camera, and points on planes: true standard deviations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SIGMA = 0.3
 
 
 def camera_covariance() -> np.ndarray:
-    """Of c, x0, y0 as one thermometer's noise makes it: they move together; and a little each."""
+    """Of c, x0, y0, which one thermometer's noise changes together, and a little each alone."""
     together = np.array([0.4e-3, 0.35e-3, -0.2e-3]) * 1.5
     Q = np.zeros((10, 10))
     Q[:3, :3] = np.outer(together, together) + np.diag([0.1e-3, 0.2e-3, 0.2e-3]) ** 2
@@ -44,7 +44,7 @@ def control_points(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def drawn(rng: np.random.Generator, points: np.ndarray, Q: np.ndarray, sigma_mm: float):
-    """A camera, the surveyed points and their images as they come out one time."""
+    """One draw of the camera, the surveyed points and their images."""
     delta = rng.multivariate_normal(np.zeros(3), Q[:3, :3])
     c, x0, y0 = INTERIOR.c + delta[0], INTERIOR.x0 + delta[1], INTERIOR.y0 + delta[2]
     image = project(points, POSE, c, x0, y0) + rng.normal(0, SIGMA, (len(points), 2))
@@ -56,7 +56,7 @@ def drawn(rng: np.random.Generator, points: np.ndarray, Q: np.ndarray, sigma_mm:
 
 
 def test_errors_are_what_the_covariance_says():
-    """Pose, camera and a place on the water over 300 draws: chi-square and error/sd near 1."""
+    """Pose, camera and a point on the water over 300 draws: χ² and error/sd near 1."""
     rng = np.random.default_rng(6)
     points, Q = control_points(6, rng), camera_covariance()
     places = np.array([[300.0, 9_000.0, 0.0], [-2_000.0, 25_000.0, 0.0]])
@@ -78,8 +78,8 @@ def test_errors_are_what_the_covariance_says():
     assert np.std(np.array(errors), axis=0) == pytest.approx(np.ones(4), abs=0.13)
 
 
-def test_places_on_a_plane_against_a_monte_carlo():
-    """Sd within 3 %, covariance within 6 %: 10,000 draws of an intersection of its own."""
+def test_points_on_a_plane_against_monte_carlo():
+    """Sd within 3 %, covariance within 6 % of 10,000 draws of an independent intersection."""
     rng = np.random.default_rng(2)
     points, Q = control_points(10, rng), camera_covariance()
     _, field, seen = drawn(rng, points, Q, 10.0)
@@ -106,7 +106,7 @@ def test_places_on_a_plane_against_a_monte_carlo():
 
 
 def intersect(uv: np.ndarray, draws: np.ndarray, level: np.ndarray, normal: np.ndarray):
-    """Rays of as many cameras with the plane normal·X = level, distortion undone by iteration."""
+    """Rays of n cameras with the plane normal·X = level, distortion removed by iteration."""
     x = (uv[:, 0] - (SIZE[0] - 1) / 2) * PITCH - draws[:, 1]
     y = -(uv[:, 1] - (SIZE[1] - 1) / 2) * PITCH - draws[:, 2]
     a, b = x.copy(), y.copy()
@@ -139,7 +139,7 @@ def test_a_gross_error_is_found():
      (slice(0, 3), True, "ok")],
 )  # fmt: skip
 def test_few_points(rows, start, word):
-    """Three points suffice where an earlier pose tells which of four it is."""
+    """Three points suffice if an earlier pose shows which of four poses it is."""
     rng = np.random.default_rng(5)
     points, Q = control_points(12, rng)[rows], camera_covariance()
     _, field, seen = drawn(rng, points, Q, 10.0)
@@ -153,7 +153,7 @@ def test_few_points(rows, start, word):
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 def test_corners_of_three_markers_on_one_board_give_a_pose(noise):
-    """Exactly in one plane and on two lines, which a solver of OpenCV does not bear."""
+    """Exactly in one plane and on two lines, for which a solver of OpenCV fails."""
     points = np.array([[0.0, y, z] for z in range(6) for y in (22.5, 127.5)])
     points[:, 2] = np.repeat([577.5, 472.5, 427.5, 322.5, 277.5, 172.5], 2)
     pose = np.array([-0.7854, 0.6155, 2.6180, 950.0, 950.0, 950.0])
@@ -167,7 +167,7 @@ def test_corners_of_three_markers_on_one_board_give_a_pose(noise):
     assert d @ np.linalg.solve(r.covariance[10:, 10:], d) < 22.5  # of 6 degrees of freedom
 
 
-def test_points_in_one_line_determine_no_pose():
+def test_points_on_one_line_determine_no_pose():
     rng = np.random.default_rng(6)
     points = np.array([-2_000.0, 9_000.0, 500.0]) + np.linspace(0, 1, 8)[:, None] * [0, 20_000, 0]
     Q = camera_covariance()

@@ -1,4 +1,4 @@
-"""The mount as a random effect: the standard deviations that a camera on a tripod deserves."""
+"""The mount as a random effect: true standard deviations of a camera on a tripod."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def rms(values: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_mount_that_stands_still_costs_nothing():
-    """60 series without a tremble: the sds of `series`, within 5 %."""
+    """60 series without a tremble have the sds of `series`, within 5 %."""
     z, sd = standardised(41, 60, 100, STILL)
     _, still = standardised(41, 60, 100, STILL, "series")
     assert rms(z) == pytest.approx(np.ones(3), abs=0.1)
@@ -41,7 +41,7 @@ def test_errors_are_as_large_as_stated(tremble):
 
 
 def test_series_states_what_the_movement_does_too():
-    """One orientation for all: the estimate stays, its sds hold the movement."""
+    """With one orientation for all the estimate is the same, and its sds include the movement."""
     z, sd = standardised(43, 5, 100, TREMBLES, "series")
     assert rms(z) == pytest.approx(np.ones(3), abs=0.2)
     assert rms(sd)[1] == pytest.approx(0.1, rel=0.25)
@@ -54,7 +54,7 @@ def adjusted(seed: int, epochs: int, tremble: Tremble, **settings):
     return r, truth
 
 
-def test_auto_says_what_it_chose_and_why():
+def test_auto_reports_its_choice_and_why():
     chosen = {}
     for name, epochs, tremble in (
         ("short", 12, STILL), ("moves", 60, TREMBLES),
@@ -69,7 +69,7 @@ def test_auto_says_what_it_chose_and_why():
 
 
 def test_a_knock_makes_the_mount_loose_not_the_camera_wrong():
-    """The tripod is moved by 2 px in mid-series: sds as of orientations per epoch, and true."""
+    """The tripod is moved by 2 px in mid-series: sds are true, and as with EOP per epoch."""
     field = scene.corner_field(per_side=4)
     rng = np.random.default_rng(45)
     grid, truth = simulate(rng, field, 80, STILL)
@@ -111,7 +111,7 @@ def test_a_camera_cannot_drift_within_a_minute_unless_it_warms_up():
 
 
 def test_a_strong_warm_up_is_no_movement_of_the_mount():
-    """16 px with a time constant of 15 epochs, seen to 0.004 px: nothing of it is the mount's."""
+    """16 px with a time constant of 15 epochs, measured to 0.004 px, are all the camera's."""
     t = np.arange(150)
     drift = 4000.0 * (1 - np.exp(-t / 15.0))[:, None] * np.array([1.0, -0.6])
     for seed in range(5):
@@ -121,7 +121,7 @@ def test_a_strong_warm_up_is_no_movement_of_the_mount():
 
 
 def test_gross_errors_in_most_epochs_do_not_take_the_epochs_out():
-    """Three targets of 48 are 20 px off in two of three epochs, before a field with sigmas."""
+    """Three targets of 48 are 20 px off in two of three epochs of a field with sigmas."""
     rng = np.random.default_rng(3)
     plain = scene.corner_field(per_side=4)
     field = TestField.build(plain.names, plain.points, 0.03)

@@ -125,7 +125,7 @@ def test_two_distances_are_weighted_and_lower_the_scale_uncertainty():
     stations = cases.convergent_stations(field, 8)
     lengths = [float(np.linalg.norm(field[b] - field[a])) for a, b in ((0, 29), (5, 24))]
     one = _survey(field, stations, 0.05, 3, [Distance("t0", "t29", lengths[0], 0.1)])[0]
-    # the second is 1 mm too long and ten times worse: it may pull by a hundredth of that at most
+    # the second is 1 mm too long and ten times worse: its effect is a hundredth of that at most
     two = _survey(
         field, stations, 0.05, 3,
         [Distance("t0", "t29", lengths[0], 0.1), Distance("t5", "t24", lengths[1] + 1.0, 1.0)],
@@ -133,7 +133,7 @@ def test_two_distances_are_weighted_and_lower_the_scale_uncertainty():
     assert two.sd_scale < one.sd_scale
     assert two.extent == pytest.approx(one.extent, rel=0.02 / 900)
     assert two.extent > one.extent
-    # the distance's own share, and a little from the photographs
+    # the distance's own sd, and a little from the photographs
     assert 1.0 < one.sd_scale / (0.1 / lengths[0]) < 1.1
 
 
@@ -232,7 +232,7 @@ def test_a_foreign_photograph_is_left_out_and_named():
 
 
 def test_a_photograph_of_another_focus_is_left_out_and_named():
-    """The principal distance of one is 3 % longer: it can be oriented, but not with the others."""
+    """With a principal distance 3 % longer it can be oriented, but not with the others."""
     field = _BENT
     rng = np.random.default_rng(6)
     stations = cases.convergent_stations(field, 8)

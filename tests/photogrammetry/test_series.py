@@ -1,4 +1,4 @@
-"""The adjustment of a series: true standard deviations with shared unknowns, and what it shares."""
+"""The adjustment of a series: true standard deviations with common unknowns, and its figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OWN = np.arange(8)
 
 
 def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None, per_side=7):
-    """A drifting camera; the true field differs from the known one by its sigma."""
+    """A drifting camera; the true field differs from the surveyed one by its sigma."""
     known = scene.corner_field(coordinate_error, per_side)
     true = TestField.build(
         known.names, known.points + rng.normal(0, coordinate_error, known.points.shape)
@@ -45,7 +45,7 @@ def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None, per_s
     return known, truth, observations
 
 
-def test_a_static_set_up_is_worth_fifty_times():
+def test_a_static_set_up_is_fifty_times_as_accurate():
     """DESIGN idea 3: 0.3 px with a free orientation per epoch, 0.005 px with one for the series."""
     field, _, observations = series(np.random.default_rng(32), coordinate_error=0.0, hidden=0.0)
     px = {}
@@ -57,7 +57,7 @@ def test_a_static_set_up_is_worth_fifty_times():
 
 
 def test_ignoring_the_targets_errors_understates():
-    """Why the offsets are there: without them, visibility alone passes for movement."""
+    """Without offsets, changing visibility alone looks like movement."""
     field, truth, observations = series(np.random.default_rng(33), coordinate_error=0.1, epochs=100)
     ratio = {}
     for offsets in (True, False):
@@ -69,20 +69,20 @@ def test_ignoring_the_targets_errors_understates():
     assert ratio[True] < 0.5 * ratio[False]
 
 
-def test_whether_it_stood_still_is_tested():
+def test_stillness_is_tested():
     rng = np.random.default_rng(34)
     field, _, observations = series(rng, epochs=40, moved=17)
     r = scene.adjusted_series(field, observations)
     assert int(np.nanargmax(r.stillness)) == 17
     assert r.stillness[17] > 40
     others = np.delete(r.stillness, 17)
-    assert np.median(others) == pytest.approx(5.35, abs=1.5)  # chi-square with 6 degrees
+    assert np.median(others) == pytest.approx(5.35, abs=1.5)  # χ² with 6 degrees of freedom
 
 
-# the same matrices for all, and each its own
+# with the same matrices for all epochs, and with different ones
 @pytest.mark.parametrize(("hidden", "correlation"), [(0.0, 0.0), (0.02, 0.4)])
 def test_epochs_by_themselves_are_those_of_the_epoch_adjustment(hidden, correlation):
-    """Without anything in common the batch is the single adjustment, epoch by epoch."""
+    """Without common unknowns the batch is the single adjustment, epoch by epoch."""
     rng = np.random.default_rng(35)
     field, _, observations = series(rng, epochs=150, coordinate_error=0.0, hidden=hidden)
     for obs in observations[::7]:
@@ -169,7 +169,7 @@ def test_gross_errors_among_twelve_targets_end_in_a_status(seed, gross_px, exter
 
 
 @pytest.mark.parametrize("factor", [1.0, 5.0])
-def test_a_field_worse_than_stated_is_said_and_scales_the_level(factor):
+def test_a_field_worse_than_stated_is_reported_and_scales_the_level(factor):
     """Over 20 series of 25 epochs; with the stated sigmas the level was wrong by `factor` sd."""
     rng = np.random.default_rng(32)
     z, ratios = [], []
@@ -213,7 +213,7 @@ def test_noise_that_grows_towards_the_edge_is_seen_with_its_sd(factor):
         assert value - 1.0 > 5.0 * sd
 
 
-def test_what_the_perspective_knows_is_what_an_epoch_knows_by_itself():
+def test_the_perspective_sd_is_that_of_an_epoch_by_itself():
     field, observations = noisy_outside(np.random.default_rng(1), 1.0)
     alike, apart = (
         scene.adjusted_series(field, observations, exterior=exterior)
@@ -226,7 +226,7 @@ def test_what_the_perspective_knows_is_what_an_epoch_knows_by_itself():
 
 
 @pytest.mark.parametrize(("held", "moved"), [("C1", 2), ("C2", 1)])
-def test_what_a_held_affinity_does_to_the_level_is_said(held, moved):
+def test_the_effect_of_a_held_affinity_on_the_level_is_reported(held, moved):
     """A camera with an affinity of 1e-4 that is not estimated; nothing else is wrong."""
     field, truth = scene.corner_field(0.02), scene.INTERIOR.as_array()
     values = replace(scene.INTERIOR, **{held: 1e-4}).as_array()
@@ -251,7 +251,7 @@ def test_what_a_held_affinity_does_to_the_level_is_said(held, moved):
 
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])
 def test_frames_that_are_all_the_same_keep_a_variance(exterior):
-    """A camera that gives its last frame again: errors of whole markers then seem to correlate."""
+    """If a camera repeats its last frame, errors of whole markers seem to correlate."""
     plain, _, observations = series(np.random.default_rng(4), 45, coordinate_error=0.02, hidden=0.0)
     names = [f"{i // 4}.{i % 4}" for i in range(len(plain))]
     field = TestField.build(names, plain.points, 0.02, kinds="marker_corner")

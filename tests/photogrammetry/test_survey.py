@@ -25,7 +25,7 @@ CAMERA = CameraModel(
 
 
 def bent(field, size, sag=5.0):
-    """The nominal field of a sheet as it really is: bent, twisted, and stretched by the printer."""
+    """The true field of a nominal sheet: bent, twisted, and stretched by the printer."""
     points = field.points * [1.002, 0.999, 1.0]
     u, v = field.points[:, 0] / size[0] - 0.5, field.points[:, 1] / size[1] - 0.5
     points[:, 2] = sag * (1 - 4 * u * u) + 0.6 * sag * u * v
@@ -48,7 +48,7 @@ def measured_distance(truth, a, b, sigma, seed=0):
 
 
 def assert_true(result, truth, least_accuracy=1 / 20_000):
-    """Coordinates within three stated standard deviations, and the accuracy of the issue."""
+    """Check coordinates to three stated standard deviations, and the relative accuracy."""
     known = truth.points[[truth.index[name] for name in result.network.names]]
     errors, normalised = cases.normalised_errors(result.network, known)
     assert np.mean(np.abs(normalised) < 3.0) > 0.99
@@ -70,7 +70,7 @@ def sheet():
 
 @pytest.mark.slow
 def test_bent_sheet_with_its_nominal_field(sheet):
-    """Among its photographs a black and a foreign one: they are named and do no harm."""
+    """A black and a foreign photograph among them are named and do no harm."""
     nominal, truth, pictures, distance = sheet
     shape = pictures["photo0.png"]().shape
     noise = np.random.default_rng(0).integers(60, 180, (77, 103), dtype=np.uint8)
@@ -94,7 +94,7 @@ def test_bent_sheet_with_its_nominal_field(sheet):
     )
 
 
-def test_bent_sheet_of_which_nothing_is_known(sheet):
+def test_bent_sheet_without_a_nominal_field(sheet):
     """Codes alone: names from the codes, diameters from the pictures."""
     _, truth, pictures, distance = sheet
     result = survey(pictures, [distance], CAMERA.sensor.pixel_pitch)

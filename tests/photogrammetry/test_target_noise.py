@@ -1,4 +1,4 @@
-"""The noise of single targets: how far it is believed, and what the test of a point makes of it."""
+"""The noise of single targets: how well it is estimated, and its effect on the test of a point."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_the_limit_is_the_quantile_of_f(alpha):
     np.testing.assert_allclose(limit_2d(alpha, 1.0 / freedom), expected, rtol=1e-9)
 
 
-def test_targets_measured_alike_are_not_told_apart_by_chance():
+def test_targets_of_equal_noise_do_not_differ_by_chance():
     rng = np.random.default_rng(5)
     ratio, freedom = noise_ratios(*drawn(rng, 10, 0.0)[:3], 1.0)
     assert np.std(np.log(ratio)) < 0.1  # of single targets: 0.45
@@ -34,26 +34,26 @@ def test_targets_measured_alike_are_not_told_apart_by_chance():
 
 
 def failing(epochs, spread, lost):
-    """Share of good points of further epochs that fail the test of what the first ones showed of
-    each target, and by how much the targets were told apart; lost: epochs that offsets take up.
+    """Share of good points of further epochs that fail the test with the targets' noise from the
+    first ones, and the targets' scatter of ln noise; lost: epochs that offsets use up.
     """
-    outside, tried, apart = 0, 0, []
+    outside, tried, scatter = 0, 0, []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         residuals, weights, used, true = drawn(rng, epochs, spread)
         residuals -= residuals.mean(axis=0) * lost
         ratio, freedom = noise_ratios(residuals, weights, used, 1.0, lost)
-        apart.append(np.log(ratio).std())
+        scatter.append(np.log(ratio).std())
         further = np.sqrt(true)[:, None] * rng.standard_normal((10, TARGETS, 2))
         tests = (further**2 / ratio).sum(axis=2)
         outside += int((tests > limit_2d(ALPHA, 1.0 / freedom)).sum())
         tried += tests.size
-    return outside / tried, np.mean(apart)
+    return outside / tried, np.mean(scatter)
 
 
 @pytest.mark.parametrize(("epochs", "spread"), [(10, 0.8), (20, 0.0), (100, 0.3)])
 def test_as_many_good_points_fail_as_stated(epochs, spread):
-    """Medians of few epochs are believed less than they could be: no more than stated, then."""
+    """Medians of few epochs have cautious weights: no more points fail than stated."""
     share, _ = failing(epochs, spread, 0)
     assert share < 1.35 * ALPHA
     assert share > 0.5 * ALPHA or epochs < 100
@@ -62,13 +62,13 @@ def test_as_many_good_points_fail_as_stated(epochs, spread):
 @pytest.mark.parametrize("epochs", [4, 6, 9])
 @pytest.mark.parametrize("spread", [0.0, 0.3, 0.8])
 def test_few_epochs_whose_offsets_take_one_of_them(epochs, spread):
-    """No more good points fail than stated, and targets measured alike are hardly told apart."""
-    share, apart = failing(epochs, spread, 1)
+    """No more good points fail than stated, and targets of equal noise hardly differ."""
+    share, scatter = failing(epochs, spread, 1)
     assert share < 1.35 * ALPHA
-    assert spread > 0 or apart < 0.15
+    assert spread > 0 or scatter < 0.15
 
 
-def test_a_target_seen_once_is_measured_as_the_others():
+def test_a_target_seen_once_has_the_noise_of_the_others():
     residuals, weights, used, _ = drawn(np.random.default_rng(3), 6, 0.5)
     used[1:, 0] = False
     ratio, freedom = noise_ratios(residuals, weights, used, 1.0, 1)

@@ -1,4 +1,4 @@
-"""A year of a camera, drawn as the means that three million epochs are condensed to."""
+"""A year of a camera, drawn as the means to which three million epochs are condensed."""
 
 from __future__ import annotations
 

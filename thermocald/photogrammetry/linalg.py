@@ -1,6 +1,6 @@
 """Linear algebra of normal equations whose unknowns differ in scale by many powers of ten.
 
-Every matrix is scaled to a unit diagonal before it is factorised. NumPy only: importing SciPy's
+Every matrix is scaled to a unit diagonal before it is factorised. NumPy only: importing SciPy
 would cost the daemon 20 MB.
 """
 
@@ -15,19 +15,19 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 
 MAD_TO_SD = 1.4826
-"""Median absolute deviation of a normal distribution to its standard deviation."""
+"""Ratio of a normal distribution's standard deviation to its median absolute deviation."""
 MEDIAN_CHI2 = 2.0 * math.log(2.0)
-"""The median of χ² with two degrees of freedom, those of an image point."""
+"""Median of χ² with the two degrees of freedom of an image point."""
 
 _SMALL = 32  # rows
 
 
 def median_known(values: Array) -> Array:
-    """Median over the first axis without NaN; NaN where nothing is known."""
+    """Return the median over the first axis, NaN ignored; NaN where all values are NaN."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.asarray(np.nanmedian(values, axis=0))
@@ -37,7 +37,7 @@ def unit_diagonal(N: Array, ridge: float = 0.0) -> tuple[Array, Array]:
     """Scale matrices (..., p, p) to a unit diagonal; return them and the factors (..., p).
 
     ridge: added to the unit diagonal, so that undetermined unknowns stay near 0; an unknown without
-    any weight then has weight 1.
+    any weight then gets weight 1.
     """
     diagonal = np.diagonal(N, axis1=-2, axis2=-1)
     scale: Array = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
@@ -71,7 +71,7 @@ def scaled_solve(N: Array, b: Array, ridge: float = 0.0) -> Array:
 
 
 def explained(N: Array, b: Array, ridge: float = 0.0) -> Array:
-    """Return the χ² that unknowns explain: bᵀN⁻¹b for N and b as in `scaled_solve`."""
+    """Return the χ² that the unknowns explain: bᵀN⁻¹b, for N and b as in `scaled_solve`."""
     total: Array = np.sum(b * scaled_solve(N, b, ridge), axis=-1 if b.ndim < N.ndim else -2)
     return total
 
@@ -83,11 +83,11 @@ def eliminate(N: Array, b: Array, kept: int) -> tuple[Array, Array]:
     return N[:kept, :kept] - beside @ X[:, :kept], b[:kept] - beside @ X[:, kept]
 
 
-def orthonormal_combinations(N: Array, least: float = 1e-6) -> tuple[Array, NDArray[np.bool_]]:
+def orthonormal_combinations(N: Array, least: float = 1e-6) -> tuple[Array, Mask]:
     """Find combinations W (p, p) of unknowns that are orthonormal under a normal matrix N (p, p).
 
-    Returns W and which of its columns (p,) N determines: those with more than `least` of the median
-    eigenvalue.
+    Returns W and a mask (p,) of the columns that N determines: those whose eigenvalue exceeds
+    `least` times the median one.
     """
     size, U = np.linalg.eigh(N)
     good = size > least * np.median(size)
@@ -95,19 +95,19 @@ def orthonormal_combinations(N: Array, least: float = 1e-6) -> tuple[Array, NDAr
 
 
 def best_level(N: Array, b: Array) -> Array:
-    """Return the values (p,) that epochs with normal equations (E, p, p), (E, p) have in common."""
+    """Return the values (p,) that fit the normal equations (E, p, p), (E, p) of all epochs best."""
     level: Array = np.linalg.lstsq(N.sum(axis=0), b.sum(axis=0), rcond=1e-12)[0]
     return level
 
 
 def subtract_level(N: Array, b: Array) -> Array:
-    """Return right-hand sides (E, p) less what the epochs have in common (`best_level`)."""
+    """Return right-hand sides (E, p) reduced by the epochs' common values (`best_level`)."""
     out: Array = b - N @ best_level(N, b)
     return out
 
 
 def inverse_of_determined(N: Array) -> Array:
-    """Inverse of one matrix, restricted to the combinations of unknowns that it determines."""
+    """Invert one matrix (p, p) on the combinations of unknowns that it determines."""
     if len(N) == 0:
         return N
     scaled, scale = unit_diagonal(N)
@@ -125,7 +125,7 @@ def inverse_of_determined(N: Array) -> Array:
 
 
 def _inverse_of_triangle(L: Array) -> Array:
-    """Inverse of a lower triangle, by halves: a quarter of the time of an inverse of any matrix."""
+    """Invert a lower triangular matrix by halves, in a quarter of the time of a general inverse."""
     half = len(L) // 2
     if half < _SMALL:
         return np.linalg.inv(L).astype(np.float64, copy=False)
@@ -137,17 +137,17 @@ def _inverse_of_triangle(L: Array) -> Array:
 
 
 def inverse_2x2(M: Array) -> Array:
-    """Inverses of matrices (n, 2, 2): numpy's decompositions take ten times as long."""
+    """Invert matrices (n, 2, 2) in closed form; NumPy's decompositions take ten times as long."""
     a, b, c, d = (M[:, i, k] for i in (0, 1) for k in (0, 1))
     adjugate = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
     inverse: Array = adjugate / (a * d - b * c)[:, None, None]
     return inverse
 
 
-def stacked_inverses(N: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Inverse of each symmetric matrix (E, p, p), and which could be inverted (E,).
+def stacked_inverses(N: Array) -> tuple[Array, Mask]:
+    """Invert symmetric matrices (E, p, p); return the inverses and a mask (E,) of the regular ones.
 
-    Those that could not are unit matrices.
+    A singular matrix has the unit matrix as its inverse.
     """
     p = N.shape[-1]
     diagonal = np.diagonal(N, axis1=1, axis2=2)
@@ -173,23 +173,23 @@ def stacked_inverses(N: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def root_of(Q: Array) -> Array:
-    """A root of a covariance (p, p), Q = root · rootᵀ."""
+    """Return a root (p, p) of a covariance (p, p): Q = root · rootᵀ."""
     try:
         triangle: Array = np.linalg.cholesky(Q).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError:  # only semi-definite
+    except np.linalg.LinAlgError:  # Q is only semi-definite
         triangle = symmetric_power(Q, 0.5)
     return triangle
 
 
 def symmetric_power(Q: Array, exponent: float, floor: float = 0.0) -> Array:
-    """A power of one symmetric matrix (p, p), its eigenvalues clipped to at least `floor`."""
+    """Return a power of one symmetric matrix (p, p), its eigenvalues raised to at least `floor`."""
     values, vectors = np.linalg.eigh(Q)
     power: Array = (vectors * np.clip(values, floor, None) ** exponent) @ vectors.T
     return power
 
 
 def correlation_matrix(covariance: Array) -> Array:
-    """Correlation coefficients (p, p); 0 where a variance is not positive."""
+    """Return the correlation coefficients (p, p); 0 where a variance is not positive."""
     variance = np.diag(covariance)
     scale = 1.0 / np.sqrt(np.where(variance > 0, variance, np.inf))
     r: Array = covariance * np.outer(scale, scale)
@@ -197,5 +197,5 @@ def correlation_matrix(covariance: Array) -> Array:
 
 
 def mad_sd(values: NDArray[np.floating[Any]], axis: int | None = None) -> Any:
-    """Standard deviation from the median absolute value, NaN ignored, as residuals have mean 0."""
+    """Return a robust standard deviation of residuals, whose mean is 0; NaN is ignored."""
     return MAD_TO_SD * np.nanmedian(np.abs(values), axis=axis)

@@ -1,14 +1,12 @@
-"""Approximate orientation from nothing: no initial values from the user.
+"""Approximate orientation without initial values from the user.
 
-The resection itself is OpenCV's (SQPnP inside RANSAC); what it lacks is the principal distance. It
-comes from the camera's data sheet where that is known, from a direct linear transformation where
-the field has depth, and otherwise from a search over fields of view; whoever explains most targets
-best wins.
+The resection itself is OpenCV's (SQPnP inside RANSAC), which needs a principal distance. The
+camera's data sheet gives it, or a direct linear transformation if the field has depth, or else a
+search over fields of view; the candidate with the smallest truncated residuals is taken.
 
-From coded targets `orient` and `refine` lead to all targets: a small robust adjustment of the pose
-and as much of the interior orientation as the targets carry, each parameter held by a weak prior,
-whose only use is to predict image points and outlines. The observations are adjusted properly
-elsewhere (`epoch.adjustment`).
+`orient` and `refine` start from coded targets and predict the image points and outlines of all
+others. For this purpose alone they adjust the pose and the interior orientation robustly, with a
+weak prior for each parameter. The proper adjustment is `epoch.adjustment`.
 
 Source: Terzakis and Lourakis (2020), SQPnP; Abdel-Aziz and Karara (1971), DLT.
 """
@@ -33,19 +31,19 @@ from thermocald.photogrammetry.camera.camera_model import (
     rays,
 )
 from thermocald.photogrammetry.field.testfield import plane_fit
-from thermocald.photogrammetry.linalg import mad_sd
+from thermocald.photogrammetry.linalg import mad_sd, scaled_solve
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera looks along +Z with y down
 _FIELDS_OF_VIEW_DEG = (18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 73.0, 85.0, 98.0)
-_TOLERANCE = 0.005  # of the image width: distortion is not known yet
-_MANY = 8  # pairs that three of them do not explain by chance
-_MINIMUM = 4
-_CLEAR = 0.5  # of the pairs, that fit
+_TOLERANCE = 0.005  # of the image width, as the distortion is still unknown
+_MANY = 8  # so many pairs do not fit a pose of three of them by chance
+_MINIMUM = 4  # pairs
+_CLEAR = 0.5  # share of the pairs that fit
 
 
 def approximate_orientation(
@@ -54,13 +52,13 @@ def approximate_orientation(
     image_points: ArrayLike,
     nominal_c: float | None = None,
     interior: InteriorOrientation | None = None,
-) -> tuple[InteriorOrientation, ExteriorOrientation, NDArray[np.bool_]]:
-    """Interior and exterior orientation good enough to start an adjustment.
+) -> tuple[InteriorOrientation, ExteriorOrientation, Mask]:
+    """Estimate an interior and exterior orientation good enough to start an adjustment.
 
-    field_points (n, 3) mm, image_points (n, 2) px, in pairs, gross errors allowed; nominal_c mm,
-    from the camera's data sheet; `interior` is taken as it stands where given.
-    Returns the orientations and a mask (n,) of the pairs that fit.
-    Raises GeometryError with fewer than four pairs, or where no orientation explains them.
+    field_points (n, 3) mm and image_points (n, 2) px: pairs, gross errors allowed; nominal_c mm:
+    from the camera's data sheet; interior: taken unchanged if given.
+    Returns the orientations and a mask (n,) of the pairs that fit. Raises GeometryError if there
+    are fewer than four pairs, or if no orientation explains them.
     """
     X = np.ascontiguousarray(field_points, dtype=float)
     uv = np.ascontiguousarray(image_points, dtype=float)
@@ -68,7 +66,7 @@ def approximate_orientation(
         raise GeometryError(
             f"too few targets for an orientation: {len(X)}, at least {_MINIMUM} are needed"
         )
-    best: tuple[float, InteriorOrientation, ExteriorOrientation, NDArray[np.bool_]] | None = None
+    best: tuple[float, InteriorOrientation, ExteriorOrientation, Mask] | None = None
     for candidate in _interiors(sensor, X, uv, nominal_c, interior):
         found = _robust_resection(sensor, candidate, X, uv)
         if found is None:
@@ -111,7 +109,7 @@ def _interiors(
 
 
 def _distances(sensor: Sensor, views_deg: tuple[float, ...]) -> list[float]:
-    """The principal distances in mm of cameras with these fields of view."""
+    """Return the principal distances, mm, of cameras with these fields of view."""
     half_mm = sensor.width * sensor.pixel_pitch / 2
     found: list[float] = (half_mm / np.tan(np.radians(views_deg) / 2)).tolist()
     return found
@@ -120,7 +118,7 @@ def _distances(sensor: Sensor, views_deg: tuple[float, ...]) -> list[float]:
 def _robust_resection(
     sensor: Sensor, interior: InteriorOrientation, X: Array, uv: Array
 ) -> tuple[ExteriorOrientation, Array] | None:
-    """RANSAC resection; the exterior orientation and each pair's residual in px, or None."""
+    """Resect by RANSAC; return the exterior orientation and residuals (n,) px, None on failure."""
     try:
         ideal = _ideal(sensor, interior, uv)
     except GeometryError:
@@ -132,7 +130,7 @@ def _robust_resection(
     exterior, rows = _exterior(*found[:2]), found[2]
     residuals = np.linalg.norm(_residuals(sensor, interior, exterior, X, uv), axis=1)
     if len(rows) <= _CLEAR * len(X):
-        # A board seen obliquely: SQPnP of few pairs fails where that of the plane does not.
+        # For a board seen obliquely SQPnP of few pairs may fail; the resection of a plane does not.
         whole = resection(sensor, interior, X, uv)[0][1]
         other = np.linalg.norm(_residuals(sensor, interior, whole, X, uv), axis=1)
         tolerance = _TOLERANCE * sensor.width
@@ -144,11 +142,12 @@ def _robust_resection(
 def majority_pose(
     X: Array, ideal: Array, threshold: float, fewest: int = _MINIMUM, seed: int = 0
 ) -> tuple[Array, Array, NDArray[Any]] | None:
-    """OpenCV's R (3, 3) and t (3,), object to camera, and the pairs that they explain, or None.
+    """Estimate OpenCV's R (3, 3) and t (3,), object to camera, and the rows that fit, or None.
 
-    X (n, 3) mm; ideal (n, 2): image points at the distance 1, y down; threshold: of what fits;
-    fewest: pairs that must. RANSAC with SQPnP, refined on the pairs that fit; with three points at
-    a time where that finds none, as of points that lie exactly in a plane.
+    X (n, 3) mm; ideal (n, 2): image points at the distance 1, y down; threshold: largest residual
+    of a pair that fits; fewest: number of pairs that must fit. RANSAC with SQPnP, refined on the
+    pairs that fit. If it finds no pose, as for points exactly in a plane, three points at a time
+    are tried.
     """
     by_three = max(fewest, _MANY, int(_CLEAR * len(X)) + 1)
     for solver, least in ((cv2.SOLVEPNP_SQPNP, fewest), (cv2.SOLVEPNP_AP3P, by_three)):
@@ -158,12 +157,12 @@ def majority_pose(
                 X, ideal, np.eye(3), None, iterationsCount=300, reprojectionError=threshold,
                 confidence=0.9999, flags=solver,
             )  # fmt: skip
-        except cv2.error:  # degenerate points fail an assertion in there
+        except cv2.error:  # degenerate points fail an assertion of OpenCV's
             continue
         if ok and inliers is not None and len(inliers) >= least:
             rows = inliers.ravel()
             centre, axes, flat = plane_fit(X[rows])
-            if flat and solver == cv2.SOLVEPNP_AP3P:  # it may be the mirrored one
+            if flat and solver == cv2.SOLVEPNP_AP3P:  # the pose may be the mirrored one
                 poses = _plane_poses(X[rows], ideal[rows], centre, axes)
                 return (*poses[0], rows) if poses else None
             rvec, tvec = cv2.solvePnPRefineLM(X[rows], ideal[rows], np.eye(3), None, rvec, tvec)
@@ -172,7 +171,10 @@ def majority_pose(
 
 
 def _plane_poses(X: Array, ideal: Array, centre: Array, axes: Array) -> list[tuple[Array, Array]]:
-    """Both poses R (3, 3), t (3,) of points in a plane (`plane_fit`), the better one first."""
+    """Return both poses R (3, 3), t (3,) of points in a plane, the better one first.
+
+    centre, axes: of the plane, from `plane_fit`.
+    """
     local = np.ascontiguousarray((X - centre) @ axes.T)
     local[:, 2] = 0.0
     _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
@@ -186,7 +188,7 @@ def _plane_poses(X: Array, ideal: Array, centre: Array, axes: Array) -> list[tup
 
 
 def _ideal(sensor: Sensor, interior: InteriorOrientation, uv: Array) -> Array:
-    """Image points (n, 2) at the distance 1 as OpenCV has them, y down."""
+    """Return undistorted image points (n, 2) at the distance 1, y down as in OpenCV."""
     direction = rays(sensor, interior.as_array(), uv)
     return np.ascontiguousarray(direction[:, :2] / -direction[:, 2:] * [1.0, -1.0])
 
@@ -194,9 +196,9 @@ def _ideal(sensor: Sensor, interior: InteriorOrientation, uv: Array) -> Array:
 def _residuals(
     sensor: Sensor, interior: InteriorOrientation, pose: ExteriorOrientation, X: Array, uv: Array
 ) -> Array:
-    """Computed minus measured (n, 2) px, large for points behind the camera."""
+    """Return measured minus predicted image points (n, 2) px; 1e6 for points behind the camera."""
     predicted = project(sensor, interior.as_array(), pose.as_array(), X)
-    return np.nan_to_num(predicted - uv, nan=1e6)
+    return np.nan_to_num(uv - predicted, nan=1e6)
 
 
 def _exterior(R: NDArray[Any], t: NDArray[Any]) -> ExteriorOrientation:
@@ -206,10 +208,10 @@ def _exterior(R: NDArray[Any], t: NDArray[Any]) -> ExteriorOrientation:
 def resection(
     sensor: Sensor, interior: InteriorOrientation, field_points: ArrayLike, image_points: ArrayLike
 ) -> list[tuple[float, ExteriorOrientation]]:
-    """All exterior orientations that explain a plane target, best first, with their RMS in px.
+    """Return the possible exterior orientations, best first, each after its RMS residual in px.
 
-    A plane target has two; where the second fits as well as the first, the pose is ambiguous.
-    Points that are not in one plane have one. Source: Collins and Bartoli (2014), IPPE.
+    Points in one plane have two: if the second fits as well as the first, the pose is ambiguous.
+    Other points have one. Source: Collins and Bartoli (2014), IPPE.
     """
     X = np.ascontiguousarray(field_points, dtype=float)
     uv = np.asarray(image_points, dtype=float)
@@ -226,7 +228,7 @@ def resection(
 
 
 def _direct_linear_transformation(sensor: Sensor, X: Array, uv: Array) -> float | None:
-    """Principal distance in mm from a DLT, None where the field has no depth."""
+    """Return the principal distance, mm, from a DLT; None if the field has no depth."""
     if len(X) < 6 or plane_fit(X, 0.02)[2]:
         return None
     centre, scale = X.mean(axis=0), X.std()
@@ -251,13 +253,13 @@ _QUICK_VIEWS_DEG = (60.0, 40.0, 80.0, 25.0)
 _GOOD_START = 0.02  # of the image's width: the RMS of a resection without distortion
 _ITERATIONS = 12
 _LEAST_SD_PX = 0.05
-_CUT = 5.0
-_KNOWN_BETTER = 20.0  # times, than a data sheet knows
+_CUT = 5.0  # times the scatter, beyond which weights fall
+_KNOWN_BETTER = 20.0  # ratio of the priors' sds without and with an earlier calibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Orientation:
-    """A camera and its pose, with the residuals (n, 2) px of the pairs it was made from."""
+    """A camera and its pose, with the residuals (n, 2) px of the pairs that gave them."""
 
     camera: CameraModel
     exterior: ExteriorOrientation
@@ -278,10 +280,10 @@ def orient(
     nominal_c: float | None = None,
     interior: InteriorOrientation | None = None,
 ) -> Orientation:
-    """Orientation from pairs of object points (n, 3) mm and image points (n, 2) px.
+    """Estimate an orientation from pairs of object points (n, 3) mm and image points (n, 2) px.
 
-    Codes are hardly ever misread, so a plain resection is tried first; where it does not fit, the
-    robust and slower `approximate_orientation` decides, and its GeometryError is passed on.
+    Codes are hardly ever misread, so a plain resection is tried first. If it does not fit, the
+    robust and slower `approximate_orientation` follows. Raises its GeometryError.
     """
     start = None
     if len(points) >= 6:
@@ -292,8 +294,8 @@ def orient(
             return found
     i, e, inliers = approximate_orientation(sensor, points, image_points, nominal_c, interior)
     part = refine(sensor, i, e, points[inliers], image_points[inliers], interior is not None)
-    uv, _, _ = partials(sensor, part.camera.interior.as_array(), part.exterior.as_array(), points)
-    return Orientation(part.camera, part.exterior, np.nan_to_num(image_points - uv, nan=1e6))
+    residuals = _residuals(sensor, part.camera.interior, part.exterior, points, image_points)
+    return Orientation(part.camera, part.exterior, residuals)
 
 
 def _quick_start(
@@ -326,13 +328,13 @@ def refine(
     image_points: Array,
     known: bool = False,
 ) -> Orientation:
-    """Adjust pose and c, x0, y0, A1, A2, B1, B2 with priors, robustly.
+    """Adjust the pose and c, x0, y0, A1, A2, B1, B2 robustly, with priors.
 
-    known: the interior orientation is an earlier calibration; a camera drifts from it by some per
-    mille, so it is held loosely all the same.
+    known: whether the interior orientation is an earlier calibration. It is held loosely even so,
+    as a camera drifts by a few per mille.
     """
     size = sensor.width * sensor.pixel_pitch
-    # What a camera's parameters may be off from nominal, as sd; A1 r² of 5 % at the image's edge.
+    # How far a camera's parameters may be from nominal, as sds; A1 r² is 5 % at the image's edge.
     radius2 = (size / 2) ** 2
     prior_sd = np.array(
         [0.3 * interior.c, 0.02 * size, 0.02 * size, 0.05 / radius2, 0.05 / radius2**2,
@@ -354,16 +356,16 @@ def refine(
         weighted = design * np.repeat(weight, 2)[:, None]
         N = design.T @ weighted + np.diag(prior)
         b = weighted.T @ r.ravel() - prior * (p - nominal)[free]
-        d = np.sqrt(np.maximum(np.diag(N), 1e-30))
-        step = np.linalg.solve(N / np.outer(d, d) + 1e-6 * np.eye(len(free)), b / d) / d
+        step = scaled_solve(N, b, ridge=1e-6)
         p[free] += step
         if p[0] <= 0 or not np.isfinite(p).all():
             p = nominal.copy()
             uv, A, _ = partials(sensor, p[:10], p[10:], points)
             break
         uv, A, _ = partials(sensor, p[:10], p[10:], points)
-        # A standard deviation from the end is near enough for a prediction.
-        if abs(last - scale) < 0.1 * scale and float(np.abs(step * d).max()) < 1.0:
+        # Within one standard deviation of the solution is close enough for a prediction.
+        in_sds = np.abs(step) * np.sqrt(np.diag(N))
+        if abs(last - scale) < 0.1 * scale and in_sds.max() < 1.0:
             break
         last = scale
     return Orientation(

@@ -1,10 +1,10 @@
-"""A test field surveyed from photographs: what they show, their network, coordinates with sds.
+"""Survey of a test field from photographs: target coordinates with sds from a network.
 
-codes and markers in every photograph ─► network of them ─► where the plain circles must be ─►
-    everything measured once more with known orientations (eccentricity) ─► network of everything
+codes and markers in every photograph ─► their network ─► predicted places of the plain circles ─►
+    all targets measured again with known orientations (eccentricity) ─► network of all targets
 
-What the nominal field says is used for names, diameters, and as a first guess only: sheets that
-bend by millimetres or were put up askew are what a survey is for.
+The nominal field gives names, diameters and approximate coordinates only: a survey is made because
+sheets bend by millimetres or were put up askew.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ RingCode = tuple[int, int]
 """Bits and number."""
 
 
-def codes_in(
+def measure_codes(
     image: Image, rows: dict[RingCode, int], grows: bool
 ) -> tuple[Observations, dict[int, float]]:
-    """Measure the ring-coded targets of an image as ellipses; also their semi-major axes in px.
+    """Measure the ring-coded targets of an image as ellipses, and their semi-major axes in px.
 
-    rows: of the codes, which gets those that are new if it `grows`; else they are left out.
+    rows: row of each code; new codes are added if it `grows` and left out otherwise.
     """
     grey = to_8_bit(image)
     maps, best = LocalMap.none(), dict[RingCode, int]()
@@ -72,7 +72,7 @@ def codes_in(
             break
     targets = np.array([rows.setdefault(code, len(rows)) for code in best], dtype=np.int64)
     fit = fit_circles(image, maps, np.ones(len(targets), dtype=bool))
-    # the fit says how the outline that it began with is to be stretched
+    # the fit estimates how the initial outline has to be stretched
     m11, m12, m22 = fit.parameters[:, 2:5].T
     stretch = np.stack([1 + m11, m12, m12, 1 + m22], axis=-1).reshape(-1, 2, 2)
     outlines = replace(maps, linear=maps.linear @ np.linalg.inv(stretch))
@@ -85,14 +85,13 @@ def codes_in(
 
 
 _ONE_SIZE = 0.15
-_NEAREST = 9  # of a target on its sheet, with itself
+_NEAREST = 9  # targets of its sheet, itself included, that give a target's normal
 
 
 def expected_field(network: Network, nominal: TestField, *, trusted_only: bool) -> TestField:
-    """The nominal field where the network has put it: surveyed coordinates, and for all others the
-    nominal ones, moved as their surveyed neighbours were.
+    """Predict the field: surveyed coordinates, and nominal ones shifted as their neighbours were.
 
-    trusted_only leaves out what an earlier pass should have found and did not.
+    trusted_only: leave out the targets that the network lacks, which an earlier pass looked for.
     """
     rows = np.array([nominal.index[name] for name in network.names])
     points = nominal.points.copy()
@@ -107,9 +106,9 @@ def expected_field(network: Network, nominal: TestField, *, trusted_only: bool) 
 
 
 def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
-    """The shifts (n, 3) mm at points between known ones: a local plane through the nearest.
+    """Interpolate the known points' shifts (n, 3) mm at the wanted points by local planes.
 
-    Weighted by the inverse square of the distance, so that a fold in the paper stays one.
+    Weights are inverse squares of the distance, so that a fold in the paper is preserved.
     """
     result = np.empty((len(wanted), 3))
     for i, x in enumerate(wanted):
@@ -117,7 +116,7 @@ def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
         near = np.argsort(d)[:12]
         weight = 1.0 / (d[near] + 1e-3 * d[near].max()) ** 2
         A = np.column_stack([np.ones(len(near)), known[near] - x])
-        # the ridge keeps slopes that the neighbours do not show (across a plane) at zero
+        # the ridge holds slopes at zero that the neighbours do not determine (across a plane)
         AtW = A.T * weight
         ridge = 1e-3 * np.trace(AtW @ A) / 4 * np.diag([0.0, 1, 1, 1])
         result[i] = np.linalg.solve(AtW @ A + ridge, AtW @ shifts[near])[0]
@@ -127,8 +126,8 @@ def _neighbours_shift(known: Array, shifts: Array, wanted: Array) -> Array:
 def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> TestField:
     """Return the coded targets of a network as a field.
 
-    radii: semi-major axes px by photograph and target, from which the diameters are found: what a
-    disc of 1 mm would measure there, lying as its neighbours do.
+    radii: semi-major axes px by photograph and target. The diameters follow by comparison with the
+    image of a disc of 1 mm in the plane of the target's neighbours.
     """
     normals = target_normals(network.points)
     ratios: dict[str, list[float]] = {name: [] for name in network.names}
@@ -145,7 +144,7 @@ def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> 
                 ratios[name].append(radii[s.photo, name] / axis)
     diameters = np.array([np.median(r) if r else np.nan for r in ratios.values()])
     together = float(np.nanmedian(diameters)) if np.isfinite(diameters).any() else float("nan")
-    # one size for all where all agree, which is as they are printed
+    # sheets are printed with one size: it is assumed where all diameters agree
     if np.nanmax(np.abs(diameters / together - 1), initial=0.0) < _ONE_SIZE:
         diameters[:] = together
     codes = [
@@ -156,7 +155,7 @@ def field_of_codes(network: Network, radii: Mapping[tuple[str, str], float]) -> 
 
 
 def surveyed_field(network: Network, template: TestField) -> TestField:
-    """The field of the network's targets: coordinates and sigmas surveyed, the rest as it was."""
+    """Return the network's targets as a field: the template's with surveyed points and sigmas."""
     order = np.argsort([template.index[name] for name in network.names])
     part = template.subset([template.index[network.names[i]] for i in order])
     return replace(part, points=network.points[order], sigmas=network.sigmas[order])
@@ -166,13 +165,13 @@ _PASSES = 2
 
 
 Pictures = Mapping[str, "Callable[[], Image]"]
-"""Photographs by name that can be loaded: grey values (H, W), 8 or 16 bit."""
+"""Functions by photograph name that load its grey values (H, W), 8 or 16 bit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """A surveyed field: the network, the field with the surveyed coordinates and sigmas, and per
-    photograph what was measured in it or why nothing was.
+    """The network, the field with surveyed coordinates and sigmas, and for each photograph what was
+    measured in it or why nothing was.
     """
 
     network: Network
@@ -231,8 +230,8 @@ class Survey:
             ),
             (
                 f"  mean standard deviations {mean[0]:.4f}, {mean[1]:.4f}, {mean[2]:.4f} mm in X, "
-                f"Y, Z; the scale alone makes {n.sd_scale * n.extent / 2:.4f} mm at the edge, the "
-                f"shape is good to 1:{1 / n.relative_accuracy:.0f} of the field"
+                f"Y, Z; the scale alone gives {n.sd_scale * n.extent / 2:.4f} mm at the edge, the "
+                f"shape is accurate to 1:{1 / n.relative_accuracy:.0f} of the field"
             ),
             f"  datum: {n.datum}",
             *(f"  left out: {name}: {reason}" for name, reason in n.unused.items()),
@@ -250,23 +249,24 @@ def survey(
     free: Sequence[str] = IOP_NAMES,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Survey:
-    """Survey a field of coded targets, and of the plain ones of its nominal field.
+    """Survey a field of coded targets and, given its nominal field, of plain ones.
 
-    distances: measured ones, they give the scale; pixel_pitch mm; nominal: the field as printed;
-    without it the coded targets alone are surveyed; interior: approximate values, or those of a
-    calibrated camera if `free` leaves them out; progress: told what is being done.
-    Raises GeometryError if the photographs cannot carry it, ImageError if they are unusable.
+    distances: measured between targets, they give the scale; pixel_pitch mm; nominal: the field as
+    printed, without which only coded targets are surveyed; interior: approximate values, or those
+    of a calibrated camera if `free` leaves them out; progress: called with each step's name.
+    Raises GeometryError if the photographs do not determine the field, ImageError if they are
+    unusable.
     """
-    sensor, names, photos, sizes, said = _first_look(pictures, pixel_pitch, nominal, progress)
+    sensor, names, photos, sizes, notes = _measure_first(pictures, pixel_pitch, nominal, progress)
     progress("first adjustment")
     known = None if nominal is None else nominal.points
-    scale = _provisional(distances, photos, names, nominal)
+    scale = _first_distances(distances, photos, names, nominal)
     network = adjust_network(
         sensor, photos, names, scale, interior=interior, nominal=known, free=free
     )
     for number in range(_PASSES):
-        # with the nominal field the plain circles come in the first pass, and take part in the
-        # second with outlines that know how their neighbours lie
+        # with a nominal field the plain circles are measured in the first pass; the second predicts
+        # their outlines from the surveyed planes of their neighbours
         of_field = None
         if nominal is None:
             expected = field_of_codes(network, sizes)
@@ -274,29 +274,29 @@ def survey(
         else:
             expected = expected_field(network, nominal, trusted_only=number > 0)
             rows = [nominal.index[name] for name in expected.names]
-            # the nominal field knows best which sheet a target is on: its sheets are plane
+            # the nominal field shows best which sheet a target is on, as its sheets are plane
             of_field, labels = nominal.points[rows], field_sheets(nominal)[rows]
             normals = sheet_normals(expected.points, labels, _NEAREST)
-        photos = _look_again(pictures, network, expected, normals, said, progress)
+        photos = _measure_again(pictures, network, expected, normals, notes, progress)
         progress(f"adjustment {number + 2} of {_PASSES + 1}")
-        # targets that the network does not have begin where they are expected
+        # the start values of targets that the network lacks are their expected coordinates
         start = replace(network, names=expected.names, points=expected.points)
         network = adjust_network(
             sensor, photos, expected.names, distances, free=free, start=start, nominal=of_field
         )
     template = expected if nominal is None else nominal
-    return Survey(network, surveyed_field(network, template), said)
+    return Survey(network, surveyed_field(network, template), notes)
 
 
-def _provisional(
+def _first_distances(
     distances: Sequence[Distance],
     photos: Mapping[str, Observations],
     names: Sequence[str],
     nominal: TestField | None,
 ) -> Sequence[Distance]:
-    """The distances whose ends have been found so far; if none, one of the nominal field's.
+    """Return the distances whose ends have been measured so far, or else one of the nominal field.
 
-    A plain circle or a code that was not read turns up only when it is known where to look.
+    A plain circle, or a code that was not read, is measured only once its place can be predicted.
     """
     seen = np.zeros(len(names), dtype=int)
     for shown in photos.values():
@@ -316,7 +316,7 @@ def _provisional(
     return [Distance(names[first], names[last], length, 0.01 * length)]
 
 
-def _first_look(
+def _measure_first(
     pictures: Pictures,
     pixel_pitch: float,
     nominal: TestField | None,
@@ -324,13 +324,15 @@ def _first_look(
 ) -> tuple[
     Sensor, tuple[str, ...], dict[str, Observations], dict[tuple[str, str], float], dict[str, str]
 ]:
-    """Measure codes and markers in every photograph; return the names that the targets' rows count,
-    the targets' sizes in px, and what went wrong.
+    """Measure codes and markers in every photograph.
+
+    Returns the sensor, the names in the order of the observations' target rows, the observations
+    by photograph, semi-major axes in px by photograph and target, and a note on each photograph.
     """
     sensor: Sensor | None = None
     seen: dict[str, Observations] = {}
     sizes: dict[tuple[str, int], float] = {}
-    said: dict[str, str] = {}
+    notes: dict[str, str] = {}
     rows: dict[RingCode, int] = {}
     if nominal is not None:
         rows = {ring_code.parse(c): row for row, c in enumerate(nominal.codes) if is_ring(c)}
@@ -342,40 +344,40 @@ def _first_look(
         if status.word in ("wrong_size", "not_grey", "no_image"):
             raise ImageError(f"{name}: {status.reason}")
         if not status.ok:
-            said[name] = status.reason
+            notes[name] = status.reason
             continue
         sensor = sensor or Sensor(image.shape[1], image.shape[0], pixel_pitch)
-        found, radii = codes_in(image, rows, grows=nominal is None)
+        found, radii = measure_codes(image, rows, grows=nominal is None)
         sizes.update({(name, row): radius for row, radius in radii.items()})
         if nominal is not None:
             found = measure_corners(image, locate_markers(image, nominal)).joined(found)
-        said[name] = f"{len(found)} coded targets"
+        notes[name] = f"{len(found)} coded targets"
         if len(found):
             seen[name] = found
     if sensor is None or not seen:
         raise ImageError(
             "no photograph shows a coded target: "
-            + "; ".join(f"{name}: {words}" for name, words in said.items())
+            + "; ".join(f"{name}: {note}" for name, note in notes.items())
         )
-    # what `field_of_codes` reads the codes from
+    # names from which `field_of_codes` reads the codes
     new = (f"R{number}" if bits == 12 else f"R14-{number}" for bits, number in rows)
     names = tuple(new) if nominal is None else nominal.names
     named = {(photo, names[row]): radius for (photo, row), radius in sizes.items()}
-    return sensor, names, seen, named, said
+    return sensor, names, seen, named, notes
 
 
-def _look_again(
+def _measure_again(
     pictures: Pictures,
     network: Network,
     expected: TestField,
     normals: Array,
-    said: dict[str, str],
+    notes: dict[str, str],
     progress: Callable[[str], None],
 ) -> dict[str, Observations]:
-    """Measure every target in the oriented photographs, eccentricity included.
+    """Measure every target in the oriented photographs, corrected for eccentricity.
 
-    normals (n, 3), NaN where unknown. A circle that is not within some pixels of its place is
-    another one and is left out.
+    normals (n, 3): NaN where unknown. Adds to `notes`. A circle more than some pixels from its
+    predicted place is another one and is left out.
     """
     stations, photos = {s.photo: s for s in network.stations}, {}
     for name, load in pictures.items():
@@ -388,7 +390,7 @@ def _look_again(
         fit = fit_circles(image, maps, have_rings(expected, rows))
         off = np.linalg.norm(fit.points - maps.centre, axis=1)
         seen = corners.joined(fit.observations(rows, fit.good & (off < _GROSS_PX)))
-        said[name] = f"{len(seen)} targets"
+        notes[name] = f"{len(seen)} targets"
         if len(seen):
             photos[name] = seen
     return photos

@@ -1,15 +1,15 @@
 """The camera model of CONVENTIONS §2: Brown's model in photogrammetric notation.
 
-The 16 parameters of an oriented camera, their names, units and places in a vector, and what they
-do: projection, partials, rays. The distortion is evaluated at the ideal point, so object point →
-image point is closed form and image point → ray is an iteration. All functions are pure and take
-arrays; image points are px with (0, 0) at the centre of the top-left pixel, y down; object points,
-projection centre, and interior orientation are mm; angles rad; `R = Rx(omega) Ry(phi) Rz(kappa)`
-turns camera into object axes.
+The 16 parameters of an oriented camera, with their names, units and order in a vector; projection,
+partials and rays. The distortion is evaluated at the ideal point, so that the image point follows
+from the object point in closed form, and the ray from the image point by iteration. All functions
+are pure and take arrays. Image points are px with (0, 0) at the centre of the top-left pixel, y
+down; object points, projection centre and interior orientation are mm; angles are rad;
+`R = Rx(omega) Ry(phi) Rz(kappa)` rotates camera axes to object axes.
 
 Parameter vectors are ordered as `PARAMETER_NAMES`: the ten of the interior orientation, then the
-six of the exterior. Leading dimensions of `iop` and `eop` are epochs; points are shared by all
-epochs or carry the same leading dimensions.
+six of the exterior. Leading dimensions of `iop` and `eop` are epochs; points are common to all
+epochs or have the same leading dimensions.
 
 Source: Brown, D. C. (1971): Close-range camera calibration; Luhmann, T. et al. (2014):
 Close-Range Photogrammetry and 3D Imaging, 2nd ed., sections 2.4 and 3.3; the affinity terms as
@@ -30,23 +30,23 @@ from thermocald.errors import GeometryError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
     from thermocald.files import QuantityReader
 
 IOP_NAMES = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2")
 EOP_NAMES = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
 PARAMETER_NAMES = IOP_NAMES + EOP_NAMES
 DEFAULT_FREE = IOP_NAMES[:8]
-"""What is estimated of the interior orientation; the affinity is held."""
+"""Interior parameters that are estimated by default; affinity and shear are held."""
 
 IOP = slice(0, 10)
 """Interior orientation."""
 EOP = slice(10, 16)
 """Exterior orientation."""
 PRINCIPAL = slice(0, 3)
-"""c, x0, y0: what thermal drift is reported of."""
+"""c, x0, y0, whose thermal drift is reported."""
 PRINCIPAL_POINT = slice(1, 3)
 """x0, y0."""
 
@@ -56,7 +56,7 @@ EOP_COLUMNS.flags.writeable = False
 
 
 def free_columns(names: tuple[str, ...]) -> list[int]:
-    """Positions of the named interior parameters, in the order of `PARAMETER_NAMES`."""
+    """Return the positions of the named interior parameters, in the order of `PARAMETER_NAMES`."""
     return [i for i, name in enumerate(IOP_NAMES) if name in names]
 
 
@@ -64,7 +64,7 @@ _UPWARDS = np.array([1.0, -1.0])  # image coordinates in mm go up, in px down
 _TURNS = np.array([-1.0, 1.0, 1.0])
 _SLOPE = np.array([2.0, 4.0, 6.0])  # of r², r⁴, r⁶ along r, over r
 _BEND = np.array([[6, 0], [0, 2], [0, 2], [2, 0], [2, 0], [0, 6]], dtype=float)
-"""By B1 and B2 from x and y: the elements xx, xy, yy of the Jacobian of the decentring part."""
+"""Jacobian of the decentring part, xx, xy, yy by x and by y (rows), as factors of B1 and B2."""
 
 _RAY_TOLERANCE_PX = 1e-9
 _RAY_ITERATIONS = 50
@@ -95,38 +95,38 @@ class Sensor:
         """The image centre in px, (2,)."""
         return np.array([(self.width - 1) / 2, (self.height - 1) / 2])
 
-    def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Which image points (..., 2) lie inside the image by at least `margin` px."""
+    def contains(self, points: ArrayLike, margin: float = 0.0) -> Mask:
+        """Return which image points (..., 2) are inside the image by at least `margin` px."""
         p = np.asarray(points, dtype=float)
         low, high_x, high_y = margin - 0.5, self.width - 0.5 - margin, self.height - 0.5 - margin
-        inside: NDArray[np.bool_] = (
+        inside: Mask = (
             (p[..., 0] >= low) & (p[..., 0] <= high_x) & (p[..., 1] >= low) & (p[..., 1] <= high_y)
         )
         return inside
 
 
 class _Parameters:
-    """Named values that are also a vector, in the order of their fields."""
+    """Named values that convert to a vector in the order of their fields."""
 
     __slots__ = ()
     _in_order: ClassVar[Callable[..., tuple[float, ...]]]
 
     def as_array(self) -> Array:
-        """The values as a vector in the order of the names."""
+        """Return the values as a vector, in the order of the fields."""
         return np.array(self._in_order(self), dtype=np.float64)
 
     @classmethod
     def from_array(cls, values: ArrayLike) -> Self:
-        """The inverse of `as_array`."""
+        """Build from a vector: the inverse of `as_array`."""
         return cls(*np.asarray(values, dtype=float).tolist())
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, float]) -> Self:
-        """From a mapping by name; names that are missing keep their defaults."""
+        """Build from a mapping by name; missing names get their defaults."""
         return cls(**{f.name: float(values[f.name]) for f in fields(cls) if f.name in values})  # type: ignore[arg-type]
 
     def with_values(self, **changes: float) -> Self:
-        """A copy with some values changed."""
+        """Return a copy with some values changed."""
         return replace(self, **changes)  # type: ignore[type-var]
 
 
@@ -173,7 +173,7 @@ class ExteriorOrientation(_Parameters):
 
     @classmethod
     def from_rotation(cls, R: ArrayLike, centre: ArrayLike) -> ExteriorOrientation:
-        """From R (3, 3), camera to object, and the projection centre (3,) mm."""
+        """Build from R (3, 3), camera to object, and the projection centre (3,) mm."""
         r = np.asarray(R, dtype=float)
         phi = np.arcsin(np.clip(r[0, 2], -1.0, 1.0))
         omega = np.arctan2(-r[1, 2], r[2, 2])
@@ -189,17 +189,17 @@ class CameraModel:
     interior: InteriorOrientation
 
     def project(self, exterior: ExteriorOrientation, points: ArrayLike) -> Array:
-        """Object points (n, 3) mm → image points (n, 2) px; NaN behind the camera."""
+        """Project object points (n, 3) mm to image points (n, 2) px; NaN behind the camera."""
         return project(self.sensor, self.interior.as_array(), exterior.as_array(), points)
 
     def rays(self, image_points: ArrayLike) -> Array:
-        """Image points (n, 2) px → unit directions (n, 3) in the camera frame."""
+        """Return unit directions (n, 3) in the camera frame of image points (n, 2) px."""
         return rays(self.sensor, self.interior.as_array(), image_points)
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSpec:
-    """A camera: name, sensor, and what is known of its interior orientation beforehand.
+    """A camera's name, sensor and a-priori interior orientation.
 
     principal_distance: mm, nominal, or None; interior: initial values, or None.
     """
@@ -211,7 +211,7 @@ class CameraSpec:
 
     @classmethod
     def read(cls, reader: QuantityReader, name: str = "camera") -> Self:
-        """Read a camera from a mapping of a YAML file; name: where it has none."""
+        """Read a camera from a mapping of a YAML file; name: the default if it has none."""
         sensor = Sensor.read(reader)
         distance = None
         if reader.mapping.get("principal_distance") is not None:
@@ -227,9 +227,9 @@ class CameraSpec:
 
 
 def rotation(angles: ArrayLike) -> Array:
-    """Angles (..., 3) omega, phi, kappa → R (..., 3, 3), camera to object."""
+    """Return R (..., 3, 3), camera to object, of the angles omega, phi, kappa (..., 3)."""
     a = np.asarray(angles, dtype=float)
-    if a.ndim == 1:  # one camera: plain numbers take a quarter of the time
+    if a.ndim == 1:  # for one camera plain numbers take a quarter of the time
         omega, phi, kappa = a.tolist()
         so, sp, sk = math.sin(omega), math.sin(phi), math.sin(kappa)
         co, cp, ck = math.cos(omega), math.cos(phi), math.cos(kappa)
@@ -249,28 +249,29 @@ def rotation(angles: ArrayLike) -> Array:
 
 
 def _turned(R: Array, eop: Array, points: Array) -> Array:
-    """The camera coordinates as (..., 3, n): what follows writes memory in one run."""
+    """Return camera coordinates (..., 3, n), an order in which later steps write contiguously."""
     turned: Array = R.swapaxes(-1, -2) @ (points.swapaxes(-1, -2) - eop[..., 3:6, None])
     return turned
 
 
 def image_to_mm(sensor: Sensor, image_points: ArrayLike) -> Array:
-    """Image points px (y down) → mm (origin at the image centre, y up)."""
+    """Convert image points from px (y down) to mm (origin at the image centre, y up)."""
     return (np.asarray(image_points, dtype=float) - sensor.centre) * (sensor.pixel_pitch * _UPWARDS)
 
 
 def image_to_px(sensor: Sensor, points_mm: ArrayLike) -> Array:
-    """The inverse of `image_to_mm`."""
+    """Convert image points from mm to px: the inverse of `image_to_mm`."""
     return np.asarray(points_mm, dtype=float) / (sensor.pixel_pitch * _UPWARDS) + sensor.centre
 
 
 def distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    """Ideal points (mm, about the principal point) → measured points (mm, about the centre).
+    """Map ideal points (mm, about the principal point) to measured ones (mm, about the centre).
 
-    iop (..., 10), x, y (..., n). Element by element, so that its last bit is the same everywhere.
+    iop (..., 10), x, y (..., n). Element by element, so that results are the same to the last bit
+    on every machine.
     """
     _, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
-    # x' = x·h + B1·r² + ..., y' = y·h + B2·r² + ...: what both have in common, and in place
+    # x' = x·h + B1·r² + ..., y' = y·h + B2·r² + ...: h is common to both; computed in place
     r2, other = x * x, y * y
     r2 += other
     h = r2 * A3
@@ -294,9 +295,9 @@ def distort(iop: Array, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -> Array:
-    """Object points → image points.
+    """Project object points to image points.
 
-    iop (..., 10), eop (..., 6), points (n, 3) or (..., n, 3) mm; returns (..., n, 2) px, NaN for
+    iop (..., 10), eop (..., 6), points (n, 3) or (..., n, 3) mm. Returns (..., n, 2) px, NaN for
     points that are not in front of the camera.
     """
     i = np.asarray(iop, dtype=float)
@@ -316,7 +317,7 @@ def project(sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike) -
 
 
 def distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return ∂(x', y')/∂(x̄, ȳ) as its four elements; arguments as `distort`."""
+    """Return the four elements xx, xy, yx, yy of ∂(x', y')/∂(x̄, ȳ); arguments as in `distort`."""
     _, _, _, A1, A2, A3, B1, B2, C1, C2 = (iop[..., None, j] for j in range(10))
     r2 = x * x + y * y
     radial = r2 * (A1 + r2 * (A2 + r2 * A3))
@@ -331,17 +332,17 @@ def distortion_jacobian(iop: Array, x: Array, y: Array) -> tuple[Array, Array, A
 def partials(
     sensor: Sensor, iop: ArrayLike, eop: ArrayLike, points: ArrayLike
 ) -> tuple[Array, Array, Array]:
-    """Image points and their analytic partial derivatives.
+    """Project object points; return image points and their analytic partial derivatives.
 
-    Arguments as `project`. Returns image points (..., n, 2) px; the derivatives by the 16
-    parameters in the order of `PARAMETER_NAMES` (..., n, 2, 16); by the object point
-    (..., n, 2, 3), px/mm.
+    Arguments as in `project`. Returns image points (..., n, 2) px; the partials with respect to the
+    16 parameters, in the order of `PARAMETER_NAMES` (..., n, 2, 16); and those with respect to the
+    object point (..., n, 2, 3), px/mm.
     """
     i = np.asarray(iop, dtype=float)
     e = np.asarray(eop, dtype=float)
     R = rotation(e[..., :3])
-    # Components stand before points, (..., 3, n), so that every line below writes memory in one
-    # run; the callers see (..., n, 2, 16) through `_points_first`.
+    # Components come before points, (..., 3, n), so that every line below writes contiguous memory;
+    # `_points_first` gives the callers a view (..., n, 2, 16).
     q = _turned(R, e, np.asarray(points, dtype=float))
     depth = -q[..., 2, :]
     if not np.minimum.reduce(depth, axis=None, initial=np.inf) > 0:  # NaN too
@@ -363,7 +364,7 @@ def partials(
     np.multiply(r2, r2, out=r4)
     np.multiply(r2, r4, out=powers[..., 3, :])
 
-    # The image point is linear in x0 to C2: first their partials, then by them the point itself.
+    # The image point is linear in x0 to C2: their partials come first and give the point itself.
     out = np.zeros((2, *batch, 16, n))
     out[0, ..., 1, :] = out[1, ..., 2, :] = 1.0
     twice = 2 * squares
@@ -375,8 +376,8 @@ def partials(
     measured = (i[..., None, 1:] @ out[..., 1:10, :])[..., 0, :]
     measured += by_axis
 
-    # ∂(x', y')/∂(x̄, ȳ) as xx, xy, yy, symmetric but for C1 and C2: slope · (x², xy, y²), and what
-    # is linear in the powers, the radial part and the bend of B1 and B2
+    # ∂(x', y')/∂(x̄, ȳ) as xx, xy, yy, symmetric but for C1 and C2: slope · (x², xy, y²), and a part
+    # linear in the powers, from the radial terms and B1, B2
     linear = np.zeros((*i.shape[:-1], 3, 6))
     linear[..., ::2, 0] = 1.0
     linear[..., ::2, 1:4] = i[..., None, 3:6]
@@ -385,7 +386,7 @@ def partials(
     jacobian *= (i[..., None, 3:6] * _SLOPE) @ powers[..., :3, :]
     jacobian += linear @ powers
 
-    # By the camera coordinates: the same with ∂/∂c as its third component
+    # With respect to the camera coordinates: the same, with ∂/∂c as its third component
     by_ideal = np.empty((2, *batch, 3, n))
     np.add(jacobian[..., :2, :], i[..., 8:10, None], out=by_ideal[0, ..., :2, :])
     by_ideal[1, ..., :2, :] = jacobian[..., 1:, :]
@@ -399,8 +400,8 @@ def partials(
     out[..., 1:10, :] *= scale
     out[..., 0, :] = by_c
 
-    # By the object point D = R · (c / depth · by_ideal); a small turn about the axis w changes q by
-    # q × w, which D sees as w · (D × q).
+    # With respect to the object point: D = R · (c / depth · by_ideal). A small rotation about the
+    # axis w changes q by q × w, and the image point by w · (D × q).
     by_point = R @ (by_ideal * (i[..., 0, None] * inverse_depth)[..., None, :])
     np.negative(by_point, out=out[..., 13:16, :])
     crosswise = uv[..., ::-1, :]
@@ -415,13 +416,13 @@ def partials(
 
 
 def _points_first(array: Array) -> Array:
-    """A view (2, ..., k, n) as (..., n, 2, k)."""
+    """Return a view (..., n, 2, k) of an array (2, ..., k, n)."""
     last = array.ndim - 1
     return array.transpose(*range(1, last - 1), last, 0, last - 1)
 
 
 def turning_axes(eop: Array, R: Array) -> Array:
-    """The axes (..., 3, 3) about which omega, phi, kappa turn the camera, in its frame (rows)."""
+    """Return the axes of rotation of omega, phi, kappa as rows (..., 3, 3) in the camera frame."""
     axes = np.zeros(R.shape)
     axes[..., 0, :] = R[..., 0, :]
     if eop.ndim == 1:  # one camera: as in `rotation`
@@ -434,9 +435,9 @@ def turning_axes(eop: Array, R: Array) -> Array:
 
 
 def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
-    """Image points (..., n, 2) px → unit directions (..., n, 3) in the camera frame.
+    """Return unit directions (..., n, 3) in the camera frame of image points (..., n, 2) px.
 
-    The camera looks along -Z. Newton's method on the distortion; converges to 1e-9 px. Raises
+    The camera looks along -Z. Newton's method on the distortion converges to 1e-9 px. Raises
     GeometryError for points where it does not: beyond the radius at which the distortion
     polynomial folds back.
     """
@@ -461,7 +462,7 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
     jxx, jxy, jyx, jyy = distortion_jacobian(i, x, y)
     finite = np.isfinite(xm) & np.isfinite(ym)
     with np.errstate(invalid="ignore"):
-        # Beyond the fold both eigenvalues may be negative: their product alone does not tell.
+        # Beyond the fold both eigenvalues may be negative, so that their product is not enough.
         folded = (jxx * jyy - jxy * jyx <= 0) | (jxx + jyy <= 0)
         folded |= ~(size <= tolerance) | ~np.isfinite(x)
     failed = finite & folded
@@ -479,4 +480,4 @@ def rays(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
 
 
 RASPBERRY_PI_V2 = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(c=3.04))
-"""What most people point at a test field: nominal values of the Raspberry Pi camera v2.1."""
+"""Nominal values of the Raspberry Pi camera v2.1, the most common one."""

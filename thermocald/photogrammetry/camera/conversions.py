@@ -1,17 +1,16 @@
-"""From our camera model to others' and back: exact where the conventions allow, else the best fit.
+"""Conversion between our camera model and others: exact where the conventions allow, else fitted.
 
-A `Family` is somebody's camera model, our own (`BROWN`) among them. Each gives its approximate
-(often exact) counterpart of our parameters, and back. Where the counterpart reproduces every pixel
-it is the answer; where not, the parameters are fitted over the image area and the result says how
-well: largest and RMS residual in px. Covariances follow by the derivative of the same fit.
+A `Family` is a camera model; ours is `BROWN`. Each converts our parameters to its own and back, at
+least approximately and often exactly. If the converted parameters reproduce every pixel, they are
+the result. Otherwise they are fitted over the image area, and the result gives the largest and the
+RMS residual in px. Covariances follow from the derivative of the same fit.
 
-Directions are (X/Z, Y/Z) in the axes that OpenCV uses: x right, y down, looking along +Z; image
-points px with (0, 0) at the centre of the top-left pixel throughout, families convert at their
-edge.
+Directions are (X/Z, Y/Z) in OpenCV's axes: x right, y down, looking along +Z. Image points are px
+with (0, 0) at the centre of the top-left pixel; families with another origin convert internally.
 
 Families:
 
-- `opencv(count)`: the radial and tangential model of OpenCV, ROS, COLMAP, mrcal, Kalibr, with as
+- `opencv(count)`: the radial and tangential model of OpenCV, ROS, COLMAP, mrcal and Kalibr, with as
   many of k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 as a format has;
 - `METASHAPE`: Agisoft's frame camera, affinity and skew applied after the distortion;
 - `measured_point(r0)`: our ten terms, the radial ones balanced by r0 mm, evaluated at the measured
@@ -50,8 +49,9 @@ _NO_POSE = np.zeros(6)
 class Family:
     """A camera model with parameters in a fixed order.
 
-    name: for messages; project: directions (n, 2) → image points (n, 2) px; from_brown: its
-    parameters for our ten, exact or near; to_brown: ours for its own.
+    name: for messages; project: function of directions (n, 2) that returns image points (n, 2) px;
+    from_brown: converts our ten parameters to the family's, exactly or approximately; to_brown:
+    converts back.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Family:
 
 
 def image_grid(sensor: Sensor, shape: tuple[int, int] = _GRID) -> Array:
-    """Image points (n, 2) px that cover the whole image, its edges included."""
+    """Return image points (n, 2) px that cover the whole image, its edges included."""
     x = np.linspace(-0.5, sensor.width - 0.5, shape[0])
     y = np.linspace(-0.5, sensor.height - 0.5, shape[1])
     u, v = np.meshgrid(x, y)
@@ -79,9 +79,9 @@ def convert(
     """Convert a camera (values and covariance in the source's order) to another family.
 
     Returns values and covariance in the target's order, whether they are exact, and the largest and
-    RMS residual over the image, px. Small changes of the source's parameters move pixels, and the
-    target's follow by least squares: so the covariance is carried over. Raises GeometryError where
-    the source's distortion folds back inside the image.
+    RMS residual over the image, px. The covariance is propagated through the least-squares fit of
+    the target's parameters to the pixels that the source's move. Raises GeometryError if the
+    source's distortion folds back inside the image.
     """
     if source is target:
         return values, covariance, True, 0.0, 0.0
@@ -91,29 +91,29 @@ def convert(
         _directions(sensor, source, values, own, pixels) for pixels in (grid, check)
     )
 
-    def seen(v: Array, d: Array) -> Array:
+    def project_target(v: Array, d: Array) -> Array:
         return target.project(sensor, v, d)
 
     result = target.from_brown(sensor, own)
-    residual = seen(result, checked) - check
+    residual = project_target(result, checked) - check
     exact = bool(np.all(np.isfinite(residual)) and np.abs(residual).max() < EXACT_PX)
     if not exact:
-        result = _fit(seen, result, grid, directions)
-        residual = seen(result, checked) - check
-    carried = None
+        result = _fit(project_target, result, grid, directions)
+        residual = project_target(result, checked) - check
+    propagated = None
     if covariance is not None:
-        G = _derivative(seen, result, directions)
+        G = _derivative(project_target, result, directions)
         F = _derivative(lambda v, d: source.project(sensor, v, d), values, directions)
         J = _least_squares(G, F)
-        carried = J @ covariance @ J.T
+        propagated = J @ covariance @ J.T
     size = np.linalg.norm(residual, axis=1)
-    return result, carried, exact, float(size.max()), float(np.sqrt(np.mean(size**2)))
+    return result, propagated, exact, float(size.max()), float(np.sqrt(np.mean(size**2)))
 
 
 def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixels: Array) -> Array:
-    """Image points → directions of a family, by Newton's method from those of a pinhole camera.
+    """Return a family's directions of image points, by Newton's method from a pinhole camera.
 
-    own (10,): the parameters of our model that are near.
+    own (10,): the nearby parameters of our model.
     """
     if family is BROWN:
         r = camera_rays(sensor, values, pixels)
@@ -135,7 +135,7 @@ def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixel
             d = d + np.linalg.solve(J, r[..., None])[..., 0]
         except np.linalg.LinAlgError:
             break
-    # the differences that the derivative is taken from limit what can be reached
+    # the numerical derivative limits the accuracy
     if worst < EXACT_PX:
         return d
     raise GeometryError(
@@ -147,7 +147,7 @@ def _directions(sensor: Sensor, family: Family, values: Array, own: Array, pixel
 def _fit(
     target: Callable[[Array, Array], Array], start: Array, pixels: Array, directions: Array
 ) -> Array:
-    """Least squares over the image area, Gauss-Newton with step halving."""
+    """Fit a family's parameters over the image area by Gauss-Newton with step halving."""
 
     def cost_of(values: Array) -> float:
         r = pixels - target(values, directions)
@@ -173,7 +173,7 @@ def _fit(
 
 
 def _least_squares(G: Array, rhs: Array) -> Array:
-    """The solution (u, k) of G (n, u) for rhs (n, k), 0 for parameters that G does not hold."""
+    """Solve G (n, u) for rhs (n, k); return (u, k), 0 for parameters whose column of G is 0."""
     scales = np.linalg.norm(G, axis=0)
     used = scales > 0
     found = np.zeros((G.shape[1], rhs.shape[1]))
@@ -185,10 +185,10 @@ def _least_squares(G: Array, rhs: Array) -> Array:
 def _derivative(
     function: Callable[[Array, Array], Array], values: Array, directions: Array
 ) -> Array:
-    """∂(image points)/∂(parameters), (2n, u), central differences.
+    """Return ∂(image points)/∂(parameters), (2n, u), by central differences.
 
-    All families are polynomial or rational in their parameters; the step is one that moves the
-    image by about a hundredth of a pixel.
+    All families are polynomial or rational in their parameters; a step moves the image by about a
+    hundredth of a pixel.
     """
     G = np.zeros((2 * len(directions), len(values)))
     base = function(values, directions)
@@ -213,19 +213,19 @@ def _derivative(
 
 
 def opencv_terms(sensor: Sensor, values: Array, covariance: Array) -> dict[str, float]:
-    """Return OpenCV's terms with sds, and the size of the image, by the closed form; quickly.
+    """Return OpenCV's parameters with sds, and the image size, quickly by the closed form.
 
-    values (10,), covariance (10, 10). Exact without an affinity and a shear, as `exact` says.
+    values (10,), covariance (10, 10). `exact` is 1 without affinity and shear, else 0.
     """
     family, step = opencv(5), 1e-30
     terms = family.from_brown(sensor, values).tolist()
-    # the derivative by a step into the complex plane: to the last digit
-    aside = family.from_brown(sensor, values[:, None] + 1j * step * np.eye(10))
-    J = np.imag(aside) / step
+    # complex-step derivative, exact to the last digit
+    stepped = family.from_brown(sensor, values[:, None] + 1j * step * np.eye(10))
+    J = np.imag(stepped) / step
     found: dict[str, float] = {"width": sensor.width, "height": sensor.height}
     for name, value, variance in zip(
         family.parameters, terms, np.diag(J @ covariance @ J.T).tolist(), strict=True
-    ):  # of a weak epoch, rounding may have left no variance
+    ):  # in a weak epoch rounding may make a variance negative
         found |= {name: value, f"sd_{name}": math.sqrt(variance) if variance >= 0 else math.nan}
     return {**found, "exact": float(values[8] == 0 and values[9] == 0)}
 
@@ -238,7 +238,7 @@ def _project_brown(sensor: Sensor, iop: Array, directions: Array) -> Array:
 BROWN = Family(
     "Brown model", IOP_NAMES, _project_brown, lambda _, values: values, lambda _, values: values
 )
-"""Our own."""
+"""Our own model."""
 
 
 _OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6",
@@ -267,7 +267,7 @@ def _project_opencv(_: Sensor, values: Array, directions: Array) -> Array:
 
 
 def _opencv_of_brown(sensor: Sensor, iop: Array) -> Array:
-    """CONVENTIONS §2."""
+    """Convert our parameters to OpenCV's (CONVENTIONS §2), exactly but for C2."""
     c, x0, y0, A1, A2, A3, B1, B2, C1, _ = iop
     p, (cx, cy), none = sensor.pixel_pitch, sensor.centre, [0 * c] * 7
     return np.array(
@@ -279,7 +279,7 @@ def _opencv_of_brown(sensor: Sensor, iop: Array) -> Array:
 
 
 def _brown_of_opencv(sensor: Sensor, values: Array) -> Array:
-    """The inverse; a rational denominator enters to first order, thin prisms not at all."""
+    """Convert OpenCV's parameters to ours: a rational denominator to first order, no thin prism."""
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, *_ = np.pad(values, (0, 16 - len(values)))
     p, c, centre = sensor.pixel_pitch, fy * sensor.pixel_pitch, sensor.centre
     A3 = 0.0 if k4 or k5 or k6 else k3 / c**6
@@ -293,7 +293,7 @@ def _brown_of_opencv(sensor: Sensor, values: Array) -> Array:
 
 
 def _project_metashape(sensor: Sensor, values: Array, directions: Array) -> Array:
-    """By its manual u = w/2 + cx + x'f + x'b1 + y'b2, with pixel centres at 0.5."""
+    """Project as in its manual: u = w/2 + cx + x'f + x'b1 + y'b2, with pixel centres at 0.5."""
     f, cx, cy, b1, b2, k1, k2, k3, k4, p1, p2 = values
     x, y = directions[:, 0], directions[:, 1]
     r2 = x * x + y * y
@@ -305,7 +305,7 @@ def _project_metashape(sensor: Sensor, values: Array, directions: Array) -> Arra
 
 
 def _metashape_of_brown(sensor: Sensor, iop: Array) -> Array:
-    """Exact without affinity and shear, or without distortion."""
+    """Convert our parameters to Metashape's; exact without affinity and shear, or distortion."""
     c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = iop
     p = sensor.pixel_pitch
     return np.array(
@@ -317,7 +317,7 @@ def _metashape_of_brown(sensor: Sensor, iop: Array) -> Array:
 
 
 def _brown_of_metashape(sensor: Sensor, values: Array) -> Array:
-    """The inverse; k4 has no counterpart."""
+    """Convert Metashape's parameters to ours; k4 has no counterpart."""
     f, cx, cy, b1, b2, k1, k2, k3, _, p1, p2 = values
     p, c = sensor.pixel_pitch, f * sensor.pixel_pitch
     return np.array(
@@ -333,7 +333,7 @@ METASHAPE = Family(
 
 
 def measured_point(r0: float) -> Family:
-    """Return our ten terms at the measured point, the radial ones balanced by r0 mm."""
+    """Return our ten terms evaluated at the measured point, the radial ones balanced by r0 mm."""
     name = f"photogrammetric model at the measured point, r0 {r0:g} mm"
 
     def project_them(sensor: Sensor, values: Array, directions: Array) -> Array:
@@ -341,7 +341,7 @@ def measured_point(r0: float) -> Family:
         ideal_x, ideal_y = c * directions[:, 0], -c * directions[:, 1]
         x, y = ideal_x, ideal_y
         for _ in range(200):
-            with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+            with np.errstate(over="ignore", invalid="ignore"):  # tested below
                 dx, dy = _balanced_correction(values, r0, x, y)
                 new_x, new_y = ideal_x + (dx + C1 * x + C2 * y), ideal_y + dy
                 change = float(np.max(np.hypot(new_x - x, new_y - y)))
@@ -353,7 +353,7 @@ def measured_point(r0: float) -> Family:
         return np.column_stack([x0 + x, -(y0 + y)]) / sensor.pixel_pitch + sensor.centre
 
     def of_brown(_: Sensor, iop: Array) -> Array:
-        """Radial and decentering terms as they are, r0's part taken up by c; affinity exact."""
+        """Keep the distortion terms, the constant part of r0 in c; convert affinity exactly."""
         values = _balanced(iop, r0)
         values[8:] /= 1 + values[8]  # x̄ = (x' - x0 - C2 ȳ) / (1 + C1)
         return values
@@ -367,8 +367,8 @@ def measured_point(r0: float) -> Family:
 
 
 def aicon(r0: float) -> Family:
-    """Return the terms at the ideal point, balanced by r0 mm, affinity applied after the
-    distortion: exact without affinity and shear.
+    """Return our terms at the ideal point, the radial ones balanced by r0 mm, with affinity and
+    shear applied after the distortion: exact without affinity and shear.
     """
 
     def project_them(sensor: Sensor, values: Array, directions: Array) -> Array:
@@ -389,7 +389,7 @@ def aicon(r0: float) -> Family:
 
 
 def _balanced_correction(values: Array, r0: float, x: Array, y: Array) -> tuple[Array, Array]:
-    """Radial and decentring Δx, Δy mm at points (mm, about the principal point)."""
+    """Return radial and decentring Δx, Δy mm at points (mm, about the principal point)."""
     A1, A2, A3, B1, B2 = values[3:8]
     r2, q = x * x + y * y, r0**2
     radial = A1 * (r2 - q) + A2 * (r2**2 - q**2) + A3 * (r2**3 - q**3)
@@ -400,21 +400,21 @@ def _balanced_correction(values: Array, r0: float, x: Array, y: Array) -> tuple[
 
 
 def _unbalanced(values: Array, r0: float) -> Array:
-    """The terms without balance that give the same image at the ideal point, exactly.
+    """Return unbalanced terms that give exactly the same image at the ideal point.
 
     With s = A1 r0² + A2 r0⁴ + A3 r0⁶ the balanced model is the unbalanced one of a camera of
-    principal distance (1-s)c: x̄ becomes (1-s)x̄, and each term is rescaled for it.
+    principal distance (1-s)c: x̄ becomes (1-s)x̄, and each term is rescaled accordingly.
     """
     A1, A2, A3 = values[3:6]
     return _stretched(values, 1 - (A1 * r0**2 + A2 * r0**4 + A3 * r0**6))
 
 
 def _balanced(values: Array, r0: float) -> Array:
-    """The inverse: the stretch depends on the rescaled terms, one real number near 1."""
+    """Return balanced terms: the inverse of `_unbalanced`, by iteration on the stretch, near 1."""
     t = 1.0
     for _ in range(100):
         A1, A2, A3 = _stretched(values, t)[3:6]
-        # unbalancing stretches by 1 - s, so balancing does by its inverse
+        # unbalancing stretches by 1 - s, balancing by its inverse
         last, t = t, 1 / (1 - (A1 * r0**2 + A2 * r0**4 + A3 * r0**6))
         if abs(t - last) < 1e-16:
             break
@@ -422,8 +422,8 @@ def _balanced(values: Array, r0: float) -> Array:
 
 
 def _stretched(values: Array, t: float) -> Array:
-    """Terms of the camera whose ideal points are `t` times as far out and whose image is the same
-    but for the constant radial part t - 1.
+    """Return the terms of a camera whose ideal points are `t` times as far from the principal point
+    and whose image is the same but for the constant radial part t - 1.
     """
     c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = values
     return np.array(

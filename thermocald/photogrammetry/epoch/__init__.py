@@ -1,1 +1,1 @@
-"""One epoch, or several photographs: least-squares adjustment and its diagnosis."""
+"""Least-squares adjustment of one epoch and its diagnosis; measuring with a known camera."""

@@ -1,12 +1,12 @@
 """Least-squares adjustment of one epoch (Gauss-Markov), with data snooping and diagnosis.
 
-From start values, or from nothing. The observations are image points with their a-priori
-covariance; object coordinates are observations too: eliminated point by point, their covariance
-adds B Σ Bᵀ to that of the image point, which is the same solution. Gross errors are found by
-Baarda's data snooping on the two coordinates of a point together.
+With or without start values. The observations are image points with their a-priori covariance, and
+object coordinates: these are eliminated point by point, so that B Σ Bᵀ is added to the covariance
+of the image point, which gives the same solution. Gross errors are found by Baarda's data snooping
+on the two coordinates of a point together.
 
-The covariance holds the noise of the image points and, per epoch, that of the object coordinates.
-It does not hold errors of the camera model.
+The covariance includes the noise of the image points and, epoch by epoch, of the object
+coordinates. It does not include errors of the camera model.
 
 Source: Luhmann et al. (2014), section 2.4; Baarda, W. (1968): A testing procedure for use in
 geodetic networks; the elimination as Mikhail and Ackermann (1976), chapter 11.
@@ -55,9 +55,7 @@ from thermocald.photogrammetry.orientation import approximate_orientation, resec
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ROUNDS = 12  # of data snooping; each may reject several targets
@@ -65,11 +63,11 @@ _ROUNDS = 12  # of data snooping; each may reject several targets
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentSettings:
-    """What is estimated and what is tested.
+    """Settings of an adjustment: what is estimated and tested.
 
-    free: names of IOP to estimate, the others keep their start values; priors: {name: (value, sd)}
-    in the parameter's unit; snooping_alpha: error probability of a single test, 0 switches it off;
-    max_rejected: share of the targets beyond which the epoch fails.
+    free: names of the IOP to estimate, the others keep their start values; priors: {name: (value,
+    sd)} in the parameter's unit; snooping_alpha: error probability of a single test, 0 for no
+    snooping; max_rejected: share of rejected targets beyond which the epoch fails.
     """
 
     free: tuple[str, ...] = DEFAULT_FREE
@@ -86,23 +84,17 @@ class AdjustmentSettings:
                 )
 
     @property
-    def unknowns(self) -> NDArray[np.int64]:
+    def unknowns(self) -> Index:
         """Positions of the unknowns in `PARAMETER_NAMES`."""
         return _positions(self.free)
 
 
 @lru_cache(maxsize=64)
-def _positions(free: tuple[str, ...]) -> NDArray[np.int64]:
+def _positions(free: tuple[str, ...]) -> Index:
     names = {*free, *EOP_NAMES}
     rows = np.array([i for i, n in enumerate(PARAMETER_NAMES) if n in names], dtype=np.int64)
     rows.flags.writeable = False
     return rows
-
-
-@lru_cache(maxsize=64)
-def _estimated(free: tuple[str, ...]) -> tuple[str, ...]:
-    """The IOP among these names, in their order."""
-    return tuple(n for n in IOP_NAMES if n in free)
 
 
 _USUAL = AdjustmentSettings()
@@ -110,11 +102,11 @@ _USUAL = AdjustmentSettings()
 
 @dataclass(frozen=True, eq=False)
 class Adjustment:
-    """The result of one least-squares solution.
+    """The result of one adjustment.
 
-    status: `ok`, or one word for why there is no result, and `reason` in a sentence. covariance
-    (16, 16) in the order of `PARAMETER_NAMES`, zero for what was held; residuals (n, 2) px,
-    measured minus adjusted, of all targets in `targets`; rejected: rows of the test field.
+    status: `ok`, or one word for why there is no result; reason: the same in a sentence; covariance
+    (16, 16): in the order of `PARAMETER_NAMES`, zero for held parameters; targets (n,): rows of the
+    test field, as in `rejected`; residuals (n, 2) px: measured minus adjusted, of all targets.
     """
 
     status: str
@@ -125,30 +117,30 @@ class Adjustment:
     free: tuple[str, ...]
     sigma0: float
     redundancy: int
-    targets: NDArray[np.int64]
+    targets: Index
     residuals: Array
     rejected: tuple[int, ...]
 
     @property
     def ok(self) -> bool:
-        """Whether there is a result that may be used."""
+        """Whether there is a usable result."""
         return self.status == "ok"
 
     @property
     def n_observations(self) -> int:
-        """Targets offered, the rejected included."""
+        """Number of measured targets, the rejected ones included."""
         return len(self.targets)
 
     @property
     def values(self) -> Array:
-        """The 16 parameters; NaN where there is none."""
+        """The 16 parameters; NaN without a result."""
         if self.interior is None or self.exterior is None:
             return np.full(16, np.nan)
         return np.concatenate([self.interior.as_array(), self.exterior.as_array()])
 
     @property
     def sd(self) -> Array:
-        """Standard deviations (16,), NaN where a parameter was held."""
+        """Standard deviations (16,); NaN for held parameters."""
         variance = np.diag(self.covariance)
         return np.sqrt(np.where(variance > 0, variance, np.nan))
 
@@ -156,7 +148,7 @@ class Adjustment:
 def failed(
     status: str, reason: str, observations: Observations | None = None, free: tuple[str, ...] = ()
 ) -> Adjustment:
-    """An epoch without a result."""
+    """Return the result of an epoch that has none, with its status and reason."""
     targets = np.empty(0, dtype=np.int64) if observations is None else observations.targets
     n = len(targets)
     return Adjustment(
@@ -177,14 +169,15 @@ def adjust(
 ) -> Adjustment:
     """Adjust one epoch from start values.
 
-    suspects: mask (n,) of observations to leave out at first; they come back where they fit; known:
-    covariance (10, 10) of `interior`, which then is observed as a whole, its priors are not used.
-    Never raises for data: an epoch without a result has a status and a reason.
+    suspects: mask (n,) of observations to leave out at first, which are taken back if they fit;
+    known: covariance (10, 10) of `interior`, which then is an observation in place of the priors.
+    Never raises because of the data: an epoch without a result has a status and a reason.
     """
     s = settings or _USUAL
     unknowns = s.unknowns
     n = len(observations)
-    priors = len(s.priors) if known is None else len(s.free)
+    # priors of held parameters are no observations
+    priors = len(s.priors.keys() & {*s.free, *EOP_NAMES}) if known is None else len(s.free)
     if 2 * n + priors - len(unknowns) < s.bounds.minimum_redundancy:
         return failed(
             "too_few_targets",
@@ -195,12 +188,12 @@ def adjust(
             s.free,
         )
     start = np.concatenate([interior.as_array(), exterior.as_array()])
-    of_camera = None
+    camera = None
     if known is not None:
         whole = np.zeros((16, 16))
         whole[IOP, IOP] = known
-        of_camera = start, whole
-    problem = Problem.build(sensor, testfield, observations, unknowns, s.priors, of_camera)
+        camera = start, whole
+    problem = Problem.build(sensor, testfield, observations, unknowns, s.priors, camera)
     use = np.ones(n, dtype=bool) if suspects is None else ~suspects
     most = most_rejected(s.max_rejected, 2 * n - len(unknowns))
     try:
@@ -241,13 +234,11 @@ def _result(
         v, points, observed = v[:, use], points[use], observed[use]
         rejected = tuple(problem.observations.targets[~use].tolist())
     sigma0 = sqrt(problem.cost(v, solution.values) / redundancy) if redundancy else 0.0
-    factor = sigma0**2
-    if redundancy < TRUSTED_REDUNDANCY:
-        factor = max(1.0, factor)  # a handful of residuals may be small by luck
+    few = redundancy < TRUSTED_REDUNDANCY
     root = np.zeros((16, len(u)))
     root[u] = solution.root
     covariance = root @ root.T
-    covariance *= factor
+    covariance *= max(1.0, sigma0**2) if few else sigma0**2  # few may be small by chance
     values = solution.values.tolist()
     result = Adjustment(
         "ok",
@@ -255,20 +246,18 @@ def _result(
         InteriorOrientation(*values[IOP]),
         ExteriorOrientation(*values[EOP]),
         covariance,
-        _estimated(s.free),
+        tuple(name for name in IOP_NAMES if name in s.free),
         sigma0,
         redundancy,
         problem.observations.targets,
         solution.residuals.T,
         rejected,
     )
-    few = redundancy < TRUSTED_REDUNDANCY
-    gross = n < len(use)
-    if few and s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy, gross):
+    if few and s.snooping_alpha > 0 and fails_global_test(sigma0**2, redundancy, n < len(use)):
         why = (
-            f"the residuals are {sigma0:.1f} times as large as their sigmas say, and a redundancy "
-            f"of {redundancy} does not show which target is wrong, or whether the noise is larger "
-            "than stated: show more targets, or state larger sigmas"
+            f"the residuals are {sigma0:.1f} times their stated sigmas, and a redundancy of "
+            f"{redundancy} does not show whether a target is wrong or the noise larger than "
+            "stated: show more targets, or state larger sigmas"
         )
         return replace(result, status="global_test", reason=why)
     reasons = weaknesses(
@@ -280,13 +269,13 @@ def _result(
 
 
 NO_BOUNDS = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
-_FEWEST_FOR_POSE = 8  # two markers: one alone has two poses, and few redundant observations
-_AMBIGUITY = 2.0  # a second pose must fit this much worse to be excluded
-_GROSS = 6.0  # times the median residual: left out at first, may come back
+_FEWEST_FOR_POSE = 8  # two markers: one alone has two poses and little redundancy
+_AMBIGUITY = 2.0  # a second pose is excluded if its residuals are this many times as large
+_GROSS = 6.0  # times the median residual; a target beyond it is left out at first
 
 
 def with_few_free(s: AdjustmentSettings) -> AdjustmentSettings:
-    """Free what a start needs, c and A1 (of what is free at all), however badly it is known."""
+    """Return settings for a start: only c and A1, as far as they are free, without any bounds."""
     few = tuple(name for name in ("c", "A1") if name in s.free)
     return replace(s, free=few, bounds=NO_BOUNDS, priors={})
 
@@ -299,11 +288,11 @@ def cold_start(
     nominal_c: float | None = None,
     interior: InteriorOrientation | None = None,
 ) -> Adjustment:
-    """Adjust an epoch of which nothing is known.
+    """Adjust an epoch without start values.
 
-    nominal_c mm, from the data sheet, or None; interior: an earlier calibration to start from.
-    The principal distance and A1 are freed first, as the higher terms follow any gross error.
-    Never raises for data: the result has a status and a reason.
+    nominal_c mm: from the data sheet, or None; interior: an earlier calibration to start from.
+    The principal distance and A1 are estimated first, as the higher terms follow any gross error.
+    Never raises because of the data: an epoch without a result has a status and a reason.
     """
     s = settings or AdjustmentSettings()
     if len(observations) == 0:
@@ -330,7 +319,7 @@ def cold_start(
     result = adjust(sensor, testfield, observations, start_interior, start_exterior, s, suspects)
     if s.snooping_alpha > 0 or not suspects.any() or result.interior is None:
         return result
-    # who switches the test off wants all targets: the suspects were left out for the start only
+    # without snooping all targets are used: the suspects were left out of the start only
     assert result.exterior is not None
     return adjust(sensor, testfield, observations, result.interior, result.exterior, s)
 
@@ -342,9 +331,9 @@ def pose_only(
     interior: InteriorOrientation,
     settings: AdjustmentSettings | None = None,
 ) -> Adjustment:
-    """The exterior orientation alone, with the interior orientation held.
+    """Estimate the exterior orientation alone, with the interior orientation held.
 
-    A pose needs targets that exclude its mirror image: a single plane seen from far away has two.
+    The targets must exclude the mirrored pose, which a single plane seen from far away has.
     """
     s = replace(settings or AdjustmentSettings(), free=(), priors={})
     n = len(observations)

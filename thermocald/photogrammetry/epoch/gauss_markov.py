@@ -1,9 +1,9 @@
 """Gauss-Markov least squares on the image points of one epoch: iteration and cofactors.
 
-The working half of `adjustment`: arrays only, no judgement. The object coordinates' covariance is
-added to the image point's, which eliminates them; after a multiplication by the inverse Cholesky
-factors all observations have unit weight. An epoch has so few points that calls cost more than
-arithmetic: what does not change is computed once, and in place where that is safe.
+The numerical half of `adjustment`, which works on arrays and decides nothing. Adding the object
+coordinates' covariance to the image point's eliminates these coordinates; multiplication by the
+inverse Cholesky factors then gives all observations unit weight. An epoch has so few points that
+calls cost more than arithmetic: constants are computed once, and in place where that is safe.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ from thermocald.photogrammetry.camera.camera_model import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
 def point_covariances(
     observations: Observations, B: Array | None, target_variances: Array | None
 ) -> Array:
-    """Covariance (n, 3) px² of each image point, xx, yy, xy, its object coordinates' included."""
+    """Return each image point's covariance (n, 3) px²: xx, yy, xy, with its object coordinates'.
+
+    B (n, 2, 3) px/mm: partials with respect to the object point; target_variances (n, 3) mm².
+    """
     out = np.zeros((3, len(observations)))
     np.square(observations.sigmas.T, out=out[:2])
     if observations.covariances is not None:
@@ -53,7 +54,7 @@ class Whitening:
     """Multiplication by the inverse Cholesky factors of the points' covariances.
 
     factor (2, n) px⁻¹: one over the diagonal of the Cholesky factors; slope (n,): regression of y
-    on x, None where no x and y are correlated.
+    on x, None if x and y are uncorrelated in all points.
     """
 
     factor: Array
@@ -61,7 +62,7 @@ class Whitening:
 
     @classmethod
     def build(cls, covariance: Array) -> Whitening:
-        """From the covariances (n, 3) px² of the points: xx, yy, xy."""
+        """Build the whitening of points with covariances (n, 3) px²: xx, yy, xy."""
         xy = covariance[:, 2]
         variances, slope = covariance.T[:2], None
         if xy.any():
@@ -71,7 +72,7 @@ class Whitening:
         return cls(1.0 / np.sqrt(variances), slope)
 
     def whiten(self, pairs: Array) -> Array:
-        """Pairs (..., 2, n), in place."""
+        """Whiten x and y (..., 2, n) in place."""
         if self.slope is not None:
             pairs[..., 1, :] -= self.slope * pairs[..., 0, :]
         pairs *= self.factor
@@ -79,14 +80,14 @@ class Whitening:
 
 
 _ITERATIONS = 30
-_SMALL = 0.3  # standard deviations: a last step that leaves less than 1e-3 px in c, x0, y0
+_SMALL = 0.3  # standard deviations; after a last step below it, c, x0, y0 are good to 1e-3 px
 _LINEAR = 10.0  # standard deviations that a solution may move without new partials
 _SINGULAR = 1e-8  # of a correlation matrix's eigenvalues
 _NO_PRIORS = np.empty(0)
 
 
 class NoConvergenceError(Exception):
-    """The iteration did not come to an end."""
+    """The iteration did not converge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +96,14 @@ class Problem:
 
     points (n, 3) mm; observations in the same order; target_variances (n, 3) mm² or None;
     unknowns (u,): positions in `PARAMETER_NAMES`; prior_weight (u, u), prior_value (u,): parameters
-    observed beforehand, weight 0 where there is none; empty where there are no priors at all.
+    observed beforehand, with weight 0 for the others; both empty if there are no priors.
     """
 
     sensor: Sensor
     points: Array
     observations: Observations
     target_variances: Array | None
-    unknowns: NDArray[np.int64]
+    unknowns: Index
     prior_weight: Array
     prior_value: Array
 
@@ -112,13 +113,14 @@ class Problem:
         sensor: Sensor,
         field: TestField,
         observations: Observations,
-        unknowns: NDArray[np.int64],
+        unknowns: Index,
         priors: Mapping[str, tuple[float, float]],
         known: tuple[Array, Array] | None = None,
     ) -> Problem:
-        """Collect what the iteration needs.
+        """Collect the inputs of the iteration.
 
-        known: values (16,) and covariance (16, 16) of a camera whose free parameters are known.
+        priors: {name: (value, sd)}; known: values (16,) and covariance (16, 16) of a camera whose
+        free parameters were observed beforehand, in place of the priors.
         """
         weight = value = _NO_PRIORS
         if priors:
@@ -144,14 +146,14 @@ class Problem:
         )
 
     def sums(self, whitened: Array, use: Mask, values: Array) -> tuple[Array, Array, float]:
-        """Normal matrix (u, u), gradient (u,) and sum of squares of the points that take part.
+        """Return the normal matrix (u, u), gradient (u,) and sum of squares of the points in use.
 
-        whitened (u + 1, 2, n): the partials and the residuals.
+        whitened (u + 1, 2, n): partials and, last, residuals.
         """
         part = whitened if np.count_nonzero(use) == len(use) else whitened.compress(use, axis=-1)
         flat = part.reshape(len(part), -1)
         residuals = flat[-1]
-        # Not flat @ flat.T: NumPy takes its symmetric product, three times as slow at this size.
+        # flat @ flat.T would be NumPy's symmetric product, three times as slow at this size.
         products = flat[:-1] @ flat.T
         N, gradient = products[:, :-1], products[:, -1]
         if len(self.prior_weight):
@@ -160,7 +162,10 @@ class Problem:
         return N, gradient, float(residuals @ residuals)
 
     def cost(self, v: Array, values: Array) -> float:
-        """Weighted sum of squared residuals, the priors' included."""
+        """Return the weighted sum of squared residuals, the priors' included.
+
+        v: whitened residuals of the points in use; values (16,).
+        """
         flat = v.ravel()
         square = float(flat @ flat)
         if len(self.prior_weight):
@@ -170,9 +175,9 @@ class Problem:
 
 
 def _weight_of(covariance: Array) -> Array:
-    """Weight (u, u) of parameters of which some are known, and perhaps only together.
+    """Invert a covariance (u, u) to a weight, 0 for parameters without a variance.
 
-    Directions in which a covariance is next to nothing are held to 1e-4 of the parameters' sds.
+    A combination of parameters with almost no variance gets an sd of 1e-4 of the parameters' sds.
     """
     weight = np.zeros(covariance.shape)
     some = np.flatnonzero(covariance.diagonal() > 0)
@@ -185,8 +190,10 @@ def _weight_of(covariance: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """values (16,); whitened (u + 1, 2, n): partials and, last, residuals of all points, those that
-    take no part too; root (u, u): cofactors = root · rootᵀ.
+    """A solution of a `Problem`.
+
+    values (16,); whitened (u + 1, 2, n): partials and, last, residuals of all points, also of
+    those not in use; root (u, u): cofactors = root · rootᵀ.
     """
 
     values: Array
@@ -203,21 +210,22 @@ class Solution:
         return coloured
 
 
-def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -> Array:
-    """A root (u, u) of the inverse of a normal matrix: N⁻¹ = root · rootᵀ.
+def cofactor_root(N: Array, unknowns: Index, damping: float = 0.0) -> Array:
+    """Return a root (u, u) of the inverse of a normal matrix: N⁻¹ = root · rootᵀ.
 
-    By Cholesky of N scaled to a unit diagonal, as the parameters differ by ten orders. Raises
-    GeometryError naming the parameters that the observations cannot tell apart.
+    N is scaled to a unit diagonal before its Cholesky factorisation, as the parameters differ by
+    ten orders of magnitude. damping: added to the unit diagonal. Raises GeometryError naming the
+    parameters that the observations cannot separate.
     """
     diagonal = N.diagonal()
     if not np.minimum.reduce(diagonal, initial=np.inf) > 0:
         names = [PARAMETER_NAMES[unknowns[i]] for i in np.flatnonzero(~(diagonal > 0))]
-        raise GeometryError(f"the observations do not see {', '.join(names)} at all")
+        raise GeometryError(f"the observations do not depend on {', '.join(names)} at all")
     scale = 1.0 / np.sqrt(diagonal)
     scaled = N * scale * scale[:, None]
     if damping:
         scaled.flat[:: len(scale) + 1] += damping
-    # NumPy's factorisation, as importing SciPy's would cost the daemon 20 MB.
+    # NumPy's factorisation, as importing SciPy would cost the daemon 20 MB.
     try:
         factor = np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError:
@@ -228,18 +236,18 @@ def cofactor_root(N: Array, unknowns: NDArray[np.int64], damping: float = 0.0) -
         together = ", ".join(PARAMETER_NAMES[unknowns[i]] for i in worst)
         raise GeometryError(
             f"the normal matrix is singular (smallest eigenvalue {eigenvalues[0]:.1e}): these "
-            f"targets cannot tell {together} apart"
+            f"targets cannot separate {together}"
         )
     root: Array = scale[:, None] * np.linalg.inv(factor).T
     return root
 
 
 def solve(problem: Problem, start: Array, use: Mask) -> Solution:
-    """Gauss-Newton, with shorter or damped steps only where a whole one does not improve.
+    """Solve by Gauss-Newton, with shorter or damped steps only where a whole one fails.
 
-    start (16,); use (n,) the observations that take part. A warm epoch needs two sets of partials:
-    its last step, by fresh ones, is too small to be looked at. Raises NoConvergenceError,
-    GeometryError.
+    start (16,); use (n,): mask of the observations in use. From good start values two sets of
+    partials suffice: the last step, by fresh ones, is too small for a test. Raises
+    NoConvergenceError, GeometryError.
     """
     u, sensor = problem.unknowns, problem.sensor
     observed = problem.observations.points.T
@@ -258,14 +266,14 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
         N, gradient, squares = problem.sums(whitened, use, values)
         if not isfinite(squares):
             raise NoConvergenceError("targets came to lie behind the camera during the iteration")
-        # After a step from nearby this is the last iteration, most likely, and needs the cofactors.
+        # Close to the solution this is most likely the last iteration, which needs the cofactors.
         root = cofactor_root(N, u) if near else None
         whole, size = _whole_step(N, gradient, u, root)
         if size < _SMALL:
             solution = Solution(
                 values, whitened, whitening, cofactor_root(N, u) if root is None else root
             )
-            return _moved(solution, u, whole)
+            return _apply_step(solution, u, whole)
         near, last = size < _LINEAR and size < 0.5 * last, size
         if near:
             values = values.copy()
@@ -285,13 +293,11 @@ def solve(problem: Problem, start: Array, use: Mask) -> Solution:
     raise NoConvergenceError(f"the adjustment did not converge in {_ITERATIONS} iterations")
 
 
-def _whole_step(
-    N: Array, gradient: Array, u: NDArray[np.int64], root: Array | None
-) -> tuple[Array, float]:
-    """The step (u,) of a normal matrix, and its size in standard deviations.
+def _whole_step(N: Array, gradient: Array, u: Index, root: Array | None) -> tuple[Array, float]:
+    """Return the Gauss-Newton step (u,) and its size in standard deviations.
 
-    By the root of the cofactors where there is one, or by a solution, which takes half of the time.
-    Raises GeometryError.
+    From the cofactors' root if given; otherwise the equations are solved, in half the time. Raises
+    GeometryError.
     """
     diagonal = N.diagonal()
     if root is None and np.minimum.reduce(diagonal) > 0:
@@ -309,11 +315,11 @@ def _whole_step(
     return root @ half, sqrt(half @ half)
 
 
-def _trial_steps(N: Array, u: NDArray[np.int64], gradient: Array) -> Iterator[Array]:
-    """Steps to try in turn.
+def _trial_steps(N: Array, u: Index, gradient: Array) -> Iterator[Array]:
+    """Yield steps to try in turn.
 
-    First along its direction, which follows the narrow valleys of correlated parameters, then
-    damped (Levenberg-Marquardt).
+    First shortened Gauss-Newton steps, which follow the narrow valleys of correlated parameters,
+    then damped ones (Levenberg-Marquardt).
     """
     root = cofactor_root(N, u)
     whole = root @ (root.T @ gradient)
@@ -326,18 +332,18 @@ def _trial_steps(N: Array, u: NDArray[np.int64], gradient: Array) -> Iterator[Ar
 
 
 def resolve(problem: Problem, solution: Solution, use: Mask) -> Solution:
-    """The solution with other observations: by the same partials where it hardly moves."""
+    """Solve with other observations in use, by the same partials if the solution hardly moves."""
     N, gradient, _ = problem.sums(solution.whitened, use, solution.values)
     root = cofactor_root(N, problem.unknowns)
     step, size = _whole_step(N, gradient, problem.unknowns, root)
     if size > _LINEAR:
         return solve(problem, solution.values, use)
     renewed = Solution(solution.values, solution.whitened.copy(), solution.whitening, root)
-    return _moved(renewed, problem.unknowns, step)
+    return _apply_step(renewed, problem.unknowns, step)
 
 
-def _moved(s: Solution, unknowns: NDArray[np.int64], step: Array) -> Solution:
-    """A solution after a small step; its residuals are changed in place, by the partials."""
+def _apply_step(s: Solution, unknowns: Index, step: Array) -> Solution:
+    """Apply a small step to a solution; its residuals are changed in place, by the partials."""
     values = s.values.copy()
     values[unknowns] += step
     residuals = s.whitened[-1]

@@ -1,8 +1,8 @@
-"""Whether the geometry carries what was estimated: weak geometry is said, not hidden.
+"""Tests of whether the geometry determines the estimated parameters.
 
-An adjustment of a frontal plane, or of targets in one corner of the image, converges and gives
-small residuals; its parameters are nevertheless not those of the camera. Every bound stands in the
-reason, with the figure that broke it.
+An adjustment of a frontal plane, or of targets in one corner of the image, converges with small
+residuals; nevertheless its parameters are not those of the camera. Every reason states the bound
+and the figure that exceeds it.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class GeometryBounds:
-    """Bounds beyond which an epoch is called weak.
+    """Bounds beyond which an epoch's geometry is weak.
 
-    minimum_redundancy: of the adjustment; correlation: largest |coefficient| between two estimated
+    minimum_redundancy: of the adjustment; correlation: largest |coefficient| of two estimated
     parameters; relative_sd_c: sd(c)/c; sd_point_px: sd of x0, y0; coverage: share of the image
-    inside the targets' hull; plane_obliqueness_deg: angle between the optical axis and the normal
-    of a plane field.
+    inside the targets' convex hull; plane_obliqueness_deg: angle between the optical axis and the
+    normal of a plane field.
     """
 
     minimum_redundancy: int = 6
@@ -46,7 +46,7 @@ class GeometryBounds:
 
 
 def image_coverage(sensor: Sensor, image_points: Array) -> float:
-    """Share of the image area inside the convex hull of image points (n, 2)."""
+    """Return the share of the image inside the convex hull of image points (n, 2)."""
     import cv2
 
     hull = cv2.convexHull(np.ascontiguousarray(image_points, dtype=np.float32))
@@ -54,7 +54,7 @@ def image_coverage(sensor: Sensor, image_points: Array) -> float:
 
 
 def obliqueness_deg(eop: Array, normal: Array) -> float:
-    """Angle between the optical axis and a plane's normal, 0 for a frontal view."""
+    """Return the angle between the optical axis and a plane's normal; 0 for a frontal view."""
     axis = rotation(eop[:3])[:, 2]
     return float(np.degrees(np.arccos(min(1.0, abs(float(axis @ normal))))))
 
@@ -68,28 +68,23 @@ def weaknesses(
     free: Iterable[str],
     bounds: GeometryBounds,
 ) -> list[str]:
-    """Why the geometry does not carry the free IOP of a result; empty where it does.
+    """Return the reasons why the geometry does not determine the free IOP; empty if it does.
 
-    points (n, 3) mm and image_points (n, 2) px of the targets that took part; values (16,) and
-    covariance (16, 16) of the adjustment. Held parameters are not blamed: a pose alone needs far
-    less.
+    points (n, 3) mm and image_points (n, 2) px of the targets used; values (16,) and covariance
+    (16, 16) of the adjustment. Held parameters are not tested: a pose alone needs far less.
     """
     sd = np.sqrt(covariance.diagonal())
     free = set(free)
     reasons = uncertain(sensor, values, sd, free, bounds)
-    if "c" in free:
-        if _has_depth(points):
-            flat = False
-        else:
-            _, axes, flat = plane_fit(points)
-        if flat:
-            angle = obliqueness_deg(values[EOP], axes[2])
-            if angle < bounds.plane_obliqueness_deg:
-                reasons.append(
-                    f"one plane seen at {angle:.0f}° from frontal (at least "
-                    f"{bounds.plane_obliqueness_deg:.0f}° are needed): principal distance and "
-                    "distance to the field cannot be separated"
-                )
+    if "c" in free and not _has_depth(points):
+        _, axes, flat = plane_fit(points)
+        angle = obliqueness_deg(values[EOP], axes[2])
+        if flat and angle < bounds.plane_obliqueness_deg:
+            reasons.append(
+                f"one plane seen at {angle:.0f}° from frontal (at least "
+                f"{bounds.plane_obliqueness_deg:.0f}° are needed): principal distance and "
+                "distance to the field cannot be separated"
+            )
     if free & {"x0", "y0", "A1", "A2", "A3", "B1", "B2"}:
         coverage = image_coverage(sensor, image_points)
         if coverage < bounds.coverage:
@@ -106,7 +101,7 @@ def weaknesses(
 def uncertain(
     sensor: Sensor, values: Array, sd: Array, free: Container[str], bounds: GeometryBounds
 ) -> list[str]:
-    """Which of c, x0 and y0, where they are free, are worse known than the bounds allow.
+    """Return a reason for each of c, x0 and y0 that is free and has an sd beyond its bound.
 
     values, sd (16,): of the adjustment.
     """
@@ -125,7 +120,7 @@ def uncertain(
 
 
 def _has_depth(points: Array) -> bool:
-    """Whether points are certainly no plane: a quick look that spares most epochs the fit."""
+    """Return whether points are certainly not in one plane: a quick test before `plane_fit`."""
     reduced = points - np.full(len(points), 1.0 / len(points)) @ points
     (a, b, c), (_, d, e), (_, _, f) = (points.T @ reduced).tolist()
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
@@ -133,7 +128,7 @@ def _has_depth(points: Array) -> bool:
 
 
 def _strongest_correlation(covariance: Array, sd: Array, bound: float) -> str:
-    # Only pairs that an IOP takes part in: EOP alone do not spoil the camera.
+    # Only pairs with an IOP: correlated EOP do no harm to the camera.
     n = len(IOP_NAMES)
     scale = 1.0 / np.where(sd > 0, sd, np.inf)
     inner = np.abs(covariance[:n] * scale)

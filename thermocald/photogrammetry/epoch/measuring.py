@@ -1,9 +1,9 @@
-"""Out of pixels into metres with a known camera: its pose, and places on a plane or a line.
+"""Measuring with a calibrated camera: its pose, and points on a plane or a line.
 
-The interior orientation is known with its covariance (of a thermal model at a temperature, say) and
-takes part as an observation, so that pose and camera come out correlated as they are. A place on a
-plane or a line follows from the collinearity equations and that of the plane; its covariance holds
-the image point's, the camera's, the pose's and the plane's.
+The interior orientation is given with its covariance (for example of a thermal model at some
+temperature). It is an observation of the resection, so that pose and camera are properly
+correlated. A point on a plane or a line follows from the collinearity equations and the plane's;
+its covariance includes the image point's, the camera's, the pose's and the plane's.
 
 Sources: Luhmann et al. (2014), sections 4.2.3 (resection) and 4.2.7 (monoplotting).
 """
@@ -39,15 +39,15 @@ from thermocald.photogrammetry.epoch.adjustment import (
 from thermocald.photogrammetry.orientation import approximate_orientation
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Index
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _FEWEST = 4  # control points: three have up to four poses
-_THIN = 0.005  # of points in one line: their extent across it over that along it
-_BESIDE_PX = 5.0  # an image point may lie so far beyond a profile's end
-_GRAZING = np.sin(np.radians(1.0))  # between a ray and a plane: beyond it a pixel is metres
+_THIN = 0.005  # extent across over extent along, up to which points count as one line
+_BESIDE_PX = 5.0  # an image point may be this far beyond a profile's end
+_GRAZING = np.sin(np.radians(1.0))  # least angle of a ray to a plane; below, a pixel means metres
 
 
 def resect(
@@ -59,11 +59,11 @@ def resect(
     start: ExteriorOrientation | None = None,
     snooping_alpha: float = 0.001,
 ) -> Adjustment:
-    """Return the pose of a camera that is known, from control points with their sigmas.
+    """Estimate the pose of a calibrated camera from control points with their sigmas.
 
     covariance (10, 10) of `interior`; start: an earlier pose, with which three points suffice.
-    The result's covariance (16, 16) joins camera and pose. Never raises for data: without a result
-    there are a status and a reason.
+    The result's covariance (16, 16) is that of camera and pose together. Never raises because of
+    the data: without a result there are a status and a reason.
     """
     known = tuple(n for n, v in zip(IOP_NAMES, covariance.diagonal(), strict=True) if v > 0)
     s = AdjustmentSettings(free=known, snooping_alpha=snooping_alpha, bounds=NO_BOUNDS)
@@ -75,7 +75,7 @@ def resect(
     points = control.points[observations.targets]
     extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if extent[1] <= _THIN * extent[0]:
-        why = "the control points lie in one line, about which the camera may turn: add one beside"
+        why = "the control points lie on one line, about which the camera can turn: add one beside"
         return failed("no_orientation", why, observations)
     suspects, pose = None, start
     if pose is None:
@@ -84,17 +84,17 @@ def resect(
                 sensor, points, observations.points, interior=interior
             )
         except GeometryError:
-            why = f"no pose explains {n} control points; x, y (px) must be those of these X, Y, Z"
+            why = f"no pose fits the {n} control points; check that x, y (px) belong to X, Y, Z"
             return failed("no_orientation", why, observations)
         suspects = ~fits
     result = adjust(sensor, control, observations, interior, pose, s, suspects, covariance)
     if len(result.rejected) > s.max_rejected * n or result.status == "too_many_rejected":
-        why = "too many of them contradict the others; x, y (px) must be those of these X, Y, Z"
+        why = "too many control points contradict the others; check that x, y belong to X, Y, Z"
         return failed("too_many_rejected", why, observations)
     if result.ok and start is None and is_ambiguous(sensor, control, observations, interior):
         why = (
             "the control points lie in one plane, and a second, mirrored pose fits nearly as "
-            "well: add one outside of the plane, or state an earlier pose"
+            "well: add one outside the plane, or give an earlier pose"
         )
         return replace(result, status="ambiguous_pose", reason=why)
     return result
@@ -102,9 +102,9 @@ def resect(
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A plane through `point` (3,) mm with a unit `normal` (3,); (n, 3) are one per image point.
+    """A plane through `point` (3,) mm with a unit `normal` (3,); (n, 3): one for each image point.
 
-    sd_mm: of its place along the normal; sd_tilt: rad, of the normal about each axis across it.
+    sd_mm: sd of its position along the normal; sd_tilt: sd of its tilt about each axis in it, rad.
     """
 
     point: Array
@@ -115,10 +115,10 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line through `point` (3,) mm along a unit `direction` (3,), such as a staff; (n, 3) are one
-    per image point.
+    """A line, such as a staff, through `point` (3,) mm along a unit `direction` (3,); (n, 3): one
+    for each image point.
 
-    sd_mm: of its place across its direction.
+    sd_mm: sd of its position across its direction.
     """
 
     point: Array
@@ -128,9 +128,9 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A surveyed profile: straight lines between `points` (k, 3) mm, such as a bank's.
+    """A surveyed profile, such as a river bank's: straight lines between `points` (k, 3) mm.
 
-    sd_mm: of its place across its direction.
+    sd_mm: sd of its position across its direction.
     """
 
     points: Array
@@ -145,16 +145,16 @@ def place_on(
     sigmas: ArrayLike,
     surface: Plane | Line | Profile,
     own: Array | None = None,
-    member: NDArray[np.int64] | None = None,
+    member: Index | None = None,
 ) -> tuple[Array, Array]:
-    """Return where image points lie on a surface: (n, 3) mm, and their joint covariance (3n, 3n).
+    """Intersect image rays with a surface; return points (n, 3) mm and covariance (3n, 3n).
 
-    values (16,) or (n, 16), covariance (16, 16): camera and pose, the pose of all is the same;
-    image_points (n, 2), sigmas (n, 2) px; own (g, 10, 10): what the cameras of g times have
-    besides, and member (n,): which of them took each point. On a line it is the place in the plane
-    through it that faces the camera: what an image point is off the line's image is left over, and
-    not in the result; a place has a direction of no variance. Raises GeometryError for a point
-    whose ray does not meet the surface before the camera.
+    values (16,) or (n, 16), covariance (16, 16): of camera and pose, the pose the same for all;
+    image_points (n, 2), sigmas (n, 2) px; own (g, 10, 10): further covariances of the camera at g
+    times; member (n,): time of each point. For a line, rays meet the plane through it that faces
+    the camera, and points are projected onto the line: an image point's distance from the line's
+    image has no effect, and points have variance along the line only. Raises GeometryError for a
+    ray that does not meet the surface in front of the camera.
     """
     uv = np.atleast_2d(np.asarray(image_points, dtype=float))
     values = np.broadcast_to(values, (len(uv), 16))
@@ -173,7 +173,7 @@ def place_on(
         row = int(np.argmax(missed))
         raise GeometryError(
             f"the ray of image point {uv[row, 0]:.1f}, {uv[row, 1]:.1f} px does not meet the plane "
-            "before the camera: is it above the horizon, or is the plane the wrong one?"
+            "in front of the camera: is it above the horizon, or is the plane the wrong one?"
         )
     X = centre + reach[:, None] * ray
     # [B; n'] dX = [du - A dp; dh]
@@ -185,7 +185,7 @@ def place_on(
     shared = common.reshape(-1, 16)
     total = shared @ covariance @ shared.T
     total += plane.sd_mm**2 * np.outer(moved.ravel(), moved.ravel())
-    if plane.sd_tilt:  # which lifts a place by its distance from the axis
+    if plane.sd_tilt:  # a tilt lifts a point in proportion to its distance from the axis
         lever = (X - plane.point) @ _across(normal[0]).T
         tilted = (moved[:, :, None] * lever[:, None, :]).reshape(-1, 2)
         total += plane.sd_tilt**2 * tilted @ tilted.T
@@ -214,14 +214,14 @@ def _facing(line: Line, centre: Array) -> Plane:
     normal = np.cross(np.cross(line.direction, centre - line.point), line.direction)
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     if not (size > 0).all():
-        raise GeometryError("the line passes through the camera: it is seen as a point")
+        raise GeometryError("the line passes through the camera, so that its image is a point")
     return Plane(line.point, normal / size, line.sd_mm)
 
 
 def _lines_of(profile: Profile, sensor: Sensor, values: Array, uv: Array) -> Line:
-    """Return the line of a profile that each image point lies on: the one whose image is nearest.
+    """Return the line of a profile for each image point: the one whose image is nearest.
 
-    values (n, 16); uv (n, 2) px. Raises GeometryError for points beside the profile's ends.
+    values (n, 16); uv (n, 2) px. Raises GeometryError for points beyond the profile's ends.
     """
     ends = project(sensor, values[:, IOP], values[0, EOP], profile.points)
     begin, step = ends[:, :-1], np.diff(ends, axis=1)
@@ -235,14 +235,14 @@ def _lines_of(profile: Profile, sensor: Sensor, values: Array, uv: Array) -> Lin
                <= 0.5 * np.sqrt(size[rows, chosen]) + _BESIDE_PX)  # fmt: skip
     if beside.any():
         x, y = uv[np.argmax(beside)]
-        raise GeometryError(f"image point {x:.1f}, {y:.1f} px lies beyond the profile's ends")
+        raise GeometryError(f"image point {x:.1f}, {y:.1f} px is beyond the profile's ends")
     direction = np.diff(profile.points, axis=0)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return Line(profile.points[chosen], direction[chosen], profile.sd_mm)
 
 
 def _across(normal: Array) -> Array:
-    """Two unit vectors (2, 3) across a normal."""
+    """Return two unit vectors (2, 3) perpendicular to a normal and to each other."""
     helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first)

@@ -1,6 +1,6 @@
-"""Data snooping of one epoch: what each image point contradicts, and which of them stay.
+"""Data snooping of one epoch: tests of the image points, and which of them are rejected.
 
-Baarda's tests on the two coordinates of a point together, with the noise that the residuals show.
+Baarda's tests on the two coordinates of a point together, with noise estimated from the residuals.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 
 TRUSTED_REDUNDANCY = 20
-"""From here on the residuals themselves give the noise."""
+"""Redundancy from which the noise is estimated from the residuals."""
 
-_MOST_OF_FEW = 0.15  # one of 7 to 13 targets, two of 14 and more
+_MOST_OF_FEW = 0.15  # one of 7 to 13 targets, two of 14 or more
 _GLOBAL_TEST_NORMAL = 3.09  # quantile of the normal distribution: error probability 0.1 %
 _AFTER_REJECTION_NORMAL = 1.28  # 10 %
 
 
 def limit_2d(alpha: float, uncertainty: Array) -> Array:
-    """Limit of a point's test at error probability alpha where the noise was found, not known.
+    """Return the limit of a point's test at error probability alpha, for an estimated noise.
 
-    uncertainty: one over the degrees of freedom with which it was found. The quantile of 2 F(2, m),
-    which has a closed form too; a median of n points' tests is worth n degrees of freedom.
+    uncertainty: one over the degrees of freedom of the noise, 0 for a given one; the median of n
+    points' tests has about n. The limit is the quantile of 2 F(2, m), which has a closed form.
     """
     if alpha <= 0:
         return np.full(np.shape(uncertainty), np.inf)
@@ -41,12 +41,12 @@ def limit_2d(alpha: float, uncertainty: Array) -> Array:
 
 def fails_global_test(
     unit: ArrayLike, redundancy: ArrayLike, after_rejection: bool = False
-) -> NDArray[np.bool_]:
-    """Whether residuals are too large for their sigmas, where they are too few to tell the noise.
+) -> Mask:
+    """Return whether residuals, too few to estimate the noise, are too large for their sigmas.
 
-    unit: variance of unit weight; redundancy: its degrees of freedom. Chi-square at 0.1 %, by
-    Wilson and Hilferty's approximation (1931); at 10 % where a target was rejected on the word of
-    the stated noise alone: noise three times as large looks the same, and takes the worst with it.
+    unit: variance of unit weight; redundancy: its degrees of freedom. χ² at 0.1 %, by Wilson and
+    Hilferty's approximation (1931). After a rejection, which relies on the stated noise alone, at
+    10 %: noise three times as large would look the same, and lose its worst target too.
     """
     quantile = _AFTER_REJECTION_NORMAL if after_rejection else _GLOBAL_TEST_NORMAL
     r = np.maximum(np.asarray(redundancy, dtype=float), 1.0)
@@ -56,17 +56,17 @@ def fails_global_test(
 
 
 def most_rejected(fraction: float, redundancy: int) -> float:
-    """Fraction of the targets that may be rejected.
+    """Return the fraction of the targets that may be rejected.
 
-    Where residuals are few a second gross error is hardly told from the good ones that it bends.
+    With few residuals a second gross error can hardly be separated from good points it distorts.
     """
     return min(fraction, _MOST_OF_FEW) if redundancy < TRUSTED_REDUNDANCY else fraction
 
 
 def point_tests(solution: Solution, use: Mask) -> Array:
-    """Return chi-square with 2 degrees of freedom per point (n,).
+    """Return each point's test (n,): χ² with 2 degrees of freedom.
 
-    A point that takes part has the residual covariance I - h'h, one that does not I + h'h.
+    The residual covariance of a point in use is I - h'h, that of any other I + h'h.
     """
     u, n = len(solution.root), len(use)
     h = solution.root.T @ solution.whitened[:-1].reshape(u, -1)
@@ -81,7 +81,7 @@ def point_tests(solution: Solution, use: Mask) -> Array:
     v = solution.whitened[-1]
     determinant = q[0] * q[1]
     determinant -= qxy * qxy
-    # A point that alone carries a parameter has no residual: it cannot be tested.
+    # A point that alone determines a parameter has no residual: it cannot be tested.
     determinant[determinant <= 1e-9] = np.inf
     squares = v * v
     squares *= q[::-1]
@@ -95,10 +95,10 @@ def point_tests(solution: Solution, use: Mask) -> Array:
 
 
 def settle(history: NDArray[np.int8], use: Mask, keep: Mask) -> Mask:
-    """Which of those that a round would keep do stay, `use` itself where nothing changes.
+    """Return the mask of a round's points to use; `use` itself if nothing changes.
 
-    history: of each point 1 if it was taken back, 2 if it was rejected again and stays out, as a
-    borderline point would otherwise come and go for ever; 0 at first. Changed in place.
+    history: 0 at first, 1 once a point was taken back, 2 once it was rejected again: then it stays
+    out, as a borderline point would otherwise alternate for ever. Changed in place.
     """
     if keep is use or not np.count_nonzero(keep != use):
         return use
@@ -109,22 +109,22 @@ def settle(history: NDArray[np.int8], use: Mask, keep: Mask) -> Mask:
 
 
 def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
-    """Which observations stay: the worst are rejected, those that fit again come back.
+    """Return the mask of observations to keep: the worst are rejected, those that fit taken back.
 
-    test (n,) of `point_tests`; alpha: error probability of one test. `series.snooping` has the same
-    rule for many epochs, whose arrays would cost a single one ten times as much.
+    test (n,): of `point_tests`; alpha: error probability of one test. `series.snooping` has the
+    same rule for many epochs; its arrays would cost a single epoch ten times as much.
     """
     if alpha <= 0:
         return use
     n = int(np.count_nonzero(use))
     used = test if n == len(use) else test[use]
-    # The median is a scale that the gross errors do not reach.
+    # The median is a scale that gross errors do not affect.
     ordered = used.copy()
     ordered.partition(n // 2)
     variance = float(ordered[n // 2]) / MEDIAN_CHI2
     few = 2 * n - unknowns < TRUSTED_REDUNDANCY
     if few:
-        variance = 1.0  # one gross error reaches every residual: the stated sigmas are the scale
+        variance = 1.0  # one gross error affects all residuals: the stated sigmas are the scale
     limit = float(limit_2d(alpha, np.asarray(0.0 if few else 1.0 / n))) * max(variance, 1e-12)
     fits = test <= limit
     if not np.count_nonzero(fits != use):
@@ -132,7 +132,7 @@ def snoop(test: Array, use: Mask, unknowns: int, alpha: float) -> Mask:
     keep: Mask = use | fits
     suspicious = use & ~fits
     if suspicious.any():
-        # One gross error lifts its neighbours: only those near the worst go at once.
+        # One gross error increases its neighbours' residuals: reject only those near the worst.
         near = 1.0 if few else 0.5
         keep[suspicious & (test >= near * used.max())] = False
     return keep

@@ -1,1 +1,1 @@
-"""A network of photographs: target coordinates in three dimensions."""
+"""Adjustment of photographs together: a free network, or known targets and one camera."""

@@ -1,15 +1,16 @@
-"""The adjustment of a network of photographs: result, checks, snooping for gross errors.
+"""The adjustment of a network of photographs: result, checks, data snooping.
 
-A self-calibrating bundle adjustment without control: interior orientation common to all
-photographs, datum by inner constraints over the targets, scale by measured distances. The test of a
-point is vᵀ Qvv⁻¹ v, chi² with two degrees of freedom: data snooping that does not depend on the
-image's axes; its limit holds for all points of the network together. A network that cannot carry
-the result is refused with its reasons.
+A self-calibrating bundle adjustment without control points: the interior orientation is common to
+all photographs, inner constraints over the targets give the datum, measured distances the scale.
+The test of a point is vᵀ Qvv⁻¹ v, χ² with two degrees of freedom, which does not depend on the
+image's axes; its limit holds for all points of the network together. A network that is too weak is
+refused with its reasons.
 
-Position and orientation by inner constraints over all targets (the mean standard deviation is
-smallest, and no target is privileged): they coincide in the mean with the nominal field if there is
-one, else the origin is the centroid and Z the normal of the best plane, towards the cameras. Scale
-by measured distances, with their standard deviations, in a rigorous sequential adjustment.
+Inner constraints over all targets give position and orientation (the mean standard deviation is
+smallest, and no target is privileged). The targets coincide in the mean with the nominal field if
+there is one; otherwise the origin is the centroid and Z the normal of the best plane, towards the
+cameras. The scale follows from the distances, with their standard deviations, in a rigorous
+sequential adjustment.
 
 Source: Luhmann, T. et al. (2014): Close-Range Photogrammetry and 3D Imaging, 2nd ed., sections
 4.4 and 7.3; Baarda, W. (1968): A testing procedure for use in geodetic networks; Förstner, W.,
@@ -44,15 +45,13 @@ from thermocald.photogrammetry.network.start import approximate
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Distance, Observations
 
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """Where a photograph was taken from; sd of the projection centre, (3,) mm."""
+    """The pose of a photograph, with the sd of the projection centre, (3,) mm."""
 
     photo: str
     exterior: ExteriorOrientation
@@ -62,7 +61,7 @@ class Station:
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """An image point that was left out: residual in px, and its test value over the limit."""
+    """A rejected image point, with its residual in px and its test value over the limit."""
 
     JSON: ClassVar = {"residual": "residual_px"}
 
@@ -76,10 +75,10 @@ class Rejection:
 class Network:
     """The adjusted network.
 
-    names: m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,) rad,
-    the largest angle of intersection of each target; interior with covariance (10, 10), zero for
-    what was held; free: names of what was not; unused: targets and photographs left out, with
-    reasons.
+    names: of the m targets; points (m, 3) mm with covariance (3m, 3m) mm²; n_rays (m,); angles (m,)
+    rad: largest angle of intersection of each target; interior_covariance (10, 10): zero for held
+    parameters; free: names of the estimated ones; unused: targets and photographs left out, with
+    reasons; sd_scale: relative.
     """
 
     names: tuple[str, ...]
@@ -100,18 +99,18 @@ class Network:
 
     @property
     def sigmas(self) -> Array:
-        """Standard deviations of the targets (m, 3) mm."""
+        """Standard deviations (m, 3) mm of the targets."""
         result: Array = np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
         return result
 
     @property
     def extent(self) -> float:
-        """The largest distance between two targets, mm (of their bounding box)."""
+        """Diagonal of the targets' bounding box, mm."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     @property
     def relative_accuracy(self) -> float:
-        """Mean standard deviation of a coordinate over the extent, without the scale's own."""
+        """Mean standard deviation of a coordinate over the extent, without that of the scale."""
         centred = self.points - self.points.mean(axis=0)
         of_scale = self.sd_scale**2 * float(np.mean(centred**2))
         shape = np.diag(self.covariance).mean() - of_scale
@@ -129,22 +128,23 @@ MIN_ROLL = np.radians(60.0)
 
 def _refuse(reasons: list[str]) -> None:
     if reasons:
-        raise GeometryError("the network cannot carry a survey: " + "; ".join(reasons))
+        raise GeometryError("the network is too weak for a survey: " + "; ".join(reasons))
 
 
 def refuse_before(
     photos: int, rays: ImageRays, distances: Sequence[Distance], names: Sequence[str]
 ) -> None:
-    """Refuse what no adjustment can mend: photographs, targets, or the scale are missing."""
+    """Refuse a network without enough photographs or targets, or without a scale."""
     reasons = []
     targets = len(np.unique(rays.target))
     if photos < MIN_PHOTOS:
-        few = f"{photos} photographs show targets, {MIN_PHOTOS} are the least and 8 to 12 are good"
-        _refuse([few])
+        _refuse([f"{photos} photographs show targets; take at least {MIN_PHOTOS}, better 8 to 12"])
     if targets < MIN_TARGETS:
-        reasons.append(f"{targets} targets are seen {MIN_RAYS} times, {MIN_TARGETS} are the least")
+        reasons.append(
+            f"{targets} targets are in at least {MIN_RAYS} photographs, {MIN_TARGETS} are needed"
+        )
     if not distances:
-        reasons.append("no distance gives the scale: --scale A B MM")
+        reasons.append("no distance gives the scale: measure one and give --scale A B MM")
     seen = {names[t] for t in np.unique(rays.target)}
     for d in distances:
         missing = [name for name in (d.a, d.b) if name not in seen]
@@ -156,14 +156,17 @@ def refuse_before(
 
 
 def refuse_weak(network: Network, weakest: tuple[str, ...]) -> None:
-    """Refuse a result whose geometry or residuals say that it is not worth its digits."""
+    """Refuse a result with weak geometry or large residuals.
+
+    weakest: names of the parameters that the network determines worst.
+    """
     reasons = []
     if len(network.stations) < MIN_PHOTOS:
         reasons.append(
             f"only {len(network.stations)} photographs could be oriented, {MIN_PHOTOS} are needed"
         )
     if network.redundancy < 10:
-        reasons.append(f"{network.redundancy} redundant observations control nothing")
+        reasons.append(f"a redundancy of {network.redundancy} is too small for any check")
     c, sd_c = network.camera.interior.c, float(np.sqrt(network.interior_covariance[0, 0]))
     if "c" in network.free and sd_c > MAX_RELATIVE_SD_C * c:
         reasons.append(
@@ -174,7 +177,7 @@ def refuse_weak(network: Network, weakest: tuple[str, ...]) -> None:
     if network.relative_accuracy > MAX_RELATIVE_SD:
         reasons.append(
             f"the coordinates' standard deviations are 1:{1 / network.relative_accuracy:.0f} "
-            f"of the field, 1:{1 / MAX_RELATIVE_SD:.0f} is the least"
+            f"of the field, at most 1:{1 / MAX_RELATIVE_SD:.0f} is accepted"
         )
     if network.sigma0 > MAX_SIGMA0:
         reasons.append(
@@ -185,12 +188,12 @@ def refuse_weak(network: Network, weakest: tuple[str, ...]) -> None:
 
 
 def advice(network: Network) -> list[str]:
-    """What would make an accepted network better, as sentences."""
+    """Return sentences on what would improve an accepted network."""
     notes = []
     three = [name for name, n in zip(network.names, network.n_rays, strict=True) if n == MIN_RAYS]
     if three:
         shown = ", ".join(three[:8]) + (", …" if len(three) > 8 else "")
-        notes.append(f"{len(three)} targets have {MIN_RAYS} rays only, the least: {shown}")
+        notes.append(f"{len(three)} targets have only {MIN_RAYS} rays, the minimum: {shown}")
     if _roll_span(network) < MIN_ROLL:
         notes.append(
             "the camera was never turned about its axis: turn it by 90° in some photographs, which "
@@ -198,12 +201,12 @@ def advice(network: Network) -> list[str]:
         )
     low = np.degrees(network.angles) < 30
     if low.any():
-        notes.append(f"{int(low.sum())} targets are intersected under less than 30°")
+        notes.append(f"{int(low.sum())} targets have rays that intersect at less than 30°")
     return notes
 
 
 def _roll_span(network: Network) -> float:
-    """The largest difference of roll between two stations, rad, about the mean view."""
+    """Return the largest difference of roll between two stations about the mean axis, rad."""
     R = np.array([s.exterior.rotation for s in network.stations])
     up = R[:, :, 1]
     axis = -R[:, :, 2].mean(axis=0)
@@ -214,26 +217,26 @@ def _roll_span(network: Network) -> float:
 
 
 MIN_RAYS = 3
-"""Rays that a target needs: of two a wrong one cannot be told, and along one of them not seen."""
+"""Rays that a target needs: with two, a wrong one cannot be identified or is not even noticed."""
 MIN_PHOTO_RAYS = 6
-"""Rays that a photograph needs to be oriented and to say something besides."""
+"""Rays that a photograph needs for its orientation and some redundancy."""
 
 _FAMILY_ERROR = 0.05
-_COARSE = 10.0  # times the limit: no accident, left out at once
+_COARSE = 10.0  # times the limit, beyond which a ray is rejected at once
 _ROUNDS = 30
 
 
 def snoop(
     sensor: Sensor, bundle: Bundle, rays: ImageRays, free: Index
-) -> tuple[Bundle, NDArray[np.bool_], Array]:
-    """Adjust, and leave out gross errors, some per round, until none is left.
+) -> tuple[Bundle, Mask, Array]:
+    """Adjust a bundle and reject gross errors, some per round, until none is left.
 
-    A target or a photograph that too few rays are left of goes with them. Returns the bundle, which
-    rays were rejected, and their tests over the limit.
+    A target or a photograph with too few rays left is rejected with them. Returns the bundle, the
+    mask of rejected rays, and the tests of all rays over the limit.
     """
     whole = BundleAdjustment(sensor, rays, free)
     bundle = whole.solve(bundle, robust=True)
-    limit = -2.0 * np.log(_FAMILY_ERROR / len(rays))  # chi² with 2 degrees of freedom
+    limit = -2.0 * np.log(_FAMILY_ERROR / len(rays))  # χ² with 2 degrees of freedom
     v2 = np.sum(whole.residuals(bundle) ** 2, axis=1)
     rejected = v2 > _COARSE * limit * max(float(np.median(v2)) / MEDIAN_CHI2, 1e-12)
     tests = np.zeros(len(rays))
@@ -256,7 +259,7 @@ def snoop(
         candidates = ~rejected & (tests > 1)
         if not candidates.any():
             break
-        # one per target, and only the strong ones: a gross error spoils its neighbours' tests
+        # one per target, and only the largest: a gross error distorts its neighbours' tests
         worst = np.zeros(int(rays.target.max()) + 1)
         np.maximum.at(worst, rays.target[candidates], tests[candidates])
         rejected |= (
@@ -265,8 +268,8 @@ def snoop(
     return bundle, rejected, tests
 
 
-def _drop_uncontrolled(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
-    """Reject all of targets and photographs that too few rays are left of (in place)."""
+def _drop_uncontrolled(rejected: Mask, rays: ImageRays) -> None:
+    """Reject all rays of targets and photographs with too few rays left, in place."""
     shown = np.bincount(rays.photo)
     before = -1
     while rejected.sum() > before:
@@ -274,7 +277,7 @@ def _drop_uncontrolled(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
         left = np.bincount(rays.target[~rejected], minlength=int(rays.target.max()) + 1)
         rejected |= left[rays.target] < MIN_RAYS
         left = np.bincount(rays.photo[~rejected], minlength=len(shown))
-        # half of a photograph always fits somewhere: that is no reason to believe it
+        # a fit of half of a photograph's rays may be chance and proves nothing
         rejected |= (left < np.maximum(MIN_PHOTO_RAYS, shown / 2))[rays.photo]
     if rejected.all():
         raise GeometryError(
@@ -283,10 +286,8 @@ def _drop_uncontrolled(rejected: NDArray[np.bool_], rays: ImageRays) -> None:
         )
 
 
-def _in_use(
-    bundle: Bundle, rays: ImageRays, good: NDArray[np.bool_]
-) -> tuple[Bundle, ImageRays, Index, Index]:
-    """The part of a network that good rays belong to, renumbered, and its rows before."""
+def _in_use(bundle: Bundle, rays: ImageRays, good: Mask) -> tuple[Bundle, ImageRays, Index, Index]:
+    """Return the photographs and targets of good rays, renumbered, and their rows before."""
     photos, photo = np.unique(rays.photo[good], return_inverse=True)
     targets, target = np.unique(rays.target[good], return_inverse=True)
     used = ImageRays(photo, target, rays.points[good], rays.whitening[good])
@@ -309,12 +310,11 @@ def adjust_network(
 ) -> Network:
     """Adjust a free network of photographs taken by one camera with unchanged focus.
 
-    photos: what was measured, by photograph; names: the m targets that its rows count; distances:
-    measured ones between targets, they give the scale; interior: approximate values, searched for
-    if None; nominal: approximate coordinates (m, 3) mm, NaN where unknown; free: the interior
-    parameters to be determined; start: an earlier result for the same photographs, whose
-    orientation is begun with.
-    Raises GeometryError where the network cannot carry it, with the reasons.
+    photos: observations by photograph; names: of the m targets, in the order of their rows;
+    distances: measured between targets, they give the scale; interior: approximate values, searched
+    for if None; nominal: approximate coordinates (m, 3) mm, NaN if unknown; free: the interior
+    parameters to estimate; start: an earlier result for the same photographs, for start values.
+    Raises GeometryError with the reasons if the network is too weak.
     """
     rays, shown = ImageRays.collect(list(photos.values())), list(photos)
     seen = np.bincount(rays.target, minlength=len(names))
@@ -344,11 +344,9 @@ def adjust_network(
     angles = _intersection_angles(bundle, final)
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle < MIN_ANGLE:
-        reason = (
-            f"the rays meet at {np.degrees(angle):.0f}° (median), {np.degrees(MIN_ANGLE):.0f}° are "
-            "the least: take photographs from further to the left, right, above, and below"
-        )
-        _refuse([reason])
+        meet, least = f"{np.degrees(angle):.0f}°", f"{np.degrees(MIN_ANGLE):.0f}°"
+        where = "take photographs from further to the left, right, above, and below"
+        _refuse([f"the rays meet at {meet} (median), at least {least} are needed: {where}"])
     adjustment = BundleAdjustment(sensor, final, free_rows)
     unknowns = len(free_rows) + 6 * len(in_use) + 3 * len(kept_names) - 7
     redundancy = 2 * len(final) - unknowns
@@ -402,7 +400,7 @@ def adjust_network(
 def _resume(
     start: Network, photos: Sequence[str], names: Sequence[str], rays: ImageRays
 ) -> tuple[Bundle, list[int], ImageRays]:
-    """The bundle of an earlier result, for the rays of its photographs and targets."""
+    """Return the bundle of an earlier result, its photographs, and their rays, renumbered."""
     rows = {name: i for i, name in enumerate(photos)}
     kept = [rows[s.photo] for s in start.stations]
     number = np.full(len(photos), -1)
@@ -421,7 +419,7 @@ def _resume(
 
 
 def _intersection_angles(bundle: Bundle, rays: ImageRays) -> Array:
-    """The largest angle between two rays of each target, (m,) rad."""
+    """Return the largest angle between two rays of each target, (m,) rad."""
     d = bundle.centres[rays.photo] - bundle.points[rays.target]
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     angles = np.zeros(len(bundle.points))
@@ -440,8 +438,8 @@ def bring_to_datum(
 ) -> tuple[Bundle, Array, Array, float, str]:
     """Scale and place a free network whose covariance (3m, 3m) has inner constraints.
 
-    index: the row of each target by name; nominal (m, 3) mm, NaN where unknown. Returns the bundle
-    in its datum, the targets' covariance in it, scale times rotation (3, 3) into it, the scale's
+    index: the row of each target by name; nominal (m, 3) mm: NaN if unknown. Returns the bundle in
+    its datum, the targets' covariance, scale times rotation (3, 3) into the datum, the scale's
     relative standard deviation, and the datum in words.
     """
     scaled, Q, scale, sd_scale = _scaled(bundle.points, covariance, distances, index)
@@ -464,11 +462,11 @@ def bring_to_datum(
 def _scaled(
     points: Array, Q: Array, distances: Sequence[Distance], index: dict[str, int]
 ) -> tuple[Array, Array, float, float]:
-    """Points and covariance with the scale that the distances give; the scale and its relative sd.
+    """Scale points and covariance by the distances; return them, the scale and its relative sd.
 
     The estimate is linear in the network's points and the measured distances: ln L = ln l + lambda
-    with the network's own covariance; one distance fixes the scale, further ones also correct the
-    shape, each to its weight.
+    with the network's covariance. One distance fixes the scale, further ones also correct the
+    shape, according to their weights.
     """
     n, m3 = len(distances), points.size
     H, r, noise = np.zeros((n, m3)), np.zeros(n), np.zeros(n)
@@ -509,7 +507,7 @@ def _placement(
     first: Distance,
     index: dict[str, int],
 ) -> tuple[Array, Array, str]:
-    """The turn (3, 3) and shift (3,) into the datum, and what it is in words."""
+    """Return the rotation (3, 3) and shift (3,) into the datum, and the datum in words."""
     if nominal is not None:
         known = np.isfinite(nominal).all(axis=1)
         if known.sum() >= 3:
@@ -520,7 +518,7 @@ def _placement(
     z = Vt[2] * (1.0 if (centres.mean(axis=0) - centroid) @ Vt[2] > 0 else -1.0)
     along = points[index[first.b]] - points[index[first.a]]
     along = along - (along @ z) * z
-    # a distance along the normal gives no direction: the field's longest side does
+    # a distance along the normal gives no direction: take the field's longest one
     if np.linalg.norm(along) < 1e-3 * np.linalg.norm(np.ptp(points, axis=0)):
         along = Vt[0]
     x = along / np.linalg.norm(along)
@@ -530,7 +528,7 @@ def _placement(
 
 
 def _rigid(points: Array, onto: Array) -> tuple[Array, Array]:
-    """The rotation and shift of least squares (Arun et al. 1987), no reflection."""
+    """Fit a rotation and shift, without reflection, by least squares (Arun et al. 1987)."""
     p, q = points.mean(axis=0), onto.mean(axis=0)
     U, _, Vt = np.linalg.svd((points - p).T @ (onto - q))
     turn = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T

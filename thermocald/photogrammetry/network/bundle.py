@@ -1,13 +1,13 @@
 """Bundle adjustment of photographs and points: normal equations, iteration and covariance.
 
-The targets are eliminated block by block (Schur complement). In a free network the gauge of seven
-(position, orientation, scale) is left free and its null space added to the reduced matrix, which
-makes it regular without constraining anything that the photographs determine; the targets follow by
-back substitution, and an S-transformation brings all of it to the datum in which the mean standard
-deviation of the targets is smallest. Where the targets are known their places and standard
-deviations are observations, and nothing is free.
+The targets are eliminated block by block (Schur complement). A free network has a datum defect of
+seven (position, orientation, scale): its null space is added to the reduced matrix, which becomes
+regular without a constraint on anything that the photographs determine. The targets follow by back
+substitution, and an S-transformation gives the datum in which the targets' mean standard deviation
+is smallest. Coordinates of known targets are observations with their standard deviations; then
+there is no datum defect.
 
-Rotations are updated in object space (`R ← exp([w]×) R`), so no camera can look into a gimbal lock.
+Rotations are updated in object space (`R ← exp([w]×) R`), so that there is no gimbal lock.
 
 Source: Baarda, W. (1973): S-transformations and criterion matrices; Granshaw, S. I. (1980): Bundle
 adjustment methods in engineering photogrammetry, Photogrammetric Record 10(56); Triggs, B. et al.
@@ -35,16 +35,14 @@ from thermocald.photogrammetry.linalg import MEDIAN_CHI2, scaled_inverse, unit_d
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations
 
     _Normals = tuple[Array, Array, Array, Array, Array]
 
 
 _N_IOP = len(IOP_NAMES)
-# Eigenvalues of the scaled matrix below this are rounding errors of its elements.
+# Smaller eigenvalues of the scaled matrix are rounding errors of its elements.
 _SINGULAR = 1e-13
 _SEPARATE_NOTHING = (
     "the normal matrix is singular: these photographs do not separate the parameters; take some "
@@ -52,17 +50,17 @@ _SEPARATE_NOTHING = (
 )
 BEHIND = 1e6
 """The whitened residual of a target behind its camera."""
-_CONTROLLED = 1e-3  # cofactor of a residual below which nothing else controls it
+_CONTROLLED = 1e-3  # cofactor of a residual below which no other observation controls it
 
 
 class KnownTargets(NamedTuple):
-    """What is known of the targets beforehand: places (m, 3) mm, weights (m, 3) mm⁻², and which
-    of them (m,) are uncertain, the others being held.
+    """A-priori coordinates of the targets: places (m, 3) mm, weights (m, 3) mm⁻², and a mask (m,)
+    of the uncertain ones, the others being held.
     """
 
     places: Array
     weights: Array
-    uncertain: NDArray[np.bool_]
+    uncertain: Mask
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +81,7 @@ class ImageRays:
 
     @classmethod
     def collect(cls, photographs: Sequence[Observations]) -> ImageRays:
-        """The image points of photographs, one after the other; targets keep their rows."""
+        """Collect the image points of photographs in their order; targets keep their rows."""
         points = np.concatenate([o.points for o in photographs]).astype(float)
         C = np.zeros((len(points), 2, 2))
         sigmas = np.concatenate([o.sigmas for o in photographs])
@@ -97,14 +95,14 @@ class ImageRays:
             np.linalg.inv(np.linalg.cholesky(C)),
         )
 
-    def select(self, keep: NDArray[np.bool_]) -> ImageRays:
-        """The rays of a mask."""
+    def select(self, keep: Mask) -> ImageRays:
+        """Return the rays of a mask."""
         return ImageRays(
             self.photo[keep], self.target[keep], self.points[keep], self.whitening[keep]
         )
 
     def in_pixels(self) -> ImageRays:
-        """The same rays with residuals in px, whatever their sigmas."""
+        """Return the rays without sigmas, so that residuals are in px."""
         return replace(self, whitening=np.broadcast_to(np.eye(2), self.whitening.shape))
 
 
@@ -120,12 +118,12 @@ class Bundle:
     points: Array
 
     def exteriors(self) -> Array:
-        """The exterior orientations (k, 6) in the order of `EOP_NAMES`."""
+        """Return the exterior orientations (k, 6) in the order of `EOP_NAMES`."""
         pairs = zip(self.rotations, self.centres, strict=True)
         return np.array([ExteriorOrientation.from_rotation(R, X).as_array() for R, X in pairs])
 
-    def moved(self, cameras: Array, targets: Array, free: Index) -> Bundle:
-        """The bundle after a step of cameras (u,) and targets (m, 3)."""
+    def apply(self, cameras: Array, targets: Array, free: Index) -> Bundle:
+        """Return the bundle after a step of cameras (u,) and targets (m, 3)."""
         interior, pose = self.interior.copy(), cameras[len(free) :].reshape(-1, 6)
         interior[free] += cameras[: len(free)]
         return Bundle(
@@ -138,11 +136,11 @@ class Bundle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cofactors:
-    """Cofactors (sigma0 = 1) of a bundle, of a free one in an arbitrary datum.
+    """Cofactors (sigma0 = 1) of a bundle; of a free one in an arbitrary datum.
 
-    cameras (u, u), interior first; mixed (u, 3m): between cameras and targets; follow (u, 3m): how
-    the targets follow the cameras; own (m, 3, 3): of the targets where the cameras stand; weakest:
-    the parameters that a free network determines worst.
+    cameras (u, u): interior first; mixed (u, 3m): between cameras and targets; follow (u, 3m):
+    derivatives of the targets by the cameras; own (m, 3, 3): of the targets with cameras held;
+    weakest: the parameters that a free network determines worst.
     """
 
     cameras: Array
@@ -154,10 +152,10 @@ class Cofactors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleAdjustment:
-    """Image points of one camera, adjusted by interior orientation, poses and targets.
+    """The adjustment of one camera's image points with interior orientation, poses and targets.
 
-    free: which of `IOP_NAMES` are unknown (indices); known: None for a free network, in which
-    position, orientation and scale are free.
+    free: indices of the unknown ones of `IOP_NAMES`; known: None for a free network, whose
+    position, orientation and scale are undefined.
     """
 
     sensor: Sensor
@@ -179,17 +177,17 @@ class BundleAdjustment:
     def solve(self, bundle: Bundle, *, robust: bool = False, iterations: int = 30) -> Bundle:
         """Adjust a bundle to the image points.
 
-        A free network by damped steps (Levenberg-Marquardt); with known targets by whole or shorter
-        ones (Gauss-Newton), which follow the narrow valley of a weak geometry to its end. `robust`
-        renews weights in each iteration (Cauchy, scaled by the median residual).
-        Raises GeometryError where it cannot converge.
+        A free network takes damped steps (Levenberg-Marquardt); one with known targets whole or
+        shorter ones (Gauss-Newton), which follow the narrow valley of a weak geometry. robust:
+        renew weights in each iteration (Cauchy, scaled by the median residual). Raises
+        GeometryError if it does not converge.
         """
         gauge = self.known is None
         w = np.ones(len(self.rays))
         damping = 1e-6 if gauge else 0.0
         v = self.residuals(bundle)
         for _ in range(iterations):
-            if robust:  # 1 for the good, falling with the square of the residual
+            if robust:  # weights fall from 1 with the square of the residual
                 size2 = np.sum(v * v, axis=1)
                 w = 1.0 / (1.0 + size2 / (9.0 * max(float(np.median(size2)) / MEDIAN_CHI2, 1e-12)))
             cost = self.cost(bundle, v, w)
@@ -198,7 +196,7 @@ class BundleAdjustment:
             for _attempt in range(12):
                 step = self._step(bundle, normals, damping)
                 if step is not None:
-                    trial = bundle.moved(fraction * step[0], fraction * step[1], self.free)
+                    trial = bundle.apply(fraction * step[0], fraction * step[1], self.free)
                     if trial.interior[0] > 0:
                         v_new = self.residuals(trial)
                         new = self.cost(trial, v_new, w)
@@ -211,7 +209,7 @@ class BundleAdjustment:
                 else:
                     fraction /= 2
             else:
-                # no step lowers the sum: it is the minimum to within rounding, or hopeless
+                # no step lowers the sum: a minimum to within rounding, or no convergence
                 if step is not None and step[2] < 1e-4:
                     return bundle
                 raise GeometryError(
@@ -231,7 +229,7 @@ class BundleAdjustment:
         return replace(bundle, rotations=U @ Vt)
 
     def cofactors(self, bundle: Bundle) -> Cofactors:
-        """Return the cofactors at the solution; GeometryError where it is undetermined."""
+        """Return the cofactors at the solution. Raises GeometryError if it is undetermined."""
         normals = self._normal_equations(bundle, np.ones(len(self.rays)))
         S, _, inverses = _reduce(normals)
         weakest: tuple[str, ...] = ()
@@ -259,8 +257,8 @@ class BundleAdjustment:
         return Cofactors(Q, Q @ follow, follow, inverses, weakest)
 
     def explained(self, bundle: Bundle, found: Cofactors) -> Array:
-        """Return the cofactors (n, 2, 2) of the adjusted, whitened image points; independent of the
-        gauge. The rays may be others than those of the adjustment.
+        """Return the cofactors (n, 2, 2) of the adjusted, whitened image points, which do not
+        depend on the datum. The rays may be others than those of the adjustment.
         """
         _, J, by_target = self._linearised(bundle, np.ones(len(self.rays)))
         f = len(self.free)
@@ -287,8 +285,8 @@ class BundleAdjustment:
         return total
 
     def _linearised(self, bundle: Bundle, weights: Array) -> tuple[Array, Array, Array]:
-        """Return whitened residuals (n, 2), and their partials by camera and pose (n, 2, f + 6) and
-        by the target (n, 2, 3), 0 where that is held.
+        """Return whitened residuals (n, 2), and the partials with respect to camera and pose
+        (n, 2, f + 6) and to the target (n, 2, 3), 0 if that is held.
         """
         rays = self.rays
         eop = bundle.exteriors()[rays.photo]
@@ -299,7 +297,7 @@ class BundleAdjustment:
         in_front = np.isfinite(computed[:, 0, 0])
         root = np.sqrt(np.where(in_front, weights, 0.0))[:, None, None] * rays.whitening
         by_point = np.nan_to_num(by_point[:, 0])
-        # q = Rᵀ d, turned about the object's axes: by w it is that by the point times d × e
+        # q = Rᵀ d: a rotation about an object axis e acts as a movement of the point by d × e
         d = points - bundle.centres[rays.photo]
         cross = np.zeros((len(rays), 3, 3))
         cross[:, 1, 0], cross[:, 2, 0] = d[:, 2], -d[:, 1]
@@ -313,8 +311,8 @@ class BundleAdjustment:
         return v, root @ by_camera, root @ by_point
 
     def _normal_equations(self, bundle: Bundle, weights: Array) -> _Normals:
-        """Return blocks: of the cameras (u, u), interior first, then six per photograph, between
-        them and the targets (u, 3m), of the targets (m, 3, 3); right-hand sides (u,), (m, 3).
+        """Return normal blocks of the cameras (u, u), interior first, then six per photograph; of
+        cameras by targets (u, 3m); of targets (m, 3, 3); and right-hand sides (u,), (m, 3).
         """
         v, by_camera, by_point = self._linearised(bundle, weights)
         rays, f = self.rays, len(self.free)
@@ -353,8 +351,8 @@ class BundleAdjustment:
     def _step(
         self, bundle: Bundle, normals: _Normals, damping: float
     ) -> tuple[Array, Array, float] | None:
-        """The damped step of cameras (u,) and targets (m, 3), and its size stepᵀ N step; None if
-        the matrix is not positive definite.
+        """Return the damped step of cameras (u,) and targets (m, 3), and its size stepᵀ N step;
+        None if the matrix is not positive definite.
         """
         S, s, inverses = _reduce(normals, damping)
         if self.known is None:
@@ -370,15 +368,15 @@ class BundleAdjustment:
         dc = scales * np.linalg.solve(scaled, scales * s)
         _, B, _, a, d = normals
         dp = np.einsum("mij,mj->mi", inverses, d - (dc @ B).reshape(-1, 3))
-        # the predicted decrease of the sum of squares, in its own unit
+        # the predicted decrease of the sum of squares
         return dc, dp, float(dc @ a + dp.ravel() @ d.ravel())
 
 
 def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Array]:
-    """The matrix and right-hand side reduced by the targets, and their blocks' inverses."""
+    """Return the matrix and right-hand side with targets eliminated, and the inverse blocks."""
     A, B, D, a, d = normals
     trace = np.trace(D, axis1=1, axis2=2)[:, None, None]
-    # a target without any weight left stays where it is
+    # a target without any weight is held
     regular = D + (damping * trace + np.where(trace == 0, 1.0, 0.0)) * np.eye(3)
     inverses = np.linalg.inv(regular)
     B3 = B.reshape(len(B), len(inverses), 3)
@@ -388,8 +386,8 @@ def _reduce(normals: _Normals, damping: float = 0.0) -> tuple[Array, Array, Arra
 
 def inner_constraints(bundle: Bundle, found: Cofactors, free: Index) -> tuple[Array, Array, Array]:
     """Return the cofactors of a free network with inner constraints over the targets: of the
-    interior orientation (10, 10), zero for what is held, the centres (k, 3, 3) mm² and the targets
-    (3m, 3m) mm².
+    interior orientation (10, 10), zero if held, the centres (k, 3, 3) mm² and the targets (3m, 3m)
+    mm².
     """
     f, k, m = len(free), len(bundle.centres), len(bundle.points)
     Qp = found.follow.T @ found.mixed
@@ -408,8 +406,8 @@ def inner_constraints(bundle: Bundle, found: Cofactors, free: Index) -> tuple[Ar
 
 
 def point_tests(v: Array, cofactors: Array) -> Array:
-    """Return vᵀ Qvv⁻¹ v (n,) of whitened residuals (n, 2) with cofactors (n, 2, 2): chi² with two
-    degrees of freedom; what nothing else controls is left out of it.
+    """Return vᵀ Qvv⁻¹ v (n,) of whitened residuals (n, 2) with cofactors (n, 2, 2): χ² with two
+    degrees of freedom, without directions that no other observation controls.
     """
     values, vectors = np.linalg.eigh(cofactors)
     along = np.einsum("nji,nj->ni", vectors, v)
@@ -420,10 +418,10 @@ def point_tests(v: Array, cofactors: Array) -> Array:
 
 
 def null_space(centres: Array, points: Array, n_interior: int) -> tuple[Array, Array]:
-    """What the photographs cannot tell: 3 shifts, 3 turns, 1 scale.
+    """Return the null space of a free network: 3 shifts, 3 rotations, 1 scale.
 
-    Returns its part over the cameras (n_interior + 6k, 7) and over the targets (3m, 7), in the
-    order of the unknowns.
+    Its parts for the cameras (n_interior + 6k, 7) and the targets (3m, 7), in the order of the
+    unknowns.
     """
 
     def motion(x: Array) -> Array:
@@ -442,9 +440,8 @@ def null_space(centres: Array, points: Array, n_interior: int) -> tuple[Array, A
 
 
 def _regularise(S: Array, null: Array) -> tuple[Array, Array, Array]:
-    """S scaled to a unit diagonal plus the projector on its null space; scales; projector."""
-    scales = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
+    """Scale S to a unit diagonal and add the projector on its null space; return all three."""
+    scaled, scales = unit_diagonal(S)
     basis, _ = np.linalg.qr(null / scales[:, None])
     projector = basis @ basis.T
-    scaled: Array = S * scales[:, None] * scales + projector
-    return scaled, scales, projector
+    return scaled + projector, scales, projector

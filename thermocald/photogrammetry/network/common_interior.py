@@ -1,9 +1,9 @@
 """Several photographs of one camera: one interior orientation, an exterior one per photograph.
 
-A bundle adjustment whose targets are known: their coordinates are unknowns with the test field's
-sigmas as prior, so that a target is where it is in all photographs. The weights of the image points
-do not depend on the unknowns, so that the iteration ends at the minimum of the sum of squares. A
-photograph too poor to carry an interior orientation of its own takes part all the same.
+A bundle adjustment with known targets: their coordinates are unknowns with the test field's sigmas
+as prior, and are the same in all photographs. The weights of the image points do not depend on the
+unknowns, so that the iteration ends at the minimum of the sum of squares. A photograph too poor for
+an interior orientation of its own is used as well.
 
 Source: Luhmann et al. (2014), section 7.3 (test-field calibration); the elimination of points as
 Brown, D. C. (1976): The bundle adjustment - progress and prospects.
@@ -26,6 +26,7 @@ from thermocald.photogrammetry.camera.camera_model import (
 )
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import image_coverage, obliqueness_deg, uncertain
+from thermocald.photogrammetry.epoch.snooping import settle
 from thermocald.photogrammetry.field.testfield import plane_fit
 from thermocald.photogrammetry.linalg import MEDIAN_CHI2
 from thermocald.photogrammetry.network.bundle import (
@@ -44,18 +45,18 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 _ITERATIONS = 60
-_ROUNDS = 10
+_ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
-_LEAST_SIGMA_MM = 1e-6  # of a coordinate without sigma alongside others with one
+_LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
 
 
 @dataclass(frozen=True, eq=False)
 class CommonInterior:
-    """One camera from several photographs.
+    """One camera calibrated from several photographs.
 
-    interior; covariance (16, 16), its EOP block zero; exteriors, exterior_covariances (n, 6, 6);
-    sigma0; redundancy; used: masks of the observations per photograph; residuals per photograph
-    (n, 2) px; reasons: why the geometry is weak, empty where it is not.
+    interior; covariance (16, 16): its EOP block is zero; exteriors, exterior_covariances (n, 6, 6);
+    sigma0; redundancy; used: mask of the observations by photograph; residuals (n, 2) px: by
+    photograph; reasons: why the geometry is weak, empty if it is not.
     """
 
     interior: InteriorOrientation
@@ -80,8 +81,8 @@ def adjust_common_interior(
 ) -> CommonInterior:
     """Adjust photographs that share an interior orientation, from start values.
 
-    fitting: masks of the observations that take part at first, per photograph; what fits the result
-    comes back. Raises GeometryError where the adjustment does not converge or is singular.
+    fitting: masks of the observations to use at first, by photograph; others that fit the result
+    are taken back. Raises GeometryError if the adjustment does not converge or is singular.
     """
     s = settings or AdjustmentSettings()
     free = np.array(free_columns(s.free), dtype=np.int64)
@@ -102,18 +103,19 @@ def adjust_common_interior(
     if fitting is not None and s.snooping_alpha > 0:
         used = np.concatenate(list(fitting))
     every = BundleAdjustment(sensor, rays, free, known)
-    for _ in range(_ROUNDS):
+    history = np.zeros(len(rays), dtype=np.int8)
+    for _ in range(_ROUNDS + int(np.bincount(rays.target).max())):
         if np.abs(every.residuals(bundle)[used]).max(initial=0.0) >= BEHIND:
             raise GeometryError("targets came to lie behind the camera during the iteration")
         part = BundleAdjustment(sensor, rays.select(used), free, known)
         bundle = part.solve(bundle, iterations=_ITERATIONS)
         found = part.cofactors(bundle)
         v = every.residuals(bundle)
-        # what took part pulls the result towards itself, what did not is off from it as well
+        # variance of a residual: less than the noise's if the ray was used, more if it was not
         signs = np.where(used, -1.0, 1.0)[:, None, None]
         tests = point_tests(v, np.eye(2) + signs * every.explained(bundle, found))
-        kept = snoop_rays(tests, rays.target, used, s.snooping_alpha)
-        if np.array_equal(kept, used):
+        kept = settle(history, used, snoop_rays(tests, rays.target, used, s.snooping_alpha))
+        if kept is used:
             break
         used = kept
     n = int(np.count_nonzero(used))
@@ -143,8 +145,8 @@ def adjust_common_interior(
 
 
 def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:
-    """Covariances (k, 6, 6) of exterior orientations, from those of turns about the object's axes
-    and of projection centres, (6k, 6k).
+    """Return the covariances (k, 6, 6) of exterior orientations, from the covariance (6k, 6k) of
+    rotations about the object's axes and projection centres.
     """
     k = len(eops)
     J = np.broadcast_to(np.eye(6), (k, 6, 6)).copy()
@@ -156,10 +158,10 @@ def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:
 
 
 def snoop_rays(tests: Array, target: Index, used: Mask, alpha: float) -> Mask:
-    """Which image points stay; of the rays of one target only the worst goes at a time."""
+    """Return the mask of image points to keep; only the worst ray of a target goes at a time."""
     if alpha <= 0:
         return used
-    # chi² with 2 degrees of freedom
+    # χ² with 2 degrees of freedom
     limit = -2.0 * np.log(alpha) * max(float(np.median(tests[used])) / MEDIAN_CHI2, 1e-12)
     worst = np.zeros(1 + int(target.max(initial=0)))
     np.maximum.at(worst, target[used], tests[used])
@@ -176,7 +178,7 @@ def _weaknesses(
     covariance: Array,
     s: AdjustmentSettings,
 ) -> list[str]:
-    """Why the photographs do not carry the free parameters."""
+    """Return the reasons why the photographs do not determine the free parameters."""
     reasons: list[str] = []
     if not s.free:
         return reasons

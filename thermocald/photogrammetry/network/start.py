@@ -1,9 +1,9 @@
-"""Approximate values for a network: from nothing but the photographs, or from nominal coordinates.
+"""Approximate values for a network, from the photographs alone or from nominal coordinates.
 
-Without nominal coordinates one pair is oriented relatively (essential matrix), the others follow
-one by one by resection on the targets intersected so far. With nominal coordinates every
-photograph is resected by itself. All of it works on rays of an approximate interior orientation,
-and tolerates wrong identifications.
+Without nominal coordinates one pair is oriented relatively (essential matrix); the others follow
+one by one by resection on the targets intersected so far. With nominal coordinates every photograph
+is resected by itself. Both work on rays of an approximate interior orientation and tolerate wrong
+identifications.
 
 Source: Nistér, D. (2004): An efficient solution to the five-point relative pose problem; Terzakis,
 G., Lourakis, M. (2020): A consistently fast and globally optimal solution to the perspective-n-
@@ -33,16 +33,16 @@ _INLIER_PX = 6.0
 _MIN_RESECTION = 6
 _MIN_PAIR = 8
 _LEAST_ANGLE = np.radians(2.0)  # between two rays of a target
-# Principal distances to try, in image widths, where nothing is known: wide angle to tele.
+# Principal distances to try for an unknown camera, in image widths: wide angle to tele.
 _TRIAL_DISTANCES = (0.75, 1.0, 1.35, 0.55, 2.0, 3.0)
 # A plane field has a second, false relative orientation per pair: three good pairs are tried.
 _GOOD_PAIRS, _PAIRS = 3, 12
 _GOOD_MEDIAN_PX = 0.5
-_GOOD_MISSING = 4  # twentieths of the image points that may be left out of a good start
+_GOOD_MISSING = 4  # twentieths of the image points that a good start may lack
 
 
 class _Start:
-    """A network under construction: poses by photo, targets by number, both as found so far."""
+    """A network under construction, with the poses and targets determined so far."""
 
     def __init__(self, sensor: Sensor, interior: Array, rays: ImageRays, n_targets: int) -> None:
         self.sensor, self.interior, self.rays = sensor, interior, rays
@@ -53,11 +53,11 @@ class _Start:
         self.points = np.full((n_targets, 3), np.nan)
 
     def rows(self, photo: int) -> Index:
-        """The rays of one photograph."""
+        """Return the rows of one photograph's rays."""
         return np.flatnonzero(self.rays.photo == photo)
 
     def resect(self, photo: int) -> bool:
-        """Orient one photograph on the targets known so far; False if it cannot be done."""
+        """Orient one photograph on the targets determined so far; return whether that succeeded."""
         rows = self.rows(photo)
         rows = rows[np.isfinite(self.points[self.rays.target[rows], 0])]
         if len(rows) < _MIN_RESECTION:
@@ -71,7 +71,7 @@ class _Start:
         return True
 
     def intersect(self) -> None:
-        """Intersect every target that oriented photographs see under a sufficient angle."""
+        """Intersect every target that oriented photographs see at a sufficient angle."""
         oriented = np.isin(self.rays.photo, list(self.poses))
         for target in np.unique(self.rays.target[oriented]):
             rows = np.flatnonzero(oriented & (self.rays.target == target))
@@ -90,7 +90,7 @@ class _Start:
                 self.points[target] = x
 
     def bundle(self) -> tuple[Bundle, list[int], ImageRays]:
-        """The bundle so far, its photographs, and its rays (renumbered photos, all targets)."""
+        """Return the bundle so far, its photographs, and its rays with photographs renumbered."""
         photos = sorted(self.poses)
         number = np.full(int(self.rays.photo.max()) + 1, -1)
         number[photos] = np.arange(len(photos))
@@ -104,7 +104,7 @@ class _Start:
         return Bundle(self.interior, np.swapaxes(R, 1, 2) @ _FLIP, centres, points), photos, used
 
     def refine(self) -> None:
-        """Do a few robust iterations over what is there, the interior orientation held."""
+        """Adjust the bundle so far by a few robust iterations, the interior orientation held."""
         bundle, photos, used = self.bundle()
         held = BundleAdjustment(self.sensor, used, np.array([], dtype=int))
         bundle = held.solve(bundle, robust=True, iterations=4)
@@ -132,16 +132,16 @@ class _Start:
         self.intersect()
 
     def common(self, first: int, second: int) -> tuple[Index, Index]:
-        """The rays of two photographs to the targets that both show."""
+        """Return the rays of two photographs to the targets that both show."""
         a, b = self.rows(first), self.rows(second)
         _, ia, ib = np.intersect1d(self.rays.target[a], self.rays.target[b], return_indices=True)
         return a[ia], b[ib]
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Pairs of photographs to begin with, the most promising first.
+        """Return pairs of photographs to begin with, the most promising first.
 
-        Promising: many common targets, and directions to them that no rotation alone explains,
-        which tells a base from a turn on the spot.
+        A promising pair has many common targets, with directions that a rotation alone does not
+        explain, so that there is a base between the photographs.
         """
         scored = []
         for a, b in combinations(np.unique(self.rays.photo).tolist(), 2):
@@ -154,7 +154,7 @@ class _Start:
         return [(a, b) for _, a, b in sorted(scored, key=lambda row: -row[0])]
 
     def begin_with_pair(self, pair: tuple[int, int]) -> None:
-        """Orient two photographs to each other; GeometryError where the pair is of no use."""
+        """Orient two photographs to each other. Raises GeometryError if they do not fit."""
         import cv2
 
         a, b = self.common(*pair)
@@ -167,7 +167,7 @@ class _Start:
         n = 0
         if E is not None and E.shape == (3, 3):
             n, R, t, _ = cv2.recoverPose(E, first, second, focal=1.0, pp=(0.0, 0.0), mask=mask)
-        # a pair that disagrees in half of its targets is not a pair, whatever its parallax promised
+        # a pair that disagrees in half of its targets is useless, however large its parallax
         if n < max(_MIN_PAIR, len(a) // 2):
             raise GeometryError("the two photographs do not fit together")
         self.poses = {
@@ -180,18 +180,18 @@ class _Start:
             raise GeometryError("the two photographs have too few targets in common")
 
     def begin_with_nominal(self, nominal: Array) -> None:
-        """Resect every photograph on nominal coordinates (m, 3) mm, NaN where unknown."""
+        """Resect every photograph on nominal coordinates (m, 3) mm, NaN if unknown."""
         self.points[:] = nominal
         for photo in np.unique(self.rays.photo):
             self.resect(int(photo))
         if len(self.poses) < 2:
             raise GeometryError("fewer than two photographs show enough of the nominal field")
-        # from here on the photographs speak, and targets without nominal coordinates join
+        # now the targets follow from the photographs, also those without nominal coordinates
         self.points[:] = np.nan
         self.intersect()
 
     def network(self, free: Index) -> tuple[Bundle, list[int], ImageRays]:
-        """Add the other photographs and adjust roughly; GeometryError where that fails."""
+        """Add the other photographs and adjust roughly. Raises GeometryError if that fails."""
         self.refine()
         self.extend()
         bundle, photos, used = self.bundle()
@@ -211,11 +211,11 @@ def approximate(
     nominal: Array | None,
     free: Index,
 ) -> tuple[Bundle, list[int], ImageRays]:
-    """The best of the approximate networks: most image points, then smallest residuals.
+    """Return the best approximate network: most image points, then smallest residuals.
 
     interior: approximate, several are tried if None; nominal (n_targets, 3) mm or None; free: the
-    interior parameters that may be determined. Returns the bundle, the photographs that are in it
-    and their rays, renumbered. Raises GeometryError if nothing can be oriented.
+    interior parameters to estimate. Returns the bundle, its photographs, and their rays,
+    renumbered. Raises GeometryError if nothing can be oriented.
     """
     width_mm = max(sensor.width, sensor.height) * sensor.pixel_pitch
     trials = (
@@ -240,7 +240,7 @@ def approximate(
                 continue
             off = BundleAdjustment(sensor, used.in_pixels(), free).residuals(bundle)
             median = float(np.median(np.linalg.norm(off, axis=1)))
-            # five percent more or fewer image points decide nothing
+            # a difference of five per cent of the image points does not count
             missing = round(20 * (1 - len(used) / len(rays)))
             if best is None or (missing, median) < best[:2]:
                 best = (missing, median, bundle, photos, used)

@@ -1,1 +1,1 @@
-"""A whole series adjusted together: epochs and their common unknowns."""
+"""Adjustment of a whole series: parameters of the epochs and common unknowns."""

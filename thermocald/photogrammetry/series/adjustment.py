@@ -1,16 +1,16 @@
-"""Adjustment of a whole series: every epoch its own parameters, all epochs their common ones.
+"""Adjustment of a whole series, with parameters per epoch and parameters common to all epochs.
 
 Parameters are per epoch (`free`, and the EOP with `exterior="per_epoch"`), common to the series
-(the EOP with `exterior="series"`, and a constant offset per target), or held. Common unknowns are
-reduced: each epoch contributes its normal equations with its own parameters eliminated.
+(the EOP with `exterior="series"`, and a constant offset per target), or held. Each epoch
+contributes normal equations of the common unknowns, with its own parameters eliminated.
 
-All epochs are in memory here; `long_series` adjusts one of any length in blocks. What comes out is
-`result`'s. A target that is hidden now and then shifts single epochs by its coordinate error; with
-`target_offsets` that error is an unknown with the test field's sigma as its prior.
+All epochs are in memory here; `long_series` adjusts a series of any length in blocks. `result`
+defines the results. A target that is hidden now and then shifts single epochs by its coordinate
+error; with `target_offsets` that error is an unknown with the test field's sigma as its prior.
 
-The exterior orientation is estimated as was asked for, or as the data show.
+The exterior orientation is estimated as set by the user, or as chosen by the data.
 
-Source: DESIGN idea 3; the test for standing still is Rao's score test (1948).
+Source: DESIGN idea 3; the test of stillness is Rao's score test (1948).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from thermocald.photogrammetry.epoch.snooping import (
 )
 from thermocald.photogrammetry.series.covariances import (
     all_cofactors,
-    by_perspective,
+    common_error_covariance,
+    correlated_error_cofactors,
+    estimate_held_affinity,
     line_weights,
-    of_common,
-    of_correlated,
-    of_held_affinity,
-    of_priors,
-    of_slow_targets,
+    perspective_cofactor_roots,
+    prior_cofactors,
+    slow_target_covariance,
     stillness,
     typical_sensitivity,
 )
@@ -58,7 +58,7 @@ from thermocald.photogrammetry.series.mount import (
     Movement,
     estimate_movement,
     image_px,
-    together,
+    mean_movement,
 )
 from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
 from thermocald.photogrammetry.series.result import (
@@ -84,18 +84,18 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
-_LOOSE_PX = 3.0  # far beyond what a mount trembles, and what one epoch knows of its perspective
+_LOOSE_PX = 3.0  # far beyond the tremble of a mount, and beyond the noise of an epoch's perspective
 
 
-def choose(
+def choose_exterior(
     series: SeriesEstimator, asked: Exterior, good: int, estimate: Estimate | None = None
 ) -> SeriesEstimator:
-    """The series with the exterior orientation that its good epochs and a first estimate allow."""
+    """Choose how the exterior orientation is estimated, from the good epochs and an estimate."""
     if estimate is None or (asked == "auto" and good < FEWEST_EPOCHS):
         why = f"{good} epochs do not show how the mount moves, {FEWEST_EPOCHS} would"
         s = replace(series.s, exterior="per_epoch")
         return replace(series, s=s, bound=None, choice=why)
-    movement, A = observed_movement(series, estimate), estimate.system.design.at.A
+    movement, A = estimate_mount_movement(series, estimate), estimate.system.design.at.A
     px = image_px(movement.covariance, A)
     if movement.still and asked == "auto":
         noise = image_px(movement.noise, A)
@@ -112,8 +112,8 @@ def choose(
     return replace(series, bound=movement.precision(), movement=movement, choice=why)
 
 
-def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
-    """The variance components of the mount's movements."""
+def estimate_mount_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
+    """Estimate the variance components of the mount's movements from an estimate of the series."""
     system, variance = estimate.system, series.variance(estimate)
     at, N = system.design.at, system.N
     before = np.concatenate([at.iop, at.eop])
@@ -125,7 +125,7 @@ def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
         extra = pairs.normal_matrices(typical[None], at.A[..., EOP])[0]
         correlated = extra / variance**2
     free = np.array(free_columns(series.s.free), dtype=np.int64)
-    good = system.good & np.isfinite(b).all(axis=1)  # without epochs that diverged
+    good = system.good & np.isfinite(b).all(axis=1)  # epochs that diverged are left out
     found, starts = [], []
     for part in series.windows or (slice(0, len(N)),):
         if good[part].sum() < FEWEST_EPOCHS and series.windows:
@@ -137,7 +137,7 @@ def observed_movement(series: SeriesEstimator, estimate: Estimate) -> Movement:
                 series.s.drift_period, correlated,
             )
         )  # fmt: skip
-    return together(found, starts) if found else STILL
+    return mean_movement(found, starts) if found else STILL
 
 
 def adjust_series(
@@ -150,13 +150,13 @@ def adjust_series(
 ) -> SeriesAdjustment:
     """Adjust all epochs of a camera, from start values good to a few per cent.
 
-    epochs: the observations, None for an epoch without, or the grid of them. Never raises for data:
-    an epoch without a result has a status and a reason.
+    epochs: the observations, None for an epoch without any, or their grid. Never raises because of
+    the data: an epoch without a result has a status and a reason.
     """
     s = settings or SeriesSettings()
     if not isinstance(epochs, ObservationGrid):
         epochs = ObservationGrid.from_observations(testfield, epochs)
-    # Targets that are never seen would only be unknowns without observations.
+    # Targets that are never seen would add unknowns without observations.
     seen = np.flatnonzero(epochs.observed.any(axis=0))
     start = np.concatenate([interior.as_array(), exterior.as_array()])
     found = adjusted(sensor, testfield.subset(seen), epochs.targets(seen), start, s)
@@ -174,9 +174,8 @@ def adjusted(
 ) -> tuple[SeriesEstimator, Estimate]:
     """Estimate a series on a grid of epochs × all targets of its field, from values (16,).
 
-    Returns the estimator in its last state, too. windows: runs of consecutive epochs, where the
-    series is a sample of a longer one; field_variance: by what the field's stated covariance is to
-    be multiplied, as far as is known.
+    Returns the final estimator and the estimate. windows: runs of consecutive epochs, if the series
+    is a sample of a longer one; field_variance: first factor of the field's stated covariance.
     """
     use = grid.observed & enough_targets(grid, s)[:, None]
     first = State(np.tile(start, (len(use), 1)), np.zeros((len(testfield), 2)), start[EOP])
@@ -184,9 +183,9 @@ def adjusted(
         sensor, testfield, grid, grid.weights, s, windows=windows, field_variance=field_variance
     )
     if s.exterior == "auto" and len(use) < FEWEST_EPOCHS:
-        series = choose(series, "auto", len(use))
+        series = choose_exterior(series, "auto", len(use))
     elif s.exterior in ("mount", "auto"):
-        # Loosely bound at first, so that no movement is taken for gross errors.
+        # The mount is loose at first, so that movements do not look like gross errors.
         A = linearise(sensor, testfield, start[IOP], start[EOP]).A[..., EOP]
         bound = np.diag((A**2).sum(axis=1).mean(axis=0)) / _LOOSE_PX**2
         loose = replace(series, s=replace(s, exterior="mount"), bound=bound)
@@ -194,7 +193,7 @@ def adjusted(
         if not estimate.settled:
             return loose, estimate
         use = estimate.system.use
-        series = choose(loose, s.exterior, int(estimate.system.good.sum()), estimate)
+        series = choose_exterior(loose, s.exterior, int(estimate.system.good.sum()), estimate)
         if series.s.exterior != "series" and np.isfinite(estimate.values).all():
             first = estimate
     return series.adjusted(first, use)
@@ -203,9 +202,9 @@ def adjusted(
 def result(
     series: SeriesEstimator, estimate: Estimate, *, affinity: bool = True
 ) -> SeriesAdjustment:
-    """Judge the epochs and scale the covariances.
+    """Give the epochs a status and scale the covariances.
 
-    affinity: whether to say what a held affinity does to the level.
+    affinity: whether to estimate the effect of a held affinity on the level.
     """
     finite = np.isfinite(estimate.values).all(axis=1)
     system = replace(estimate.system, good=estimate.system.good & finite)
@@ -218,33 +217,31 @@ def result(
     excess, own, sound = np.zeros(16), system.design.own, system.good
     block = (slice(None), own[:, None], own)
     few = series.has_offsets and len(use) < FEW_EPOCHS
-    # what errors of image points have in common in few epochs the offsets take up
+    # in few epochs the offsets absorb the common part of the image points' errors
     least = np.maximum(unit, 1.0) if few else unit
-    # What priors contribute is known as well as they are, not as the epoch.
-    bound = of_priors(system)
+    # The priors' part is scaled by the series' variance, not by the epoch's.
+    bound = prior_cofactors(system)
     relative[block] -= bound
     many = s.target_noise and len(use) >= FEW_EPOCHS
     pairs = series.pairs(estimate) if many else None
-    if pairs is not None and len(pairs):
-        relative += of_correlated(system, pairs, pooled)
-    else:
-        pairs = None
+    if pairs:
+        relative += correlated_error_cofactors(system, pairs, pooled)
     relative *= epoch_variance(least, redundancy, pooled)[:, None, None]
     relative[block] += pooled * bound
     level *= pooled
     trend *= pooled
     movement = series.movement
     if s.exterior == "series" and len(use) >= FEWEST_EPOCHS:
-        movement = observed_movement(series, estimate)
+        movement = estimate_mount_movement(series, estimate)
     mount_trend = np.zeros((16, 16))
     if movement.covariance.any() and sound.any():
         if s.exterior == "series":
-            relative[block] += of_common(system, movement.covariance)
+            relative[block] += common_error_covariance(system, movement.covariance)
         G = typical_sensitivity(system)
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
     slow = np.zeros((16, 16))
     if many:
-        slow = of_slow_targets(
+        slow = slow_target_covariance(
             system, slow_errors(estimate.residuals, use), series.testfield.groups
         )
         trend += slow
@@ -252,7 +249,7 @@ def result(
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
         excess[own] = _excess(series, estimate.values[:, own], variances, sound)
         relative[:, own, own] += excess[own] * sound[:, None]
-    # Slow errors: a line through zero in the middle of the series, uncertain at its ends.
+    # Slow errors: a straight line through zero in the middle of the series, uncertain at its ends.
     if slow.any():
         relative += np.linspace(-0.5, 0.5, len(use))[:, None, None] ** 2 * slow
     relative[~sound] = 0.0
@@ -262,16 +259,16 @@ def result(
     known = sigma0[sound & np.isfinite(sigma0)]
     held_affinity = None
     if affinity and sound.any():
-        held_affinity = of_held_affinity(
+        held_affinity = estimate_held_affinity(
             series.sensor, series.testfield, system, estimate, estimate.residuals,
             series.field_variance,
         )  # fmt: skip
     return replace(
-        judged(series, estimate, relative, unit / pooled, sigma0, redundancy, still),
+        judge_epochs(series, estimate, relative, unit / pooled, sigma0, redundancy, still),
         level_covariance=level,
         excess_sd=np.sqrt(excess),
         trend_sd=np.sqrt(np.diag(trend + mount_trend)),
-        perspective_sd=np.sqrt(pooled) * by_perspective(system),
+        perspective_sd=np.sqrt(pooled) * perspective_cofactor_roots(system),
         field_ratio=float(np.sqrt(series.field_variance)),
         outer_noise=_outer_noise(series, estimate),
         noise_ratio=float(np.median(known)) if len(known) else 1.0,
@@ -279,12 +276,12 @@ def result(
         movement=movement,
         choice=series.choice,
         slow=slow,
-        pairs=pairs,
+        pairs=pairs or None,
     )
 
 
 def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, float]:
-    """Noise of the outermost target over that in the image's middle, and its sd."""
+    """Return the noise of the outermost target over that in the image's middle, and its sd."""
     system, sensor = estimate.system, series.sensor
     half = 0.5 * np.array([sensor.width - 1, sensor.height - 1])
     radius = np.linalg.norm(system.design.at.predicted - half, axis=1)
@@ -294,12 +291,13 @@ def _outer_noise(series: SeriesEstimator, estimate: Estimate) -> tuple[float, fl
         tests *= np.divide(
             series.stated[..., 0], weights, out=np.zeros_like(weights), where=weights > 0
         )
-    offered = series.grid.observed & system.good[:, None]  # the rejected too: noise is cut else
+    # with rejected points, as the noise would be too small without its largest values
+    offered = series.grid.observed & system.good[:, None]
     return noise_by_radius(tests, offered, radius)
 
 
 def _excess(series: SeriesEstimator, values: Array, variances: Array, sound: Mask) -> Array:
-    """Variances (p,) by which neighbouring epochs scatter beyond theirs; windows one by one."""
+    """Return the excess variances (p,) of neighbouring epochs, averaged over the windows."""
     kinks, drift = series.s.exterior != "per_epoch", series.s.drift_period > 0
     parts = [
         excess_scatter(values[w][sound[w]], variances[w][sound[w]], kinks, drift)
@@ -311,19 +309,19 @@ def _excess(series: SeriesEstimator, values: Array, variances: Array, sound: Mas
 
 
 def epoch_variance(unit: Array, redundancy: Array, pooled: float) -> Array:
-    """Variance of unit weight (E,) that scales an epoch's covariance.
+    """Return the variances of unit weight (E,) that scale the epochs' covariances.
 
-    The epoch's own, and never below the series' where a handful of residuals may be small by luck.
+    The epoch's own, but at least the series' if its few residuals may be small by chance.
     """
     few = redundancy < TRUSTED_REDUNDANCY
     own: Array = np.where(few, np.maximum(unit, pooled), unit)
     return np.where(redundancy > 0, own, pooled)
 
 
-_FEW = 0.6  # share of a series' targets below which an epoch's geometry is looked at by itself
+_FEW = 0.6  # share of a series' targets below which an epoch's geometry is tested by itself
 
 
-def judged(
+def judge_epochs(
     series: SeriesEstimator,
     estimate: Estimate,
     covariance: Array,
@@ -332,9 +330,9 @@ def judged(
     redundancy: Array,
     stillness: Array,
 ) -> SeriesAdjustment:
-    """The epochs with their status and reason, and without what belongs to the series as a whole.
+    """Give each epoch its status and reason; return a result without the series' own figures.
 
-    covariance (E, 16, 16); unit (E,): variance of unit weight over the series' own; sigma0,
+    covariance (E, 16, 16); unit (E,): variance of unit weight over the series'; sigma0,
     redundancy, stillness (E,).
     """
     sensor, testfield, grid, s = series.sensor, series.testfield, series.grid, series.s
@@ -343,7 +341,7 @@ def judged(
     offered, used = observed.sum(axis=1), use.sum(axis=1)
     status, reasons = ["ok"] * len(use), [""] * len(use)
 
-    def say(rows: Mask, word: str, sentence: str) -> None:
+    def fail(rows: Mask, word: str, sentence: str) -> None:
         for row in np.flatnonzero(rows):
             if status[row] == "ok":
                 status[row] = word
@@ -351,44 +349,43 @@ def judged(
 
     few = 2 * offered - s.carried < TRUSTED_REDUNDANCY
     most = np.where(few, most_rejected(s.max_rejected, 0), s.max_rejected)
-    say(offered == 0, "no_observations", "no target was measured")
-    say(
+    fail(offered == 0, "no_observations", "no target was measured")
+    fail(
         ~enough_targets(grid, s),
         "too_few_targets",
         f"{{n}} targets for {s.carried} unknowns of the epoch leave too little "
         "redundancy: show more targets or hold parameters fixed",
     )
-    say(
+    fail(
         used < (1 - most) * offered,
         "too_many_rejected",
         "{bad} of {n} targets contradict the others: a moved test field, a wrong one, or a "
         "blurred image",
     )
-    say(~estimate.solved, "weak_geometry", "these targets cannot carry the parameters")
+    fail(~estimate.solved, "weak_geometry", "these targets do not determine the parameters")
     failing = fails_global_test(unit, redundancy)
     if failing.any():
         about = neighbours_variance(unit, estimate.solved)
         failing = fails_global_test(unit / about, redundancy)
-    say(
+    fail(
         failing,
         "global_test",
-        "the residuals are larger than the noise of its neighbours allows, and too few to tell "
-        "which target is wrong: show more targets",
+        "the residuals are larger than the noise of the epochs around it allows, and too few to "
+        "show which target is wrong: show more targets",
     )
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     c, pitch = values[:, 0], sensor.pixel_pitch
-    say(
+    fail(
         np.sqrt(np.maximum(variance[:, 0], 0.0)) > bounds.relative_sd_c * c,
         "weak_geometry",
         f"the principal distance is known to worse than {bounds.relative_sd_c:.1%}",
     )
-    say(
+    fail(
         np.sqrt(variance[:, PRINCIPAL_POINT].max(axis=1).clip(0.0)) > bounds.sd_point_px * pitch,
         "weak_geometry",
         f"the principal point is known to worse than {bounds.sd_point_px:.0f} px",
     )
-    # Geometry is that of the series' targets; only epochs that see few of them are looked at
-    # one by one.
+    # The best epoch's geometry stands for all; only epochs with few targets are tested one by one.
     ever = use.any(axis=0).sum()
     few = (used < _FEW * ever) & (np.array(status) == "ok")
     typical = int(np.argmax(used))
@@ -396,15 +393,14 @@ def judged(
         if status[row] != "ok":
             continue
         seen = use[row]
-        found = weaknesses(
+        weak = weaknesses(
             sensor, testfield.points[seen], grid.points[row, seen], values[row], covariance[row],
             s.free, bounds,
         )  # fmt: skip
-        said = "; ".join(found).replace("{", "(").replace("}", ")")
-        if said and row == typical:
-            say(np.ones(len(use), dtype=bool), "weak_geometry", said)
-        elif said:
-            status[row], reasons[row] = "weak_geometry", said
+        if weak:
+            rows = np.full(len(use), row == typical)
+            rows[row] = True
+            fail(rows, "weak_geometry", "; ".join(weak))
     values[[word != "ok" for word in status]] = np.nan
     return SeriesAdjustment(
         s, values, covariance, np.zeros((16, 16)), sigma0, redundancy, use, observed & ~use,

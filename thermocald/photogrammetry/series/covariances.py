@@ -1,6 +1,6 @@
-"""How sure an adjusted series is: covariances of its parameters from the linearised system.
+"""Covariances of an adjusted series' parameters, from the linearised system.
 
-Two kinds are kept apart: what differs between epochs, and the level, which all have in common.
+Errors that differ between epochs are separate from the level, the errors common to all epochs.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.system import SeriesSystem, State
     from thermocald.photogrammetry.series.target_noise import CorrelatedPairs
 
-AFFINITY = 1e-4  # of a good lens: fx and fy of phones differ by 1e-4 to 3e-3
+AFFINITY = 1e-4  # of a good lens; fx and fy of phones differ by 1e-4 to 3e-3
 C1, C2 = PARAMETER_NAMES.index("C1"), PARAMETER_NAMES.index("C2")
 _STEPS = 4  # of Gauss-Newton, from the adjusted series
-_MOST_TAKEN_OFF = 0.6  # of the variance of a combination of parameters
+_MOST_REMOVED = 0.6  # of the variance of a combination of parameters
 
 
 def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
     """Return the cofactors of all parameters.
 
-    Those (E, 16, 16) relative to the series; of what all epochs have in common (16, 16); and of
-    what the common unknowns do to a straight line from the first to the last epoch (16, 16).
+    Those relative to the series (E, 16, 16); those of the level (16, 16); and those of the change
+    of a straight line from the first to the last epoch by the common unknowns (16, 16).
 
-    An epoch's parameters depend on the common unknowns by -G; what of G is the same in all
-    epochs cancels in differences within the series, the rest is the epoch's own.
+    An epoch's parameters depend on the common unknowns by -G. The mean of G over the epochs cancels
+    in differences within the series; the deviation from it is the epoch's own.
     """
     design = system.design
     own, common = design.own, design.common
@@ -61,7 +61,7 @@ def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
         for part, C in system.couplings():
             deviation = (system.Q[part] @ C - mean) @ root
             Q[part] += deviation @ np.swapaxes(deviation, 1, 2)
-        # A parameter that is both own and common takes both ways.
+        # A parameter that is both own and common depends on them both ways.
         all_level = np.zeros((16, width))
         all_level[common] = root[: len(common)]
         all_level[own] -= mean @ root
@@ -71,11 +71,11 @@ def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
     return relative, level, trend
 
 
-def of_slow_targets(system: SeriesSystem, errors: Array, group: Index) -> Array:
-    """Covariance (16, 16) of a straight line over the series from targets' slow errors.
+def slow_target_covariance(system: SeriesSystem, errors: Array, group: Index) -> Array:
+    """Return the covariance (16, 16) of a straight line over the series from slow target errors.
 
-    errors (T, 2) px: seen in the residuals, of which a group of targets that errs together has
-    already pulled a part into the parameters; as in the jackknife (HC3) that is put back:
+    errors (T, 2) px: from the residuals. The parameters have absorbed a part of the error of a
+    group of targets with a common error; it is restored as in the jackknife (HC3):
     Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups.
     """
     design = system.design
@@ -96,7 +96,7 @@ def of_slow_targets(system: SeriesSystem, errors: Array, group: Index) -> Array:
         Jg = J[rows].reshape(len(e), -1)
         left = np.eye(len(e)) - Jg @ inverse[0] @ Jg.T
         values, vectors = np.linalg.eigh(left)
-        # What a group determines alone cannot be seen in its residuals at all.
+        # A group's residuals do not show what the group alone determines.
         back = vectors @ ((vectors.T @ e) / np.maximum(values, 0.1))
         pull = inverse[0] @ (Jg.T @ back)
         total += np.outer(pull, pull)
@@ -104,27 +104,29 @@ def of_slow_targets(system: SeriesSystem, errors: Array, group: Index) -> Array:
     return out
 
 
-def of_correlated(system: SeriesSystem, pairs: CorrelatedPairs, variance: float) -> Array:
-    """What correlated errors add to the cofactors (E, 16, 16) of own parameters.
+def correlated_error_cofactors(
+    system: SeriesSystem, pairs: CorrelatedPairs, variance: float
+) -> Array:
+    """Return the part of the own parameters' cofactors (E, 16, 16) from correlated errors.
 
-    variance: of unit weight of the series, in which the pairs were found.
+    variance: of unit weight of the series from which the pairs come.
     """
     design = system.design
     extra = pairs.normal_matrices(system.used(), design.at.A[..., design.own]) / variance
     own = system.Q @ extra @ system.Q
-    # Covariances from epochs that do not see the same targets may be indefinite together: at most
-    # three fifths are taken off the variance of any combination.
+    # Covariances from epochs that see different targets may be indefinite together: the variance
+    # of a combination is reduced by three fifths at most.
     root = np.linalg.cholesky(system.Q)
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(inverse @ own @ np.swapaxes(inverse, 1, 2))
     back = root @ vectors
-    own = (back * np.maximum(values, -_MOST_TAKEN_OFF)[:, None, :]) @ np.swapaxes(back, 1, 2)
+    own = (back * np.maximum(values, -_MOST_REMOVED)[:, None, :]) @ np.swapaxes(back, 1, 2)
     own[~system.good] = 0.0
     return among_all(own, design.own)
 
 
-def of_priors(system: SeriesSystem) -> Array:
-    """The part (E, p, p) of the cofactors that the priors contribute, Q P Q."""
+def prior_cofactors(system: SeriesSystem) -> Array:
+    """Return the part (E, p, p) of the cofactors that the priors contribute, Q P Q."""
     design = system.design
     part: Array = system.Q @ design.own_prior @ system.Q
     part[~system.good] = 0.0
@@ -132,7 +134,7 @@ def of_priors(system: SeriesSystem) -> Array:
 
 
 def typical_sensitivity(system: SeriesSystem) -> Array:
-    """By how much own parameters (p,) follow an error of the pose (6,), in a typical epoch."""
+    """Return the derivatives (p, 6) of a typical epoch's own parameters by an error of the pose."""
     design = system.design
     N = system.N[system.good].mean(axis=0)
     Q, _ = cofactors((N[design.own[:, None], design.own] + design.own_prior)[None])
@@ -140,11 +142,11 @@ def typical_sensitivity(system: SeriesSystem) -> Array:
     return sensitivity
 
 
-def by_perspective(system: SeriesSystem) -> Array:
-    """Roots of the cofactors (16,) of a typical epoch's parameters if the mount could stand
-    anywhere in each.
+def perspective_cofactor_roots(system: SeriesSystem) -> Array:
+    """Return the roots (16,) of a typical epoch's cofactors with a completely free mount.
 
-    NaN for what is held, where nothing is common to the epochs or where rounding has left nothing.
+    NaN for held parameters, for a series without a common pose, and where rounding makes a cofactor
+    negative.
     """
     out = np.full(16, np.nan)
     if len(system.design.common) and system.good.any():
@@ -157,8 +159,8 @@ def by_perspective(system: SeriesSystem) -> Array:
 
 @dataclass(frozen=True)
 class HeldAffinity:
-    """Of C1 and C2, where they are held: by how much the targets say that they differ, with sds
-    (k,), and by how much 1 would move the level (k, 16).
+    """Estimated differences (k,) of the held ones of C1 and C2 from their held values, their sds
+    (k,), and the change of the level (k, 16) for a difference of 1.
     """
 
     names: tuple[str, ...]
@@ -167,7 +169,7 @@ class HeldAffinity:
     moves: Array
 
 
-def of_held_affinity(
+def estimate_held_affinity(
     sensor: Sensor,
     field: TestField,
     system: SeriesSystem,
@@ -175,10 +177,10 @@ def of_held_affinity(
     residuals: Array,
     field_variance: float,
 ) -> HeldAffinity:
-    """Estimate from the mean image of all epochs how far C1 and C2 are from what they are held at.
+    """Estimate how far C1 and C2 are from their held values, by the mean image of all epochs.
 
-    residuals (E, T, 2) px; field_variance: by which the field's stated covariance was multiplied,
-    perhaps for that very affinity: here it is as stated, and the sds follow what misfit is left.
+    residuals (E, T, 2) px; field_variance: factor of the field's stated covariance. As this very
+    affinity may have caused it, the covariance is as stated here, and the sds follow the misfit.
     """
     design, A = system.design, system.design.at.A
     free = np.union1d(design.own, design.common)
@@ -221,12 +223,12 @@ def _normals(A: Array, W: Array) -> Array:
 
 
 def _full(weights: Array) -> Array:
-    """Weights (T, 3) xx, yy, xy as matrices (T, 2, 2)."""
+    """Return weights (T, 3) xx, yy, xy as matrices (T, 2, 2)."""
     return np.stack([weights[:, [0, 2]], weights[:, [2, 1]]], axis=1)
 
 
-def of_common(system: SeriesSystem, covariance: Array) -> Array:
-    """Covariance (E, p, p) of own parameters where the common ones (q, q) err in an epoch."""
+def common_error_covariance(system: SeriesSystem, covariance: Array) -> Array:
+    """Propagate a covariance (q, q) of an epoch's common parameters to its own ones (E, p, p)."""
     design = system.design
     G = system.Q @ system.N[:, design.own[:, None], design.common]
     part: Array = G @ covariance @ np.swapaxes(G, 1, 2)
@@ -246,9 +248,9 @@ def pose_equations(N: Array, b: Array, own: Index, Q: Array) -> tuple[Array, Arr
 
 
 def stillness(system: SeriesSystem, residuals: Array) -> Array:
-    """Chi-square (E,) of the held exterior orientation being the same in an epoch as in the series.
+    """Test whether an epoch's exterior orientation is the series'; return χ² (E,).
 
-    Rao's score test: the gradient by its six parameters, with the epoch's own ones reduced.
+    Rao's score test: the gradient of the six parameters, with the epoch's own ones reduced.
     """
     b = system.gradient(residuals)
     V, g = pose_equations(system.N, b, system.design.own, system.Q)
@@ -258,7 +260,7 @@ def stillness(system: SeriesSystem, residuals: Array) -> Array:
 
 
 def line_weights(good: Mask) -> Array:
-    """Weights (E,) that give the change of a straight line from the first epoch to the last."""
+    """Return weights (E,) of the change of a straight line from the first epoch to the last."""
     t = np.flatnonzero(good).astype(np.float64)
     weights = np.zeros(len(good))
     if len(t) > 1:

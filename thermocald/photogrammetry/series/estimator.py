@@ -1,7 +1,7 @@
 """The estimator of a series: Gauss-Newton with reduced common unknowns, and data snooping.
 
-Works on arrays of all epochs at hand: a whole series, or one block of a long one, whose common
-unknowns are then held at what is known of them.
+The arrays are those of a whole series, or of one block of a long series. The common unknowns of a
+block are held at their known values.
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.result import SeriesSettings
 
 NOISE_SHOWN = 0.5
-"""Share of the redundancy below which residuals show the priors, not the noise: of one epoch."""
+"""Share of an epoch's redundancy below which residuals show the priors rather than the noise."""
 
-_ENOUGH_FOR_NOISE = 4  # epochs that show the noise of single targets
-_GUESSED = 10.0  # degrees of freedom with which stated noise tells that of a single target
-_MANY = 10.0  # observations for each common unknown: their priors hardly matter any more
+_ENOUGH_FOR_NOISE = 4  # epochs needed to estimate the noise of single targets
+_GUESSED = 10.0  # degrees of freedom of a single target's noise as stated
+_MANY = 10.0  # observations per common unknown beyond which priors hardly matter
 _ITERATIONS = 15
 _HALVINGS = 6  # of a step at most
-_SMALL = 0.1  # standard deviations: a last step that the partials carry to 1e-3
-_SMALLER = 1e-4  # of one block among many: the result must not depend on the blocks
-_NEAR = 10.0  # standard deviations: by what the residuals follow a step by the partials
+_SMALL = 0.1  # standard deviations; the partials apply a last step below it to 1e-3
+_SMALLER = 1e-4  # the same for a block, as the result must not depend on the blocks
+_NEAR = 10.0  # standard deviations up to which the partials predict the residuals after a step
 _ROUNDS = 8  # of data snooping
 _FIELD_ROUNDS = 4  # of the field's own variance component
-_SAME_FIELD = 0.1  # of it
-_LEAST_TOLD = 0.1  # of an offset by the image points, to count
+_SAME_FIELD = 0.1  # relative change of that component at convergence
+_LEAST_SHARE = 0.1  # of an offset that image points must determine, for the offset to count
 _FEWEST_OFFSETS = 8
 _BEYOND_CHANCE = 3.1  # standard deviations
 _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more than about 1e-3
@@ -70,8 +70,8 @@ _RELINEARISE_PX = 1.0  # movement of the mean that changes the partials by more 
 
 @dataclass(frozen=True, eq=False)
 class Estimate(State):
-    """A state as estimated, the residuals (E, T, 2) px that it leaves, the system, and which
-    epochs converged (E,).
+    """An estimated state with its residuals (E, T, 2) px, its system, and a mask (E,) of the epochs
+    that converged.
     """
 
     residuals: Array
@@ -80,27 +80,27 @@ class Estimate(State):
 
     @property
     def solved(self) -> Mask:
-        """Which epochs (E,) carry their parameters and converged."""
+        """Mask (E,) of the epochs that determine their parameters and converged."""
         return self.converged & self.system.good
 
     @property
     def settled(self) -> bool:
-        """Whether most epochs that take part are solved."""
+        """Whether most epochs in use are solved."""
         return bool(2 * self.solved.sum() >= self.system.use.any(axis=1).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesEstimator:
-    """A series as it is adjusted.
+    """A series with the settings of its adjustment.
 
-    grid: the observations with the weights in use; stated (E, T, 3): their weights as stated;
-    bound (6, 6): inverse covariance of the movements of the mount; movement: what that rests on;
-    choice: why the exterior orientation is estimated as it is; held: the linearisation at which
-    common unknowns are known, None where they are estimated; unit: variance of unit weight that the
-    priors start with; windows: runs of consecutive epochs, where the series is a sample of a longer
-    one; typical: variance of unit weight for epochs too poor to tell their own, None: that of these
-    epochs; field_variance: by what the stated covariance of the field's coordinates is multiplied;
-    freedom (T,): degrees of freedom with which each target's noise is known, None: as stated.
+    grid: the observations with the weights in use; stated (E, T, 3): their stated weights; bound
+    (6, 6): inverse covariance of the mount's movements; movement: its variance components; choice:
+    why the exterior orientation is estimated as it is; held: the linearisation of held common
+    unknowns, None if they are estimated; unit: initial variance of unit weight for the priors;
+    windows: runs of consecutive epochs, if the series is a sample of a longer one; typical:
+    variance of unit weight for epochs too poor to estimate theirs, None for that of these epochs;
+    field_variance: factor of the field's stated covariance; freedom (T,): degrees of freedom of
+    each target's estimated noise, None if the noise is as stated.
     """
 
     sensor: Sensor
@@ -119,23 +119,23 @@ class SeriesEstimator:
     freedom: Array | None = None
 
     def adjusted(self, start: State, use: Mask) -> tuple[SeriesEstimator, Estimate]:
-        """Solve, find the gross errors and the targets' own noise; the series with that noise.
+        """Estimate the series, its gross errors and the targets' noise.
 
-        use (E, T): the image points offered.
+        use (E, T): the image points offered. Returns the series with that noise and the estimate.
         """
         series, s, offered = self, self.s, use
         estimate = series.solve(start, use, self.unit)
-        found = estimate.solved | ~use.any(axis=1)
-        if not found.all():
-            # Gross errors among few targets: such an epoch must not spoil what all share.
-            few = 2 * found.sum() < len(found)
-            use = series._screened(start, use) if few else use & estimate.converged[:, None]
+        solved = estimate.solved | ~use.any(axis=1)
+        if not solved.all():
+            # Gross errors among few targets of an epoch must not spoil the common unknowns.
+            few = 2 * solved.sum() < len(solved)
+            use = series._screen(start, use) if few else use & estimate.converged[:, None]
             offered = offered & use.any(axis=1, keepdims=True)
             estimate = series.solve(start, use, self.unit)
         if s.snooping_alpha > 0:
             estimate = series.snoop(estimate, offered)
-            first_look = self.grid.weights is self.stated
-            if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE and first_look:
+            as_stated = self.grid.weights is self.stated
+            if s.target_noise and len(use) >= _ENOUGH_FOR_NOISE and as_stated:
                 known = series._with_target_noise(estimate)
                 again = known.solve(estimate, estimate.system.use, 1.0)
                 if again.settled or not estimate.settled:
@@ -148,39 +148,40 @@ class SeriesEstimator:
                 use = estimate.system.use
                 again = wider.solve(estimate, use, wider.variance(estimate))
                 if not again.settled:
-                    break  # a field that is known no better does not carry the parameters
+                    break  # a field of this accuracy does not determine the parameters
                 series, estimate = wider, wider.snoop(again, offered)
         return series, estimate
 
     def estimate_field_variance(self, estimate: Estimate) -> float | None:
-        """Estimate what the field's stated covariance is to be multiplied by, at least 1.
+        """Estimate the factor, at least 1, of the field's stated covariance.
 
-        From the targets' offsets: their weighted squares over how much of each the image points
-        tell, the median, which targets that have moved do not reach. None where that shows nothing
-        beyond chance.
+        From the targets' offsets: the median of their weighted squares over the share of each that
+        the image points determine; moved targets do not affect it. None if not significant.
         """
         design, q = estimate.system.design, len(estimate.system.design.common)
         Q = estimate.system.Q_common
-        alone = self.s.exterior == "per_epoch"  # takes up what offsets have in common
+        alone = self.s.exterior == "per_epoch"  # the EOP absorb what offsets have in common
         if alone or not len(design.offset_prior) or self.held is not None or len(Q) <= q:
             return None
         (wx, wy, wxy), (x, y) = design.offset_prior.T, estimate.offsets.T
         T = len(wx)
         at, to = q + np.arange(T), q + T + np.arange(T)
         held = wx * Q[at, at] + wy * Q[to, to] + 2.0 * wxy * Q[at, to]
-        told = 1.0 - held / 2.0  # of an offset's two coordinates
-        shown = told > _LEAST_TOLD
+        share = 1.0 - held / 2.0  # of an offset's two coordinates
+        shown = share > _LEAST_SHARE
         if shown.sum() < _FEWEST_OFFSETS:
             return None
         squares = (wx * x * x + wy * y * y + 2.0 * wxy * x * y) / self.variance(estimate)
-        ratio = float(np.median(squares[shown] / told[shown])) / MEDIAN_CHI2
+        ratio = float(np.median(squares[shown] / share[shown])) / MEDIAN_CHI2
         ratio *= self.field_variance
-        chance = 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / (MEDIAN_WORTH * 2.0 * told[shown].sum()))
+        chance = 1.0 + _BEYOND_CHANCE * np.sqrt(2.0 / (MEDIAN_WORTH * 2.0 * share[shown].sum()))
         return ratio if ratio > chance or self.field_variance > 1.0 else None
 
-    def _screened(self, start: State, use: Mask) -> Mask:
-        """Which points (E, T) take part where most epochs do not converge: what fits each one's
-        pose with the interior orientation of the start; none of an epoch that this does not help.
+    def _screen(self, start: State, use: Mask) -> Mask:
+        """Select points (E, T) for a series of which most epochs do not converge.
+
+        The selected points fit a pose per epoch with the initial interior orientation. An epoch
+        whose pose does not converge keeps none.
         """
         middle = np.median(start.values, axis=0)
         s = replace(self.s, exterior="per_epoch", free=(), target_offsets=False, priors={})
@@ -191,24 +192,24 @@ class SeriesEstimator:
 
     @property
     def has_offsets(self) -> bool:
-        """Whether the targets have offsets: only where the field has sigmas."""
+        """Whether the targets have offsets, for which the field needs sigmas."""
         return self.s.target_offsets and bool((self.testfield.sigmas > 0).any())
 
     def solve(self, start: State, use: Mask, variance: float) -> Estimate:
-        """Gauss-Newton with one linearisation at the series' mean, renewed while that moves.
+        """Solve by Gauss-Newton, with one linearisation at the series' mean, renewed if that moves.
 
-        variance: of unit weight, by which the offsets' prior is weighted against image points.
-        Where most epochs of a series do not converge, its geometry is so weak that whole steps
-        lead too far, and shorter ones are tried.
+        variance: of unit weight, by which priors are weighted against image points. If most epochs
+        of a series do not converge, its geometry is so weak that whole steps go too far, and
+        shorter ones are tried.
         """
-        whole = self._iterated(start, use, variance)
+        whole = self._iterate(start, use, variance)
         if not whole.system.design.width or whole.settled:
             return whole
-        shorter = self._iterated(start, use, variance, _HALVINGS)
+        shorter = self._iterate(start, use, variance, _HALVINGS)
         return max(shorter, whole, key=lambda estimate: estimate.solved.sum())
 
-    def _iterated(self, start: State, use: Mask, variance: float, halvings: int = 0) -> Estimate:
-        """`solve` with every step halved until it helps, so often at most."""
+    def _iterate(self, start: State, use: Mask, variance: float, halvings: int = 0) -> Estimate:
+        """Iterate, with every step halved up to `halvings` times until it helps."""
         state = start
         system = self._linearised(state.values, use, variance)
         own, common = system.design.own, system.design.common
@@ -217,11 +218,11 @@ class SeriesEstimator:
             step = system.step(residuals, state)
             sizes = step.sizes
             if halvings and step.size >= _SMALL:
-                shorter = self._shortened(system, state, step, halvings)
+                shorter = self._shorten(system, state, step, halvings)
                 if shorter is None:
                     break
                 step = shorter
-            state = system.design.moved(state, step)
+            state = system.design.apply(state, step)
             if step.size < (_SMALL if self.held is None else _SMALLER):
                 system.move(residuals, step)
                 break
@@ -238,15 +239,15 @@ class SeriesEstimator:
                 system = self._linearised(state.values, use, variance)
         return Estimate(state.values, state.offsets, state.pose, residuals, system, sizes < _NEAR)
 
-    def _shortened(
+    def _shorten(
         self, system: SeriesSystem, state: State, step: Step, halvings: int
     ) -> Step | None:
-        """The step, halved until the next one is shorter; None where it never is.
+        """Halve a step until the next one is shorter; return None if it never is.
 
         Source: the natural monotonicity test, Deuflhard (2004), Newton methods, section 3.3.
         """
         for _ in range(halvings):
-            there = system.design.moved(state, step)
+            there = system.design.apply(state, step)
             left = self._residuals(there, planes(2, *system.use.shape))
             if system.step(left, there).size < step.size:
                 return step
@@ -254,13 +255,14 @@ class SeriesEstimator:
         return None
 
     def snoop(self, estimate: Estimate, offered: Mask) -> Estimate:
-        """The estimate without gross errors; offered (E, T): points that may come back."""
-        shared = estimate.system.design.width > 0
-        return (self._snoop_together if shared else self._snoop_apart)(estimate, offered)
+        """Estimate without gross errors; offered (E, T): points that may be taken back."""
+        if estimate.system.design.width:
+            return self._snoop_together(estimate, offered)
+        return self._snoop_apart(estimate, offered)
 
     def _with_target_noise(self, estimate: Estimate) -> SeriesEstimator:
-        """The series with every target's weights from the scatter of its own residuals."""
-        # where epochs are few, what their offsets take of the targets' residuals counts
+        """Return the series with each target's weights from the scatter of its own residuals."""
+        # in few epochs the share of the residuals that offsets absorb is not negligible
         use = estimate.system.use
         lost = int(self.has_offsets and len(use) < FEW_EPOCHS)
         ratios, freedom = noise_ratios(
@@ -272,7 +274,7 @@ class SeriesEstimator:
         return replace(self, grid=ObservationGrid(self.grid.points, weights), freedom=freedom)
 
     def pairs(self, estimate: Estimate) -> CorrelatedPairs:
-        """Image coordinates whose errors correlate."""
+        """Find the pairs of image coordinates with correlated errors."""
         use = estimate.system.use
         return correlated_pairs(
             estimate.residuals, use, self.testfield.groups, self.redundancy_share(use)
@@ -280,21 +282,21 @@ class SeriesEstimator:
 
     @property
     def _noise_freedom(self) -> Array | None:
-        """Degrees of freedom (T,) with which the noise of each target is known; None: as stated."""
+        """Degrees of freedom (T,) of each target's noise; None if the noise is as stated."""
         if self.freedom is None and self.s.target_noise:
             return np.full(len(self.testfield), _GUESSED)
         return self.freedom
 
     def redundancy_share(self, use: Mask) -> float:
-        """Redundancy over observations: what the parameters have left of the residuals."""
+        """Return the redundancy over the number of observations."""
         n = 2 * int(use.sum())
         own = len(self.s.per_epoch) * int(use.any(axis=1).sum())
         return max((n - own) / max(n, 1), 0.05)
 
     def _snoop_together(self, estimate: Estimate, offered: Mask) -> Estimate:
-        """Data snooping where all epochs share unknowns: every round solves the series again.
+        """Snoop epochs that share unknowns, solving the whole series again after every round.
 
-        An estimate that has not settled tells no gross errors: the last one that has is kept.
+        An estimate that has not settled shows no gross errors: the last settled one is returned.
         """
         if not estimate.settled:
             return estimate
@@ -307,7 +309,7 @@ class SeriesEstimator:
                 typical = typical_variance(tests, use)
             alpha = self.s.snooping_alpha
             if self.shown_share(estimate) < NOISE_SHOWN:
-                alpha **= 2  # errors of the field look like gross ones: only those beyond doubt
+                alpha **= 2  # errors of the field look like gross ones: reject only certain ones
             keep = snoop_series(
                 tests, offered, use, self.s.carried, alpha, typical, self._noise_freedom
             )
@@ -323,17 +325,17 @@ class SeriesEstimator:
         return estimate
 
     def _snoop_apart(self, estimate: Estimate, offered: Mask) -> Estimate:
-        """Data snooping where epochs share nothing: only those that changed are solved again."""
+        """Snoop epochs that share no unknowns, solving only changed ones again."""
         values, residuals = estimate.values, estimate.residuals
         converged = estimate.converged.copy()
         system = whole = replace(estimate.system, use=estimate.system.use.copy())
         use, rows = whole.use, np.arange(len(whole.use))
         history = np.zeros(use.shape, dtype=np.int8)
-        part: slice | Index = slice(None)  # without a copy
+        part: slice | Index = slice(None)  # all epochs, without a copy
         typical = self.typical
         for _ in range(_ROUNDS):
             tests = point_tests(system, residuals[part])
-            if typical is None:  # of all epochs, at the first look
+            if typical is None:  # in the first round, which has all epochs
                 typical = typical_variance(tests, use)
             keep = snoop_series(
                 tests, offered[part], use[part], self.s.carried, self.s.snooping_alpha, typical,
@@ -348,7 +350,7 @@ class SeriesEstimator:
                 break
             system = SeriesSystem.formed(whole.design, self.grid.weights[rows], keep[changed])
             some = replace(self, grid=ObservationGrid(self.grid.points[rows], system.weights))
-            values[rows], residuals[rows], converged[rows] = some._without(
+            values[rows], residuals[rows], converged[rows] = some._solve_again(
                 system, values[rows], residuals[rows], estimate
             )
             use[rows], whole.Q[rows], whole.good[rows] = system.use, system.Q, system.good
@@ -357,11 +359,12 @@ class SeriesEstimator:
             estimate, values=values, residuals=residuals, system=whole, converged=converged
         )
 
-    def _without(
+    def _solve_again(
         self, system: SeriesSystem, values: Array, left: Array, known: State
     ) -> tuple[Array, Array, Mask]:
-        """Values (E, 16) and residuals (E, T, 2) of epochs of which points were taken out, and
-        which converged (E,).
+        """Solve epochs whose points in use have changed, in place.
+
+        values (E, 16); left (E, T, 2) px: residuals. Returns both and a mask (E,) of convergence.
         """
         for _ in range(_ITERATIONS):
             step = system.step(left, replace(known, values=values))
@@ -383,8 +386,10 @@ class SeriesEstimator:
         return system.solved() if design.width else system
 
     def design(self, at: Partials, variance: float, *, with_common: bool = True) -> Design:
-        """The unknowns at a linearisation; variance: of unit weight, by which priors are weighted
-        against image points; with_common: the common ones too.
+        """Return the unknowns at a linearisation.
+
+        variance: of unit weight, by which priors are weighted against image points; with_common:
+        whether to include the common unknowns.
         """
         s, own = self.s, self.s.per_epoch
         common = s.common if with_common else s.common[:0]
@@ -403,7 +408,7 @@ class SeriesEstimator:
         )  # fmt: skip
 
     def _residuals(self, state: State, out: Array) -> Array:
-        """Measured minus predicted (E, T, 2) px at each epoch's own values, into `out`."""
+        """Write measured minus predicted points (E, T, 2) px, at each epoch's values, to `out`."""
         values = state.values
         if (values == values[:1]).all():
             first = project(self.sensor, values[0, IOP], values[0, EOP], self.testfield.points)
@@ -418,21 +423,21 @@ class SeriesEstimator:
         return out
 
     def sums(self, estimate: Estimate) -> tuple[Array, Array]:
-        """Weighted sum of squares (E,) and redundancy (E,) of every epoch."""
+        """Return the weighted sum of squares (E,) and the redundancy (E,) of every epoch."""
         use = estimate.system.use
         vPv = sums_of_squares(self.grid.weights, estimate.residuals, use)
         system = estimate.system
         n = use.sum(axis=1) * system.good
         share = system.common_share * n / max(int(n.sum()), 1)
-        # a prior leaves an epoch less than p parameters of its own
+        # with priors an epoch's parameters use up less than p observations
         held = np.einsum("epq,qp->e", system.Q, system.design.own_prior)
         return vPv, 2 * n - (len(system.design.own) - held) - share
 
     def noise(self, estimate: Estimate, used: float = 0.0) -> tuple[Array, Array, Array]:
-        """Variance of unit weight by the weights in use, sigma0 by the stated ones, NaN without
-        redundancy, and redundancy (E,) of every epoch.
+        """Return three arrays (E,): the variance of unit weight by the weights in use, sigma0 by
+        the stated weights (NaN without redundancy), and the redundancy.
 
-        used: observations of each epoch that common unknowns, which are held, have used up.
+        used: observations per epoch that held common unknowns have used up.
         """
         vPv, redundancy = self.sums(estimate)
         redundancy = redundancy - used
@@ -445,21 +450,21 @@ class SeriesEstimator:
         )
 
     def variance(self, estimate: Estimate) -> float:
-        """Variance of unit weight of the series: the median over its epochs, and what was stated
-        where they show little of it.
+        """Return the variance of unit weight of the series: the median over its epochs, drawn to
+        the stated one if their redundancy is small.
         """
         vPv, redundancy = self.sums(estimate)
         good = estimate.system.good
-        known = max(float(redundancy[good].sum()) * self.shown_share(estimate), 0.0)
+        shown = max(float(redundancy[good].sum()) * self.shown_share(estimate), 0.0)
         good = good & (redundancy > 0)
-        found = float(np.median(vPv[good] / redundancy[good])) or 1.0 if good.any() else 1.0
-        return (known * found + TRUSTED_REDUNDANCY) / (known + TRUSTED_REDUNDANCY)
+        median = float(np.median(vPv[good] / redundancy[good])) or 1.0 if good.any() else 1.0
+        return (shown * median + TRUSTED_REDUNDANCY) / (shown + TRUSTED_REDUNDANCY)
 
     def shown_share(self, estimate: Estimate) -> float:
-        """Which share of the redundancy shows the noise, however wrong the priors are."""
+        """Return the share of the redundancy that shows the noise even if the priors are wrong."""
         system = estimate.system
         whole = float(self.sums(estimate)[1][system.good].sum())
         if whole > _MANY * system.design.width:
-            return 1.0  # an unknown's prior holds at most a quarter of an observation
+            return 1.0  # an unknown's prior takes up at most a quarter of an observation
         held, twice = system.held
         return 1.0 - (held - twice) / whole if whole > 0 else 0.0

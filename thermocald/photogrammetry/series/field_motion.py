@@ -1,12 +1,12 @@
 """Movements of the test field: targets that wander, and boards that move as rigid bodies.
 
-They are looked for in what a free camera per epoch leaves, so that nothing the camera does can be
-mistaken for them. A single target wanders where its slow residuals are far beyond those of the
-others on its board, whose residuals are never quite still in a real field. Of a board, a step at an
-unknown time (it was knocked) and slow settling (it creeps) in its six degrees of freedom are
-compared with what a free camera per epoch cannot take up of them. A board has moved where that
-explains most of its targets' slow movement, most of what each of them would do by itself, and far
-more than the same explains of the boards that stand.
+Movements are estimated from the residuals of a free camera per epoch, which contain no movement of
+the camera. A single target wanders if its slow residuals are far larger than those of the others on
+its board; in a real field residuals are never quite constant. For a board two trajectories are
+tested in its six degrees of freedom, reduced by the free cameras: a step at an unknown time (a
+knock) and slow settling (creep). A board has moved if a trajectory explains most of its targets'
+slow movement, most of what single movements of its targets would explain, and far more than the
+same explains for boards that stand still.
 
 Source: a step at an unknown time as Page (1955), Biometrika 42, 523-527.
 """
@@ -25,41 +25,38 @@ from thermocald.photogrammetry.series.normals import ObservationGrid
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from thermocald.arrays import Array, Index, Mask
 
-    from thermocald.arrays import Array
-
-    Rows = NDArray[np.int64]
 
 FEWEST_EPOCHS = 20
-"""Below, a series shows no movement of its field."""
+"""Epochs needed to show a movement of the field."""
 GAIN = 100.0
-"""χ² from which on something moved: of six degrees of freedom and a thousand times, 1e-15."""
+"""Least χ² of a movement: with six degrees of freedom and a thousand tests its level is 1e-15."""
 LEAST_PX = 0.02
-"""Movements below are not worth a word."""
+"""Movements below it are not reported."""
 OTHERS = 8.0
-"""Times what most of the others do."""
+"""Least ratio of a movement's χ² to that of most others."""
 MOST_TARGETS = 0.2
-"""Share of the targets: so many do not wander by themselves."""
+"""Share of the targets that can wander; if more seem to, none is reported."""
 FEW_TARGETS = 100
-"""Of which some that wander may hide each other."""
+"""Number of targets up to which wandering ones may mask each other."""
 
-_ORDERS = 14
+_ORDERS = 14  # of slow trajectories
 _PASSES = 3
-_MOST = 80.0  # per cent of the targets, which stay below what a single one does
-_SEEN = 0.3  # of the epochs: of what wanders fast, many are taken for gross errors
-_ON_TRIAL = 4  # so many
+_MOST = 80.0  # percentile of the targets' χ² that represents most others
+_SEEN = 0.3  # share of the epochs: points of a fast wander are often rejected as gross errors
+_ON_TRIAL = 4  # most targets that are left out together on trial
 _LEAST_FREE = 0.05  # redundancy of a coordinate
 
 
 @dataclass(frozen=True, eq=False)
 class FieldSeries:
-    """What a series shows of its field.
+    """The residuals of a series, for the analysis of its field.
 
-    times (E,) s; residuals (E, T, 2) px, NaN where unseen; weights (E, T, 3) px⁻²; A (T, 2, P), B
-    (T, 2, 3): partials by the camera's parameters and by the object points (T, 3) mm; boards (T,):
-    labels, -1 on none; names: of the targets; numbers (E,): the epochs' own; cameras (E, P, P):
-    inverse normal matrices, where free cameras have been taken out.
+    times (E,) s; residuals (E, T, 2) px: NaN if unseen; weights (E, T, 3) px⁻²; A (T, 2, P), B
+    (T, 2, 3): partials with respect to the camera's parameters and the object points; points (T, 3)
+    mm; boards (T,): labels, -1 for none; names: of the targets; numbers (E,): of the epochs;
+    cameras (E, P, P): inverse normal matrices of free cameras, once these are reduced.
     """
 
     times: Array
@@ -68,20 +65,20 @@ class FieldSeries:
     A: Array
     B: Array
     points: Array
-    boards: Rows
+    boards: Index
     names: tuple[str, ...]
-    numbers: Rows
+    numbers: Index
     cameras: Array | None = None
 
     @property
-    def used(self) -> NDArray[np.bool_]:
-        """Which image points (E, T) there are."""
-        out: NDArray[np.bool_] = np.isfinite(self.residuals[..., 0]) & (self.weights[..., 0] > 0)
+    def used(self) -> Mask:
+        """Mask (E, T) of the image points with a residual and a weight."""
+        out: Mask = np.isfinite(self.residuals[..., 0]) & (self.weights[..., 0] > 0)
         return out
 
     @property
     def w(self) -> Array:
-        """Weights (E, T, 2) of the coordinates that there are."""
+        """Weights (E, T, 2) of the coordinates, 0 for points not used."""
         return np.where(self.used[..., None], self.weights[..., :2], 0.0)
 
 
@@ -89,14 +86,14 @@ class FieldSeries:
 class FieldMovement:
     """One board or target that moved.
 
-    kind: `knock`, `creep` or `wander`; rows: of the field, targets: their names; epoch: number of
-    the first after a knock, else 0; time, sd_time s from the start of the series, of a knock;
-    trajectory (E,) 0 to 1; image (k, 2) px: where it went in the image; size_mm, sd_mm: RMS over
-    its targets across the rays; size_px; gain: χ² that it explains.
+    kind: `knock`, `creep` or `wander`; rows: of the k targets in the field; targets: their names;
+    epoch: number of the first epoch after a knock, else 0; time, sd_time s: of a knock, from the
+    start of the series; trajectory (E,): 0 to 1; image (k, 2) px: whole movement in the image;
+    size_mm, sd_mm: RMS over the targets across the rays; size_px; gain: χ² that it explains.
     """
 
     kind: str
-    rows: Rows
+    rows: Index
     targets: tuple[str, ...]
     epoch: int
     time: float
@@ -110,7 +107,7 @@ class FieldMovement:
 
     @property
     def sentence(self) -> str:
-        """For people."""
+        """The movement in words."""
         who = f"{self.targets[0]} to {self.targets[-1]} ({len(self.targets)} targets)"
         size = f"{self.size_mm:.3f} ± {self.sd_mm:.3f} mm ({self.size_px:.3f} px)"
         if self.kind == "knock":
@@ -120,7 +117,7 @@ class FieldMovement:
         return f"target {self.targets[0]} wanders by {size} RMS"
 
     def as_dict(self) -> dict[str, Any]:
-        """For a document."""
+        """Return the movement as an entry of a document."""
         knocked = self.kind == "knock"
         return {
             "kind": self.kind,
@@ -134,8 +131,8 @@ class FieldMovement:
         }
 
 
-def without(s: FieldSeries, rows: Rows) -> FieldSeries:
-    """The series as if some targets had not been observed."""
+def without(s: FieldSeries, rows: Index) -> FieldSeries:
+    """Return the series as if some targets had not been observed."""
     weights = s.weights.copy()
     weights[:, rows] = 0.0
     return replace(s, weights=weights)
@@ -144,9 +141,9 @@ def without(s: FieldSeries, rows: Rows) -> FieldSeries:
 def taken_off(
     grid: ObservationGrid, moved: Sequence[FieldMovement], rows: slice = slice(None)
 ) -> ObservationGrid:
-    """Return observations as if the field had stood still: boards back, wandering targets out.
+    """Return observations as of a still field: boards moved back, wandering targets left out.
 
-    rows: the grid's epochs among those that told of the movements.
+    rows: the grid's epochs within the movements' trajectories.
     """
     points, wandering = grid.points.copy(order="K"), np.zeros(grid.observed.shape, dtype=bool)
     for m in moved:
@@ -158,16 +155,17 @@ def taken_off(
 
 
 def put_back(s: FieldSeries, movement: FieldMovement) -> FieldSeries:
-    """The series as if something had not moved."""
+    """Return the series as if a board had not moved."""
     residuals = s.residuals.copy()
     residuals[:, movement.rows] -= movement.trajectory[:, None, None] * movement.image
     return replace(s, residuals=residuals)
 
 
 def wandering_targets(s: FieldSeries) -> list[FieldMovement]:
-    """Single targets whose slow residuals are far beyond those of the others on their board.
+    """Find single targets whose slow residuals are far larger than those of others on their board.
 
-    A few among few targets bend the cameras until none stands out: such are left out together.
+    Several among few targets may distort the cameras so that none stands out: these are found by
+    leaving them out together.
     """
     if len(s.times) < FEWEST_EPOCHS:
         return []
@@ -193,44 +191,43 @@ def wandering_targets(s: FieldSeries) -> list[FieldMovement]:
 
 
 def _find_masked(s: FieldSeries, most: int) -> list[int]:
-    """Find targets, `most` at most, that stand out only where all of them are left out."""
+    """Find up to `most` targets that stand out only if all of them are left out."""
     rows, found = list[int](), list[int]()
     if s.used.any(axis=0).sum() > FEW_TARGETS:
         return found
     free = with_free_cameras(s)
-    own = _own_power(free, s.w, bent=True)
+    own = _own_power(free, s.w, included=True)
     for _ in range(most):
         rows.append(int(np.argmax(np.where(_often_seen(free), own, 0.0))))
         free = with_free_cameras(without(s, np.array(rows)))
         there = _often_seen(free)
         if there.sum() < _FEWEST_OTHERS:
             break
-        own = _own_power(free, free.w, bent=True)
+        own = _own_power(free, free.w, included=True)
         limits = _usual_limits(free, own, there)[rows]
-        stand_out = _own_power(free, s.w, bent=False)[rows] > limits
+        stand_out = _own_power(free, s.w, included=False)[rows] > limits
         if stand_out.all() and all(_size_px(_slow_movement(free, r)) >= LEAST_PX for r in rows):
             found = list(rows)
     return found
 
 
-def _often_seen(s: FieldSeries) -> NDArray[np.bool_]:
-    """Which targets (T,) are seen in so many epochs that they may show a wander."""
-    out: NDArray[np.bool_] = s.used.sum(axis=0) >= max(FEWEST_EPOCHS, _SEEN * len(s.times))
+def _often_seen(s: FieldSeries) -> Mask:
+    """Return a mask (T,) of the targets seen in enough epochs to show a wander."""
+    out: Mask = s.used.sum(axis=0) >= max(FEWEST_EPOCHS, _SEEN * len(s.times))
     return out
 
 
 def _slow_power(s: FieldSeries) -> Array:
-    """χ² (T,) of the slow residuals of each target."""
+    """Return χ² (T,) of each target's slow residuals."""
     v = np.nan_to_num(s.residuals) * np.sqrt(s.w)
     out: Array = np.sum(np.tensordot(cosines(s.times), v, 1) ** 2, axis=(0, 2))
     return out
 
 
-def _own_power(s: FieldSeries, w: Array, bent: bool) -> Array:
-    """χ² (T,) that each target's slow movement explains by itself.
+def _own_power(s: FieldSeries, w: Array, included: bool) -> Array:
+    """Return χ² (T,) that a slow movement of each single target explains.
 
-    w (E, T, 2): weights; bent: whether the target itself bends the camera with the others, or they
-    alone give it.
+    w (E, T, 2): weights; included: whether the target itself took part in the camera's estimate.
     """
     flat = s.A.reshape(-1, s.A.shape[-1])
     N = weighted_products(s.w.mean(axis=0).reshape(1, -1), flat, flat)[0]
@@ -238,7 +235,7 @@ def _own_power(s: FieldSeries, w: Array, bent: bool) -> Array:
     root = np.sqrt(w.mean(axis=0))
     J = s.A * root[..., None]
     of_camera = J @ np.linalg.inv(N + held * np.eye(len(N))) @ J.swapaxes(1, 2)
-    values, vectors = np.linalg.eigh(np.eye(2) + (-of_camera if bent else of_camera))
+    values, vectors = np.linalg.eigh(np.eye(2) + (-of_camera if included else of_camera))
     seen = np.isfinite(s.residuals)
     level = np.nan_to_num(s.residuals).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     v = np.where(seen, s.residuals - level, 0.0) * root
@@ -247,8 +244,8 @@ def _own_power(s: FieldSeries, w: Array, bent: bool) -> Array:
     return out
 
 
-def _usual_limits(s: FieldSeries, power: Array, there: NDArray[np.bool_]) -> Array:
-    """What each target's χ² (T,) has to exceed for a wander, from the others of its board."""
+def _usual_limits(s: FieldSeries, power: Array, there: Mask) -> Array:
+    """Return the limits (T,) of χ² beyond which targets wander, from the others on their boards."""
     limits = np.full(len(power), float(np.percentile(power[there], _MOST)))
     for board in np.unique(s.boards[there & (s.boards >= 0)]):
         limits[s.boards == board] = np.percentile(power[there & (s.boards == board)], _MOST)
@@ -257,7 +254,7 @@ def _usual_limits(s: FieldSeries, power: Array, there: NDArray[np.bool_]) -> Arr
 
 
 def _slow_movement(s: FieldSeries, row: int) -> Array:
-    """The slow part of a target's residuals (E, 2) px."""
+    """Return the slow part (E, 2) px of a target's residuals."""
     slow = cosines(s.times)
     out: Array = slow.T @ np.einsum("je,ek->jk", slow, np.nan_to_num(s.residuals[:, row]))
     return out
@@ -268,7 +265,7 @@ def _size_px(smooth: Array) -> float:
 
 
 def with_free_cameras(s: FieldSeries) -> FieldSeries:
-    """The series as a free camera per epoch leaves it."""
+    """Return the series with the residuals of a free camera per epoch."""
     w, P = s.w, s.A.shape[-1]
     flat = s.A.reshape(-1, P)
     scale = np.sqrt(np.maximum((flat**2).mean(axis=0), 1e-300))
@@ -277,7 +274,7 @@ def with_free_cameras(s: FieldSeries) -> FieldSeries:
     held = 1e-9 * np.einsum("epp->e", N)[:, None, None] + 1e-12
     inverse = np.linalg.inv(N + held * np.eye(P))
     left, total = s.residuals, np.maximum(w.sum(axis=0), 1e-12)
-    for _ in range(_PASSES):  # targets that come and go pull at the cameras by their own error
+    for _ in range(_PASSES):  # targets that come and go distort cameras by their own errors
         b = (w * np.nan_to_num(left)).reshape(len(w), -1) @ flat
         values = np.einsum("epq,eq->ep", inverse, b)
         left = left - (values @ flat.T).reshape(left.shape)
@@ -286,14 +283,14 @@ def with_free_cameras(s: FieldSeries) -> FieldSeries:
 
 
 def weighted_products(w: Array, a: Array, b: Array) -> Array:
-    """Σ w a bᵀ (E, p, q) of weights (E, n) and partials (n, p), (n, q)."""
+    """Return Σ w a bᵀ (E, p, q) for weights (E, n) and partials (n, p), (n, q)."""
     pairs = (a[:, :, None] * b[:, None, :]).reshape(len(a), -1)
     out: Array = (w @ pairs).reshape(len(w), a.shape[1], b.shape[1])
     return out
 
 
 def cosines(times: Array) -> Array:
-    """Smooth trajectories (n, E) of unit length and zero mean."""
+    """Return smooth orthonormal trajectories (n, E) with zero mean."""
     u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
     rows = np.cos(np.pi * np.arange(1, _ORDERS + 1)[:, None] * u[None])
     rows = rows - rows.mean(axis=1, keepdims=True)
@@ -302,7 +299,7 @@ def cosines(times: Array) -> Array:
 
 
 def _wanderer(s: FieldSeries, free: FieldSeries, row: int) -> FieldMovement:
-    """Describe a target that wanders; s: the series with it, free: with free cameras."""
+    """Describe a wandering target; s: the series with it; free: the series with free cameras."""
     smooth = _slow_movement(free, row)
     inverse = np.linalg.pinv(s.B[row])
     moved = smooth @ inverse.T
@@ -319,20 +316,20 @@ def _wanderer(s: FieldSeries, free: FieldSeries, row: int) -> FieldMovement:
     )  # fmt: skip
 
 
-_SIDE = 4  # epochs before and after a knock
-_LARGEST = 0.6  # share of the targets on one board: beyond, the others moved
+_SIDE = 4  # least number of epochs before and after a knock
+_LARGEST = 0.6  # largest share of the targets on one board; beyond it, the others moved
 _FEWEST_OTHERS = 8
-_SHARE = 0.6  # of a board's slow movement that its trajectory has to explain
-_RIGID = 0.5  # of what its targets would do one by one that the board has to explain
+_SHARE = 0.6  # of a board's slow movement that the trajectory must explain
+_RIGID = 0.5  # of the χ² of its targets' single movements that the board must explain
 _MOST_BOARDS = 4
 _TRIES = 400  # times of a knock
-_SETTLING = (0.08, 0.3)  # of the duration: time constants
+_SETTLING = (0.08, 0.3)  # time constants over the duration
 
 
 def board_movements(s: FieldSeries, wandering: Sequence[FieldMovement]) -> list[FieldMovement]:
-    """Boards that were knocked or creep, the largest first; each with the others in place.
+    """Find boards that were knocked or creep, the largest first, each with the earlier moved back.
 
-    wandering: single targets, which would pull at the cameras, and they at the boards.
+    wandering: single targets, left out as they would distort the cameras and thereby the boards.
     """
     if len(s.times) < FEWEST_EPOCHS:
         return []
@@ -363,17 +360,17 @@ def board_movements(s: FieldSeries, wandering: Sequence[FieldMovement]) -> list[
     return found
 
 
-def _usual(s: FieldSeries, boards: list[Rows]) -> float:
-    """χ² that boards which stand usually explain by moving."""
+def _usual(s: FieldSeries, boards: list[Index]) -> float:
+    """Return the median χ² that a movement of boards which stand still would explain."""
     trajectories, _ = _trajectories(s.times)
     gains = [_gains(*_board_equations(s, r, _rigid(s, r)), trajectories)[0].max() for r in boards]
     return float(np.median(gains)) if gains else 0.0
 
 
 def refined(s: FieldSeries, movement: FieldMovement) -> FieldMovement:
-    """A board's movement with what a series, from which it was removed, still shows of it.
+    """Refine a board's movement by a series from which it was removed.
 
-    Gross errors are looked for again once a board is back in its place.
+    In this series gross errors were snooped again with the board moved back.
     """
     free = with_free_cameras(s)
     rigid = _rigid(free, movement.rows)
@@ -384,8 +381,8 @@ def refined(s: FieldSeries, movement: FieldMovement) -> FieldMovement:
     return replace(movement, image=image, size_mm=size, sd_mm=sd, size_px=size_px)
 
 
-def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
-    """The best trajectory of one board; None where it stands."""
+def _board(s: FieldSeries, rows: Index) -> FieldMovement | None:
+    """Return one board's movement along the best trajectory; None if it stands still."""
     rigid = _rigid(s, rows)
     M, r = _board_equations(s, rows, rigid)
     trajectories, firsts = _trajectories(s.times)
@@ -394,7 +391,7 @@ def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
     if gain[best] < GAIN:
         return None
     epoch = firsts[best]
-    if epoch and len(firsts) < len(s.times) - _SIDE:  # a long series: the epochs between two tries
+    if epoch and len(firsts) < len(s.times) - _SIDE:  # in a long series, try the epochs between
         stride = firsts[1] - firsts[0]
         near = range(max(epoch - stride, _SIDE), min(epoch + stride, len(s.times) - _SIDE) + 1)
         trajectories, firsts = _steps(len(s.times), near), list(near)
@@ -422,8 +419,8 @@ def _board(s: FieldSeries, rows: Rows) -> FieldMovement | None:
     )  # fmt: skip
 
 
-def _rigid(s: FieldSeries, rows: Rows) -> Array:
-    """∂ image points (2k,) / ∂ shifts mm and turns, these in mm at the board's size, (2k, 6)."""
+def _rigid(s: FieldSeries, rows: Index) -> Array:
+    """Return ∂ image points / ∂ shifts, rotations (2k, 6), px/mm; rotations at the board's size."""
     X = s.points[rows] - s.points[rows].mean(axis=0)
     size = max(float(np.sqrt((X**2).sum(axis=1).mean())), 1e-9)
     x, y, z = X.T / size
@@ -436,8 +433,8 @@ def _rigid(s: FieldSeries, rows: Rows) -> Array:
     return out
 
 
-def _board_equations(s: FieldSeries, rows: Rows, rigid: Array) -> tuple[Array, Array]:
-    """Normal equations (E, 6, 6), (E, 6) of a board's movement, the cameras eliminated."""
+def _board_equations(s: FieldSeries, rows: Index, rigid: Array) -> tuple[Array, Array]:
+    """Return normal equations (E, 6, 6), (E, 6) of a board's movement, the cameras eliminated."""
     assert s.cameras is not None
     w = s.w[:, rows].reshape(len(s.times), -1)
     C = weighted_products(w, rigid, s.A[rows].reshape(-1, s.A.shape[-1]))
@@ -447,7 +444,7 @@ def _board_equations(s: FieldSeries, rows: Rows, rigid: Array) -> tuple[Array, A
 
 
 def _trajectories(times: Array) -> tuple[Array, list[int]]:
-    """Steps at some hundred epochs, then settling, (n, E), 0 to 1; a step's first epoch, else 0."""
+    """Return trajectories (n, E), 0 to 1, steps and then settling, and each step's epoch, or 0."""
     E = len(times)
     stride = int(np.ceil(E / _TRIES))
     firsts = range(_SIDE, E - _SIDE + 1, stride)
@@ -457,12 +454,12 @@ def _trajectories(times: Array) -> tuple[Array, list[int]]:
 
 
 def _steps(epochs: int, firsts: range) -> Array:
-    """Steps (n, E) at some epochs."""
+    """Return steps (n, E) at n epochs."""
     return (np.arange(epochs) >= np.array(firsts)[:, None]).astype(float)
 
 
 def _gains(M: Array, r: Array, trajectories: Array) -> tuple[Array, Array]:
-    """χ² (n,) that a board explains by moving along each trajectory, and the movements (n, 6)."""
+    """Return χ² (n,) that a board's movement along n trajectories explains, and its size (n, 6)."""
     E = len(M)
     flat = M.reshape(E, -1)
     N11 = M.sum(axis=0)
@@ -480,9 +477,9 @@ def _gains(M: Array, r: Array, trajectories: Array) -> tuple[Array, Array]:
 def _across(
     B: Array, image: Array, rigid: Array, M: Array, trajectory: Array
 ) -> tuple[float, float, float]:
-    """RMS over targets of the movement across the rays, mm, its standard deviation, and px.
+    """Return the RMS over targets of a movement across the rays, mm, its sd, and the RMS in px.
 
-    M (E, 6, 6): normal equations of the board, whose level is eliminated; trajectory (E,).
+    M (E, 6, 6): normal equations of the board, whose level is eliminated here; trajectory (E,).
     """
     flat = M.reshape(len(M), -1)
     N12 = (trajectory @ flat).reshape(6, 6)

@@ -1,19 +1,18 @@
-"""Adjustment of a series of any length, in blocks of epochs, or of epochs as they come.
+"""Adjustment of a series of any length, in blocks of epochs or epoch by epoch.
 
-A sample of the epochs, runs of neighbours from the first to the last, is adjusted as a whole series
-(`adjustment`). It says how the camera stands, how far its mount moves, what single targets are
-measured to and where they are off. Any other epoch is then adjusted with that known
-(`KnownSeries`), in blocks, or one by one. A block gives its epochs' own parameters, and adds to the
-sums of what all have in common (`CommonSums`): its normal equations with its own parameters
-reduced. At the epochs' own solution the reduced right-hand side is the plain gradient, which is
-summed epoch by epoch. The matrix is that of the mean weights of all epochs that see the same
-targets; it differs from the sum by the square of how much their weights vary, and costs one
-reduction per kind of epoch. What these sums change of the common unknowns is put on the epochs by
-its mean where single epochs differ by less than a twentieth of their standard deviation; else there
-is another pass.
+A sample of the epochs, evenly spread runs of neighbours, is adjusted as a whole series
+(`adjustment`). It gives the camera's pose, the mount's movement, and the noise and offsets of the
+targets. With these held (`KnownSeries`) all epochs are adjusted, in blocks or one by one. A block
+gives its epochs' own parameters, and contributes to the sums of the common unknowns (`CommonSums`)
+its normal equations with its own parameters reduced. At the epochs' solution the reduced right-hand
+side is the plain gradient, which is summed epoch by epoch. The matrix is that of the mean weights
+of all epochs that see the same targets: it differs from the sum by the square of the weights'
+variation, and costs one reduction per kind of epoch. The sums correct the common unknowns. The mean
+effect is added to the epochs if single epochs differ from it by less than a twentieth of their
+standard deviation; otherwise there is another pass.
 
-A block needs nothing of the others, so that blocks may be adjusted on several processes. The result
-is one row per epoch, and a sample in full.
+Blocks are independent, so that several processes can adjust them. The result is one row per epoch,
+and the sample in full.
 
 Source: Helmert blocking, Wolf, H. (1978): The Helmert block method.
 """
@@ -29,11 +28,16 @@ import numpy as np
 from thermocald.parallel import in_order
 from thermocald.photogrammetry.camera.camera_model import EOP
 from thermocald.photogrammetry.linalg import inverse_of_determined, root_of
-from thermocald.photogrammetry.series.adjustment import adjusted, epoch_variance, judged, result
+from thermocald.photogrammetry.series.adjustment import (
+    adjusted,
+    epoch_variance,
+    judge_epochs,
+    result,
+)
 from thermocald.photogrammetry.series.covariances import (
+    correlated_error_cofactors,
     line_weights,
-    of_correlated,
-    of_priors,
+    prior_cofactors,
     stillness,
 )
 from thermocald.photogrammetry.series.normals import (
@@ -70,18 +74,19 @@ if TYPE_CHECKING:
     Kind = tuple[Index, SeriesSystem, Array]
 
 
-_FEW = 0.02  # share of a block's epochs that is worth a matrix of its own
+_FEW = 0.02  # share of a block's epochs from which a kind gets its own matrix
 _MOST = 12  # kinds of epochs in a block
-_MOST_PATTERNS = 300  # of targets seen, over the series; the epochs of others count together
+_MOST_PATTERNS = 300  # of targets seen, over the series; epochs with others are summed together
 
 
 @dataclass(eq=False)
 class CommonSums:
-    """The sums over the blocks so far.
+    """Sums over blocks for the common unknowns.
 
-    design: the unknowns; gradient (q + 2T,); ends: the first and the last epoch; patterns: of the
-    epochs that see the same targets how many there are, sums of their numbers and of these squared,
-    of the gradients (p,) of their own parameters, and of their weights (T, 3), one after the other.
+    design: the unknowns; gradient (q + 2T,); ends: the first and the last epoch; patterns: for the
+    epochs that see the same targets, one after the other: their count, the sums of their numbers
+    and of the squares of these, of the gradients (p,) of their own parameters, and of their weights
+    (T, 3).
     """
 
     design: Design
@@ -95,8 +100,8 @@ class CommonSums:
     def add(self, first: int, system: SeriesSystem, left: Array, right: Array) -> None:
         """Add a block that begins at epoch `first`.
 
-        system: of the block, its common unknowns held; left (E, T, 2) px: residuals; right (E, p):
-        gradient of the own parameters, which is 0 at their solution.
+        system: of the block, with the common unknowns held; left (E, T, 2) px: residuals; right
+        (E, p): gradient of the own parameters, 0 at their solution.
         """
         good = np.flatnonzero(system.good)
         if not len(good) or not self.design.width:
@@ -122,17 +127,17 @@ class CommonSums:
             self._count(bits, part)
 
     def _count(self, bits: bytes, part: Array) -> None:
-        """Add epochs that see the same targets; those of rare patterns together."""
+        """Add the sums of epochs that see the same targets; rare patterns are added together."""
         if bits not in self.patterns and len(self.patterns) >= _MOST_PATTERNS:
             bits = b""
         self.patterns[bits] = self.patterns.get(bits, 0.0) + part
 
     def solved(self, known: KnownSeries) -> tuple[KnownSeries, Array, Array, float]:
-        """Return what is known of the common unknowns with these sums, and what that changes.
+        """Estimate the common unknowns from the sums; return the new series and the changes.
 
-        By how much own parameters (p,) change in the mean; by how much (p, q + 2T) the common
-        unknowns tilt a straight line from the first to the last epoch; by how many of their
-        standard deviations single kinds of epochs change otherwise.
+        These are the mean change (p,) of the own parameters; the change (p, q + 2T) of a straight
+        line from the first to the last epoch by the common unknowns; and the largest deviation of a
+        kind of epochs from the mean change, in standard deviations.
         """
         design, p, T = self.design, len(self.design.own), len(self.design.at.A)
         q, width = len(design.common), design.width
@@ -175,9 +180,9 @@ class CommonSums:
 
 
 def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
-    """Sort the epochs of a block: the frequent ones by what they see, the others together.
+    """Group the epochs of a block by the targets that they see, with rare patterns in one group.
 
-    design: of the series; system: of the block, its common unknowns held.
+    design: of the series; system: of the block, with the common unknowns held.
     """
     good = np.flatnonzero(system.good)
     if not len(good):
@@ -205,15 +210,15 @@ def _kinds_of(design: Design, system: SeriesSystem) -> list[Kind]:
 
 @dataclass(frozen=True, eq=False)
 class KnownSeries:
-    """What epochs adjusted together say of their series.
+    """A series as known from epochs adjusted together, to adjust further ones.
 
-    estimator: as it adjusts further epochs, the common unknowns held; design: the unknowns of the
-    series; offsets (T, 2) px, pose (6,): the common ones, their cofactors (q + 2T, q + 2T), the
-    mean G (p, q + 2T) by which own parameters follow an error of theirs; used: how many
-    observations they use up; excess (16,): variance by which epochs scatter beyond theirs; ratios
-    (T, 3): by what weights are multiplied; middle (16,): where epochs start; pairs, movement:
-    errors that targets share, and the mount's; slow (16, 16): covariance of a straight line over
-    the series from slow errors of targets.
+    estimator: for further epochs, with the common unknowns held; design: the unknowns of the
+    series; offsets (T, 2) px, pose (6,): the common ones; cofactors (q + 2T, q + 2T): theirs; mean
+    (p, q + 2T): mean G by which own parameters depend on the common ones; used: number of
+    observations that these use up; excess (16,): variance of the epochs' excess scatter; ratios
+    (T, 3): factors of the weights; middle (16,): start values of epochs; pairs: correlated errors
+    of targets; movement: of the mount; slow (16, 16): covariance of a straight line over the series
+    from slow errors of targets.
     """
 
     estimator: SeriesEstimator
@@ -234,7 +239,7 @@ class KnownSeries:
     def of(
         cls, series: SeriesEstimator, estimate: Estimate, sample: SeriesAdjustment
     ) -> KnownSeries:
-        """Collect what adjusted epochs say of a series."""
+        """Collect the series from a sample of adjusted epochs."""
         system, unit = estimate.system, series.variance(estimate)
         at = system.design.at
         design = series.design(at, unit)
@@ -258,11 +263,11 @@ class KnownSeries:
     def adjusted(
         self, grid: ObservationGrid, epochs: int, line: Array | None = None
     ) -> tuple[Estimate, SeriesAdjustment]:
-        """Adjust epochs.
+        """Adjust epochs with the common unknowns held.
 
-        epochs: how many there are, which the common unknowns rest on; line (E,): where in the
-        series each is, from -0.5 for the first of all to 0.5 for the last. The level and what
-        belongs to the series as a whole are not in the result.
+        epochs: number of epochs that determined the common unknowns; line (E,): position of each
+        epoch in the series, from -0.5 for the first to 0.5 for the last. The result is without the
+        level and the series' own figures.
         """
         s, pooled = self.estimator.s, self.estimator.unit
         weighted = ObservationGrid(grid.points, grid.weights * self.ratios)
@@ -285,12 +290,12 @@ class KnownSeries:
             score = stillness(replace(system, N=N), estimate.residuals)
             still = score / np.where(redundancy > 0, unit, 1.0)
         relative_unit = unit / pooled
-        return estimate, judged(
+        return estimate, judge_epochs(
             held, estimate, covariance, relative_unit, sigma0, redundancy, still
         )
 
     def _covariance(self, system: SeriesSystem, unit: Array) -> Array:
-        """Return covariances (E, 16, 16) of epochs without what all epochs have in common.
+        """Return the covariances (E, 16, 16) of epochs relative to the series.
 
         unit (E,): variance of unit weight that scales each.
         """
@@ -301,11 +306,13 @@ class KnownSeries:
             away = G - self.mean
             mine[rows] += away @ self.cofactors @ away.T
             if self.pairs is not None:
-                mine[rows] += of_correlated(one, self.pairs, pooled)[0][np.ix_(own, own)]
+                mine[rows] += correlated_error_cofactors(one, self.pairs, pooled)[0][
+                    np.ix_(own, own)
+                ]
             if swayed.any():
                 added[rows] = G[:, :6] @ swayed @ G[:, :6].T
-        # What priors contribute is known as well as they are, not as the epoch.
-        bound = of_priors(system) if system.design.own_prior.any() else 0.0
+        # The priors' part is scaled by the series' variance, not by the epoch's.
+        bound = prior_cofactors(system) if system.design.own_prior.any() else 0.0
         mine -= bound
         mine *= unit[:, None, None]
         mine += pooled * bound
@@ -316,7 +323,7 @@ class KnownSeries:
 
 
 def _ratios(series: SeriesEstimator) -> Array:
-    """Return by what the weights of each target (T, 3) are multiplied, from its own noise."""
+    """Return the factors (T, 3) of each target's weights that its own noise gave."""
     seen = series.stated[..., 0] > 0
     ratios = np.ones((seen.shape[1], 3))
     for k in (0, 1):
@@ -329,11 +336,11 @@ def _ratios(series: SeriesEstimator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LongAdjustment:
-    """A long series as adjusted; parameters in the order of `PARAMETER_NAMES`.
+    """An adjusted long series; parameters in the order of `PARAMETER_NAMES`.
 
-    rows: the epochs one by one; level_sd, trend_sd (16,), as in `SeriesAdjustment`; sample: some
-    epochs, those of `sampled` (P,), as adjusted together: their covariances, residuals and offsets;
-    passes: how often the observations were read.
+    rows: the epochs; level_sd, trend_sd (16,): as in `SeriesAdjustment`; sample: the adjustment of
+    the epochs `sampled` (P,) together, with covariances, residuals and offsets; passes: number of
+    times that the observations were read.
     """
 
     rows: EpochRows
@@ -347,11 +354,11 @@ class LongAdjustment:
 _TOGETHER_POINTS = 1_300_000  # a day of 150 targets: 200 MB
 _FEWEST_TOGETHER, _MOST_TOGETHER = 2_000, 10_000  # epochs
 _PASSES = 3
-_SAME = 0.05  # standard deviations that the last pass may leave an epoch without
+_SAME = 0.05  # standard deviations of an epoch by which the last pass may be wrong
 
 
 def together_at_most(targets: int) -> int:
-    """Return how many epochs of so many targets are adjusted at once."""
+    """Return the number of epochs with so many targets that are adjusted at once."""
     wanted = _TOGETHER_POINTS // max(targets, 1)
     return min(max(wanted, _FEWEST_TOGETHER), _MOST_TOGETHER)
 
@@ -369,9 +376,10 @@ def adjust_long_series(
 ) -> LongAdjustment:
     """Adjust a series of any length, from start values good to a few per cent.
 
-    together: epochs of the sample, by default as many as a day of 150 targets has; jobs: processes
-    that adjust blocks, with the same bits for any number; advance: receives how many epochs the
-    first pass has done. Never raises for data: an epoch without a result has a status and a reason.
+    together: epochs of the sample, by default `together_at_most`; jobs: processes that adjust
+    blocks, with the same bits for any number; advance: called with the number of epochs that the
+    first pass has just adjusted. Never raises because of the data: an epoch without a result has a
+    status and a reason.
     """
     epochs = len(source)
     windows = spread_windows(epochs, together or together_at_most(len(testfield)))
@@ -401,7 +409,7 @@ def adjust_long_series(
 def _adjust_block(
     state: tuple[KnownSeries, int], item: tuple[int, ObservationGrid]
 ) -> tuple[int, EpochRows, CommonSums]:
-    """Adjust the block of epochs from `first` on: its rows, and what it adds to the sums."""
+    """Adjust the block of epochs from `first` on; return `first`, its rows and its sums."""
     (known, epochs), (first, grid) = state, item
     line = (first + np.arange(len(grid))) / max(epochs - 1, 1) - 0.5
     estimate, block = known.adjusted(grid, epochs, line)
@@ -414,10 +422,10 @@ def _adjust_block(
 def _carry(
     known: KnownSeries, later: KnownSeries, d_own: Array, line: Array, rows: EpochRows
 ) -> tuple[Array, Array]:
-    """Put the last change of the common unknowns on all epochs, in place.
+    """Apply the last change of the common unknowns to all epochs, in place.
 
-    later: with the common unknowns from all sums; d_own, line: as of `CommonSums.solved`. Returns
-    the standard deviations (16,) of what all epochs have in common, and of a straight line.
+    later: with the common unknowns from all sums; d_own, line: from `CommonSums.solved`. Returns
+    the standard deviations (16,) of the level and of a straight line.
     """
     unit, design = known.estimator.unit, known.design
     own, common, q = design.own, design.common, len(design.common)

@@ -1,21 +1,23 @@
 """The mount as a random effect: how far a camera moves about its mean pose between epochs.
 
-The exterior orientation of an epoch is that of the series plus a movement m ~ N(0, S). Image shift
-and scale show a movement to hundredths of a pixel, but so does a change of the principal point or
-distance; only the perspective separates the two, a hundred times worse. S is therefore estimated
-from the *trajectory* of the pose that each epoch would have with the interior orientation held: a
-camera that warms up follows an integrated random walk there, a mount trembles (white) or sways and
-settles (with memory, first-order autoregressive). The variance components maximise the likelihood
-in the cosine domain, direction by direction of the movement that the field shows best.
+The exterior orientation of an epoch is that of the series plus a movement m ~ N(0, S). A movement
+shifts and scales the image, which shows it to hundredths of a pixel, but so does a change of the
+principal point or distance; only the perspective separates the two, with a hundredth of that
+accuracy. S is therefore estimated from the *trajectory*: the pose of each epoch with the interior
+orientation held. There a camera that warms up follows an integrated random walk, while a mount
+trembles (white) or sways and settles (with memory, first-order autoregressive). The variance
+components maximise the likelihood in the cosine domain, direction by direction; directions that the
+field shows well are separate from the others.
 
-Does not hold: a change of the interior orientation as abrupt as a tremble is taken for the mount's,
-which makes the standard deviations larger than they need be, not smaller.
+Limit: a change of the interior orientation as abrupt as a tremble is attributed to the mount, which
+makes the standard deviations too large, not too small.
 
-In the trajectory there may be jumps: the mount was knocked, or a lens slipped. A jump that the
-perspective attributes to the interior orientation is left to the camera; every other one counts as
-a movement of the mount.
+The trajectory may have jumps, if the mount was knocked or a lens slipped. A jump that the
+perspective attributes to the interior orientation is the camera's; every other one is a movement of
+the mount.
 
-How long the memory is, and whether a component is there at all, is averaged over as plausible.
+The result is averaged over the lengths of the memory, and over models with and without each
+component, weighted by their plausibility.
 
 Sources: variance components as Patterson and Thompson (1971), Biometrika 58, 545-554; Whittle
 (1953), Estimation and information in stationary time series; the maximisation by multiplicative
@@ -45,29 +47,29 @@ if TYPE_CHECKING:
 
 
 _PHI = np.array([0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98])
-_LONG_PHI = np.append(_PHI, [0.99, 0.995, 0.998])  # where no drift can be mistaken for it
+_LONG_PHI = np.append(_PHI, [0.99, 0.995, 0.998])  # for series without drift, which looks alike
 _UPDATES = 150
 _WHITE_COST = 8.0  # log-likelihood that a tremble must gain, in the best of six directions
-_SLOW_COST = 2.0  # that a memory must gain with it
+_SLOW_COST = 2.0  # further log-likelihood that a memory must gain
 _NEGLIGIBLE = 0.02  # of the noise's variance
 _MOST_FREQUENCIES = 2000
 _LEAK_DEGREE = 6
-_LEAST_PER_DEGREE = 20  # fast frequencies: fewer would lose much of the mount itself
-_END = 15  # epochs at each end that tell the slope there
+_LEAST_PER_DEGREE = 20  # fast frequencies; with fewer much of the mount's movement would be lost
+_END = 15  # epochs at each end that give the slope there
 
 
 def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
-    """Return the components of every column of a trajectory.
+    """Estimate the variance components of every column of a trajectory.
 
-    Variances (k,) of the white part and of that with memory about the mean; the memory of the
-    latter in epochs, 0 without it. trajectory (E, k) in units of its noise; period: the shortest of
-    the drift in epochs, 0 for none. A component that the likelihood does not ask for is 0.
+    trajectory (E, k): in units of its noise; period: shortest period of the drift in epochs, 0 for
+    none. Returns the variances (k,) of the white part and of the part with memory, about its mean,
+    and the memory in epochs, 0 without one. A component without support by the likelihood is 0.
     """
-    levelled = _without_leak(_level_at_its_ends(trajectory), period) if period else trajectory
+    levelled = _remove_leak(_level_ends(trajectory), period) if period else trajectory
     power = _cosines(levelled) ** 2
     n = len(trajectory)
     omega = np.pi * np.arange(1, n) / n
-    if len(power) > _MOST_FREQUENCIES:  # the high ones are pooled, they look alike
+    if len(power) > _MOST_FREQUENCIES:  # the high ones are alike and are pooled
         power, omega, count = _pooled(power, omega)
     else:
         count = np.ones(len(power))
@@ -85,7 +87,7 @@ def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
     evidence[:, 2] = likelihood - _WHITE_COST - _SLOW_COST
     evidence -= evidence.max(axis=(0, 1))
     plausible = np.exp(evidence)
-    each = plausible.sum(axis=1)  # of a memory, by direction; the mount has one memory for all
+    each = plausible.sum(axis=1)  # memories by directions; the mount has one memory for all
     together = np.log(each).sum(axis=1)
     of_memory = np.exp(together - together.max())
     of_memory /= of_memory.sum()
@@ -94,7 +96,7 @@ def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
     white += (plausible[:, 2] * swaying[:, 1]).sum(axis=0)
     by_memory = plausible[:, 2] * swaying[:, 2]
     by_memory *= np.array([1.0 - mean_variance(phi, n) for phi in memories])[:, None]
-    if not period:  # without a drift of the camera, whatever wanders is the mount
+    if not period:  # without a drift of the camera all slow movement is the mount's
         missing = (count @ power) / n - 1.0 - white - by_memory.sum(axis=0)
         by_memory[-1] = np.maximum(by_memory[-1] + missing, 0.0)
     negligible = white + by_memory.sum(axis=0) < _NEGLIGIBLE
@@ -106,9 +108,9 @@ def components(trajectory: Array, period: float) -> tuple[Array, Array, float]:
 
 
 def _drift(omega: Array, period: float) -> Array:
-    """Spectrum of a camera that warms up: an integrated random walk without fast movements.
+    """Return the spectrum of a camera that warms up: an integrated random walk, low-pass filtered.
 
-    period: the shortest in epochs, 0 for a random walk without a bound.
+    period: the shortest in epochs, 0 for no filter.
     """
     x = 2.0 - 2.0 * np.cos(omega)
     if not period:
@@ -120,8 +122,8 @@ def _drift(omega: Array, period: float) -> Array:
     return shape
 
 
-def _level_at_its_ends(trajectory: Array) -> Array:
-    """The trajectory (E, k) less the parabola with its slopes at both ends.
+def _level_ends(trajectory: Array) -> Array:
+    """Subtract from a trajectory (E, k) the parabola with its slopes at both ends.
 
     Its mirror image then continues it smoothly, and a drift stays at the low frequencies.
     """
@@ -137,11 +139,11 @@ def _level_at_its_ends(trajectory: Array) -> Array:
     return level
 
 
-def _without_leak(trajectory: Array, period: float) -> Array:
-    """The trajectory (E, k) less the polynomial that explains most of its fast part.
+def _remove_leak(trajectory: Array, period: float) -> Array:
+    """Subtract from a trajectory (E, k) the polynomial that explains most of its fast part.
 
-    A strong drift that does not end flat has high frequencies of its own, those of a polynomial;
-    besides a millipixel of noise they would be taken for movements of the mount.
+    A strong drift that is not level at its ends has high frequencies, as a polynomial has; with
+    noise of a millipixel they would look like movements of the mount.
     """
     n = len(trajectory)
     low = int(2 * n / period)
@@ -155,7 +157,7 @@ def _without_leak(trajectory: Array, period: float) -> Array:
 
 
 def _cosines(trajectory: Array) -> Array:
-    """Coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
+    """Return the coefficients (E - 1, k) of the orthonormal cosine transform, without the mean."""
     n = len(trajectory)
     even = np.concatenate([trajectory, trajectory[::-1]])
     spectrum = np.fft.rfft(even, axis=0)[1:n]
@@ -165,7 +167,7 @@ def _cosines(trajectory: Array) -> Array:
 
 
 def _pooled(power: Array, omega: Array) -> tuple[Array, Array, Array]:
-    """The low frequencies one by one, the others in equal groups, and how many each stands for."""
+    """Average the power of high frequencies in equal groups; return power, omega and counts."""
     half = _MOST_FREQUENCIES // 2
     groups = np.array_split(np.arange(half, len(power)), half)
     return (
@@ -176,13 +178,13 @@ def _pooled(power: Array, omega: Array) -> tuple[Array, Array, Array]:
 
 
 def _fit(power: Array, count: Array, shapes: Array) -> tuple[Array, Array]:
-    """Fit the sizes (..., components, k) of spectra (..., components, m) alongside white noise of
-    variance 1: power (m, k), count (m,).
+    """Fit the sizes of spectra (..., components, m) on white noise of variance 1.
 
-    Returns them and the likelihood (..., k).
+    power (m, k); count (m,): frequencies in each. Returns the sizes (..., components, k) and the
+    log-likelihood (..., k).
     """
     weight = count[:, None]
-    # Spectra are steep: start where each alone would give the power of its own frequencies.
+    # Spectra are steep: each starts at the size that explains the power of its own frequencies.
     share = shapes * count
     share /= np.maximum(share.sum(axis=-1, keepdims=True), 1e-300)
     peak = (shapes * share).sum(axis=-1, keepdims=True)
@@ -200,25 +202,25 @@ def _fit(power: Array, count: Array, shapes: Array) -> tuple[Array, Array]:
 
 
 def mean_variance(phi: float, n: int) -> float:
-    """Variance of the mean of n values with unit variance and correlation φ^|i-j|."""
+    """Return the variance of the mean of n values with unit variance and correlation φ^|i-j|."""
     if n <= 1 or phi >= 1:
         return 1.0
     sum_ = (1 + phi) / (1 - phi) - 2 * phi * (1 - phi**n) / (n * (1 - phi) ** 2)
     return float(min(sum_ / n, 1.0))
 
 
-_HIDDEN = 0.3  # of the noise's variance: too little to estimate it epoch by epoch
-_FLAT = 1e-6  # of the noise: directions without movement
+_HIDDEN = 0.3  # of the noise's variance, below which a movement cannot be estimated per epoch
+_FLAT = 1e-6  # of the noise's variance, for directions without movement
 
 
 @dataclass(frozen=True, eq=False)
 class Movement:
-    """How far a mount moves about its mean pose over a series.
+    """The variance components of a mount's movement about its mean pose over a series.
 
-    white, slow (6, 6): covariance of the exterior orientation, rad and mm, of a movement without
-    and with memory, about the mean over the series; memory: epochs after which the latter has lost
-    63 % of its correlation; noise (6, 6): covariance of the pose of one epoch with its interior
-    orientation held; jumps: the epochs from which on it stood elsewhere.
+    white, slow (6, 6): covariances of the exterior orientation, rad and mm, for movements without
+    and with memory; memory: epochs after which the slow movement has lost 63 % of its correlation;
+    noise (6, 6): covariance of one epoch's pose with the interior orientation held; jumps: the
+    first epoch after each jump.
     """
 
     white: Array
@@ -234,25 +236,25 @@ class Movement:
 
     @property
     def still(self) -> bool:
-        """Whether no movement was found that one epoch's noise would not hide."""
+        """Whether the movement is hidden by the noise of one epoch in every direction."""
         whiten = self._whitening()
         inside = np.linalg.eigvalsh(whiten @ self.covariance @ whiten.T)
         return bool(inside[-1] < _HIDDEN)
 
     def _whitening(self) -> Array:
-        """T with T · noise · Tᵀ = 1."""
+        """Return T (6, 6) with T · noise · Tᵀ = 1."""
         scaled, scale = unit_diagonal(self.noise)
         whitening: Array = symmetric_power(scaled, -0.5, 1e-12) * scale
         return whitening
 
     def precision(self) -> Array:
-        """Inverse covariance (6, 6); directions without movement are held to 1e-3 of the noise."""
+        """Return the inverse covariance (6, 6), with an sd of at least 1e-3 of the noise's."""
         T = self._whitening()
         inside = T @ self.covariance @ T.T
         return T.T @ symmetric_power(inside, -1.0, _FLAT) @ T
 
     def tilt(self, weights: Array) -> Array:
-        """Covariance (6, 6) of Σ w m over the epochs, weights (E,): of a line, say."""
+        """Return the covariance (6, 6) of Σ w m over the epochs, with weights (E,)."""
         white: Array = self.white * float(weights @ weights)
         if not self.slow.any():
             return white
@@ -270,10 +272,10 @@ STILL = Movement(np.zeros((6, 6)), np.zeros((6, 6)), 0.0, np.eye(6))
 """A mount that does not move."""
 
 
-def together(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
-    """The mean of the movements of parts of a series, which start at some epochs.
+def mean_movement(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
+    """Return the mean of the movements of parts of a series, with the longest memory.
 
-    The memory is the longest; jumps count as those of the series.
+    starts: first epoch of each part, from which the jumps' epochs in the series follow.
     """
     return Movement(
         np.mean([m.white for m in movements], axis=0),
@@ -285,7 +287,7 @@ def together(movements: Sequence[Movement], starts: Sequence[int]) -> Movement:
 
 
 def image_px(covariance: Array, A: Array) -> float:
-    """What a movement of some covariance (6, 6) does to the image, px, by partials (T, 2, 16).
+    """Return the effect of a movement's covariance (6, 6) on the image, px, by partials (T, 2, 16).
 
     RMS over targets, per coordinate.
     """
@@ -294,19 +296,19 @@ def image_px(covariance: Array, A: Array) -> float:
 
 
 _LARGE = 8.0  # robust standard deviations of the change between neighbours
-_LASTING = 0.5  # of the change must remain
-_SIDE = 8  # epochs before and after that tell where the pose stood
-_MOST = 8
+_LASTING = 0.5  # share of the change that must remain
+_SIDE = 8  # epochs before and after a jump that give its step
+_MOST = 8  # jumps examined
 _SURE = 4.0  # standard deviations by which the perspective must exclude a movement
-_UNSEEN = 3.0
+_UNSEEN = 3.0  # standard deviations below which the perspective shows no movement
 
 
-def jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array, Array]:
-    """Find the jumps of a trajectory (E, k), in units of its noise, that are the mount's.
+def find_jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array, Array]:
+    """Find the mount's jumps in a trajectory (E, k), in units of its noise.
 
     M (E, k, k), g (E, k): normal equations of the pose with the interior orientation free. Returns
-    the epochs from which on the pose stood elsewhere, the stairs (E, k) that it made, and the
-    covariance (k, k) of the pose about its mean that they are.
+    the first epoch after each jump, the sum of the steps (E, k), and the covariance (k, k) of the
+    pose about its mean that the steps cause.
     """
     E = len(trajectory)
     rows: list[int] = []
@@ -327,7 +329,7 @@ def jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array, Arra
         if abs(step[column]) < _LASTING * abs(change[worst, column]):
             continue
         left[row:] -= step
-        if not _is_the_cameras(row, step, M, g):
+        if not _is_of_camera(row, step, M, g):
             rows.append(row)
             stairs[row:] += step
             variance = factor * mad_sd(change, axis=0) ** 2 / 2
@@ -337,7 +339,7 @@ def jumps(trajectory: Array, M: Array, g: Array) -> tuple[list[int], Array, Arra
 
 
 def _step(trajectory: Array, row: int) -> tuple[Array, float]:
-    """The step (k,) at an epoch on a straight line, and its variance over the noise's."""
+    """Return the step (k,) of a straight line at an epoch, and its variance over the noise's."""
     first = max(row - _SIDE, 0)
     part = trajectory[first : row + _SIDE]
     t = np.arange(first, first + len(part)) - row
@@ -345,41 +347,41 @@ def _step(trajectory: Array, row: int) -> tuple[Array, float]:
     return estimator @ part, float(estimator @ estimator)
 
 
-def _is_the_cameras(row: int, step: Array, M: Array, g: Array) -> bool:
-    """Whether the perspective excludes that the pose made a step."""
+def _is_of_camera(row: int, step: Array, M: Array, g: Array) -> bool:
+    """Return whether the perspective excludes a step of the pose."""
 
-    def half(part: slice) -> tuple[float, float]:
+    def estimate(part: slice) -> tuple[float, float]:
         information = float(np.einsum("i,eij,j->", step, M[part], step))
         return float((g[part] @ step).sum()) / max(information, 1e-300), information
 
-    (before, known_before), (after, known_after) = half(slice(None, row)), half(slice(row, None))
-    if min(known_before, known_after) <= 0:
+    (before, weight_before), (after, weight_after) = map(estimate, (slice(row), slice(row, None)))
+    if min(weight_before, weight_after) <= 0:
         return False
-    sd = float(np.sqrt(1.0 / known_before + 1.0 / known_after))
+    sd = float(np.sqrt(1.0 / weight_before + 1.0 / weight_after))
     moved = after - before
     return abs(1.0 - moved) > _SURE * sd and abs(moved) < _UNSEEN * sd
 
 
 FEWEST_EPOCHS = 20
-"""Below, the epochs do not tell a tremble from their own noise."""
+"""Epochs needed to separate a tremble from the noise."""
 
 FASTEST_DRIFT_S = 240.0
 """Period below which a camera hardly follows its temperature."""
 
 _WINDOW = 15  # epochs of the local cubic that smooths the interior orientation
-_CUBIC = 0.6  # of the drift's shortest period: the window of the local cubic that follows it
-_SPIKE = 6.0  # robust standard deviations: a passer-by, not the mount
-_WEAK = 3.0  # times the usual variance of the pose: an epoch that says little of the movement
+_CUBIC = 0.6  # window of the local cubic that follows the drift, over the drift's shortest period
+_SPIKE = 6.0  # robust standard deviations beyond which a deviation is a passer-by, not the mount
+_WEAK = 3.0  # times the usual variance of the pose, beyond which an epoch is interpolated
 _FEWEST_A_PERIOD = 12.0  # epochs
 _LEAST_WARMING_K = 0.5
-_PERIODS = 2.5  # a series must be so many periods long to show a drift
+_PERIODS = 2.5  # periods that a series must have to show a drift
 
 
 def drift_period(time_s: Array, temperature: Array) -> float:
-    """The shortest period of a camera's drift in epochs; 0 where the series is too short for one.
+    """Return the shortest period of a camera's drift in epochs; 0 if the series is too short.
 
-    time_s (E,): of the epochs; temperature (E,) °C, NaN where unknown: a camera that warms up
-    drifts in a short series too.
+    time_s (E,): of the epochs; temperature (E,) °C, NaN if unknown: a camera that warms up drifts
+    even in a short series.
     """
     if len(time_s) < 2:
         return 0.0
@@ -399,12 +401,11 @@ def estimate_movement(
     period: float = 24.0,
     correlated: Array | None = None,
 ) -> Movement:
-    """Variance components of the mount from the normal equations of a series.
+    """Estimate the variance components of the mount from the normal equations of a series.
 
     N (E, 16, 16), b (E, 16): of every epoch at one linearisation, in units of the noise; own (p,):
-    the free interior parameters; good (E,): epochs to use; period: of `drift_period`; correlated
-    (6, 6): what correlated
-    errors add to the normal matrix of the pose, ΣAᵀPCPA.
+    the free interior parameters; good (E,): epochs to use; period: from `drift_period`; correlated
+    (6, 6): part of the pose's normal matrix from correlated errors, ΣAᵀPCPA.
     """
     rows = np.flatnonzero(good)
     if len(rows) < FEWEST_EPOCHS:
@@ -418,15 +419,15 @@ def estimate_movement(
         inverse = np.linalg.inv(root)
         noise += inverse.T @ correlated @ inverse
     whiten = symmetric_power(noise, -0.5, 1e-3)
-    trajectory = _filled(trajectory @ whiten, weak)
+    trajectory = _fill(trajectory @ whiten, weak)
     back = np.linalg.inv(root) @ np.linalg.inv(whiten)
-    # what the perspective alone says of the pose, the interior orientation eliminated
+    # the pose by the perspective alone, the interior orientation eliminated
     M, g = pose_equations(N, b, own, stacked_inverses(N[:, own[:, None], own])[0])
-    jumped, stairs, of_jumps = jumps(trajectory, back.T @ M @ back, g @ back)
+    jumped, stairs, of_jumps = find_jumps(trajectory, back.T @ M @ back, g @ back)
     trajectory = trajectory - stairs
     period = min(period, len(trajectory) / _PERIODS)
     if period:
-        smooth = _smoothed(trajectory, int(_CUBIC * period))
+        smooth = _smooth(trajectory, int(_CUBIC * period))
     else:
         trajectory = trajectory - trajectory.mean(axis=0)
         smooth = np.zeros_like(trajectory)
@@ -447,11 +448,12 @@ def estimate_movement(
 
 
 def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, Mask]:
-    """Poses (E, 6) with the interior orientation held, in units of their noise; the root of their
-    usual normal matrix; and which epochs (E,) say little.
+    """Return poses (E, 6) with the interior orientation held, in units of their noise; the root of
+    their usual normal matrix; and a mask (E,) of weak epochs. The poses are None if that is
+    singular.
 
-    Held is the smooth trajectory of the interior orientation, put back by the usual matrices:
-    targets that come and go then do not turn a drift into a movement.
+    The interior orientation is held at its smooth trajectory, whose effect is added again by the
+    usual matrices, so that targets that come and go do not turn a drift into a movement.
     """
     usual = N[:, EOP, EOP].mean(axis=0)
     interior = np.zeros((len(N), len(own)))
@@ -459,8 +461,7 @@ def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, 
         Q, found = stacked_inverses(N[:, own[:, None], own])
         interior = np.einsum("epq,eq->ep", Q, b[:, own])
         interior[~found] = np.nan
-        interior = _filled(interior, ~found)
-        interior = _smoothed(interior)
+        interior = _smooth(_fill(interior, ~found))
     Q, found = stacked_inverses(N[:, EOP, EOP])
     coupling = N[:, EOP_COLUMNS[:, None], own]
     pose = np.einsum("eij,ej->ei", Q, b[:, EOP] - np.einsum("eip,ep->ei", coupling, interior))
@@ -476,7 +477,7 @@ def _trajectories(N: Array, b: Array, own: Index) -> tuple[Array | None, Array, 
 
 
 def _visible(N: Array, own: Index, root: Array) -> Array:
-    """Return how much of a movement (6, 6) an epoch sees by its perspective, 0 to 1, in units of
+    """Return the share (6, 6), 0 to 1, of a movement that an epoch's perspective shows, in units of
     `root`; the rest looks like a change of the interior orientation.
     """
     usual = N.mean(axis=0, keepdims=True)
@@ -488,10 +489,10 @@ def _visible(N: Array, own: Index, root: Array) -> Array:
 
 
 def _directions(rough: Array, visible: Array) -> Array:
-    """Orthonormal directions (6, 6) of the movements, from their rough part (E, 6).
+    """Return orthonormal directions (6, 6) of the movements, from their rough part (E, 6).
 
-    Those that an epoch sees and those that it does not are kept apart: a chance correlation of the
-    two would let the one predict the other.
+    Directions that an epoch's perspective shows are separate from the others, as by a chance
+    correlation the former would predict the latter.
     """
     share, axes = np.linalg.eigh(visible)
     found = []
@@ -502,8 +503,8 @@ def _directions(rough: Array, visible: Array) -> Array:
     return np.concatenate(found, axis=1)
 
 
-def _filled(trajectory: Array, missing: Mask) -> Array:
-    """The trajectory with missing epochs interpolated between their neighbours."""
+def _fill(trajectory: Array, missing: Mask) -> Array:
+    """Interpolate missing epochs of a trajectory between their neighbours."""
     if not missing.any() or missing.all():
         return trajectory
     t = np.arange(len(trajectory))
@@ -511,8 +512,8 @@ def _filled(trajectory: Array, missing: Mask) -> Array:
     return np.column_stack([np.interp(t, t[kept], column[kept]) for column in trajectory.T])
 
 
-def _smoothed(trajectory: Array, window: int = _WINDOW) -> Array:
-    """Local cubics over a window of epochs through a trajectory (E, k), also at its ends."""
+def _smooth(trajectory: Array, window: int = _WINDOW) -> Array:
+    """Smooth a trajectory (E, k) by local cubics over a window of epochs, also at its ends."""
     window = min(max(window, 7), len(trajectory) // 2 - 1) | 1
     half = window // 2
     x = np.arange(-half, half + 1) / half

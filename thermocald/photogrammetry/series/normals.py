@@ -1,12 +1,12 @@
 """Observations of many epochs, and their normal equations at one common linearisation point.
 
-A static camera sees the same field in every epoch, so the partial derivatives are one array for the
-whole series and each epoch differs only in its weights and residuals. All normal matrices are then
-one matrix product: (epochs × targets) · (targets × products of partials). Everything that follows
-(series adjustment, filter, discovery) works on these sums.
+A static camera sees the same field in every epoch, so that the partial derivatives are one array
+for the whole series, and epochs differ only in weights and residuals. All normal matrices are then
+one matrix product: (epochs × targets) · (targets × products of partials). Series adjustment, filter
+and discovery work on these sums.
 
-In memory the coordinates stand before the epochs, so that every operation on all x, or on all
-weights of x, runs through one stretch of it; callers see the shapes that are documented.
+In memory the coordinates come before the epochs, so that all x, or all weights of x, are
+contiguous; callers see the documented shapes.
 
 Source: Luhmann et al. (2014), section 2.4.4; the reduction of common unknowns as Mikhail and
 Ackermann (1976), Observations and Least Squares, chapter 10.
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from thermocald.arrays import Array, Index
+    from thermocald.arrays import Array, Index, Mask
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 
-_LOOKED_AT = 60  # epochs that tell where targets are
-_OFTEN = 0.2  # of them, to tell it of a target
-_CHUNK_POINTS = 20_000  # worked on at a time, in the processor's cache
+_SAMPLE = 60  # epochs from which misplaced targets are found
+_OFTEN = 0.2  # share of them that must show a target
+_CHUNK_POINTS = 20_000  # processed at a time, to stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class ObservationGrid:
     """The observations of many epochs on one grid of epochs × targets of the test field.
 
-    points (E, T, 2) px, NaN where a target was not observed; weights (E, T, 3) px⁻²: the elements
-    xx, yy, xy of each point's inverse covariance, 0 where it was not observed or is rejected.
+    points (E, T, 2) px: NaN if a target was not observed; weights (E, T, 3) px⁻²: the elements xx,
+    yy, xy of each point's inverse covariance, 0 if it was not observed or is rejected.
     """
 
     points: Array
@@ -52,7 +52,7 @@ class ObservationGrid:
     def from_observations(
         cls, field: TestField, epochs: Sequence[Observations | None]
     ) -> ObservationGrid:
-        """Lay the epochs' observations out; an epoch that is None stays empty."""
+        """Build the grid of the epochs' observations; an epoch that is None stays empty."""
         present = [(e, obs) for e, obs in enumerate(epochs) if obs is not None and len(obs)]
         shape = (len(epochs), len(field))
         if not present:
@@ -76,15 +76,16 @@ class ObservationGrid:
     def from_rows(
         cls,
         shape: tuple[int, int],
-        epochs: NDArray[np.int64],
-        targets: NDArray[np.int64],
+        epochs: Index,
+        targets: Index,
         measured: Array,
         sigmas: Array,
         covariances: Array | None = None,
     ) -> ObservationGrid:
-        """The grid of n image points: their epochs, targets (n,), measured, sigmas (n, 2) px.
+        """Build the grid of n image points.
 
-        shape: epochs and targets of the grid; covariances (n,) px² of x with y.
+        shape: numbers of epochs and targets; epochs, targets (n,): of the points; measured, sigmas
+        (n, 2) px; covariances (n,) px²: of x and y.
         """
         points, weights = planes(2, *shape), planes(3, *shape)
         points[...] = np.nan
@@ -107,7 +108,7 @@ class ObservationGrid:
     def blocks(
         self, windows: Sequence[slice] | None = None, size: int = 1000
     ) -> Iterator[tuple[int, ObservationGrid]]:
-        """Yield grids of at most `size` consecutive epochs, each with its first epoch (from 0).
+        """Yield grids of at most `size` consecutive epochs, each after its first epoch (from 0).
 
         windows: only the epochs of these slices, ascending.
         """
@@ -115,23 +116,23 @@ class ObservationGrid:
             yield rows.start, ObservationGrid(self.points[rows], self.weights[rows])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For another process, one component after the other there as well."""
+        """Pickle with one component after the other, so that the copy has the same order."""
         parts = (np.ascontiguousarray(np.moveaxis(a, -1, 0)) for a in (self.points, self.weights))
         return _of_planes, tuple(parts)
 
     @property
-    def observed(self) -> NDArray[np.bool_]:
-        """(E, T): what takes part."""
+    def observed(self) -> Mask:
+        """Mask (E, T) of the points with a weight."""
         return self.weights[..., 0] > 0
 
-    def targets(self, columns: NDArray[np.int64]) -> ObservationGrid:
-        """Some of the targets."""
+    def targets(self, columns: Index) -> ObservationGrid:
+        """Return the grid of some targets."""
         if len(columns) == self.points.shape[1]:
             return self
         return ObservationGrid(self.points[:, columns], self.weights[:, columns])
 
-    def reject(self, mask: NDArray[np.bool_]) -> ObservationGrid:
-        """The same, the observations of a mask (E, T) without weight."""
+    def reject(self, mask: Mask) -> ObservationGrid:
+        """Return the grid with the observations of a mask (E, T) without weight."""
         if not mask.any():
             return self
         weights = self.weights.copy(order="K")
@@ -140,13 +141,13 @@ class ObservationGrid:
 
 
 def _of_planes(points: Array, weights: Array) -> ObservationGrid:
-    """The grid of components before epochs, as it is pickled."""
+    """Unpickle a grid: points (2, E, T), weights (3, E, T)."""
     return ObservationGrid(np.moveaxis(points, 0, -1), np.moveaxis(weights, 0, -1))
 
 
 @dataclass(frozen=True, eq=False)
 class Partials:
-    """The linearisation: iop (10,), eop (6,), predicted (T, 2) px, A (T, 2, 16), B (T, 2, 3)."""
+    """A linearisation: iop (10,), eop (6,), predicted (T, 2) px, A (T, 2, 16), B (T, 2, 3)."""
 
     iop: Array
     eop: Array
@@ -156,7 +157,7 @@ class Partials:
 
 
 def linearise(sensor: Sensor, field: TestField, iop: ArrayLike, eop: ArrayLike) -> Partials:
-    """The partial derivatives of all targets at one point; targets out of sight get zeros."""
+    """Compute the partials of all targets for one camera; 0 for targets behind it."""
     i, e = np.asarray(iop, dtype=float), np.asarray(eop, dtype=float)
     predicted, A, B = partials(sensor, i, e, field.points)
     seen = np.isfinite(predicted[:, 0])
@@ -165,7 +166,7 @@ def linearise(sensor: Sensor, field: TestField, iop: ArrayLike, eop: ArrayLike) 
 
 
 def normal_matrices(weights: Array, A: Array) -> Array:
-    """Σ Aᵀ P A of every epoch: weights (E, T, 3), A (T, 2, k) → (E, k, k)."""
+    """Return Σ Aᵀ P A (E, k, k) of every epoch, for weights (E, T, 3) and A (T, 2, k)."""
     k = A.shape[-1]
     rows, columns = np.triu_indices(k)
     xx, yy, xy = products(A)
@@ -175,16 +176,16 @@ def normal_matrices(weights: Array, A: Array) -> Array:
         flat = weights[..., 0] @ xx + weights[..., 1] @ yy
     if np.any(weights[..., 2]):
         flat += weights[..., 2] @ xy
-    pair = np.empty((k, k), dtype=np.int64)  # where in `flat` an element stands
+    pair = np.empty((k, k), dtype=np.int64)  # an element's column in `flat`
     pair[rows, columns] = pair[columns, rows] = np.arange(len(rows))
     N: Array = np.take(flat, pair, axis=1)
     return N
 
 
 def products(A: Array) -> tuple[Array, Array, Array]:
-    """Of partials (T, 2, k) in x, in y, and of x with y, for each pair of parameters (T, k(k+1)/2).
+    """Multiply partials (T, 2, k) for each pair of parameters: x by x, y by y, and x by y.
 
-    The pairs are those of `np.triu_indices(k)`.
+    Returns three arrays (T, k(k+1)/2); the pairs are those of `np.triu_indices(k)`.
     """
     rows, columns = np.triu_indices(A.shape[-1])
     x, y = np.ascontiguousarray(A[:, 0].T), np.ascontiguousarray(A[:, 1].T)
@@ -194,14 +195,14 @@ def products(A: Array) -> tuple[Array, Array, Array]:
 
 
 def planes(components: int, epochs: int, targets: int) -> Array:
-    """Fresh memory (epochs, targets, components), one component after the other."""
+    """Allocate an array (epochs, targets, components) with one component after the other."""
     return np.moveaxis(np.empty((components, epochs, targets)), 0, -1)
 
 
 def runs(count: int, size: int, windows: Sequence[slice] | None = None) -> Iterator[slice]:
     """Yield the rows of `count` epochs, at most `size` at a time.
 
-    windows: only the rows of these slices, ascending; each begins a run.
+    windows: only the rows of these slices, ascending; each starts a new run.
     """
     for window in windows or (slice(0, count),):
         for first in range(window.start, window.stop, size):
@@ -211,13 +212,13 @@ def runs(count: int, size: int, windows: Sequence[slice] | None = None) -> Itera
 def chunks(epochs: int, targets: int) -> Iterator[slice]:
     """Yield the epochs in parts whose points stay in the processor's cache.
 
-    The arrays of a long series would also have to be fetched from the system, page by page.
+    Temporary arrays of a whole long series would also cost a page fault for every page.
     """
     return runs(epochs, max(_CHUNK_POINTS // max(targets, 1), 1))
 
 
-def same_rows(*arrays: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Which rows of arrays (E, ...) are the same: representatives (M,), and whose each is (E,).
+def same_rows(*arrays: NDArray[Any]) -> tuple[Index, Index]:
+    """Find equal rows of arrays (E, ...); return representatives (M,) and the one of each row (E,).
 
     Epochs that see the same targets with the same weights have the same normal matrix.
     """
@@ -235,12 +236,10 @@ def same_rows(*arrays: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int6
     return first, of
 
 
-def right_hand_sides(
-    weights: Array, residuals: Array, A: Array, use: NDArray[np.bool_] | None = None
-) -> Array:
-    """Aᵀ P l (E, k) of every epoch; use (E, T): what takes part, or all that has a weight.
+def right_hand_sides(weights: Array, residuals: Array, A: Array, use: Mask | None = None) -> Array:
+    """Return Aᵀ P l (E, k) of every epoch.
 
-    NaN residuals must not take part.
+    use (E, T): mask of points, by default all with a weight; their residuals must not be NaN.
     """
     E, T = residuals.shape[:2]
     b = np.empty((E, A.shape[-1]))
@@ -251,10 +250,8 @@ def right_hand_sides(
     return b
 
 
-def sums_of_squares(
-    weights: Array, residuals: Array, use: NDArray[np.bool_] | None = None
-) -> Array:
-    """vᵀ P v (E,) of every epoch; use as in `right_hand_sides`."""
+def sums_of_squares(weights: Array, residuals: Array, use: Mask | None = None) -> Array:
+    """Return vᵀ P v (E,) of every epoch; use: as in `right_hand_sides`."""
     E, T = residuals.shape[:2]
     total = np.empty(E)
     for part in chunks(E, T):
@@ -264,22 +261,22 @@ def sums_of_squares(
         y *= v[..., 1]
         x += y
         x.sum(axis=1, out=total[part])
-        # only where targets were not observed: a look at all would cost as much as the sum
+        # NaN of unobserved targets is excluded only if there is any: a test would cost a sum
         if np.isnan(total[part]).any():
             np.nansum(x, axis=1, out=total[part])
     return total
 
 
-def sums_of_targets(weights: Array, residuals: Array, use: NDArray[np.bool_]) -> Array:
-    """P v (T, 2) of every target, over the epochs in which it takes part, use (E, T)."""
+def sums_of_targets(weights: Array, residuals: Array, use: Mask) -> Array:
+    """Return P v (T, 2) of every target, summed over the epochs of a mask `use` (E, T)."""
     total = np.zeros((residuals.shape[1], 2))
     for part in chunks(*residuals.shape[:2]):
         total += _weighted(weights[part], residuals[part], use[part]).sum(axis=1).T
     return total
 
 
-def _weighted(weights: Array, residuals: Array, use: NDArray[np.bool_] | None) -> Array:
-    """P v (2, E, T) of every point, 0 where it takes no part."""
+def _weighted(weights: Array, residuals: Array, use: Mask | None) -> Array:
+    """Return P v (2, E, T) of every point, 0 if it is not in use."""
     out = np.empty((2, *residuals.shape[:2]))
     correlated = weights[..., 2].any()
     for k in range(2):
@@ -292,16 +289,16 @@ def _weighted(weights: Array, residuals: Array, use: NDArray[np.bool_] | None) -
     return out
 
 
-def cofactors(N: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Inverse of each matrix (E, p, p), and which could be inverted (E,); the others get units."""
+def cofactors(N: Array) -> tuple[Array, Mask]:
+    """Invert matrices (E, p, p) in chunks, as `stacked_inverses` does."""
     inverse, good = np.empty(N.shape), np.empty(len(N), dtype=bool)
     for part in chunks(len(N), N.shape[-1] ** 2):
         inverse[part], good[part] = stacked_inverses(N[part])
     return inverse, good
 
 
-def among_all(Q: Array, own: NDArray[np.int64]) -> Array:
-    """Matrices (E, p, p) of some parameters as those of all (E, 16, 16), 0 for the others."""
+def among_all(Q: Array, own: Index) -> Array:
+    """Expand matrices (E, p, p) of some parameters to all (E, 16, 16), 0 for the others."""
     whole = np.zeros((len(Q), 16, 16))
     runs = np.split(np.arange(len(own)), np.flatnonzero(np.diff(own) > 1) + 1)
     for rows in runs:
@@ -315,14 +312,14 @@ def among_all(Q: Array, own: NDArray[np.int64]) -> Array:
 
 
 class ObservationBlocks(Protocol):
-    """The observations of consecutive epochs, on all targets of the field."""
+    """A source of the observations of consecutive epochs, on all targets of the field."""
 
     def __len__(self) -> int: ...
 
     def blocks(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
-        """Yield grids of consecutive epochs with the first epoch (from 0) of each.
+        """Yield grids of consecutive epochs, each after its first epoch (from 0).
 
         windows: only the epochs of these slices, ascending.
         """
@@ -331,7 +328,7 @@ class ObservationBlocks(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class WithoutTargets:
-    """The same as if some targets (rows of the field) had never been observed."""
+    """A source as if some targets (rows of the field) had never been observed."""
 
     source: ObservationBlocks
     targets: Index
@@ -350,9 +347,9 @@ class WithoutTargets:
 
 
 def often_shown(misclosure: Array) -> Array:
-    """Median over epochs of misclosures (E, T, 2), NaN for targets that few of them show.
+    """Return the median of misclosures (E, T, 2) over epochs, NaN for targets that few epochs show.
 
-    Such a target may lie where no other one tells of the distortion.
+    Such a target may be where no other one determines the distortion.
     """
     shown = np.isfinite(misclosure[..., 0]).mean(axis=0)
     return np.where(shown[:, None] < _OFTEN, np.nan, median_known(misclosure))
@@ -360,13 +357,13 @@ def often_shown(misclosure: Array) -> Array:
 
 def misplaced_targets(
     sensor: Sensor, testfield: TestField, grid: ObservationGrid, cameras: Array
-) -> NDArray[np.bool_]:
-    """Find targets (T,) that are far from where the epochs' own cameras (E, 16) expect them.
+) -> Mask:
+    """Return a mask (T,) of targets far from their places as predicted by the epochs' cameras.
 
-    NaN for a camera that is not known.
+    cameras (E, 16): NaN for an unknown one.
     """
     rows = np.flatnonzero(np.isfinite(cameras).all(axis=1))
-    rows = rows[:: max(len(rows) // _LOOKED_AT, 1)]
+    rows = rows[:: max(len(rows) // _SAMPLE, 1)]
     if not len(rows):
         return np.zeros(len(testfield), dtype=bool)
     expected = project(sensor, cameras[rows, IOP], cameras[rows, EOP], testfield.points)
@@ -377,9 +374,9 @@ def misplaced_targets(
 
 
 def spread_windows(epochs: int, most: int, count: int = 12) -> tuple[slice, ...]:
-    """Return up to `count` runs of consecutive epochs, `most` epochs in all, from first to last.
+    """Return `count` evenly spread runs of consecutive epochs, with `most` epochs in all.
 
-    All epochs in one where they are not more than that.
+    If there are no more epochs than that, one run has them all.
     """
     if epochs <= most:
         return (slice(0, epochs),)
@@ -389,7 +386,7 @@ def spread_windows(epochs: int, most: int, count: int = 12) -> tuple[slice, ...]
 
 
 def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> ObservationGrid:
-    """Return the epochs of some windows on one grid."""
+    """Read the epochs of some windows into one grid."""
     if isinstance(source, ObservationGrid) and list(windows) == [slice(0, len(source))]:
         return source
     whole = ObservationGrid(planes(2, 0, 0), planes(3, 0, 0))
@@ -407,7 +404,7 @@ def gathered(source: ObservationBlocks, windows: Sequence[slice]) -> Observation
 def recut(
     blocks: Iterable[tuple[int, ObservationGrid]], length: int
 ) -> Iterator[tuple[int, ObservationGrid]]:
-    """Yield the same epochs `length` at a time, so that blocks do not depend on the reader."""
+    """Yield the epochs of blocks `length` at a time, so that blocks do not depend on the reader."""
     points: list[Array] = []
     weights: list[Array] = []
     begin = held = 0

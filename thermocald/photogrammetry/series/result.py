@@ -1,9 +1,9 @@
-"""The result of a series' adjustment: what was estimated per epoch and what once, and the status.
+"""The result of a series' adjustment: parameters per epoch and common ones, with status.
 
-Two standard deviations come out of it. That of a difference within the series holds the noise of
-the epoch and the differences of visibility; the *level*, what all epochs have in common (the EOP's
-and the targets' uncertainty), is stated separately and cancels in every drift. An epoch without a
-result has its reason in a sentence.
+There are two kinds of standard deviations. That of a difference within the series includes the
+epoch's noise and the effect of changing visibility. That of the *level*, the errors common to all
+epochs (of the EOP and the targets), is separate and cancels in every drift. An epoch without a
+result has a reason in a sentence.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ Exterior = Literal["per_epoch", "series", "mount", "auto"]
 """How the exterior orientation of a series is estimated."""
 
 EXTERIOR_CHOICES: tuple[str, ...] = get_args(Exterior)
-"""The words for it."""
+"""The values of `Exterior`."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeriesSettings(AdjustmentSettings):
-    """What is estimated per epoch and what once, beside the settings of single epochs.
+    """Settings of a series' adjustment, beyond those of single epochs.
 
-    exterior: `per_epoch`: every epoch its own orientation; `series`: one for all epochs; `mount`:
-    one for all and a movement of each epoch, whose variance is estimated; `auto`: what the data
-    choose of the three; target_offsets: a constant offset per target, with the test field's sigmas
-    as prior; target_noise: the measuring noise, also its correlations within a marker and what
-    neighbouring epochs scatter beyond it, from the series' own scatter where it is long enough;
-    drift_period: the shortest of the camera's drift in epochs (`mount.drift_period`), 0 for a
-    series too short for one.
+    exterior: `per_epoch`: an orientation for every epoch; `series`: one for all epochs; `mount`:
+    one for all and a movement for every epoch, whose variance is estimated; `auto`: one of the
+    three, chosen by the data; target_offsets: estimate a constant offset per target, with the test
+    field's sigmas as prior; target_noise: estimate the measuring noise, its correlations within a
+    marker and the excess scatter of neighbouring epochs, if the series is long enough;
+    drift_period: shortest period of the camera's drift in epochs (`mount.drift_period`), 0 if the
+    series is too short for a drift.
     """
 
     exterior: Exterior = "series"
@@ -59,13 +59,13 @@ class SeriesSettings(AdjustmentSettings):
 
     @classmethod
     def of(cls, settings: AdjustmentSettings, exterior: str) -> SeriesSettings:
-        """Return the series' settings that go with those of single epochs."""
+        """Return the series' settings with those of single epochs."""
         given = {each.name: getattr(settings, each.name) for each in fields(AdjustmentSettings)}
         return cls(**given, exterior=cast("Exterior", exterior))
 
     @property
     def per_epoch(self) -> Index:
-        """Positions of the parameters that every epoch has of its own."""
+        """Positions of the parameters that are estimated per epoch."""
         own = free_columns(self.free)
         if self.exterior != "series":
             own += list(EOP_COLUMNS)
@@ -73,23 +73,23 @@ class SeriesSettings(AdjustmentSettings):
 
     @property
     def carried(self) -> int:
-        """How many unknowns an epoch has to carry: a movement of the mount costs hardly any."""
+        """Number of unknowns per epoch; a movement of the mount takes hardly any redundancy."""
         interior = free_columns(self.free)
         return len(interior) + (6 if self.exterior == "per_epoch" else 0)
 
     @property
     def common(self) -> Index:
-        """Positions of the parameters that are estimated once."""
+        """Positions of the parameters that are common to all epochs."""
         return np.empty(0, dtype=np.int64) if self.exterior == "per_epoch" else EOP_COLUMNS
 
 
 @dataclass(frozen=True, eq=False)
 class EpochRows:
-    """Epochs of a series as adjusted, one by one.
+    """The adjusted epochs of a series, one row each.
 
-    values, sd (E, 16): NaN where an epoch has no result or a parameter was held; sigma0,
-    redundancy, stillness (E,): NaN where there is none; n_observations, n_rejected (E,): how many
-    targets, the rejected in both; status, reasons: E words and sentences.
+    values, sd (E, 16): NaN if an epoch has no result or a parameter was held; sigma0, redundancy,
+    stillness (E,): NaN if undefined; n_observations, n_rejected (E,): numbers of targets, the
+    rejected ones in both; status, reasons: E words and E sentences.
     """
 
     values: Array
@@ -104,7 +104,7 @@ class EpochRows:
 
     @classmethod
     def empty(cls, epochs: int) -> EpochRows:
-        """Return rows to be put in."""
+        """Return rows without content, for `put`."""
         values, sd = np.empty((2, epochs, 16))
         sigma0, redundancy, stillness = np.empty((3, epochs))
         observed, rejected = np.empty((2, epochs), dtype=np.int64)
@@ -112,11 +112,11 @@ class EpochRows:
         return cls(values, sd, sigma0, redundancy, stillness, observed, rejected, words, sentences)
 
     def put(self, first: int, part: EpochRows) -> None:
-        """Put consecutive epochs in, from epoch `first` on."""
+        """Store consecutive epochs, from epoch `first` on."""
         here = slice(first, first + len(part.values))
         for column in fields(self):
             values = getattr(part, column.name)
-            if isinstance(values, list):  # each text once, however many epochs have it
+            if isinstance(values, list):  # one object per text, however many epochs have it
                 values = map(sys.intern, values)
             getattr(self, column.name)[here] = values
 
@@ -125,22 +125,21 @@ class EpochRows:
 class SeriesAdjustment:
     """The adjusted series; rows are epochs, parameters in the order of `PARAMETER_NAMES`.
 
-    values (E, 16), NaN where an epoch has no result; covariance (E, 16, 16): relative to the
-    series; level_covariance (16, 16): common to all epochs; sigma0 (E,); redundancy (E,);
-    observed, rejected (E, T); residuals (E, T, 2) px; offsets (T, 2) px, NaN where none was
-    estimated; status, reasons: per epoch; stillness (E,): chi-square with 6 degrees of
-    freedom of the epoch's own EOP against the series', NaN where the EOP are per epoch; excess_sd
-    (16,): by how much neighbouring epochs scatter beyond their noise because the set-up trembles
-    or the light flickers; contained in the covariance, 0 where it is not significant; trend_sd
-    (16,): what a straight line from the first epoch to the last owes to targets: their coordinates'
-    uncertainty where the visible ones changed on the way, slow errors of their own, and a mount
-    with memory; perspective_sd (16,): of an epoch whose mount could stand anywhere, NaN where each
-    has its own exterior orientation anyway; field_ratio: the standard deviations of the field's
-    coordinates over those stated, 1 where no more are shown; outer_noise: noise of the outermost
-    target over that in the image's middle, and its standard deviation; noise_ratio: the noise found
-    over the one stated; affinity: of C1 and C2 where they are held; movement: of the mount;
-    choice: how the exterior orientation was estimated and why; slow (16, 16): covariance of a
-    straight line from slow errors of targets; pairs: of coordinates that err together.
+    values (E, 16): NaN if an epoch has no result; covariance (E, 16, 16): relative to the series;
+    level_covariance (16, 16): common to all epochs; sigma0 (E,); redundancy (E,); observed,
+    rejected (E, T); residuals (E, T, 2) px; offsets (T, 2) px: NaN if not estimated; status,
+    reasons: per epoch; stillness (E,): χ² with 6 degrees of freedom of the epoch's own EOP against
+    the series', NaN if the EOP are per epoch; excess_sd (16,): scatter of neighbouring epochs
+    beyond their noise, as the set-up trembles or the light flickers: included in the covariance, 0
+    if not significant; trend_sd (16,): of a straight line from the first epoch to the last, from
+    the targets' coordinates if the visible ones changed, slow errors of targets, and a mount with
+    memory; perspective_sd (16,): of an epoch with a completely free mount, NaN if the EOP are per
+    epoch; field_ratio: estimated over stated standard deviations of the field's coordinates, at
+    least 1; outer_noise: noise of the outermost target over that in the image's middle, and its
+    standard deviation; noise_ratio: estimated over stated noise; affinity: of held C1 and C2;
+    movement: of the mount; choice: how the exterior orientation was estimated, and why; slow
+    (16, 16): covariance of a straight line from slow errors of targets; pairs: of coordinates with
+    correlated errors.
     """
 
     settings: SeriesSettings
@@ -175,7 +174,7 @@ class SeriesAdjustment:
 
     @property
     def sd(self) -> Array:
-        """Standard deviations (E, 16), NaN where held; of common parameters with the level."""
+        """Standard deviations (E, 16), NaN if held; those of common parameters with the level."""
         variance = np.diagonal(self.covariance, axis1=1, axis2=2).copy()
         common = self.settings.common
         variance[:, common] += np.diag(self.level_covariance)[common]
@@ -185,17 +184,17 @@ class SeriesAdjustment:
 
     @property
     def level_sd(self) -> Array:
-        """Standard deviation (16,) of what all epochs have in common."""
+        """Standard deviations (16,) of the level."""
         return np.sqrt(np.clip(np.diag(self.level_covariance), 0.0, None))
 
     @property
     def ok(self) -> Mask:
-        """(E,): epochs with a result."""
+        """Mask (E,) of the epochs with a result."""
         return np.array([s == "ok" for s in self.status], dtype=bool)
 
     @property
     def rows(self) -> EpochRows:
-        """The epochs one by one."""
+        """The epochs as rows."""
         rejected = self.rejected.sum(axis=1)
         return EpochRows(
             self.values, self.sd, np.where(self.ok, self.sigma0, np.nan), self.redundancy,
@@ -204,7 +203,7 @@ class SeriesAdjustment:
         )  # fmt: skip
 
     def spread(self, targets: Index, n: int) -> SeriesAdjustment:
-        """The same with its columns of targets put where they stand in a larger test field."""
+        """Return the result with its targets at rows `targets` of a test field of n targets."""
         if len(targets) == n:
             return self
 
@@ -225,7 +224,7 @@ class SeriesAdjustment:
 
 
 def enough_targets(grid: ObservationGrid, s: SeriesSettings) -> Mask:
-    """(E,): epochs with enough targets for their own parameters."""
+    """Return a mask (E,) of the epochs with enough targets for their own parameters."""
     count = 2 * grid.observed.sum(axis=1) - s.carried
     enough: Mask = count >= s.bounds.minimum_redundancy
     return enough

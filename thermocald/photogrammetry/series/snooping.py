@@ -1,6 +1,6 @@
-"""Data snooping in a series: every point against its own epoch, and which of them stay.
+"""Data snooping in a series: every point is tested against its own epoch.
 
-As `epoch.snooping.point_tests` and `snoop` do for one epoch, for all epochs at once.
+The same as `epoch.snooping.point_tests` and `snoop`, for all epochs at once.
 """
 
 from __future__ import annotations
@@ -15,18 +15,14 @@ from thermocald.photogrammetry.series.normals import chunks, products
 from thermocald.photogrammetry.series.system import SeriesSystem, alike
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
-
-    Columns = NDArray[np.int64]
+    from thermocald.arrays import Array, Index, Mask
 
 
 def point_tests(system: SeriesSystem, residuals: Array) -> Array:
-    """Chi-square (2) of every image point (E, T) against its epoch.
+    """Return the test (E, T) of every image point against its epoch: χ² with 2 degrees of freedom.
 
-    Points that take no part are tested as check points. The common unknowns are taken as known,
-    as they rest on all epochs.
+    Points not in use are tested as check points. The common unknowns count as error-free, as they
+    come from all epochs.
     """
     first, of = system.alike or alike(system.weights, system.use)
     E, T = residuals.shape[:2]
@@ -48,9 +44,9 @@ def point_tests(system: SeriesSystem, residuals: Array) -> Array:
 
 
 def _test_weights(
-    system: SeriesSystem, epochs: slice | Columns, products: tuple[Array, Array, Array]
+    system: SeriesSystem, epochs: slice | Index, products: tuple[Array, Array, Array]
 ) -> Array:
-    """Inverse covariance (3, M, T) of the residuals, xx, yy, twice xy; 0 without a test."""
+    """Return the residuals' inverse covariance (3, M, T): xx, yy, twice xy; 0 without a test."""
     weights = system.weights[epochs]
     rows, columns = np.triu_indices(len(system.design.own))
     Q = system.Q[epochs][:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
@@ -69,7 +65,7 @@ def _test_weights(
 
 
 def _variances(tests: Array, used: Mask) -> Array:
-    """Variance of unit weight (E,) from each epoch's median, which gross errors do not reach."""
+    """Return variances of unit weight (E,) from each epoch's median, robust to gross errors."""
     n = used.sum(axis=1)
     half = np.minimum(n // 2, tests.shape[1] - 1)
     ordered = np.where(used, tests, np.inf)
@@ -80,7 +76,7 @@ def _variances(tests: Array, used: Mask) -> Array:
 
 
 def typical_variance(tests: Array, used: Mask) -> float:
-    """Variance of unit weight that most epochs agree on; 1 where no residuals show it."""
+    """Return the epochs' median variance of unit weight; 1 without residuals."""
     variances = _variances(tests, used)
     return float(np.median(variances[used.any(axis=1)])) or 1.0 if used.any() else 1.0
 
@@ -94,10 +90,10 @@ def snoop_series(
     typical: float,
     freedom: Array | None,
 ) -> Mask:
-    """Which image points (E, T) stay, epoch by epoch, as `epoch.snooping.snoop` does.
+    """Return the mask (E, T) of image points to keep, by the rule of `epoch.snooping.snoop`.
 
-    typical: variance of unit weight of the series, for epochs too poor to tell their own; freedom
-    (T,): degrees of freedom with which each target's noise is known, None: it is as stated.
+    typical: variance of unit weight of the series, for epochs too poor to estimate theirs; freedom
+    (T,): degrees of freedom of each target's noise, None if the noise is as stated.
     """
     keep = offered.copy()
     for part in chunks(*used.shape):

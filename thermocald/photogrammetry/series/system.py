@@ -1,9 +1,9 @@
 """The linearised series: normal equations of all epochs with their common unknowns reduced.
 
-A `Design` says what is unknown per epoch and what once, and what priors say of it. Own parameters
-are per epoch (p of them), common ones are the series' (q parameters, then the offsets in x and in y
-of the T targets). A parameter may be both: an epoch's own part is then drawn to the common one, a
-random effect. Arrays only; how sure it all is, `covariances` says.
+A `Design` defines the unknowns and their priors. Own parameters are those of an epoch (p of them),
+common ones those of the series (q parameters, then the offsets in x and in y of the T targets). A
+parameter may be both: an epoch's own part is then drawn to the common one, as a random effect.
+Arrays only; `covariances` gives the accuracy.
 
 Source: the reduction of common unknowns as Helmert blocking, Wolf, H. (1978): The Helmert block
 method.
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """values (E, 16), offsets (T, 2) px and the common pose (6,)."""
+    """Values of the unknowns: values (E, 16), offsets (T, 2) px and the common pose (6,)."""
 
     values: Array
     offsets: Array
@@ -46,12 +46,12 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The unknowns of a series.
+    """The unknowns of a series and their priors.
 
-    at: the linearisation; own (p,), common (q,): positions of the parameters; known (16,): the
-    values that priors draw parameters to; own_prior (p, p), common_prior (q,): their weights, 0 for
-    those without; sways: whether an epoch's exterior orientation is drawn to the common one
-    instead; offset_prior (T, 3) px⁻²: weights xx, yy, xy of the offsets, (0, 3) without offsets.
+    at: the linearisation; own (p,), common (q,): positions of the parameters; known (16,): values
+    of the priors; own_prior (p, p), common_prior (q,): their weights, 0 without a prior; sways:
+    whether the prior of an epoch's exterior orientation is the common one instead; offset_prior
+    (T, 3) px⁻²: weights xx, yy, xy of the offsets, (0, 3) without offsets.
     """
 
     at: Partials
@@ -65,17 +65,17 @@ class Design:
 
     @property
     def width(self) -> int:
-        """How many common unknowns there are, q or q + 2T."""
+        """Number of common unknowns, q or q + 2T."""
         return len(self.common) + 2 * len(self.offset_prior)
 
     def common_pull(self, pose: Array, offsets: Array) -> Array:
-        """Gradient (width,) by which priors draw the common unknowns."""
+        """Return the gradient (width,) of the common unknowns' priors."""
         pull: Array = self.common_prior * (self.known[self.common] - pose[: len(self.common)])
         (wx, wy, wxy), (x, y) = self.offset_prior.T, offsets[: len(self.offset_prior)].T
         return np.concatenate([pull, -wx * x - wxy * y, -wxy * x - wy * y])
 
-    def moved(self, state: State, step: Step) -> State:
-        """The state after a step."""
+    def apply(self, state: State, step: Step) -> State:
+        """Return the state after a step."""
         values = state.values.copy()
         values[:, self.own] += step.d_own
         values[:, self.common] += step.d_common
@@ -83,7 +83,10 @@ class Design:
         return State(values, state.offsets + step.d_offsets, pose)
 
     def gradient(self, weights: Array, residuals: Array) -> Array:
-        """Gradient (width,) of the common unknowns: weights (E, T, 3), residuals (E, T, 2) px."""
+        """Return the gradient (width,) of the common unknowns.
+
+        weights (E, T, 3), residuals (E, T, 2) px.
+        """
         b = right_hand_sides(weights, residuals, self.at.A[..., self.common])
         t = len(self.offset_prior)
         v, w = np.nan_to_num(residuals[:, :t]), weights[:, :t]
@@ -92,7 +95,7 @@ class Design:
         return np.concatenate([b.sum(axis=0), x, y])
 
     def prior_matrix(self) -> Array:
-        """Weights (width, width) of the priors of the common unknowns."""
+        """Return the weights (width, width) of the common unknowns' priors."""
         out = np.zeros((self.width, self.width))
         q = len(self.common)
         out[np.arange(q), np.arange(q)] = self.common_prior
@@ -100,7 +103,7 @@ class Design:
         return out
 
     def with_offsets(self, weights: Array, columns: Index) -> Array:
-        """Blocks (E, k, 2T) of some parameters with the offsets."""
+        """Return the blocks (E, k, 2T) of some parameters with the offsets."""
         t = len(self.offset_prior)
         wx, wy, wxy = np.moveaxis(weights[:, :t], -1, 0)[:, :, None]
         ax, ay = self.at.A[:t, 0, columns].T, self.at.A[:t, 1, columns].T
@@ -118,7 +121,7 @@ def _add_blocks(matrix: Array, blocks: Array) -> None:
 
 
 def offset_weights(field: TestField, at: Partials) -> Array:
-    """Inverse covariance (T, 3) px⁻² of the offsets, from that of the object coordinates."""
+    """Return the offsets' weights (T, 3) px⁻² from the sigmas of the object coordinates."""
     variance = field.sigmas**2
     tiny = 1e-12  # px²: a target without sigma has no offset
     xx = (at.B[:, 0] ** 2 * variance).sum(axis=1) + tiny
@@ -128,15 +131,15 @@ def offset_weights(field: TestField, at: Partials) -> Array:
     return weights
 
 
-_FARTHEST_PX = 200.0  # that one step may move an image point by
-_KEPT = 4_000_000  # numbers of all couplings together, 32 MB
-_CHUNK = 128  # epochs whose couplings with the offsets are held at a time
+_FARTHEST_PX = 200.0  # largest movement of an image point by one step
+_KEPT = 4_000_000  # elements of all couplings, 32 MB, up to which they are kept
+_CHUNK = 128  # epochs whose couplings with the offsets are computed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Corrections d_own (E, p), d_common (q,), d_offsets (T, 2) px; size in standard deviations of
-    all together, and sizes (E,) of each epoch.
+    """Corrections d_own (E, p), d_common (q,), d_offsets (T, 2) px; size of the whole step and
+    sizes (E,) of the epochs' steps in standard deviations.
     """
 
     d_own: Array
@@ -146,7 +149,7 @@ class Step:
     sizes: Array
 
     def halved(self) -> Step:
-        """Half of it; as far from the solution as before."""
+        """Return half the step; the sizes stay, as the solution is as far away as before."""
         own, common, offsets = self.d_own / 2, self.d_common / 2, self.d_offsets / 2
         return Step(own, common, offsets, self.size, self.sizes)
 
@@ -155,11 +158,11 @@ class Step:
 class SeriesSystem:
     """Normal equations at one linearisation.
 
-    weights (E, T, 3): a priori; use (E, T): which points take part; N (E, 16, 16), empty where
-    nothing is common; Q (E, p, p): cofactors of an epoch's own parameters, the common ones held;
-    good (E,): epochs that carry theirs; Q_common (q, q), or with offsets (q + 2T, q + 2T), empty
-    before `solved`; alike: which epochs have the same matrices, as of `same_rows`, or None where
-    that is no longer known; coupled: what `couplings` gave, where that takes little memory.
+    weights (E, T, 3): a priori; use (E, T): points in use; N (E, 16, 16): empty without common
+    unknowns; Q (E, p, p): cofactors of the epochs' own parameters, the common ones held; good (E,):
+    epochs that determine their parameters; Q_common (q, q), or with offsets (q + 2T, q + 2T): empty
+    before `solved`; alike: epochs with the same matrices, from `same_rows`, None if outdated;
+    coupled: the result of `couplings`, if it needs little memory.
     """
 
     design: Design
@@ -188,20 +191,20 @@ class SeriesSystem:
         return cls(design, weights, use, N, Q, good, np.empty((0, 0)), (first, of))
 
     def solved(self) -> SeriesSystem:
-        """The same with the cofactors of the common unknowns."""
+        """Return the system with the cofactors of the common unknowns."""
         if len(self.good) * len(self.design.own) * self.design.width <= _KEPT:
             self.coupled = list(self.couplings())
         return replace(self, Q_common=inverse_of_determined(self.common_normals()))
 
     def used(self, rows: Index | Mask | slice = slice(None)) -> Array:
-        """Weights (e, T, 3) of some epochs, 0 where a point takes no part."""
+        """Return the weights (e, T, 3) of some epochs, 0 for points not in use."""
         used: Array = self.weights[rows] * self.use[rows][..., None]
         return used
 
     def common_normals(self, count: Array | None = None) -> Array:
-        """Normal matrix of the common unknowns, the own parameters of all epochs reduced.
+        """Return the normal matrix of the common unknowns, with all own parameters reduced.
 
-        count (E,): how many epochs each of these stands for, one by default.
+        count (E,): number of epochs that each of these represents, one by default.
         """
         n = np.ones(len(self.good)) if count is None else count
         design, q = self.design, len(self.design.common)
@@ -220,7 +223,7 @@ class SeriesSystem:
         return full
 
     def couplings(self) -> Iterator[tuple[Index, Array]]:
-        """Chunks of good epochs and their blocks (e, p, q + 2T) of own with common unknowns."""
+        """Yield chunks of good epochs and their blocks (e, p, q + 2T) of own by common unknowns."""
         if self.coupled is not None:
             yield from self.coupled
             return
@@ -236,7 +239,7 @@ class SeriesSystem:
             yield part, C
 
     def step(self, residuals: Array, state: State) -> Step:
-        """One Gauss-Newton step from a state, which leaves residuals (E, T, 2) px."""
+        """Return one Gauss-Newton step from a state with its residuals (E, T, 2) px."""
         design, q = self.design, len(self.design.common)
         right = self.own_gradient(residuals, state)
         right[~self.good] = 0.0
@@ -257,10 +260,10 @@ class SeriesSystem:
         size += float(sizes.max(initial=0.0))
         d_offsets = np.zeros_like(state.offsets)
         d_offsets[: len(design.offset_prior)] = d_all[q:].reshape(2, -1).T
-        return Step(self._bounded(solved), d_all[:q], d_offsets, size, sizes)
+        return Step(self._bound(solved), d_all[:q], d_offsets, size, sizes)
 
-    def _bounded(self, d_own: Array) -> Array:
-        """The steps (E, p), shortened where they would move the image out of all proportion."""
+    def _bound(self, d_own: Array) -> Array:
+        """Shorten steps (E, p) that would move an image point by more than `_FARTHEST_PX`."""
         A = self.design.at.A[..., self.design.own]
         reach = np.abs(d_own) @ np.abs(A).max(axis=(0, 1), initial=0.0)
         far = np.flatnonzero(reach > _FARTHEST_PX)
@@ -272,7 +275,7 @@ class SeriesSystem:
         return d_own
 
     def move(self, residuals: Array, step: Step) -> None:
-        """Carry the residuals (E, T, 2) through a small step by the partials, in place."""
+        """Update the residuals (E, T, 2) px for a small step by the partials, in place."""
         A, own = self.design.at.A, self.design.own
         if self.design.width:
             residuals -= A[..., self.design.common] @ step.d_common + step.d_offsets
@@ -282,11 +285,11 @@ class SeriesSystem:
             residuals[part, :, 1] -= step.d_own[part] @ Ay
 
     def gradient(self, residuals: Array) -> Array:
-        """Aᵀ P l (E, 16) of every epoch."""
+        """Return Aᵀ P l (E, 16) of every epoch."""
         return right_hand_sides(self.weights, residuals, self.design.at.A, self.use)
 
     def own_gradient(self, residuals: Array, state: State) -> Array:
-        """Gradient (E, p) of the own parameters, with that of their priors; 0 at the solution."""
+        """Return the gradient (E, p) of the own parameters and their priors; 0 at the solution."""
         own, A = self.design.own, self.design.at.A
         b = right_hand_sides(self.weights, residuals, A[..., own], self.use)
         if self.design.own_prior.any():
@@ -298,16 +301,16 @@ class SeriesSystem:
 
     @property
     def common_share(self) -> float:
-        """How many of the observations the common unknowns use up."""
+        """Number of observations that the common unknowns use up."""
         return self.design.width - self.held[0]
 
     @cached_property
     def held(self) -> tuple[float, float]:
-        """Traces of how far priors hold the common unknowns, Q P, and of its square.
+        """Traces of Q P, the share of the priors in the common unknowns, and of its square.
 
-        Along a direction of which the prior tells the share h, h - h² of an observation rests on
-        the prior being as stated: of one epoch alone a wrong prior and another noise look the same,
-        and many tell them apart.
+        Along a direction in which the prior has the share h, the redundancy h - h² depends on the
+        prior being as stated: in one epoch a wrong prior and a different noise look the same, only
+        many epochs separate them.
         """
         prior, (wx, wy, wxy) = self.design.common_prior, self.design.offset_prior.T
         pose, x, y = np.split(self.Q_common, [len(prior), len(prior) + len(wx)], axis=1)
@@ -316,5 +319,5 @@ class SeriesSystem:
 
 
 def alike(weights: Array, use: Mask) -> tuple[Index, Index]:
-    """Epochs of which the same points take part with the same weights, as of `same_rows`."""
+    """Find epochs with the same points in use with the same weights, as `same_rows` does."""
     return same_rows(np.packbits(use, axis=1), *np.moveaxis(weights, -1, 0))

@@ -1,11 +1,11 @@
 """The measuring noise of a series' targets, from the scatter of their own residuals.
 
-A-priori sigmas seldom know that a near, bright marker is measured better than a far one, nor that
-two corners of a marker share an edge and err together (corners from fitted edges correlate at -0.7
-along the edge they share). Over a series of a static camera both can be seen.
+A-priori sigmas seldom state that a near, bright marker is measured better than a far one, or that
+two corners of a marker have correlated errors (corners from fitted edges correlate at -0.7 along a
+common edge). A series of a static camera shows both.
 
-Source: variance components as Förstner (1979); how far single variances are to be believed: Smyth
-(2004), Linear models and empirical Bayes methods, Stat. Appl. Genet. Mol. Biol. 3(1), section 3;
+Source: variance components as Förstner (1979); the shrinkage of single variances: Smyth (2004),
+Linear models and empirical Bayes methods, Stat. Appl. Genet. Mol. Biol. 3(1), section 3;
 the covariance of least squares under correlated noise, Q (Aᵀ P C P A) Q, as Koch (1999), 3.2.
 """
 
@@ -18,42 +18,39 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from thermocald.arrays import Array, Mask
+    from thermocald.arrays import Array, Index, Mask
 
 MEDIAN_WORTH = 0.37
-"""Degrees of freedom of a mean that a median of squares is worth, for each square."""
+"""Efficiency of the median of squares: degrees of freedom per square."""
 
 FEW_EPOCHS = 10
-"""Epochs below which targets that wander slowly look like targets that lie elsewhere."""
+"""Epochs below which a slow wander of targets looks like an offset."""
 
-_MEDIANS_FROM = 10.0  # degrees of freedom of a target's median; one of fewer is luck
-_CUT = 2.5  # standard deviations: beyond it a residual counts as this one
-_LEFT_OF_CUT = 0.9776  # of the mean square of a normal distribution cut there
-_ALIKE = 1e4  # degrees of freedom of targets that are all measured alike
+_MEDIANS_FROM = 10.0  # degrees of freedom that a target's median needs
+_CUT = 2.5  # standard deviations at which larger residuals are cut
+_LEFT_OF_CUT = 0.9776  # mean square of a standard normal distribution cut there
+_ALIKE = 1e4  # degrees of freedom if the noise of all targets is the same
 _MEDIAN_CHI2_1 = 0.4549
 _SIGNIFICANT = 4.0  # correlations of n pairs below 4/√n are noise: 6e-5 two-sided
 _FEWEST_PAIRS = 40
 _LEAST_CORRELATION = 0.3
 _SMOOTH = 15  # epochs
 _FEWEST_RADII = 8  # targets
-_LOG_CHI2 = np.pi**2 / 6  # variance of the logarithm of chi-square with two degrees of freedom
+_LOG_CHI2 = np.pi**2 / 6  # variance of the logarithm of χ² with two degrees of freedom
 _NOISIEST = 9.0  # times the series' variance of unit weight: three times its noise
-_CLIP = 60.0  # times the median square: beyond it is not scatter but a jump
+_CLIP = 60.0  # times the median square, beyond which a square is a jump
 
 
 def noise_ratios(
     residuals: Array, weights: Array, used: Mask, redundancy_share: float, lost: int = 0
 ) -> tuple[Array, Array]:
-    """Variance (T, 2) of each target's coordinates in units of its a-priori variance, and the
-    degrees of freedom (T,) with which it is known.
+    """Estimate variances (T, 2) of the targets' coordinates in units of their a-priori variances;
+    return them with their degrees of freedom (T,).
 
     residuals (E, T, 2) px; weights (E, T, 3) px⁻²; used (E, T); redundancy_share: redundancy over
-    observations; lost: epochs of each target that its offset takes up. Robust: medians of squares,
-    of a few epochs their means, which jumps do not reach; drawn to what the targets have in common:
-    strongly where their variances differ no more than so many epochs leave them uncertain (Smyth,
-    2004).
+    observations; lost: epochs of each target that its offset uses up. Robust: from medians of
+    squares, or for a few epochs means of squares with jumps cut. They are drawn to the targets'
+    common variance, strongly if they differ no more than by chance (Smyth, 2004).
     """
     squares = np.where(used[..., None], residuals**2 * weights[..., :2], np.nan) / redundancy_share
     n = used.sum(axis=0)[:, None].astype(np.float64)
@@ -62,7 +59,7 @@ def noise_ratios(
         squares *= np.divide(n, left, out=np.full_like(n, np.nan), where=left > 0)
         n = left
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # targets that take no part
+        warnings.simplefilter("ignore", RuntimeWarning)  # targets that are not in use
         middle = np.nanmedian(squares, axis=0) / _MEDIAN_CHI2_1
         usual = float(np.nanmedian(middle)) if np.isfinite(middle).any() else 1.0
         worth = MEDIAN_WORTH * n
@@ -76,7 +73,7 @@ def noise_ratios(
         return np.ones(ratio.shape), np.full(len(worth), _ALIKE)
     freedom = np.broadcast_to(worth, ratio.shape)[shown]
     common = float(np.median((ratio / of_usual)[shown]))
-    # the freedom of a prior that lets the logarithms scatter by as much: trigamma(prior/2) = it
+    # degrees of freedom of a prior with this scatter of logarithms: trigamma(prior/2) = between
     of_chance = float(np.mean(2.0 / freedom + 2.0 / freedom**2))  # of ln χ²: trigamma(freedom/2)
     between = float(np.var(np.log(ratio[shown]))) - of_chance
     prior = (1.0 + np.sqrt(1.0 + 2.0 * between)) / between if between > 0 else _ALIKE
@@ -92,15 +89,15 @@ class CorrelatedPairs:
     i, j (m,): coordinates, 2·target + axis; covariance (m,) px².
     """
 
-    i: NDArray[np.int64]
-    j: NDArray[np.int64]
+    i: Index
+    j: Index
     covariance: Array
 
     def __len__(self) -> int:
         return len(self.i)
 
     def normal_matrices(self, weights: Array, A: Array) -> Array:
-        """What the pairs add to Aᵀ P C P A: weights (E, T, 3), A (T, 2, p) → (E, p, p)."""
+        """Return the pairs' part (E, p, p) of Aᵀ P C P A, for weights (E, T, 3), A (T, 2, p)."""
         E, p = len(weights), A.shape[-1]
         rows, columns = np.triu_indices(p)
         flat = np.ascontiguousarray(A).reshape(-1, p)
@@ -115,13 +112,13 @@ class CorrelatedPairs:
 
 
 def correlated_pairs(
-    residuals: Array, used: Mask, group: NDArray[np.int64], redundancy_share: float
+    residuals: Array, used: Mask, group: Index, redundancy_share: float
 ) -> CorrelatedPairs:
-    """Pairs of coordinates of one group whose residuals correlate over a series.
+    """Find pairs of coordinates within a group whose residuals correlate over a series.
 
-    residuals (E, T, 2) px; used (E, T); group (T,): what each target belongs to. In a group with a
-    significant correlation every covariance counts, the small ones too: leaving them out would
-    understate the group's common error. Without such groups the result is empty.
+    residuals (E, T, 2) px; used (E, T); group (T,): label of each target's group. A group with a
+    significant correlation has all its covariances in the result, as without the small ones its
+    common error would be too small. Without such a group the result is empty.
     """
     E = len(residuals)
     seen = np.repeat(used, 2, axis=1)
@@ -155,11 +152,11 @@ def correlated_pairs(
 
 
 def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, float]:
-    """Noise of the outermost target over that in the image's middle, and its standard deviation.
+    """Estimate the noise of the outermost target over that in the image's middle, with its sd.
 
     tests (E, T): squared residuals over their stated variance; used (E, T); radius (T,): of the
-    targets from the image's middle. The logarithm of the noise is a straight line in r², which
-    gross errors do not bend; targets scatter about it as they do. NaN where nothing shows it.
+    targets from the image's middle. The logarithm of the noise is a straight line in r², robust to
+    gross errors; the sd follows the targets' scatter about it. NaN if it cannot be estimated.
     """
     counted = used & (tests > 0)
     n = counted.sum(axis=0)
@@ -180,11 +177,11 @@ def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, flo
 
 
 def slow_errors(residuals: Array, used: Mask) -> Array:
-    """What each target's error changes by from the first epoch to the last, (T, 2) px.
+    """Estimate the change (T, 2) px of each target's error from the first epoch to the last.
 
     residuals (E, T, 2) px; used (E, T). Light that wanders over a marker, or a board that gives
-    way, moves single targets slowly; each one's own line through its residuals tells by how much.
-    Its noise is taken off: 0 where the line is not steeper than that.
+    way, moves single targets slowly. The change is that of a straight line through a target's
+    residuals, less the line's noise, and 0 if the line is no steeper than its noise.
     """
     E = len(residuals)
     t = np.linspace(-0.5, 0.5, E)[:, None, None]
@@ -220,14 +217,13 @@ def neighbours_variance(unit: Array, known: Mask) -> Array:
     return np.clip(middle, 1.0, _NOISIEST)[at]
 
 
-def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool = True) -> Array:
-    """Variance (k,) by which epochs scatter about a smooth trajectory beyond their variances.
+def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool) -> Array:
+    """Estimate the excess variance (k,) of epochs about a smooth trajectory; 0 if not significant.
 
-    values, variances (E, k) of consecutive epochs. The smooth trajectory is a local cubic over 15
-    epochs, which leaves a drift with a time constant of 30 epochs its thousandth; kinks: whether
-    single kinks of the trajectory (a lamp switched) exceed the noise, so that a median must judge;
-    drift: whether the camera may drift at all, else the trajectory is constant; 0 where the excess
-    is not significant (5 %).
+    values, variances (E, k): of consecutive epochs. The trajectory is a local cubic over 15 epochs,
+    whose residuals have a thousandth of a drift with a time constant of 30 epochs; kinks: whether
+    it may have kinks beyond the noise (a lamp switched), so that a median is needed; drift: whether
+    the camera may drift, else the trajectory is constant. The test is at 5 %.
     """
     half = _SMOOTH // 2
     if len(values) < 2 * _SMOOTH:
@@ -236,7 +232,7 @@ def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool = T
         normed = (values - values.mean(axis=0)) ** 2 / variances
         ratio = normed.mean(axis=0) * len(values) / (len(values) - 1)
         significant = ratio > 1 + 1.65 * np.sqrt(2 / len(values))
-        # The mean of the squares themselves: what few epochs with large variances add is theirs.
+        # Each epoch's own variance is subtracted, so that a few large ones do not raise the excess.
         wide = (values - values.mean(axis=0)) ** 2 - variances
         return np.where(significant, np.maximum(wide.mean(axis=0), 0.0), 0.0)
     x = np.arange(-half, half + 1) / half
@@ -250,7 +246,7 @@ def excess_scatter(values: Array, variances: Array, kinks: bool, drift: bool = T
     if kinks:
         ratio, worth = np.median(normed, axis=0) / _MEDIAN_CHI2_1, MEDIAN_WORTH * left
     else:
-        # Epochs in which a passer-by hides half of the targets scatter more than others, and count.
+        # The mean counts epochs that scatter more, as when a passer-by hides half of the targets.
         ratio, worth = np.minimum(normed, _CLIP * np.median(normed, axis=0)).mean(axis=0), left
     significant = ratio > 1 + 1.65 * np.sqrt(2 / (worth * n))
     excess: Array = np.where(significant, (ratio - 1) * variances.mean(axis=0), 0.0)

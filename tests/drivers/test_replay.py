@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from thermocald.epoch import Epoch
-from thermocald.errors import BadReading, DeviceFinished, DeviceNotFound, PermanentDeviceError
+from thermocald.errors import (
+    BadReading,
+    DeviceFinished,
+    DeviceNotFound,
+    PermanentDeviceError,
+    TestFieldError,
+)
 from thermocald.hal import VirtualClock, open_device
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import (
@@ -65,6 +71,23 @@ def test_measurements_come_without_a_picture(write):
     assert found.targets.tolist() == [0, 2]
     assert np.array_equal(found.points, seen.points)
     assert np.array_equal(found.covariances, seen.covariances)
+
+
+@pytest.mark.parametrize(
+    "changed", [{"target": None}, {"x": [1.0]}, {"sxy": [0.0]}, {"sy": ["a"] * 2}]
+)
+def test_measurements_that_do_not_match_have_a_clear_error(changed):
+    lists = {
+        "target": ["a", "b"],
+        "x": [1.0, 2.0],
+        "y": [1.0, 2.0],
+        "sx": [1.0] * 2,
+        "sy": [1.0] * 2,
+    }
+    field = TestField.build(["a", "b"], np.eye(3)[:2])
+    assert len(observations_from_lists(lists, field)) == 2
+    with pytest.raises(TestFieldError, match="with an entry for each target"):
+        observations_from_lists(lists | changed, field)
 
 
 def test_readings_keep_their_own_instants(write):

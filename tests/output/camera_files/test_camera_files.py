@@ -328,6 +328,8 @@ def test_metashape_sensor_with_covariance(tmp_path):
     assert sd[:3] == pytest.approx([0.004, 0.002, 0.0], abs=1e-9)
     # A1 = k1/c²: the covariance knows both
     assert sd[3] == pytest.approx(np.hypot(1e-3 / i.c**2, 2 * 0.1 / i.c**3 * 0.004), rel=1e-4)
+    path.write_text(text.replace("<params>f cx k1</params>", ""))
+    assert camera_files.read(path, pixel_pitch=0.002).covariance is None
 
 
 @pytest.mark.parametrize("r0", [0.0, 1.5])

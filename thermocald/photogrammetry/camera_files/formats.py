@@ -463,9 +463,9 @@ def _decode_metashape(text: str) -> CameraRecord:
 def _metashape_covariance(root: ET.Element) -> Array | None:
     """Return the covariance in the order of the family, zero for parameters held fixed."""
     node = root.find(".//sensor/covariance")
-    if node is None:
+    names = [] if node is None else (node.findtext("params") or "").split()
+    if node is None or not names:
         return None
-    names = (node.findtext("params") or "").split()
     n = len(names)
     C = numbers((node.findtext("coeffs") or "").split(), "covariance", (n * n,)).reshape(n, n)
     full = np.zeros((len(_TAGS),) * 2)

@@ -242,20 +242,30 @@ def observations_to_lists(seen: Observations, field: TestField) -> dict[str, Any
 
 
 def observations_from_lists(lists: Mapping[str, Any], field: TestField) -> Observations:
-    """Invert `observations_to_lists`; TestFieldError for a target that is not in the field."""
-    rows = [field.index.get(name, -1) for name in lists["target"]]
-    if -1 in rows:
-        name = lists["target"][rows.index(-1)]
-        raise TestFieldError(
-            f"target {name!r} was measured but is not in the test field; is it the right field?"
+    """Invert `observations_to_lists`.
+
+    Raises TestFieldError for a target that is not in the field, and for lists that do not match.
+    """
+    try:
+        names = list(lists["target"])
+        rows = [field.index.get(name, -1) for name in names]
+        points, sigmas = (
+            np.array([lists[x], lists[y]], dtype=float).T.reshape(len(rows), 2)
+            for x, y in (("x", "y"), ("sx", "sy"))
         )
-    n = len(rows)
-    return Observations(
-        np.array(rows, dtype=np.int64),
-        np.array([lists["x"], lists["y"]], dtype=float).T.reshape(n, 2),
-        np.array([lists["sx"], lists["sy"]], dtype=float).T.reshape(n, 2),
-        np.array(lists["sxy"], dtype=float) if "sxy" in lists else None,
-    )
+        covariances = None
+        if "sxy" in lists:
+            covariances = np.array(lists["sxy"], dtype=float).reshape(len(rows))
+    except (KeyError, TypeError, ValueError) as error:
+        raise TestFieldError(
+            "observations need the lists target, x, y, sx and sy, with an entry for each target"
+        ) from error
+    if -1 in rows:
+        raise TestFieldError(
+            f"target {names[rows.index(-1)]!r} was measured but is not in the test field; is it "
+            "the right field?"
+        )
+    return Observations(np.array(rows, dtype=np.int64), points, sigmas, covariances)
 
 
 ELSEWHERE = 0.0025  # of the principal distance, if the camera is adjusted

@@ -132,7 +132,7 @@ def test_text_and_tree_are_the_same():
         ("lag(temperature, [1])", "neither a number nor a name"),
         ("product(above(temperature, k), above(board, k))", "a name of its own"),
         ("square(wave(temperature, P, phi))", "phi is a parameter of the camera"),
-        ("square(" * 20 + "temperature" + ")" * 20, "more than 8 operators"),
+        ("square(" * 20 + "temperature" + ")" * 20, "more than 8 nested operators"),
         ("square(" * 200, "at most 300 characters"),
         ("lag(", "cannot be read"),
     ],

@@ -157,8 +157,8 @@ BAD = {
     "camera": [
         (("heat", "bodies", "lens", "capacity"), -2.0, "-2 J/K; it must be above 0"),
         (("heat", "links", 0, "conductance"), 0.0, "0 W/K; it must be above 0"),
-        (("heat", "links", 0, "between"), ["lens"], "must be .one, other."),
-        (("heat", "links", 0, "between"), ["lens", "board", "air"], "must be .one, other."),
+        (("heat", "links", 0, "between"), ["lens"], "must be a list of two names"),
+        (("heat", "links", 0, "between"), ["lens", "board", "air"], "must be a list of two names"),
         (("thermometers", "temperature", "body"), "lans", "is 'lans'; bodies are lens, board"),
         (("thermometers", "air", "missing"), 1.0, "share below 1"),
         (("measuring", "sigma"), 0.0, "above 0"),

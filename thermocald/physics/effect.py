@@ -64,8 +64,8 @@ class Prediction:
     @classmethod
     def none(cls, epochs: int, field: TestField | None = None) -> Prediction:
         """Return a prediction without any influence."""
-        one, (iop, eop) = np.ones, (np.zeros((epochs, n)) for n in (10, 6))
-        factors = one((epochs, 3)), one(epochs), one(epochs)
+        iop, eop = np.zeros((epochs, 10)), np.zeros((epochs, 6))
+        factors = np.ones((epochs, 3)), np.ones(epochs), np.ones(epochs)
         return cls(iop, eop, *factors, np.zeros(epochs), [], field)
 
     @property

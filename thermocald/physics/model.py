@@ -232,7 +232,7 @@ class ThermalModel:
 
     def value(self, name: str) -> float:
         """Return a number by its name in `parameter_names`; not of the exterior orientation."""
-        group, key = name.split(".", 1)
+        group, key = name.rsplit(".", 1)  # a formula may hold dots
         if group == "interior":
             return float(getattr(self.interior, key))
         if group == "rates":
@@ -241,7 +241,7 @@ class ThermalModel:
 
     def sd(self, name: str) -> float:
         """Return the standard deviation of a number by its name, 0 if unknown."""
-        group, key = name.split(".", 1)
+        group, key = name.rsplit(".", 1)
         if group in ("interior", "rates"):
             return float(self.sds.get(name, 0.0))
         return float(next(e for e in self.effects if e.name == group).sds.get(key, 0.0))
@@ -250,7 +250,7 @@ class ThermalModel:
         """Return the model with other values for some rates and effects' parameters."""
         own: dict[str, dict[str, float]] = {}
         for name, value in numbers.items():
-            group, key = name.split(".", 1)
+            group, key = name.rsplit(".", 1)
             own.setdefault(group, {})[key] = value
         effects = tuple(
             replace(e, values={**e.values, **own[e.name]}) if e.name in own else e

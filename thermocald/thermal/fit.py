@@ -83,10 +83,8 @@ class HypothesisFitter:
             reduced = self.series[series]
             operator = drive_matrix(reduced.history, drives)
             assert operator is not None
-            return (
-                reduced.averaged(drive(reduced.history, drives)),
-                reduced.states(reduced.history.reference, operator),
-            )
+            states = reduced.states(reduced.history.reference, operator)
+            return self.drive_trajectory(terms, series), states
 
         key = (series, tuple((name, tuple(values.items())) for name, values in drives))
         return self._once("drive", key, compute)

@@ -18,7 +18,7 @@ For a fit, a user gives an effect as `--effect NAME[:PARAMETER=VALUE,…]`:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -126,7 +126,7 @@ class Fit:
     weightings: tuple[Weighting, ...]
     designs: tuple[tuple[Array, Array, NDArray[np.int64]], ...]
     reduced: tuple[tuple[Array, Array, float], ...]
-    searched: tuple[tuple[int, str], ...] = field(default=())
+    searched: tuple[tuple[int, str], ...] = ()
 
     @property
     def objective(self) -> float:
@@ -318,21 +318,18 @@ def parse_effect(text: str) -> ModelEffect:
         kind = catalogue.get(name)
     except ConfigurationError as error:
         raise UsageError(f"--effect {text}: {error}") from error
-    values: dict[str, Any] = {k: p.default for k, p in kind.nonlinear.items() if not p.text}
-    chosen: list[str] = []
+    values: dict[str, Any] = {}
     for part in filter(None, rest.split(",")):
         key, equals, value = (w.strip() for w in part.partition("="))
         if key not in kind.units():
             raise UsageError(
                 f"--effect {text}: {name} has no parameter {key!r}; {_nearest(key, kind.units())}"
             )
-        if key in kind.linear:
-            chosen.append(key)
-        elif not equals:
+        if not equals and key not in kind.linear:
             raise UsageError(f"--effect {text}: {key} has no value; give {key}=VALUE")
         if not equals:
-            continue
-        if key in kind.nonlinear and kind.nonlinear[key].text:
+            values.setdefault(key, 0.0)
+        elif key in kind.nonlinear and kind.nonlinear[key].text:
             names = kind.nonlinear[key].unit == "names"
             values[key] = tuple(value.split("+")) if names else value
         else:
@@ -346,9 +343,8 @@ def parse_effect(text: str) -> ModelEffect:
             raise UsageError(
                 f"--effect {text}: {key} is missing; give it, as in --effect {name}:{key}={example}"
             )
-    coefficients = dict.fromkeys(chosen or kind.usual, 0.0)
     try:
-        return ModelEffect(name, {**coefficients, **values})
+        return effect_with(name, values)
     except ConfigurationError as error:
         raise UsageError(f"--effect {text}: {error}") from error
 

@@ -277,10 +277,8 @@ def detect_tremble(evidence: ReducedSeries) -> bool:
     The test uses differences of an order so high that nothing that follows a temperature remains:
     no effect is assumed, and no thermometer's error matters.
     """
-    M = evidence.N.mean(axis=0)
-    W, good = orthonormal_combinations(M)
-    W = W[:, good]
-    d = np.diff((evidence.values @ M @ W)[evidence.n > 0], _FAST, axis=0)
+    W = find_combinations([evidence])
+    d = np.diff((evidence.values @ evidence.N.mean(axis=0) @ W)[evidence.n > 0], _FAST, axis=0)
     if len(d) < criteria.FEWEST:
         return False
     spread = mad_sd(d, axis=0)
@@ -356,8 +354,7 @@ def _measure_fast_power(
     image noise only; the thermometers' share is subtracted.
     """
     e = fitter.series[series]
-    W, good = orthonormal_combinations(e.N.mean(axis=0))
-    W = W[:, good]
+    W = find_combinations([e])
     fast = waves(e.times, len(e.times) - 1)[:, slower:].T
     z = fast @ (_subtract_fit(fitter, fit, series) @ W)
     power: Array = z.T @ z / len(fast)

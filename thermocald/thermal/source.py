@@ -104,18 +104,16 @@ def condensed(
         rows = _Rows(begins, np.concatenate([p.count for p in parts]), merged)
         rows = rows.at(np.argsort(begins, kind="stable"))
     rows = rows.at(rows.grid.observed.any(axis=1) | (rows.count > 0))
-    return _put_on_rows(series, rows.first, rows.count, rows.grid)
+    return _put_on_rows(series, rows)
 
 
-def _put_on_rows(
-    series: SeriesInput, first: Index, count: Index, grid: ObservationGrid
-) -> SeriesInput:
+def _put_on_rows(series: SeriesInput, rows: _Rows) -> SeriesInput:
     """Return the series with times, readings and columns averaged over rows, and their noise."""
 
     def mean(values: Array) -> Array:
         there = np.isfinite(values)
-        n = np.add.reduceat(there.astype(float), first)
-        total = np.add.reduceat(np.where(there, values, 0.0), first)
+        n = np.add.reduceat(there.astype(float), rows.first)
+        total = np.add.reduceat(np.where(there, values, 0.0), rows.first)
         return np.asarray(np.where(n > 0, total / np.maximum(n, 1.0), np.nan))
 
     noises = {}
@@ -123,7 +121,7 @@ def _put_on_rows(
         values = np.asarray(readings, dtype=float)
         resolution = series.resolutions.get(name)
         one = estimate_reading_noise(series.reading_times, values, resolution)
-        n = np.add.reduceat(np.isfinite(values).astype(float), first)
+        n = np.add.reduceat(np.isfinite(values).astype(float), rows.first)
         # errors due to the resolution do not average out
         floor = (resolution or 0.0) / np.sqrt(12.0) / 3.0
         noises[name] = np.maximum(one / np.sqrt(np.maximum(n, 1.0)), floor)
@@ -132,10 +130,10 @@ def _put_on_rows(
         frame_times=mean(series.frame_times),
         reading_times=mean(series.reading_times),
         readings={n: mean(np.asarray(r, dtype=float)) for n, r in series.readings.items()},
-        grid=grid,
-        numbers=series.numbers[first],
+        grid=rows.grid,
+        numbers=series.numbers[rows.first],
         columns={n: mean(c) for n, c in (series.columns or {}).items()},
-        counts=count,
+        counts=rows.count,
         noises=noises,
     )
 

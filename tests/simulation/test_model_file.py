@@ -45,6 +45,14 @@ def test_round_trip(tmp_path):
     assert model.version == 4
 
 
+def test_a_number_outside_the_matrix_has_its_standard_deviation():
+    names = ("thermal_lag.tau", "second_heat_source.c", "interior.c", "interior.A1")
+    known = full_model().covariance_of(names)
+    assert np.allclose(np.diag(known), [3.6, 1e-14, 1e-8, 0.0], rtol=1e-12, atol=0.0)
+    assert known[0, 2] == known[2, 0] == 1e-6
+    assert not known[1, [0, 2]].any()
+
+
 def change(document, path, value):
     *parents, last = path
     for key in parents:

@@ -19,7 +19,7 @@ The camera file:
     thermometers:                                # the first is the reference
       temperature: {body: lens, noise: 0.04, resolution: 0.0625}            # K
 
-The programme file, which states what is done to a camera and when it takes frames:
+The programme file, with the frames' times and the heat that acts on the camera:
 
     format: thermocald-programme/1
     name: lamp cycles
@@ -30,7 +30,7 @@ The programme file, which states what is done to a camera and when it takes fram
     reading: {offset: 0.0, spread: 1.0}          # s: readings at frame time + offset ± spread
     begin: 1600000000.0                          # s UTC
     initial: 22.0                                # °C, of all bodies; default: ambient at the start
-    ambient: 22.0                                # °C: a number, pieces, or a log (see `course`)
+    ambient: 22.0                                # °C: a number, pieces, or a log (see `heat`)
     sources:                                     # W into bodies of the camera file
       housing: [{from: 0, to: 60, value: 0}, {from: 60, to: 900, value: 6.0},
                 {from: 900, to: 1500, value: 0}]
@@ -66,7 +66,7 @@ PROGRAMME_FORMAT = "thermocald-programme/1"
 
 @dataclass(frozen=True)
 class Programme:
-    """A simulation's epochs, and the heat that acts on the camera meanwhile.
+    """The epochs of a simulation, with the boundaries and heat sources during them.
 
     epochs: their number; interval s, jitter s, reading_offset, reading_spread s, begin s UTC;
     initial °C, None for the ambient temperature at the start; boundaries {name: Course °C}, sources
@@ -178,7 +178,7 @@ USUAL_THERMOMETERS: Mapping[str, SimulatedThermometer] = {
 
 @dataclass(frozen=True)
 class CameraDevice:
-    """A camera in its set-up, as the camera file describes it."""
+    """A camera in its set-up, as described by the camera file."""
 
     name: str
     sensor: Sensor

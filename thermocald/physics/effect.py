@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.history import Follower, History
 
-    Values = Mapping[str, Any]  # of parameters: numbers, or a channel, or names of targets
+    Values = Mapping[str, Any]  # of parameters: numbers, a channel's name, or targets' names
     Estimates = Mapping[str, Mapping[str, Any]]  # {parameter: {value, sd, unit}}
 
 
@@ -182,7 +182,7 @@ class Steady:
 
 
 class Effect:
-    """One physical cause. Subclasses are stateless; their docstrings state the formula.
+    """A physical cause. Subclasses are stateless; their docstrings state the formula.
 
     name: as in the catalogue; noun: its name in sentences; says: a sentence with its estimates in
     braces; nonlinear: the parameters to search; linear: {coefficient: unit}; usual: the
@@ -397,7 +397,7 @@ class Effect:
 
 
 class Operated(Effect):
-    """An effect that sends the reference temperature through an operator.
+    """An effect that passes the reference temperature through an operator.
 
     operator: its key in `operators.OPERATORS`; its constants are the effect's parameters.
     """

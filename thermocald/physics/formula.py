@@ -114,7 +114,7 @@ class Node:
         )
 
     def simpler(self) -> Iterator[Node]:
-        """Yield every formula with one operator less: a node replaced by one of its inputs."""
+        """Yield every formula with one operator fewer: a node replaced by one of its inputs."""
         yield from self.inputs
         for i, node in enumerate(self.inputs):
             for other in node.simpler():
@@ -405,7 +405,7 @@ class OfFormula(Effect):
 
     def sentence(self, estimates: Estimates) -> str:
         constants = {
-            name: _say_constant(e, self.nonlinear[name]).replace("degC", "°C")
+            name: _format_constant(e, self.nonlinear[name]).replace("degC", "°C")
             for name, e in estimates.items()
             if name in self.nonlinear
         }
@@ -414,7 +414,7 @@ class OfFormula(Effect):
         return f"{', '.join(moved) or 'the camera'} {verb} {self.node.words(constants)}"
 
 
-def _say_constant(estimate: Values, parameter: Parameter) -> str:
+def _format_constant(estimate: Values, parameter: Parameter) -> str:
     """Format an estimate, with "about" if it is not determined."""
     value, sd = estimate["value"], estimate["sd"]
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"

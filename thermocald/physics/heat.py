@@ -64,17 +64,17 @@ class Course:
         t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
         if len(t) == 1:
             return cls.constant(float(v[0]))
-        keep = np.append(np.diff(t) > 0, True)[:-1]
+        keep = np.diff(t) > 0
         return cls(np.append(t[:-1][keep], t[-1]), v[:-1][keep], v[1:][keep])
 
     @classmethod
     def steps(cls, times: ArrayLike, values: ArrayLike) -> Self:
-        """Make a course with value i from times[i] to times[i+1]; there is one time more."""
+        """Make a course with value i from times[i] to times[i+1]; it needs one more time."""
         v = np.asarray(values, dtype=float)
         return cls(np.asarray(times, dtype=float), v, v.copy())
 
     def at(self, times: ArrayLike, side: Literal["left", "right"] = "right") -> Array:
-        """Return the values at some times: at a jump after it, or before it (side: left)."""
+        """Return the values at some times; at a jump, that after it, or before it (side: left)."""
         t = np.asarray(times, dtype=float)
         piece = np.clip(np.searchsorted(self.times, t, side=side) - 1, 0, len(self.begin) - 1)
         length = self.times[piece + 1] - self.times[piece]
@@ -86,7 +86,7 @@ class Course:
 def read_course(
     reader: QuantityReader, key: str, unit: str, duration: float, folder: Path
 ) -> Course:
-    """Read the course at a key of a programme file; it must cover 0 to `duration` s, gapless."""
+    """Read the course at a key; it must cover 0 to `duration` s without gaps."""
     raw = reader.mapping.get(key)
     if isinstance(raw, list):
         course = _read_pieces(reader, key, unit)

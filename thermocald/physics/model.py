@@ -259,11 +259,11 @@ class ThermalModel:
         return replace(self, rates={**self.rates, **own.get("rates", {})}, effects=effects)
 
     def covariance_of(self, names: Sequence[str]) -> Array:
-        """Return the covariance (k, k) of some numbers, from their sds if there is no matrix."""
-        if self.covariance is None or not set(names) & set(self.covariance_names):
-            return np.diag([self.sd(name) ** 2 for name in names])
-        place = {name: i for i, name in enumerate(self.covariance_names)}
-        rows = np.array([place.get(name, -1) for name in names])
-        known = rows >= 0
-        full = np.array(self.covariance)[np.ix_(rows, rows)]
-        return np.where(np.outer(known, known), full, 0.0)
+        """Return the covariance (k, k) of some numbers; those outside the matrix have their sds."""
+        place = {name: i for i, name in enumerate(self.covariance_names) if self.covariance}
+        out = np.diag([0.0 if name in place else self.sd(name) ** 2 for name in names])
+        known = [i for i, name in enumerate(names) if name in place]
+        if known:
+            rows = [place[names[i]] for i in known]
+            out[np.ix_(known, known)] = np.array(self.covariance)[np.ix_(rows, rows)]
+        return out

@@ -237,7 +237,7 @@ class Scene:
         iop (10,), eop (6,); points (n, 3) mm: of the targets (default: the field's); seed: of the
         noise; blur_factor: factor on the look's blur.
         """
-        # arguments may differ in their last bits between machines; rounding changes below 1e-5 px
+        # rounded (by less than 1e-5 px), as arguments may differ in their last bits by machine
         iop, eop = np.round(iop, 10), np.concatenate([np.round(eop[:3], 10), np.round(eop[3:], 6)])
         where = self.field.points if points is None else np.round(points, 6)
         look = self.look

@@ -205,7 +205,7 @@ class HypothesisFitter:
     def weighting(
         self, terms: Sequence[Term], blocks: Sequence[Block], x: Array, series: int
     ) -> Weighting:
-        """Return the weighting of a series with the covariance at some coefficients."""
+        """Return the weighting of a series with the covariance for some coefficients."""
         carried: list[ReadingErrorTerm] = []
         for block, operator, channel in self.list_operators(terms, blocks, series):
             d = np.zeros(len(COLUMNS))

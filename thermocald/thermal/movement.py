@@ -204,10 +204,10 @@ def _improve_mount(fitter: HypothesisFitter, fit: Fit, mount: Mount) -> Mount:
 
 
 def _estimate_amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
-    """Estimate each series' amplitudes (F,) of the movement, and a root R (·, F) of their
-    covariance RᵀR, given the data.
+    """Estimate each series' amplitudes (F,) of the movement, given the data.
 
-    The covariance includes the uncertainty of levels and coefficients.
+    Returns them with a root R (·, F) of their covariance RᵀR, which includes the uncertainty of
+    levels and coefficients.
     """
     known = scaled_inverse(fit.normals()[0], 1e-10)
     out = []

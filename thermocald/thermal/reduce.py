@@ -218,7 +218,7 @@ def _free(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSettings:
 def linearise_series(source: SeriesInput) -> Partials:
     """Linearise a series at the camera that is adjusted to its mean image."""
     mean = median_known(source.grid.points)
-    # targets seen in half of the epochs that show any carry the orientation
+    # the orientation uses targets that are in at least half of the epochs with any
     looked = int(source.grid.observed.any(axis=1).sum())
     often = source.grid.observed.sum(axis=0) >= 0.5 * max(looked, 1)
     rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
@@ -383,7 +383,7 @@ def _reduce(
         n=count,
         sigma0=sigma0 / np.sqrt(variance),
         variance=variance,
-        correlation=_measure_slowness(v),
+        correlation=_measure_correlation(v),
         gross=int(bad.sum()),
         # epochs without weight do not count for the offsets of hidden targets either
         hidden=group_hidden_targets(
@@ -446,7 +446,7 @@ def _solve_offsets(weights: Array, v: Array, N: Array, A: Array) -> Array:
     return out
 
 
-def _measure_slowness(v: Array) -> float:
+def _measure_correlation(v: Array) -> float:
     """Return the variance of slow noise over white noise: 1 + 2 Σ autocorrelations.
 
     The residuals of all targets are used together; their means have been removed as offsets.

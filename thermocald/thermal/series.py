@@ -51,7 +51,7 @@ class SeriesInput:
     (R,)} °C, the first is the reference; resolutions {channel: K or None}; grid: image points,
     epochs × targets; numbers (E,): of the epochs; series: its name; interior: a start value;
     columns {name: (E,)}: other recorded quantities at each frame, NaN where missing; counts (E,):
-    numbers of epochs whose means the rows are, None if rows are epochs; noises {channel: (R,)} K:
+    numbers of epochs averaged in the rows, None if rows are epochs; noises {channel: (R,)} K:
     standard deviations of readings that are means, else None.
     """
 
@@ -215,7 +215,7 @@ class ReducedSeries:
         return replace(self, N=N, b=b, yy=self.yy * f, hidden=hidden)
 
     def squares(self, rest: Array) -> Array:
-        """Return the squares (E,) of a movement (E, P) without its level, in image noise."""
+        """Return the squares (E,) of a movement (E, P) without its level, per image noise."""
         r = rest - best_level(self.N, np.einsum("epq,eq->ep", self.N, rest))
         squares: Array = np.einsum("ep,epq,eq->e", r, self.N, r)
         return squares

@@ -4,7 +4,7 @@ A long series is condensed while it is read: its rows are means of epochs, over 
 the camera moves fast.
 
 Heat is slow. Over a year, means over about an hour represent the camera's trajectories. Faster
-movement is searched in the image: in its shift and scale, epoch by epoch, after a straight line in
+movement is searched in the image: in its shift and scale, epoch by epoch, minus a straight line in
 the temperature. Short means remain in the few windows (of about a day) in which most is left, or in
 which the temperature itself changes fastest. A mean of image points has the sum of their weights,
 so that the normal equations lose nothing if the camera does not move within a row.

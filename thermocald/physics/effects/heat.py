@@ -1,4 +1,4 @@
-"""Effects of the way that heat takes to the camera, and of the time at which it is measured."""
+"""Effects of the heat flow to the camera, and of the time at which temperature is measured."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ class SecondHeatSource(Proportional):
         channel = str(values["channel"])
         if channels is None or channel not in channels:
             raise DataError(
-                f"the model also depends on the temperature {channel!r}; give it as channels="
+                f"the model also depends on {channel!r}: give its temperature, channels="
                 f"{{{channel!r}: …}}"
             )
         return Steady((float(channels[channel]) - T0, 0.0, 0.0))

@@ -180,7 +180,7 @@ class MountMotion(Operated):
     """A signal a (L - T₀) in the exterior orientation; τ dL/dt = T - L, L = T at the start.
 
     Without tau, or with tau = 0, L is T. A bracket of length l and expansion α shifts the camera by
-    l α per K; one of whose sides is warmer by ΔT, it turns it by l α ΔT over its thickness.
+    l α per K, and turns it by l α ΔT over its thickness if one side is warmer by ΔT.
     Source: Timoshenko (1925), J. Optical Society of America 11, 233-255 (bending by heat).
     """
 

@@ -312,7 +312,7 @@ class Effect:
         """
         if self.steady_signal is None and self.kind == "signal":
             raise DataError(
-                f"effect {self.name} has no value at a steady temperature; "
+                f"effect {self.name} states no value at a steady temperature; "
                 "give a temperature log instead"
             )
         return self.steady_signal or Steady()

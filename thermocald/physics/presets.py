@@ -181,7 +181,7 @@ def preset_simulation(
     preset = PRESETS[name]
     device = _device(preset)
     programme = _programme(preset, device, series)
-    test_field = field if field is not None else corner_field("circles", 7, 90.0)
+    test_field = corner_field() if field is None else field
     bare = ThermalModel(
         preset.camera,
         preset.sensor,

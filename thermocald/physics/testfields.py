@@ -107,7 +107,7 @@ def demonstration_field(kind: FieldKind = "markers") -> TestField:
     """Lay out a corner field that fills the image: 192 marker corners, or 147 circles."""
     if kind == "markers":
         return corner_field("markers", per_side=4, pitch_mm=150.0)
-    return corner_field(kind, per_side=7, pitch_mm=90.0)
+    return corner_field(kind)
 
 
 def load_field(kind_or_path: str) -> TestField:

@@ -103,7 +103,6 @@ def condensed(
         begins = np.concatenate([p.first for p in parts])
         rows = _Rows(begins, np.concatenate([p.count for p in parts]), merged)
         rows = rows.at(np.argsort(begins, kind="stable"))
-    rows = rows.at(rows.grid.observed.any(axis=1) | (rows.count > 0))
     return _put_on_rows(series, rows)
 
 

@@ -54,7 +54,7 @@ def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64
     return left, right, share
 
 
-def _input(knots: Array, values: Array, at: Array) -> tuple[NDArray[np.int64], Array]:
+def _interpolate(knots: Array, values: Array, at: Array) -> tuple[NDArray[np.int64], Array]:
     """Return the left knot and the polygon's value at times (E,), both (E,)."""
     left, right, share = _edges(knots, at)
     return left, values[left] * (1.0 - share) + values[right] * share
@@ -178,7 +178,7 @@ def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:
     P = min(max(P, T - r), T + r), P = T at the first knot. knots, values (K,), at (E,); (E,).
     Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis.
     """
-    left, now = _input(knots, values, at)
+    left, now = _interpolate(knots, values, at)
     return np.clip(_play_states(values, half_width)[left], now - half_width, now + half_width)
 
 
@@ -211,7 +211,7 @@ def _play_moves(
     states = _play_states(values, half_width)
     moved = np.append(True, states[1:] != states[:-1])
     source = np.maximum.accumulate(np.where(moved, np.arange(len(values)), 0))
-    left, now = _input(knots, values, at)
+    left, now = _interpolate(knots, values, at)
     moving = (states[left] < now - half_width) | (states[left] > now + half_width)
     return moving, source[left], (at == knots[left]) & moved[left]
 
@@ -234,7 +234,7 @@ def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDA
 
 def running_maximum(knots: Array, values: Array, at: Array) -> Array:
     """Return the highest value from the first knot to each time, (E,)."""
-    left, now = _input(knots, values, at)
+    left, now = _interpolate(knots, values, at)
     return np.asarray(np.maximum(np.maximum.accumulate(values)[left], now))
 
 
@@ -243,7 +243,7 @@ def running_maximum_matrix(knots: Array, values: Array, at: Array) -> csr_array:
     highest = np.maximum.accumulate(values)
     risen = np.append(True, values[1:] > highest[:-1])
     source = np.maximum.accumulate(np.where(risen, np.arange(len(values)), 0))
-    left, now = _input(knots, values, at)
+    left, now = _interpolate(knots, values, at)
     return interpolation_matrix(knots, at, (now <= highest[left], source[left]))
 
 

@@ -134,7 +134,7 @@ PRESETS: Mapping[str, Preset] = {
 """The presets, by name."""
 
 
-def _device(preset: Preset) -> CameraDevice:
+def _make_device(preset: Preset) -> CameraDevice:
     """Return a camera module in a housing that cools in air: 63 % of the change in 300 s."""
     loss = 0.2375
     network = HeatNetwork(
@@ -149,7 +149,7 @@ def _device(preset: Preset) -> CameraDevice:
     return CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
 
 
-def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
+def _make_programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
     (loss,) = (g for _, second, g in device.network.links if second == "ambient")
     duration = (_EPOCHS - 1) * _INTERVAL_S
     ambient = preset.begin_degc if preset.lamp else 23.0
@@ -179,8 +179,8 @@ def preset_simulation(
     if name not in PRESETS:
         raise ConfigurationError(f"unknown preset {name!r}; known are: {', '.join(PRESETS)}")
     preset = PRESETS[name]
-    device = _device(preset)
-    programme = _programme(preset, device, series)
+    device = _make_device(preset)
+    programme = _make_programme(preset, device, series)
     test_field = corner_field() if field is None else field
     bare = ThermalModel(
         preset.camera,
@@ -200,12 +200,12 @@ def preset_simulation(
     model = replace(
         bare,
         rates={"c": preset.drift_c_mm / warming, "x0": x0, "y0": y0},
-        effects=tuple(_effects(preset, way, warming)),
+        effects=tuple(_make_effects(preset, way, warming)),
     )
     return Simulation(model, device, test_field, programme, seed)
 
 
-def _effects(preset: Preset, way: Array, warming: float) -> list[ModelEffect]:
+def _make_effects(preset: Preset, way: Array, warming: float) -> list[ModelEffect]:
     x0, y0 = (way * preset.set_share / warming).tolist()
     a1, b1, b2 = (change / warming for change in preset.distortion_drift)
     wanted: list[tuple[Callable[[Effect], bool], dict[str, float]]] = [

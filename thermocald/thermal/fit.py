@@ -389,7 +389,7 @@ class HypothesisFitter:
             out.append((value - float(dict(term.nonlinear)[name]), 1.0 / sd**2))
         return out
 
-    def _with_prior(self, fit: Fit) -> float:
+    def _objective_with_prior(self, fit: Fit) -> float:
         return fit.objective + sum(w * left**2 for left, w in self.prior_terms(fit) if w)
 
     def refine(self, fit: Fit, max_iterations: int = 6, only: Sequence[int] | None = None) -> Fit:
@@ -416,7 +416,7 @@ class HypothesisFitter:
                         continue
                     tried = terms
                     trial = self.fit(terms, fit.coefficients, 2, only)
-                    gain = self._with_prior(fit) - self._with_prior(trial)
+                    gain = self._objective_with_prior(fit) - self._objective_with_prior(trial)
                     if gain > 0:
                         fit, improved = trial, True
                         break

@@ -323,7 +323,7 @@ def parse_effect(text: str) -> ModelEffect:
         key, equals, value = (w.strip() for w in part.partition("="))
         if key not in kind.units():
             raise UsageError(
-                f"--effect {text}: {name} has no parameter {key!r}; {_nearest(key, kind.units())}"
+                f"--effect {text}: {name} has no parameter {key!r}; {_suggest(key, kind.units())}"
             )
         if not equals and key not in kind.linear:
             raise UsageError(f"--effect {text}: {key} has no value; give {key}=VALUE")
@@ -371,18 +371,18 @@ def check_names(listed: Iterable[ModelEffect], series: Iterable[ReducedSeries]) 
             if channel is not None and channel not in s.source.readings:
                 raise UsageError(
                     f"effect {effect.name}: {s.source.name} has no temperature column {channel!r}; "
-                    f"{_nearest(channel, s.source.readings)}"
+                    f"{_suggest(channel, s.source.readings)}"
                 )
             targets = effect.values.get("targets", ())
             for target in (targets,) if isinstance(targets, str) else targets:
                 if target not in s.source.field.index:
                     raise UsageError(
                         f"effect {effect.name}: the test field of {s.source.name} has no target "
-                        f"{target!r}; {_nearest(target, s.source.field.index)}"
+                        f"{target!r}; {_suggest(target, s.source.field.index)}"
                     )
 
 
-def _nearest(name: str, known: Iterable[str]) -> str:
+def _suggest(name: str, known: Iterable[str]) -> str:
     names = list(known)
     near = get_close_matches(name, names, 1)
     if near:

@@ -207,7 +207,7 @@ _MEAN_IMAGE_PX, _SHARPEST_PX = 0.1, 1e-4  # standard deviation of the mean image
 _ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
 
-def _free(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSettings:
+def _make_settings(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSettings:
     """Return settings that free some interior parameters, with priors near zero for weak ones."""
     c = source.principal_distance or source.sensor.width * source.sensor.pixel_pitch
     spreads = (0.3 / c**2, 0.3 / c**4, 0.3 / c**6, 0.02 / c, 0.02 / c, 0.02, 0.02)
@@ -225,7 +225,7 @@ def linearise_series(source: SeriesInput) -> Partials:
     seen = Observations(rows, mean[rows], np.full((len(rows), 2), _MEAN_IMAGE_PX))
     # all parameters first: with C1 and C2 fixed, the principal point absorbs them, and the partials
     # are those of another camera; but for a single wall, all together may not converge
-    settings, held = _free(source, IOP_NAMES), _free(source, IOP_NAMES[:-2])
+    settings, held = _make_settings(source, IOP_NAMES), _make_settings(source, IOP_NAMES[:-2])
     c = source.principal_distance
     found = cold_start(source.sensor, source.field, seen, settings, c)
     if found.interior is None:

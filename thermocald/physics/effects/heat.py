@@ -143,7 +143,7 @@ class SelfHeating(OfTime):
     behaviour: Mapping[str, str] = {
         "idle": "rises and settles although the thermometer is constant",
         "restart": "comes again after each power-on",
-        "hold": "goes on with its own time constant",
+        "hold": "continues with its own time constant",
         "cycle": "does not repeat with the cycles",
     }
 

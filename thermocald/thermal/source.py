@@ -227,19 +227,20 @@ def _find_gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.boo
         out[-short:] = _find_gross(p[-short:], seen[-short:], short)
     values = np.where(seen[..., None], p, np.nan)[:n]
     runs = values.reshape(-1, short, *p.shape[1:])
-    ordered = np.sort(runs, axis=1)  # NaN go to the end
-    count = np.isfinite(ordered).sum(axis=1)
-    pick = np.maximum(count - 1, 0) // 2
-    median = np.take_along_axis(ordered, pick[:, None], axis=1)
-    off = (runs - median).reshape(n, *p.shape[1:])
+    off = (runs - _take_lower_median(runs)).reshape(n, *p.shape[1:])
     # the whole image may move within a short mean
-    ordered = np.sort(off, axis=1)
-    pick = np.maximum(np.isfinite(ordered).sum(axis=1) - 1, 0) // 2
-    off = np.abs(off - np.take_along_axis(ordered, pick[:, None], axis=1))
+    off = np.abs(off - _take_lower_median(off))
     known = np.isfinite(off)
     scale = float(mad_sd(off[known])) if known.any() else 0.0
     out[:n] |= (np.where(known, off, 0.0) > criteria.GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
     return out
+
+
+def _take_lower_median(values: Array) -> Array:
+    """Return the lower median over axis 1, which stays with length 1, ignoring NaN."""
+    ordered = np.sort(values, axis=1)  # NaN go to the end
+    count = np.isfinite(ordered).sum(axis=1, keepdims=True)
+    return np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=1)
 
 
 def _shift_and_scale(p: Array, w: Array, middle: Array) -> Array:

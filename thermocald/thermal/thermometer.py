@@ -102,11 +102,11 @@ class Thermometer:
     def slope_jump(self, times: Array) -> Array:
         """Return the sd (E,) K/s of the rate at some times due to jumps next to them."""
         t, size, _ = self._jumps()
-        width = np.diff(t)
-        middle = 0.5 * (t[:-1] + t[1:])
-        near = np.abs(times[:, None] - middle[None]) < 1.1 * np.median(width)
-        out: Array = 0.5 * np.max(np.where(near, size[None], 0.0), axis=1)
-        return out
+        middle, reach = 0.5 * (t[:-1] + t[1:]), 1.1 * float(np.median(np.diff(t)))
+        first = np.searchsorted(middle, times - reach, side="right")
+        last = np.searchsorted(middle, times + reach)
+        near = (size[i:j].max(initial=0.0) for i, j in zip(first, last, strict=True))
+        return 0.5 * np.fromiter(near, dtype=float, count=len(times))
 
 
 def estimate_reading_noise(times: Array, readings: Array, resolution: float | None) -> float:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from thermocald.thermal.thermometer import (
+    Thermometer,
     estimate_reading_noise,
     find_times_between,
     smooth_channel,
@@ -145,3 +149,18 @@ def test_on_a_curve_nothing_is_unknown_but_the_readings():
     assert not weights[:, ~c.real].any()
     # as sharp as a reading, but for the ends, where there are two neighbours on one side
     assert np.linalg.norm(weights, axis=1).max() < 1.1
+
+
+def test_jumps_of_a_long_series_need_no_matrix_of_frames_and_readings():
+    t = 2.0 * np.arange(20_000)
+    T = 20.0 + 0.02 * np.maximum(t - 20_001.0, 0.0)  # a lamp, between two readings
+    zero, real = np.zeros(len(t)), np.ones(len(t), dtype=bool)
+    thermometer = Thermometer(t, T, zero, zero, csr_array((1, 1)), real, 1e-4)
+    frames = 5.0 * np.arange(8_000)
+    tracemalloc.start()
+    jump = thermometer.slope_jump(frames)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6
+    assert frames[jump > 0].tolist() == [20_000.0, 20_005.0]
+    assert jump.max() == pytest.approx(0.01, rel=0.01)

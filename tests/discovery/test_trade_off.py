@@ -64,7 +64,7 @@ def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alon
 
     assert found["parameters"] == ["k"]
     assert found["exchanged"]
-    assert "known only together, as others explain the same: slope and " in say_together(found)
+    assert "known only together, as other values fit as well: slope and " in say_together(found)
 
 
 @pytest.mark.parametrize(("middle", "width"), [(50.0, 20.0), (60.0, 30.0), (3783.7, 288.2)])

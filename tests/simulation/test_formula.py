@@ -15,6 +15,7 @@ from thermocald.physics.history import History
 from thermocald.physics.model import ModelEffect
 from thermocald.physics.model_file import read_effects, write_effects
 from thermocald.physics.operators import OPERATORS
+from thermocald.physics.presets import preset_simulation
 
 SECONDS = np.arange(1200.0)
 T = 25.0 + 8.0 * np.sin(SECONDS / 190.0) + 3.0 * np.sin(SECONDS / 47.0)
@@ -132,7 +133,7 @@ def test_text_and_tree_are_the_same():
         ("lag(temperature, [1])", "neither a number nor a name"),
         ("product(above(temperature, k), above(board, k))", "a name of its own"),
         ("square(wave(temperature, P, phi))", "phi is a parameter of the camera"),
-        ("square(" * 20 + "temperature" + ")" * 20, "more than 8 operators"),
+        ("square(" * 20 + "temperature" + ")" * 20, "more than 8 nested operators"),
         ("square(" * 200, "at most 300 characters"),
         ("lag(", "cannot be read"),
     ],
@@ -149,6 +150,15 @@ def test_units_and_words():
     estimates = {"k": {"value": 30.0, "sd": 0.1, "unit": "degC"}, "a_c": {}}
     assert effect.sentence(estimates) == "c follows ∫ (T − 30.00 ± 0.10 °C)₊ dt"
     assert catalogue.get("signed_square(rate(temperature))").units()["c"] == "mm/(K2/s2)"
+
+
+def test_a_number_in_a_formula_does_not_split_its_name():
+    model = preset_simulation("rpi-v2.1-heating").model
+    model = model.with_effect(ModelEffect("above(temperature, 30.5)", {"c": 1e-4}, {"c": 1e-6}))
+    name = "above(temperature, 30.5).c"
+    assert name in model.parameter_names()
+    assert (model.value(name), model.sd(name)) == (1e-4, 1e-6)
+    assert model.with_values({name: 2e-4}).value(name) == 2e-4
 
 
 def test_a_column_that_was_not_recorded_is_named(history):

@@ -45,6 +45,14 @@ def test_round_trip(tmp_path):
     assert model.version == 4
 
 
+def test_a_number_outside_the_matrix_has_its_standard_deviation():
+    names = ("thermal_lag.tau", "second_heat_source.c", "interior.c", "interior.A1")
+    known = full_model().covariance_of(names)
+    assert np.allclose(np.diag(known), [3.6, 1e-14, 1e-8, 0.0], rtol=1e-12, atol=0.0)
+    assert known[0, 2] == known[2, 0] == 1e-6
+    assert not known[1, [0, 2]].any()
+
+
 def change(document, path, value):
     *parents, last = path
     for key in parents:
@@ -157,8 +165,8 @@ BAD = {
     "camera": [
         (("heat", "bodies", "lens", "capacity"), -2.0, "-2 J/K; it must be above 0"),
         (("heat", "links", 0, "conductance"), 0.0, "0 W/K; it must be above 0"),
-        (("heat", "links", 0, "between"), ["lens"], "must be .one, other."),
-        (("heat", "links", 0, "between"), ["lens", "board", "air"], "must be .one, other."),
+        (("heat", "links", 0, "between"), ["lens"], "must be a list of two names"),
+        (("heat", "links", 0, "between"), ["lens", "board", "air"], "must be a list of two names"),
         (("thermometers", "temperature", "body"), "lans", "is 'lans'; bodies are lens, board"),
         (("thermometers", "air", "missing"), 1.0, "share below 1"),
         (("measuring", "sigma"), 0.0, "above 0"),

@@ -1,12 +1,12 @@
-"""The catalogue of effects, and the chain of those that replace the temperature.
+"""The catalogue of effects, and the chain of drives.
 
-The registry is the entry point `thermocald.effects`, for the built-in effects (in `pyproject.toml`)
-and for those of other distributions alike; an entry's name is the effect's. A formula (`formula`)
-is an effect too, whose name is its text.
+Effects are registered at the entry point `thermocald.effects`, the built-in ones (in
+`pyproject.toml`) as well as those of other distributions; an entry has the effect's name. A formula
+(`formula`) is an effect too, named by its text.
 
-Effects of kind `drive` (a lag, a delay, a play) act one after the other, each on what the one
-before makes of the temperature at the times of the readings. Simulation, fit and discovery use
-this one chain, forward and as the matrix that carries the readings' errors through it.
+Effects of kind `drive` (a lag, a delay, a play) form a chain: each acts on the previous one's
+output at the times of the readings. Simulation, fit and discovery share this chain, forward and as
+the matrix that propagates the readings' errors through it.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ _GROUP = "thermocald.effects"
 def names() -> tuple[str, ...]:
     """Return the names of the catalogue's effects, sorted.
 
-    ConfigurationError where there is none: the installation is older than the program.
+    Raises ConfigurationError if there are none: the installation is older than the program.
     """
-    found = tuple(sorted({point.name for point in entry_points(group=_GROUP)}))
-    if not found:
+    installed = tuple(sorted({point.name for point in entry_points(group=_GROUP)}))
+    if not installed:
         raise ConfigurationError(
             "no effect is installed: thermocald's entry points are older than the program; "
             "install it again (python -m pip install -e .)"
         )
-    return found
+    return installed
 
 
 @cache
 def get(name: str) -> Effect:
-    """Return an effect by its name, or by the formula that it is.
+    """Return the effect with a name, which may be a formula.
 
-    ConfigurationError where there is none, or where it is not one.
+    Raises ConfigurationError if there is none, or if the entry point is not an effect.
     """
     if is_formula(name):
         return OfFormula(name)
@@ -75,7 +75,7 @@ def get(name: str) -> Effect:
 
 
 def find(wanted: Callable[[Effect], bool]) -> Effect:
-    """Return the first effect with some property; ConfigurationError where none has it."""
+    """Return the first effect with a property; ConfigurationError if none has it."""
     for name in names():
         if wanted(get(name)):
             return get(name)
@@ -83,12 +83,12 @@ def find(wanted: Callable[[Effect], bool]) -> Effect:
 
 
 def seen_in(place: str) -> Effect:
-    """Return the effect seen in the measuring noise ("noise") or in single targets ("targets")."""
+    """Return the effect that shows in a place: in the "noise", or in single "targets"."""
     return find(lambda effect: effect.seen_in == place)
 
 
 def driven_history(history: History, drives: Drives) -> History:
-    """Send the readings of a history's reference through drives [(effect, values)]."""
+    """Return the history with its reference's readings passed through drives [(effect, values)]."""
     for name, values in drives:
         driven = get(name).drive(history.at(history.reading_times), **values)
         history = replace(history, readings={**history.readings, history.reference: driven})
@@ -96,7 +96,7 @@ def driven_history(history: History, drives: Drives) -> History:
 
 
 def drive(history: History, drives: Drives) -> Array:
-    """Return the temperature (E,) °C behind the linear terms at the history's times."""
+    """Return the temperature (E,) °C in the linear terms at the history's times."""
     if not drives:
         return history.temperature()
     name, values = drives[-1]
@@ -106,8 +106,8 @@ def drive(history: History, drives: Drives) -> Array:
 def drive_matrix(history: History, drives: Drives, at_readings: bool = False) -> csr_array | None:
     """Return ∂ drive / ∂ readings, (E, R), sparse.
 
-    at_readings: of the driven readings (R, R) instead, None (the identity) where there is no
-    drive.
+    at_readings: whether to return ∂ driven readings / ∂ readings (R, R) instead, None for the
+    identity if there is no drive.
     """
     chain: csr_array | None = None
     for number, (name, values) in enumerate(drives, start=1):

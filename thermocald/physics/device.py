@@ -1,4 +1,4 @@
-"""A camera as a device to simulate: sensor, set-up, heat, thermometers, how well it measures.
+"""A simulated camera (sensor, set-up, heat, thermometers, accuracy), and its programme.
 
 The camera file:
 
@@ -7,35 +7,35 @@ The camera file:
     width: 3280
     height: 2464
     pixel_pitch: 0.00112                         # mm
-    exterior: {omega: …, …, Z0: 1000.0}          # rad, mm; default: before the field's middle
-    distance: 1300.0                             # mm, for that default
+    exterior: {omega: …, …, Z0: 1000.0}          # rad, mm; default: facing the field's centre
+    distance: 1300.0                             # mm, of that default
     measuring: {sigma: 0.04, missed: 0.02, gross: 0.002, gross_size: 3.0}   # px, shares, px
     look: {paper: 200, ink: 30, blur: 0.8, noise: 2.0, vignetting: 0.15}    # DN, px, share
     heat:
       bodies: {lens: {capacity: 0.6}, board: {capacity: 15.0}}              # J/K
-      links:                                     # W/K; what is not a body is a boundary
+      links:                                     # W/K; any other name is a boundary
       - {between: [lens, board], conductance: 0.01}
       - {between: [board, ambient], conductance: 0.05}
     thermometers:                                # the first is the reference
       temperature: {body: lens, noise: 0.04, resolution: 0.0625}            # K
 
-Programmes: what is done to a camera, and when it looks.
+The programme file, with the frames' times and the heat that acts on the camera:
 
     format: thermocald-programme/1
     name: lamp cycles
     series: M1
     epochs: 150
     interval: 10.0                               # s
-    jitter: 0.0                                  # s, of the frames' cadence (sigma)
-    reading: {offset: 0.0, spread: 1.0}          # s: thermometers are read ± spread about the frame
+    jitter: 0.0                                  # s, of the frames' times (sigma)
+    reading: {offset: 0.0, spread: 1.0}          # s: readings at frame time + offset ± spread
     begin: 1600000000.0                          # s UTC
-    initial: 22.0                                # °C, all bodies; default: ambient at the start
-    ambient: 22.0                                # °C: a number, pieces, or a log (see `course`)
+    initial: 22.0                                # °C, of all bodies; default: ambient at the start
+    ambient: 22.0                                # °C: a number, pieces, or a log (see `heat`)
     sources:                                     # W into bodies of the camera file
       housing: [{from: 0, to: 60, value: 0}, {from: 60, to: 900, value: 6.0},
                 {from: 900, to: 1500, value: 0}]
 
-Other boundaries than `ambient` stand under `boundaries: {chamber: …}`.
+Boundaries other than `ambient` are listed under `boundaries: {chamber: …}`.
 """
 
 from __future__ import annotations
@@ -66,10 +66,11 @@ PROGRAMME_FORMAT = "thermocald-programme/1"
 
 @dataclass(frozen=True)
 class Programme:
-    """Epochs and what happens during them.
+    """The epochs of a simulation, with the boundaries and heat sources during them.
 
-    epochs, interval s, jitter s, reading_offset, reading_spread s, begin s UTC; initial °C or None
-    (as the ambient at the start); boundaries {name: Course °C}, sources {body: Course W}.
+    epochs: their number; interval s, jitter s, reading_offset, reading_spread s, begin s UTC;
+    initial °C, None for the ambient temperature at the start; boundaries {name: Course °C}, sources
+    {body: Course W}.
     """
 
     name: str
@@ -86,12 +87,12 @@ class Programme:
 
     @property
     def duration(self) -> float:
-        """From the first frame to the last, nominally, s."""
+        """The nominal time from the first frame to the last, s."""
         return (self.epochs - 1) * self.interval
 
 
 def read_programme(path: Path) -> Programme:
-    """Read a programme file; ConfigurationError names file and key, and where there is a gap."""
+    """Read a programme file; ConfigurationError names the file, the key, and any gap."""
     document = read_yaml(path)
     top = QuantityReader(path, document)
     top.require_format(PROGRAMME_FORMAT)
@@ -121,7 +122,7 @@ def read_programme(path: Path) -> Programme:
 
 
 def _group(top: QuantityReader, key: str, known: Sequence[str]) -> QuantityReader:
-    """Enter the mapping at a key, which holds nothing else than these; empty where it is absent."""
+    """Return a reader of the mapping at a key, empty if absent; only known keys are allowed."""
     group = top.inner(key) if top.mapping.get(key) is not None else QuantityReader(key, {})
     group.only(known)
     return group
@@ -141,8 +142,10 @@ CAMERA_FORMAT = "thermocald-camera/1"
 
 @dataclass(frozen=True, slots=True)
 class Measuring:
-    """How image points are measured: sigma px of a coordinate; share of targets missed; share
-    grossly wrong, and by how much (sigma, px) those are.
+    """The quality of image measurement.
+
+    sigma px, of a coordinate; missed, gross: shares of the targets that are missed or grossly
+    wrong; gross_size px: sigma of gross errors.
     """
 
     sigma: float = 0.04
@@ -162,8 +165,10 @@ USUAL_NETWORK = HeatNetwork(
         ("test_field", "ambient", 5.0),
     ),
 )
-"""A camera module on a board in a housing before a test field: of the order of a Raspberry Pi in a
-plastic case, whose module warms with a time constant of a few minutes.
+"""A camera module on a board in a housing before a test field.
+
+The values are of the order of those of a Raspberry Pi in a plastic case, whose module warms with a
+time constant of a few minutes.
 """
 USUAL_THERMOMETERS: Mapping[str, SimulatedThermometer] = {
     "temperature": SimulatedThermometer("lens"),
@@ -173,7 +178,7 @@ USUAL_THERMOMETERS: Mapping[str, SimulatedThermometer] = {
 
 @dataclass(frozen=True)
 class CameraDevice:
-    """A camera in its set-up, as the camera file describes it."""
+    """A camera in its set-up, as described by the camera file."""
 
     name: str
     sensor: Sensor
@@ -193,7 +198,7 @@ class CameraDevice:
 
 
 def read_camera_device(path: Path) -> CameraDevice:
-    """Read a camera file; ConfigurationError names file and key."""
+    """Read a camera file; ConfigurationError names the file and the key."""
     document = read_yaml(path)
     top = QuantityReader(path, document)
     top.require_format(CAMERA_FORMAT)
@@ -214,7 +219,7 @@ def read_camera_device(path: Path) -> CameraDevice:
                 f"is {thermometer.body!r}; bodies are {', '.join(network.bodies)}",
             )
     if not thermometers:
-        raise top.fail("thermometers", "is empty: one thermometer is needed")
+        raise top.fail("thermometers", "is empty; give at least one thermometer")
     where = _group(top, "exterior", EOP_NAMES)
     measuring = _group(top, "measuring", ("sigma", "missed", "gross", "gross_size"))
     look = _group(top, "look", ("paper", "ink", "blur", "noise", "vignetting"))

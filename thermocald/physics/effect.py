@@ -1,18 +1,19 @@
-"""What an effect is: a physical cause with a name, a signature and parameters.
+"""Effects: physical causes with a name, a signature and parameters.
 
-One class is used three times: forward in the simulation (`influence`), as columns in a fit
-(`drive`, `signal`, with `sensitivity` to carry the thermometer's error through them), and as words
-in a report (`sentence`, `experiment_against`). Everything in which effects differ is stated here
-as a property or a method: no other module asks for an effect by its name.
+An effect is used in three ways: forward in a simulation (`influence`), as columns of a fit
+(`drive`, `signal`, and `sensitivity`, which propagates the thermometer's error through them), and
+as text in a report (`sentence`, `experiment_against`). Whatever distinguishes effects is a property
+or a method here: no other module tests for an effect by its name.
 
-Three kinds:
+There are three kinds:
 
-* `drive` replaces the temperature that drives the linear terms of the base model;
-* `signal` adds coefficient × signal(t) to some of the camera's parameters;
-* `image` acts beyond the camera's parameters: object points, measuring noise, blur.
+* a `drive` replaces the temperature in the linear terms of the base model;
+* a `signal` adds coefficient × signal(t) to some of the camera's parameters;
+* an `image` effect acts on what the camera's parameters do not hold: object points, measuring
+  noise, blur.
 
-Non-linear parameters are those a fit has to search (a time constant, a threshold); coefficients
-are linear: for a `signal` they bear the names of the parameters they act on.
+A fit has to search for the non-linear parameters (a time constant, a threshold). The coefficients
+are linear; those of a `signal` are named after the parameters that they act on.
 """
 
 from __future__ import annotations
@@ -36,19 +37,19 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.history import Follower, History
 
-    Values = Mapping[str, Any]  # of parameters: numbers, or a channel, or names of targets
+    Values = Mapping[str, Any]  # of parameters: numbers, a channel's name, or targets' names
     Estimates = Mapping[str, Mapping[str, Any]]  # {parameter: {value, sd, unit}}
 
 
 @dataclass(slots=True, eq=False)
 class Prediction:
-    """What a model says of E times; its effects add their influence to it one after the other.
+    """A model's prediction for E times, to which its effects add their influence in turn.
 
-    iop (E, 10), eop (E, 6): orientations, in the order of IOP_NAMES and EOP_NAMES (eop is what
-    effects add where the model has no exterior orientation); scale (E, 3): factors of the object
-    coordinates; noise_factor, blur_factor (E,); displacements: of some targets, their rows (k,) of
-    the test field, vector (3,) mm, and when (E,); drive (E,) °C: the temperature behind the linear
-    terms; field: where it is known what stands before the camera.
+    iop (E, 10), eop (E, 6): orientations, in the order of IOP_NAMES and EOP_NAMES (eop holds only
+    the effects' changes if the model has no exterior orientation); scale (E, 3): factors of the
+    object coordinates; noise_factor, blur_factor (E,); displacements: of displaced targets the rows
+    (k,) in the test field, the vector (3,) mm, and the epochs concerned (E,); drive (E,) °C: the
+    temperature in the linear terms; field: the test field, if given.
     """
 
     iop: Array
@@ -63,17 +64,17 @@ class Prediction:
     @classmethod
     def none(cls, epochs: int, field: TestField | None = None) -> Prediction:
         """Return a prediction without any influence."""
-        one, (iop, eop) = np.ones, (np.zeros((epochs, n)) for n in (10, 6))
-        factors = one((epochs, 3)), one(epochs), one(epochs)
+        iop, eop = np.zeros((epochs, 10)), np.zeros((epochs, 6))
+        factors = np.ones((epochs, 3)), np.ones(epochs), np.ones(epochs)
         return cls(iop, eop, *factors, np.zeros(epochs), [], field)
 
     @property
     def moves_points(self) -> bool:
-        """Whether object points are anywhere else than in the test field's file."""
+        """Whether any object point differs from the test field's file."""
         return bool(self.displacements) or bool(np.any(self.scale != 1.0))
 
     def points(self, points: Array, epochs: slice = slice(None)) -> Array:
-        """Move object points (n, 3) mm to where they are at some of the epochs, (e, n, 3)."""
+        """Return the positions (e, n, 3) mm of object points (n, 3) mm at some of the epochs."""
         moved = points[None, :, :] * self.scale[epochs][:, None, :]
         for rows, vector, active in self.displacements:
             moved[:, rows, :] += active[epochs].astype(float)[:, None, None] * vector
@@ -82,13 +83,13 @@ class Prediction:
 
 Role = Literal["", "period", "phase", "event", "delay", "time_constant", "threshold", "width"]
 
-# Units of IOP and EOP as the files write them (CONVENTIONS §2).
+# Units of IOP and EOP as written in files (CONVENTIONS §2).
 PARAMETER_UNITS = dict.fromkeys(PARAMETER_NAMES, "mm") | {
     "A1": "mm-2", "A2": "mm-4", "A3": "mm-6", "B1": "mm-1", "B2": "mm-1", "C1": "1", "C2": "1",
     "omega": "rad", "phi": "rad", "kappa": "rad",
 }  # fmt: skip
 
-# Experiments that separate two effects; each effect states how it responds to some of them.
+# Experiments that separate two effects; an effect's `behaviour` is its response to some of them.
 EXPERIMENTS: dict[str, str] = {
     "hold": "hold the lamp at 45 °C for 20 minutes",
     "cycle": "heat and cool twice between the same two temperatures",
@@ -107,9 +108,10 @@ EXPERIMENTS: dict[str, str] = {
 class Parameter:
     """A non-linear parameter of an effect.
 
-    unit; low, high: range to search; default: start value; log: searched by its logarithm; text: a
-    name (a channel, targets) rather than a number; role: what it means to a search, which chooses
-    the grid of trial values by it; sized: nobody knows beforehand how large it is.
+    unit; low, high: range of the search; default: start value; log: whether the search is in its
+    logarithm; text: whether it is a name (a channel, targets) rather than a number; role: its
+    meaning, which determines the grid of trial values; sized: whether its order of magnitude is
+    unknown beforehand.
     """
 
     unit: str
@@ -122,7 +124,7 @@ class Parameter:
     sized: bool = False
 
     def difference_step(self, value: float) -> float:
-        """Return a step for difference quotients: small for its effect, large for rounding."""
+        """Return a step for difference quotients: linear in effect, yet well above rounding."""
         if self.log or self.sized:
             return 1e-3 * max(abs(value), 1e-6)
         if self.unit == "degC" or self.role == "threshold":
@@ -130,9 +132,9 @@ class Parameter:
         return 0.05 if self.role == "delay" else 1e-3
 
     def bounded(self, old: float, new: float, slack: float = 1.0) -> float:
-        """Limit a step of an iteration to the range, and to a factor of 2 if `log`.
+        """Limit an iteration's new value to the range and, if `log`, to a factor of 2 from the old.
 
-        slack: factor on the lower bound: data may ask for less than a simulation makes sense of.
+        slack: factor on the lower bound, as data may call for less than a simulation can use.
         """
         low = self.low
         if self.log:
@@ -141,7 +143,7 @@ class Parameter:
 
 
 def say_estimate(estimate: Values) -> str:
-    """Write an estimate as people do: 84.1 ± 1.9 s, two digits of the standard deviation."""
+    """Format an estimate with two digits of its standard deviation: 84.1 ± 1.9 s."""
     value, sd, unit = estimate.get("value"), estimate.get("sd"), estimate.get("unit", "")
     unit = "" if unit == "1" else f" {unit}"
     if isinstance(value, str) or value is None:
@@ -158,7 +160,7 @@ def say_estimate(estimate: Values) -> str:
 
 
 def coefficient_units(per: str, parameters: tuple[str, ...] = PARAMETER_NAMES) -> dict[str, str]:
-    """Return units of coefficients that act on parameters: mm/K, rad/K, …; `per`: "K", "s", "1"."""
+    """Return the units of coefficients by parameter: mm/K, rad/K, …; `per`: "K", "s", "1"."""
     return {n: PARAMETER_UNITS[n] + (f"/{per}" if per != "1" else "") for n in parameters}
 
 
@@ -168,10 +170,10 @@ SeenIn = Literal["trajectory", "noise", "targets"]
 
 @dataclass(frozen=True, slots=True)
 class Steady:
-    """An effect's signal at a temperature T at which the camera has long been.
+    """An effect's signal once the camera has settled at a temperature T; 0 by default.
 
-    powers: factors of (T - T₀)⁰, (T - T₀)¹, (T - T₀)²; knee: °C above which T - knee is added,
-    and the name of the parameter that it is; nothing of all this by default.
+    powers: factors of (T - T₀)⁰, (T - T₀)¹, (T - T₀)²; knee: °C above which T - knee is added, or
+    None; knee_name: the effect's parameter that is the knee.
     """
 
     powers: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -180,22 +182,21 @@ class Steady:
 
 
 class Effect:
-    """One physical cause. Subclasses are stateless; their docstrings state the formula.
+    """A physical cause. Subclasses are stateless; their docstrings state the formula.
 
-    name: as in the catalogue; noun: for sentences; says: a sentence with its estimates in braces;
-    nonlinear: searched parameters; linear: {coefficient: unit}; usual: the coefficients that act
-    unless told otherwise; fresh: non-linear parameters that belong to one series and do not carry
-    over to another; optional: non-linear parameters that a model may leave out; behaviour: answers
-    to EXPERIMENTS.
+    name: as in the catalogue; noun: its name in sentences; says: a sentence with its estimates in
+    braces; nonlinear: the parameters to search; linear: {coefficient: unit}; usual: the
+    coefficients that act by default; fresh: non-linear parameters that differ between series;
+    optional: non-linear parameters that a model may leave out; behaviour: {experiment: response},
+    for keys of EXPERIMENTS.
 
-    For a search: seen_in: the trajectories of the camera's parameters, the measuring noise, or
-    single targets; parameter_sets: the sets of coefficients that it may act on, by default the
-    usual ones; moves_mount: it may act on the orientation of the camera instead;
-    irreversible: it stays after cooling; follows_rate: its signal is the temperature's rate;
-    columns:
-    {coefficient: column of the reduced series} where names differ; steady_signal: see `steady`;
-    of_now: it follows from the first, the highest, the lowest and the last three readings, so that
-    a live camera need not keep the others.
+    For a search: seen_in: where it shows, in the trajectories of the camera's parameters, in the
+    measuring noise, or in single targets; parameter_sets: the sets of coefficients that it may act
+    on, by default the usual ones; moves_mount: whether it may act on the exterior orientation
+    instead; irreversible: whether it remains after cooling; follows_rate: whether its signal is the
+    rate of the temperature; columns: {coefficient: column of the reduced series} where names
+    differ; steady_signal: see `steady`; of_now: whether it follows from the first, the highest, the
+    lowest and the last three readings, so that a live camera need not store the others.
     """
 
     name: str
@@ -218,52 +219,52 @@ class Effect:
     of_now: bool = False
 
     def follower(self, values: Values) -> Follower | None:  # noqa: ARG002
-        """The drive with its state, for readings one by one; None where it needs them all."""
+        """Return the drive for readings that come one by one; None if it needs all of them."""
         return None
 
     @property
     def is_drive(self) -> bool:
-        """Whether it replaces the temperature behind the linear terms."""
+        """Whether it replaces the temperature in the linear terms."""
         return self.kind == "drive"
 
     @property
     def is_event(self) -> bool:
-        """Whether it happens at one time of a series or not at all; its size is the series' own."""
+        """Whether it happens at one time of a series, with a size of its own, or not at all."""
         return any(self.nonlinear[name].role == "event" for name in self.fresh)
 
     @property
     def is_periodic(self) -> bool:
-        """Whether it cycles: two signals, whose weights are amplitude and phase of the series."""
+        """Whether it cycles: two signals, whose weights give each series' amplitude and phase."""
         return any(self.nonlinear[name].role == "phase" for name in self.fresh)
 
     @property
     def delay(self) -> str:
-        """The parameter that to first order delays the temperature, s; "" where there is none."""
+        """The name of the parameter that, to first order, is a delay in s; "" if there is none."""
         if not self.is_drive:
             return ""
         roles = ("delay", "time_constant")
         return next((n for n, p in self.nonlinear.items() if p.role in roles), "")
 
     def column(self, coefficient: str) -> str:
-        """Return the column of a reduced series that a coefficient acts on."""
+        """Return the column of a reduced series on which a coefficient acts."""
         return self.columns.get(coefficient, coefficient)
 
     def drive(self, history: History, **nonlinear: Any) -> Array:
-        """Return the temperature (E,) °C that drives the linear terms in place of T."""
+        """Return the temperature (E,) °C that replaces T in the linear terms."""
         raise NotImplementedError(f"{self.name} is not a drive")
 
     def signal(self, history: History, **nonlinear: Any) -> Array:
-        """Return the time series (E, k) that the coefficients multiply; k is 1, or 2 of a wave."""
+        """Return the signal (E, k) that the coefficients multiply; k is 1, or 2 for a wave."""
         raise NotImplementedError(f"{self.name} has no signal")
 
     def channel(self, history: History, **nonlinear: Any) -> str:  # noqa: ARG002
-        """Return the temperature column that it reads."""
+        """Return the temperature column that the effect reads."""
         return history.reference
 
     def sensitivity(self, history: History, **nonlinear: Any) -> csr_array:
         """Return ∂ (drive or first signal) / ∂ readings of `channel`, (E, R), sparse.
 
-        Where a subclass knows no formula: by differences, one reading at a time.
+        Differences, one reading at a time, unless a subclass has a formula.
         """
         from scipy.sparse import csr_array
 
@@ -282,50 +283,51 @@ class Effect:
         return csr_array(columns)
 
     def further_sensitivities(self, history: History, **nonlinear: Any) -> dict[str, csr_array]:  # noqa: ARG002
-        """Return the same for every further column that it reads, {channel: (E, R)}."""
+        """Return the sensitivity to every other column that it reads, {channel: (E, R)}."""
         return {}
 
     def unresolved(self, history: History, rate_jump: Array, **_: Any) -> Array:  # noqa: ARG002
-        """Return the sd (E,) of drive or first signal that the times of the readings leave.
+        """Return the sd (E,) of drive or first signal due to the spacing of the readings.
 
-        What happens between two readings, or after the last, no reading tells; their noise is not
-        meant. rate_jump (E,) K/s: how uncertain the rate of the temperature is at the frames,
-        because it jumps next to them. Most effects need the temperature alone, which straight lines
-        between readings tell.
+        The readings do not show what happens between two of them or after the last one; their noise
+        is not included. rate_jump (E,) K/s: sd of the temperature's rate at the frames, because it
+        jumps next to them. Most effects need the temperature alone, for which straight lines
+        between the readings are accurate enough: 0 by default.
         """
         return np.zeros(len(history.times))
 
     def turns(self, history: History, **nonlinear: Any) -> NDArray[np.bool_]:  # noqa: ARG002
-        """Find epochs (E,) in which the drive depends on which reading was an extreme.
+        """Find the epochs (E,) in which the drive depends on which reading was the extreme.
 
-        What `sensitivity` says is uncertain there.
+        There the `sensitivity` itself is uncertain.
         """
         return np.zeros(len(history.times), dtype=bool)
 
     def steady(self, values: Values, T0: float, channels: Mapping[str, float] | None) -> Steady:  # noqa: ARG002
-        """Return the signal of a camera that has long been at one temperature, and never hotter.
+        """Return the signal of a camera that has settled at a temperature and was never hotter.
 
-        T0: the model's reference temperature °C; channels: °C of other thermometers. A drive has
-        settled. DataError where the effect does not say: such a model needs a temperature log.
+        T0: the model's reference temperature °C; channels: °C of other thermometers. Drives have
+        settled too. Raises DataError if the effect has no steady state: the model then needs a
+        temperature log.
         """
         if self.steady_signal is None and self.kind == "signal":
             raise DataError(
-                f"effect {self.name} does not say what it is at a steady temperature; "
+                f"effect {self.name} states no value at a steady temperature; "
                 "give a temperature log instead"
             )
         return self.steady_signal or Steady()
 
     def weights(self, values: Values, name: str) -> Array:
-        """Return the weight (k,) of each signal in one coefficient; a wave's is split by phase."""
+        """Return the weight (k,) of each signal for one coefficient; the phase splits a wave's."""
         return np.array([float(values[name])])
 
     def split(self, values: Values) -> tuple[dict[str, Any], dict[str, float]]:
-        """Split parameter values into (non-linear ones, coefficients)."""
+        """Split parameter values into non-linear ones and coefficients."""
         searched = {k: values[k] for k in self.nonlinear if k in values}
         return searched, {k: float(values[k]) for k in self.linear if k in values}
 
     def influence(self, history: History, values: Values, found: Prediction) -> None:
-        """Add what it changes at the history's times; a drive changes nothing by itself."""
+        """Add the effect's changes at the history's times to a prediction; none for a drive."""
         searched, coefficients = self.split(values)
         if self.kind == "signal" and any(coefficients.values()):
             course = self.signal(history, **searched)
@@ -334,11 +336,11 @@ class Effect:
                 to[:, names.index(name)] += course @ self.weights(values, name)
 
     def units(self) -> dict[str, str]:
-        """Return the unit of every parameter by its name."""
+        """Return the units of all parameters by name."""
         return {**{k: p.unit for k, p in self.nonlinear.items()}, **self.linear}
 
     def check(self, values: Values) -> None:
-        """Raise ConfigurationError where a parameter is missing, unknown or no number in range."""
+        """Raise ConfigurationError if a parameter is missing, unknown, or not a number in range."""
         place = f"effect {self.name}"
         known = self.units()
         for name in values:
@@ -363,23 +365,23 @@ class Effect:
                 raise ConfigurationError(f"{place}: {name} = {value} {given.unit} is negative")
         if self.linear and not any(name in values for name in self.linear):
             raise ConfigurationError(
-                f"{place}: it needs at least one of the coefficients {', '.join(self.linear)}"
+                f"{place} needs at least one of the coefficients {', '.join(self.linear)}"
             )
 
     def sentence(self, estimates: Estimates) -> str:
-        """Write one sentence for a report; estimates: {parameter: {value, sd, unit}}."""
-        said = {}
+        """Write a sentence for a report; estimates: {parameter: {value, sd, unit}}."""
+        texts = {}
         for name, estimate in estimates.items():
             value = estimate["value"]
             names = [value] if isinstance(value, str) else value
-            said[name] = ", ".join(names) if isinstance(names, list) else say_estimate(estimate)
+            texts[name] = ", ".join(names) if isinstance(names, list) else say_estimate(estimate)
         if self.says:
-            return self.says.format_map(said)
-        numbers = ", ".join(f"{name} = {value}" for name, value in said.items())
+            return self.says.format_map(texts)
+        numbers = ", ".join(f"{name} = {value}" for name, value in texts.items())
         return f"{self.noun}{': ' if numbers else ''}{numbers}"
 
     def experiment_against(self, other: Effect) -> str:
-        """Say what to do to tell this effect from another, and what one would see."""
+        """Describe an experiment that separates this effect from another, with both outcomes."""
         answers = [
             (action, self.behaviour.get(key), other.behaviour.get(key))
             for key, action in EXPERIMENTS.items()
@@ -389,13 +391,13 @@ class Effect:
                 return f"{action}: {self.noun} {mine}, {other.noun} {theirs}"
         for action, mine, theirs in answers:
             if mine or theirs:
-                said = f"{self.noun} {mine}" if mine else f"{other.noun} {theirs}"
-                return f"{action}: {said}"
-        return f"record longer and under another programme than now ({self.noun}, {other.noun})"
+                outcome = f"{self.noun} {mine}" if mine else f"{other.noun} {theirs}"
+                return f"{action}: {outcome}"
+        return f"record longer, with another temperature programme ({self.noun}, {other.noun})"
 
 
 class Operated(Effect):
-    """An effect that sends the reference temperature through an operator.
+    """An effect that passes the reference temperature through an operator.
 
     operator: its key in `operators.OPERATORS`; its constants are the effect's parameters.
     """
@@ -403,7 +405,7 @@ class Operated(Effect):
     operator: str
 
     def _arguments(self, history: History, values: Values) -> tuple[Any, ...]:
-        """Return what the operator takes: values, or a polygon and times; and its constants."""
+        """Return the operator's arguments: values, or a polygon and times; and its constants."""
         constants = [values.get(name, c.default) for name, c in self.nonlinear.items()]
         if not OPERATORS[self.operator].remembers:
             return history.temperature(), *constants
@@ -426,7 +428,7 @@ class Operated(Effect):
 
 
 class OfTime(Effect):
-    """An effect that knows the time alone: the thermometer's error does not reach it."""
+    """An effect that depends on time alone: the thermometer's error does not reach it."""
 
     usual: tuple[str, ...] = IOP_NAMES[:3]
     of_now = True
@@ -439,14 +441,14 @@ class OfTime(Effect):
 
 
 class Proportional(Effect):
-    """An effect whose signal is a power of T - T₀, at once; T is that of its `channel`."""
+    """An effect whose signal is a power of T - T₀, without delay; T is that of its `channel`."""
 
     power: int = 1
     usual: tuple[str, ...] = IOP_NAMES[:3]
     of_now = True
     steady_signal = Steady((0.0, 1.0, 0.0))
     behaviour: Mapping[str, str] = {
-        "hold": "does not move while the temperature stands",
+        "hold": "does not move while the temperature is constant",
         "cycle": "runs along the same line up and down",
     }
 

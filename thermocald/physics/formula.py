@@ -1,13 +1,13 @@
-"""Formulas as effects: `integral(above(temperature, k))` where the catalogue has no name.
+"""Formulas as effects, such as `integral(above(temperature, k))`, beyond the catalogue's names.
 
-A leaf is a temperature channel (`temperature`), `time`, s since the first frame, or another
+A leaf is a temperature channel (`temperature`), `time` (s since the first frame) or another
 recorded column (`column("humidity")`). Constants are numbers or names; the names are the effect's
-parameters. The text is read as Python's grammar has it and never executed: anything but calls
-of known operators, names, numbers and quoted names is refused.
+parameters. The text is parsed by Python's grammar and never executed: only calls of known
+operators, names, numbers and quoted names are accepted.
 
-Operators with memory work on the polygon of the reference's readings, which other channels are
-interpolated to; pointwise ones at the times that are asked for. A formula's name is its text, so it
-stands in model files and commands as any other effect does:
+Operators with memory work on the polygon of the reference's readings, to which other channels are
+interpolated; pointwise operators work at the requested times. A formula is named by its text, and
+so is written in model files and commands like any other effect:
 
     effects:
     - effect: integral(above(temperature, k))
@@ -47,7 +47,7 @@ _COLUMN = "column"
 _LONGEST = 300  # characters of a formula
 _DEEPEST = 8
 _OFFSET_C = "degC"
-_TOGETHER = 0.99
+_TOGETHER = 0.99  # correlation from which constants are determined only jointly
 _ON_THE_CURVE = 41  # temperatures
 
 
@@ -55,8 +55,8 @@ _ON_THE_CURVE = 41  # temperatures
 class Node:
     """An operator with its inputs and constants, or a leaf.
 
-    operator: a key of OPERATORS, or "" for a temperature channel, "time", "column"; name: of the
-    channel or column; constants: names, or numbers where they are bound.
+    operator: a key of OPERATORS, or of a leaf "" (a temperature channel), "time", "column"; name:
+    of the channel or column; constants: names, or numbers once bound.
     """
 
     operator: str
@@ -66,36 +66,36 @@ class Node:
 
     @property
     def kind(self) -> Operator:
-        """The operator; KeyError at a leaf."""
+        """The operator; KeyError for a leaf."""
         return OPERATORS[self.operator]
 
     @property
     def is_leaf(self) -> bool:
-        """Whether it is a recorded quantity itself."""
+        """Whether the node is a recorded quantity."""
         return not self.inputs
 
     @property
     def depth(self) -> int:
-        """How many operators stand above each other."""
+        """The number of nested operators."""
         return 0 if self.is_leaf else 1 + max(n.depth for n in self.inputs)
 
     @property
     def size(self) -> int:
-        """How many operators it holds."""
+        """The number of operators."""
         return sum(not n.is_leaf for n in self.walk())
 
     def walk(self) -> Iterator[Node]:
-        """Yield the node and all below it."""
+        """Yield the node and all nodes below it."""
         yield self
         for node in self.inputs:
             yield from node.walk()
 
     def channels(self) -> tuple[str, ...]:
-        """List the temperature channels that it reads, in order."""
+        """Return the temperature channels in the formula, in order."""
         return tuple(dict.fromkeys(n.name for n in self.walk() if n.is_leaf and not n.operator))
 
     def free(self) -> Iterator[tuple[str, Constant, Node]]:
-        """Yield the constants that are names: (name, what it is, the node that it belongs to)."""
+        """Yield the constants that are names: (name, the operator's constant, its node)."""
         for node in self.walk():
             if node.is_leaf:
                 continue
@@ -104,7 +104,7 @@ class Node:
                     yield value, constant, node
 
     def bound(self, values: Mapping[str, float]) -> Node:
-        """Replace all names by numbers; KeyError where one is missing."""
+        """Replace all names by numbers; KeyError if one is missing."""
         if self.is_leaf:
             return self
         return replace(
@@ -114,14 +114,14 @@ class Node:
         )
 
     def simpler(self) -> Iterator[Node]:
-        """Yield every formula with one operator less: a node replaced by one of its inputs."""
+        """Yield every formula with one operator fewer: a node replaced by one of its inputs."""
         yield from self.inputs
         for i, node in enumerate(self.inputs):
             for other in node.simpler():
                 yield replace(self, inputs=(*self.inputs[:i], other, *self.inputs[i + 1 :]))
 
     def named(self) -> tuple[Node, dict[str, float]]:
-        """Replace all numbers by names, and return the numbers by those names."""
+        """Replace all numbers by names; return the formula, and the numbers by name."""
         values: dict[str, float] = {}
 
         def rename(node: Node) -> Node:
@@ -140,7 +140,7 @@ class Node:
         return rename(self), values
 
     def text(self) -> str:
-        """Write the formula as files hold it; `parse` reads it."""
+        """Return the text that `parse` reads and files hold."""
         if self.operator == TIME:
             return TIME
         if self.operator == _COLUMN:
@@ -152,8 +152,9 @@ class Node:
         return f"{self.operator}({', '.join(parts)})"
 
     def steady(self, temperatures: Array) -> Array | None:
-        """Return the values (n,) of a bound formula where the camera has long been at one of some
-        temperatures (n,) °C; None where it is no function of a temperature.
+        """Return a bound formula's settled values (n,) at constant temperatures (n,) °C.
+
+        None if the formula is not a function of one temperature.
         """
         if self.is_leaf:
             return None if self.operator else temperatures
@@ -168,13 +169,13 @@ class Node:
 
     @property
     def is_celsius(self) -> bool:
-        """Whether its values are temperatures, not differences or powers of them."""
+        """Whether the values are temperatures, not differences or powers of them."""
         if self.is_leaf:
             return not self.operator
         return self.kind.keeps and self.inputs[0].is_celsius
 
     def unit(self) -> dict[str, int]:
-        """Return the exponents of K, s and columns' own units in its values."""
+        """Return the unit of the values as {unit: exponent}, of K, s and the columns' units."""
         if self.operator == TIME:
             return {"s": 1}
         if self.operator == _COLUMN:
@@ -190,7 +191,7 @@ class Node:
         return {name: power for name, power in total.items() if power}
 
     def unit_of(self, constant: Constant) -> str:
-        """Return the unit of one of its own constants."""
+        """Return the unit of one of the operator's constants."""
         if constant.role == "time_constant":
             return "s"
         if not constant.same_unit:
@@ -202,7 +203,7 @@ class Node:
     # -- words ---------------------------------------------------------------------------------
 
     def words(self, spoken: Mapping[str, str], reference: str = "temperature") -> str:
-        """Write the formula as mathematics; spoken: {name of a constant: value in words}."""
+        """Return the formula as mathematics; spoken: {name of a constant: text of its value}."""
         if self.operator == TIME:
             return "t"
         if self.is_leaf:
@@ -214,7 +215,7 @@ class Node:
 
 
 def unit_text(powers: Mapping[str, int]) -> str:
-    """Write a unit as files do: K s, K2/s, 1."""
+    """Format a unit as in files: K s, K2/s, 1."""
     up = [f"{n}{p if p > 1 else ''}" for n, p in powers.items() if p > 0]
     down = [f"{n}{-p if p < -1 else ''}" for n, p in powers.items() if p < 0]
     if not up and not down:
@@ -223,7 +224,7 @@ def unit_text(powers: Mapping[str, int]) -> str:
 
 
 def parse(text: str) -> Node:
-    """Read the tree of a formula. ConfigurationError says what cannot be read."""
+    """Parse a formula; ConfigurationError names what cannot be read."""
     if len(text) > _LONGEST:
         raise ConfigurationError(f"a formula has at most {_LONGEST} characters: {text[:40]} …")
     try:
@@ -244,14 +245,14 @@ def parse(text: str) -> Node:
 
 def _parse_node(tree: ast.expr, text: str, depth: int) -> Node:
     if depth > _DEEPEST:
-        raise ConfigurationError(f"formula {text!r}: more than {_DEEPEST} operators in each other")
+        raise ConfigurationError(f"formula {text!r}: more than {_DEEPEST} nested operators")
     if isinstance(tree, ast.Name):
         return Node(TIME) if tree.id == TIME else Node("", name=tree.id)
     if isinstance(tree, ast.Constant) and isinstance(tree.value, str):
         return Node("", name=tree.value)
     if not (isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name)) or tree.keywords:
         raise ConfigurationError(
-            f"formula {text!r}: {ast.unparse(tree)!r} is not a recorded quantity; write a "
+            f"formula {text!r}: {ast.unparse(tree)!r} is not a recorded quantity; give a "
             f'channel, time, column("…"), or one of {", ".join(OPERATORS)}'
         )
     name, arguments = tree.func.id, tree.args
@@ -290,26 +291,26 @@ def _parse_constant(tree: ast.expr, text: str) -> str | float:
 
 
 class Evaluator:
-    """One history; what has been computed is kept, as formulas share their parts."""
+    """Formulas on one history; values are cached, as formulas have parts in common."""
 
     def __init__(self, history: History) -> None:
         self.history = history
         self.knots = history.polygon().times
-        self._kept: dict[tuple[Node, bool], Array] = {}
+        self._cache: dict[tuple[Node, bool], Array] = {}
 
     def values(self, node: Node, at_knots: bool = False) -> Array:
         """Return the values (E,) of a bound formula at the frames, or (K,) at the knots."""
         key = (node, at_knots)
-        if key not in self._kept:
-            self._kept[key] = (
+        if key not in self._cache:
+            self._cache[key] = (
                 self._leaf(node, self.knots if at_knots else self.history.times)
                 if node.is_leaf
                 else node.kind.value(*self._arguments(node, at_knots))
             )
-        return self._kept[key]
+        return self._cache[key]
 
     def _arguments(self, node: Node, at_knots: bool) -> tuple[Any, ...]:
-        """Return what a node's operator takes: values of its inputs, or a polygon and times."""
+        """Return the arguments of a node's operator: its inputs' values, or a polygon and times."""
         if not node.kind.remembers:
             return *(self.values(n, at_knots) for n in node.inputs), *node.constants
         inner = self.values(node.inputs[0], at_knots=True)
@@ -352,7 +353,7 @@ class Evaluator:
         return csr_array(total)
 
     def shifted(self, node: Node, jump: Array) -> Array:
-        """Return the values (E,) where rates of readings are off by `jump` (E,), per s."""
+        """Return the values (E,) if all rates of readings are changed by `jump` (E,), per s."""
         if node.operator == "rate" and node.inputs[0].is_leaf:
             return self.values(node) + jump
         if node.is_leaf or node.kind.remembers:
@@ -361,9 +362,9 @@ class Evaluator:
 
 
 class OfFormula(Effect):
-    """Adds a × formula. The formula is data: a tree of known operators over recorded quantities.
+    """A signal a × formula, a tree of known operators over recorded quantities.
 
-    Raises ConfigurationError where its text cannot be read.
+    Raises ConfigurationError if the formula's text cannot be read.
     """
 
     usual = ("c", "x0", "y0")
@@ -403,18 +404,18 @@ class OfFormula(Effect):
         return np.abs(evaluator.shifted(node, rate_jump) - evaluator.values(node))
 
     def sentence(self, estimates: Estimates) -> str:
-        said = {
-            name: _say_constant(e, self.nonlinear[name]).replace("degC", "°C")
+        constants = {
+            name: _format_constant(e, self.nonlinear[name]).replace("degC", "°C")
             for name, e in estimates.items()
             if name in self.nonlinear
         }
         moved = [n[2:] for n in estimates if n.startswith("a_")]
         verb = "follow" if len(moved) > 1 else "follows"
-        return f"{', '.join(moved) or 'the camera'} {verb} {self.node.words(said)}"
+        return f"{', '.join(moved) or 'the camera'} {verb} {self.node.words(constants)}"
 
 
-def _say_constant(estimate: Values, parameter: Parameter) -> str:
-    """Write an estimate; one that is not determined as about so much."""
+def _format_constant(estimate: Values, parameter: Parameter) -> str:
+    """Format an estimate, with "about" if it is not determined."""
     value, sd = estimate["value"], estimate["sd"]
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     if sd is None or (parameter.log and not sd <= abs(value)):
@@ -430,16 +431,16 @@ def known_together(
     temperatures: tuple[float, float, float],
     exchanged: Sequence[str] = (),
 ) -> dict[str, Any] | None:
-    """Return what is known of a formula whose constants are known only together; None of others.
+    """Return the joint result for constants that the data determine only together, or None.
 
-    values: its constants, then sizes and rates of each parameter that it moves (`moved`), whose
-    covariance is given; temperatures °C: the lowest, the mean, the highest; exchanged: constants
-    of which the data say nothing by themselves. Of others those are tied that correlate by 0.99
-    with another or with a size.
+    values: the formula's constants, then the sizes and the rates of the parameters that it moves
+    (`moved`); covariance: of all of these; temperatures °C: the lowest, the mean, the highest;
+    exchanged: constants of which the data determine nothing separately. Further constants are tied
+    if they correlate by 0.99 with another constant or with a size. None if no constant is tied.
 
-    Slope and curvature are those of the parabola that is nearest over the range, at the mean: they
-    hold the rate, too, which trades with the formula's own slope. None for formulas that are no
-    function of a temperature.
+    The result has slope and curvature, at the mean, of the parabola that fits best over the range;
+    they include the rate, which is correlated with the formula's own slope. A formula that is not a
+    function of one temperature has neither.
     """
     names, x, P = list(values), np.array(list(values.values())), len(moved)
     L = len(names) - 2 * P
@@ -490,26 +491,26 @@ def known_together(
 
 
 def say_together(known: Mapping[str, Any]) -> str:
-    """Write what `known_together` found, as the end of a sentence."""
+    """Write the result of `known_together` as the end of a sentence."""
     names = ", ".join(known["parameters"])
     if known["exchanged"]:
-        text = f"{names} and the size are known only together, as others explain the same"
+        text = f"{names} and the size are known only together, as other values fit as well"
     else:
         r = known["correlation"]
         text = f"{names} and the size are best known together, as they correlate by {r:.4f}"
     if "slope" not in known:
         return text
-    said = []
+    parts = []
     for name, slope in known["slope"].items():
         factor, unit = (1e3, "µm") if slope["unit"] == "mm/K" else (1.0, slope["unit"][:-2])
         both = [
             with_sd(factor * e["value"], factor * e["sd"], f"{unit}/{per}")
             for e, per in ((slope, "K"), (known["curvature"][name], "K²"))
         ]
-        said.append(f"{name} {' and '.join(both)}")
-    return f"{text}: slope and curvature at {known['temperature']:.1f} °C are {', '.join(said)}"
+        parts.append(f"{name} {' and '.join(both)}")
+    return f"{text}: slope and curvature at {known['temperature']:.1f} °C are {', '.join(parts)}"
 
 
 def is_formula(name: str) -> bool:
-    """Return whether an effect's name is a formula's text: it calls an operator."""
+    """Return whether an effect's name is a formula, that is, calls an operator."""
     return "(" in name

@@ -1,27 +1,24 @@
-"""Heat: bodies with capacities, conductances between them, and sources.
+"""Heat: bodies with capacities, conductances between them, and sources; and thermometers on them.
 
     C_i dT_i/dt = Σ_j G_ij (T_j - T_i) + P_i(t)
 
-Each body has one temperature (lumped capacity). Boundaries, such as the air or a thermal chamber,
-have a temperature that is given. Sources and boundaries are straight in pieces; for such a drive
-the solution is known in closed form in the modes of the network, and no step width is involved:
-temperatures are exact to rounding on any time axis.
+Each body has one temperature (lumped capacity). The temperature of boundaries, such as the air or a
+thermal chamber, is given. Sources and boundaries are piecewise linear in time; for these the modes
+of the network have a closed solution. No step width is involved: temperatures are exact to rounding
+on any time axis.
 
 Source: Incropera, DeWitt (2007): Fundamentals of Heat and Mass Transfer, 6th ed., chapter 5;
 modes of a symmetric system as in any text on linear vibrations.
 
-Courses in time: what a lamp, a processor or the air does, as straight pieces that may jump.
-
-In a file a course is a number (always the same), a list of pieces without gaps,
+A course is the power of a lamp or a processor, or the temperature of the air, as straight pieces
+that may jump. In a file it is a number (a constant), a list of pieces without gaps,
 
     - {from: 0, to: 60, value: 0.0}
     - {from: 60, to: 900, begin: 0.0, end: 5.0}        # a ramp
 
-or a log that is played in:
+or a log that is replayed:
 
     {log: weather.csv, time: seconds, value: temperature, largest_gap: 900}
-
-Thermometers as instruments: what one says is not the temperature of what it is fixed to.
 """
 
 from __future__ import annotations
@@ -46,10 +43,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Straight pieces that follow each other without gaps.
+    """A piecewise linear function of time, without gaps; it may jump between pieces.
 
-    times (p+1,): s ascending, where pieces meet; begin, end (p,): values at the ends of each.
-    Before the first and after the last piece the value is held.
+    times (p+1,): s ascending, where pieces meet; begin, end (p,): values at both ends of each
+    piece. Before the first and after the last piece the value is constant.
     """
 
     times: Array
@@ -58,26 +55,26 @@ class Course:
 
     @classmethod
     def constant(cls, value: float) -> Self:
-        """Make a course that is always the same."""
+        """Make a constant course."""
         return cls(np.array([0.0, 0.0]), np.array([value]), np.array([value]))
 
     @classmethod
     def polygon(cls, times: ArrayLike, values: ArrayLike) -> Self:
-        """Join points by straight lines; of two points at one time it jumps."""
+        """Join points by straight lines; two points at one time are a jump."""
         t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
         if len(t) == 1:
             return cls.constant(float(v[0]))
-        keep = np.append(np.diff(t) > 0, True)[:-1]
+        keep = np.diff(t) > 0
         return cls(np.append(t[:-1][keep], t[-1]), v[:-1][keep], v[1:][keep])
 
     @classmethod
     def steps(cls, times: ArrayLike, values: ArrayLike) -> Self:
-        """Hold value i from times[i] to times[i+1]; one time more than values."""
+        """Make a course with value i from times[i] to times[i+1]; it needs one more time."""
         v = np.asarray(values, dtype=float)
         return cls(np.asarray(times, dtype=float), v, v.copy())
 
     def at(self, times: ArrayLike, side: Literal["left", "right"] = "right") -> Array:
-        """Return the value right after each time, or right before it (side: left), if it jumps."""
+        """Return the values at some times; at a jump, that after it, or before it (side: left)."""
         t = np.asarray(times, dtype=float)
         piece = np.clip(np.searchsorted(self.times, t, side=side) - 1, 0, len(self.begin) - 1)
         length = self.times[piece + 1] - self.times[piece]
@@ -89,9 +86,7 @@ class Course:
 def read_course(
     reader: QuantityReader, key: str, unit: str, duration: float, folder: Path
 ) -> Course:
-    """Read the course at a key of a programme file; it must cover 0 to `duration` s without a
-    gap.
-    """
+    """Read the course at a key; it must cover 0 to `duration` s without gaps."""
     raw = reader.mapping.get(key)
     if isinstance(raw, list):
         course = _read_pieces(reader, key, unit)
@@ -129,7 +124,7 @@ def _read_pieces(reader: QuantityReader, key: str, unit: str) -> Course:
 
 
 def _read_log(reader: QuantityReader, unit: str, folder: Path) -> Course:
-    """Read a CSV file with a header, one time a row; time 0 is its first row."""
+    """Read a CSV file with a header and one row per time; time 0 is the first row."""
     import csv
 
     reader.only(("log", "time", "value", "largest_gap"))
@@ -154,7 +149,7 @@ def _read_log(reader: QuantityReader, unit: str, folder: Path) -> Course:
     except (OSError, UnicodeDecodeError) as cause:
         raise ConfigurationError(f"{path}: cannot be read: {cause}") from cause
     if len(rows) < 2:
-        raise ConfigurationError(f"{path}: a log needs two rows at least")
+        raise ConfigurationError(f"{path}: a log needs at least two rows")
     times, values = np.array(rows).T
     if not np.isfinite(times).all() or not np.isfinite(values).all():
         raise ConfigurationError(f"{path}: holds a value that is not finite (a gap in {unit})")
@@ -171,11 +166,11 @@ def _read_log(reader: QuantityReader, unit: str, folder: Path) -> Course:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedThermometer:
-    """A thermometer on a body.
+    """A thermometer on a body or boundary, with its errors.
 
-    body: whose temperature it follows; lag s: its own time constant; offset K; noise K (sigma);
-    resolution K: readings are multiples of it, 0 for none; missing: share of readings that fail;
-    stuck: (from, to) s while it repeats its last value.
+    body: where it is; lag s: its own time constant; offset K; noise K (sigma); resolution K:
+    readings are multiples of it, 0 for none; missing: share of readings that fail; stuck: (from,
+    to) s, when it repeats its last value.
     """
 
     body: str
@@ -193,26 +188,26 @@ class SimulatedThermometer:
 
         times (g,) s, temperatures (g,) °C: of the body, joined by straight lines.
         """
-        # drawn in full whatever the settings, so that one setting does not change another's noise
+        # drawn in full whatever the settings, so that no setting changes the noise of another
         noise = rng.standard_normal(len(instants))
         missed = rng.random(len(instants))
         if self.lag > 0:
             true = lag(times, temperatures, self.lag, instants)
         else:
             true = np.interp(instants, times, temperatures)
-        said = true + self.offset + self.noise * noise
+        readings = true + self.offset + self.noise * noise
         if self.resolution > 0:
-            said = np.rint(said / self.resolution) * self.resolution
+            readings = np.rint(readings / self.resolution) * self.resolution
         if self.stuck is not None:
             held = np.flatnonzero((instants >= self.stuck[0]) & (instants < self.stuck[1]))
             if len(held):
-                said[held] = said[max(held[0] - 1, 0)]
-        said[missed < self.missing] = np.nan
-        return said
+                readings[held] = readings[max(held[0] - 1, 0)]
+        readings[missed < self.missing] = np.nan
+        return readings
 
 
 def read_thermometer(reader: QuantityReader) -> SimulatedThermometer:
-    """Read a thermometer of a camera file; units s and K."""
+    """Read a thermometer of a camera file, in s and K."""
     reader.only(("body", "lag", "offset", "noise", "resolution", "missing", "stuck"))
     stuck = None
     if reader.mapping.get("stuck") is not None:
@@ -232,10 +227,11 @@ def read_thermometer(reader: QuantityReader) -> SimulatedThermometer:
 
 @dataclass(frozen=True)
 class HeatNetwork:
-    """Bodies {name: capacity J/K} and the links between two each: names and a conductance W/K.
+    """A network of bodies and boundaries, linked by conductances.
 
-    Other names in links are boundaries; capacities and conductances are above 0. Raises
-    ConfigurationError where a link has no body.
+    capacities: {body: J/K}; links: (name, name, conductance W/K), where a name that is not a body
+    is a boundary. Capacities and conductances are above 0. Raises ConfigurationError if a link has
+    no body.
     """
 
     capacities: Mapping[str, float]
@@ -250,17 +246,17 @@ class HeatNetwork:
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies."""
+        """The names of the bodies."""
         return tuple(self.capacities)
 
     @property
     def boundaries(self) -> tuple[str, ...]:
-        """Names of what has a given temperature."""
+        """The names of the boundaries, whose temperatures are given."""
         names = dict.fromkeys(n for link in self.links for n in link[:2])
         return tuple(n for n in names if n not in self.capacities)
 
     def _matrices(self) -> tuple[Array, Array, Array]:
-        """Return capacities (n,), conductances (n, n) and those to the boundaries (n, m)."""
+        """Return capacities (n,), conductance matrix (n, n), conductances to boundaries (n, m)."""
         names, n = [*self.bodies, *self.boundaries], len(self.bodies)
         G = np.zeros((len(names), len(names)))
         for first, second, conductance in self.links:
@@ -277,8 +273,7 @@ class HeatNetwork:
         powers: Mapping[str, Course],
         temperatures: Mapping[str, Course],
     ) -> dict[str, Array]:
-        """Return temperatures °C of all bodies and boundaries at times (E,) s, ascending, from 0
-        on.
+        """Return the temperatures °C of bodies and boundaries at times (E,) s, ascending from 0.
 
         initial: °C at time 0, of each body or of all; powers: W into bodies; temperatures: °C of
         the boundaries.
@@ -291,7 +286,7 @@ class HeatNetwork:
         for name in powers:
             if name not in self.capacities:
                 raise ConfigurationError(
-                    f"a source heats {name!r}, which is not a body; bodies are "
+                    f"a source heats {name!r}, which is not a body; the bodies are "
                     f"{', '.join(self.bodies)}"
                 )
         inner = [c.times for c in (*powers.values(), *temperatures.values())]
@@ -324,12 +319,12 @@ class HeatNetwork:
 
 
 def _solve_mode(grid: Array, rate: float, begin: Array, end: Array, start: float) -> Array:
-    """Solve Z' = -rate z + f with f straight from begin[k] to end[k+1] over each step; (g,)."""
+    """Solve z' = -rate z + f on the grid, (g,); f is linear from begin[k] to end[k+1]."""
     h = np.diff(grid)
     x = rate * h
     small = x < 1e-4
     safe = np.where(small, 1.0, x)
-    # φ1 = (1 - e^-x)/x and φ2 = (x - 1 + e^-x)/x², by their series where they would cancel
+    # φ1 = (1 - e^-x)/x and φ2 = (x - 1 + e^-x)/x², as series where their terms would cancel
     phi1 = np.where(small, 1.0 - x / 2 + x * x / 6, -np.expm1(-safe) / safe)
     phi2 = np.where(small, 0.5 - x / 6 + x * x / 24, (safe + np.expm1(-safe)) / safe**2)
     driven = np.append(start, h * (phi1 * begin[:-1] + phi2 * (end[1:] - begin[:-1])))
@@ -337,8 +332,10 @@ def _solve_mode(grid: Array, rate: float, begin: Array, end: Array, start: float
 
 
 def read_network(reader: QuantityReader) -> HeatNetwork:
-    """From a camera file: `bodies: {lens: {capacity: 0.6}}`, `links: [{between: [lens, housing],
-    conductance: 0.02}]`; J/K and W/K.
+    """Read the network of a camera file, in J/K and W/K.
+
+    Its keys: `bodies: {lens: {capacity: 0.6}}`, `links: [{between: [lens, housing], conductance:
+    0.02}]`.
     """
     reader.only(("bodies", "links"))
     bodies = reader.inner("bodies")
@@ -352,6 +349,6 @@ def read_network(reader: QuantityReader) -> HeatNetwork:
         link.only(("between", "conductance"))
         ends = link.mapping.get("between")
         if not isinstance(ends, list) or len(ends) != 2:
-            raise link.fail("between", "must be [one, other]")
+            raise link.fail("between", "must be a list of two names")
         links.append((str(ends[0]), str(ends[1]), link.number("conductance", "W/K", above=0.0)))
     return HeatNetwork(capacities, tuple(links))

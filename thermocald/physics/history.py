@@ -1,14 +1,14 @@
-"""The temperature history of a series: what an effect is given.
+"""The temperature history of a series, from which effects are computed.
 
-Readings are joined by straight lines; between the first and the last frame the temperature is
-therefore known at every time, also where a reading is missing or was taken a second away from the
-frame. The operators on such a polygon are in `operators`.
+Readings are joined by straight lines, so that the temperature has a value at any time between the
+first and the last frame, even if a reading is missing or was taken a second before or after the
+frame. The operators on this polygon are in `operators`.
 
-Time 0 is the first frame of the series, and the past begins there: before it the temperature has
-always been the one of time 0.
+Time 0 is the first frame of the series. The past begins there: before it, the temperature is taken
+as constant.
 
-Followers are those operators one knot at a time: each takes the knots of a polygon in order and
-gives the value at the last, the same numbers at the cost of one knot.
+Followers are operators that take the knots of a polygon one by one, in order, and return the value
+at the last knot: the same numbers, at the cost of one knot.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Polygon:
-    """A temperature as a polygon: times (K,) s ascending, values (K,) °C, and where they come from.
+    """A temperature as a polygon: times (K,) s ascending, values (K,) °C.
 
-    matrix (K, R): values = matrix @ readings (with missing readings as 0).
+    matrix (K, R): values = matrix @ readings, with missing readings as 0.
     """
 
     times: Array
@@ -46,19 +46,19 @@ class Polygon:
     matrix: csr_array
 
     def at(self, times: ArrayLike) -> Array:
-        """Return the temperature (...,) °C at some times; held beyond the ends."""
+        """Return the temperature (...,) °C at some times; constant beyond the ends."""
         result: Array = np.interp(np.asarray(times, dtype=float), self.times, self.values)
         return result
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """What was recorded of the temperature, and the times for which it is asked.
+    """The recorded temperatures, and the times at which they are evaluated.
 
-    times (E,): s since the series' start, ascending: the frames; reading_times (R,): s on the same
-    axis; readings: {channel: (R,)} °C, NaN where missing; reference: the channel that is T;
-    T0: the model's reference temperature °C, one value for all series of a camera; columns: {name:
-    (times (N,) s, values (N,))} of what else was recorded, such as a humidity.
+    times (E,): of the frames, s since the series' start, ascending; reading_times (R,): s on the
+    same axis; readings: {channel: (R,)} °C, NaN where missing; reference: the channel of T; T0: the
+    model's reference temperature °C, one value for all series of a camera; columns: {name: (times
+    (N,) s, values (N,))} of other recorded quantities, such as a humidity.
     """
 
     times: Array
@@ -76,7 +76,7 @@ class History:
             )
 
     def at(self, times: ArrayLike) -> Self:
-        """Ask for other times."""
+        """Return the history with other times."""
         return replace(self, times=np.asarray(times, dtype=float))
 
     @cached_property
@@ -84,9 +84,9 @@ class History:
         return {}
 
     def polygon(self, channel: str | None = None) -> Polygon:
-        """Return a channel (default: the reference) as a polygon that covers all frames.
+        """Return the polygon of a channel (default: the reference); it covers all frames.
 
-        Raises DataError where the channel is unknown or was never read.
+        Raises DataError if the channel is unknown or was never read.
         """
         name = channel or self.reference
         if name not in self._polygons:
@@ -109,14 +109,14 @@ class History:
 
 
 def _lay_polygon(times: Array, readings: Array, frames: Array) -> Polygon:
-    """Put knots at the valid readings; carry the ends on along the outer edges, one edge far."""
+    """Lay knots at the valid readings; extrapolate the outer edges by at most their own length."""
     from scipy.sparse import csr_array
 
     rows = np.flatnonzero(np.isfinite(readings) & np.isfinite(times))
     if not len(rows):
         raise DataError("the temperature was never read: every reading of the column is empty")
     rows = rows[np.argsort(times[rows], kind="stable")]
-    # of several readings with one time stamp the last one counts
+    # of several readings with the same time stamp, the last one counts
     rows = rows[np.append(np.diff(times[rows]) > 0, True)]
     t, n = times[rows], len(rows)
     begin, end = frames.min(initial=t[0]), frames.max(initial=t[-1])
@@ -140,11 +140,11 @@ def _lay_polygon(times: Array, readings: Array, frames: Array) -> Polygon:
 
 
 Follower = Callable[[float, float], float]
-"""An operator that keeps its state: takes the next knot, s and °C, and returns its value there."""
+"""An operator with a state: it takes the next knot, s and °C, and returns its value there."""
 
 
 def follow_lag(tau: float) -> Follower:
-    """`operators.lag` with a time constant s."""
+    """Return a follower of `operators.lag`, with a time constant s."""
     last = before = state = math.nan
 
     def push(time: float, value: float) -> float:
@@ -162,7 +162,7 @@ def follow_lag(tau: float) -> Follower:
 
 
 def follow_play(half_width: float) -> Follower:
-    """`operators.play` with a half-width K."""
+    """Return a follower of `operators.play`, with a half-width K."""
     state = math.nan
 
     def push(_: float, value: float) -> float:
@@ -176,7 +176,7 @@ def follow_play(half_width: float) -> Follower:
 
 
 def follow_delay(d: float) -> Follower:
-    """The value d s ago; with a negative delay the present one, as nobody knows more."""
+    """Return a follower of a delay d s; if it is negative, the present value is the best known."""
     knots: deque[tuple[float, float]] = deque()
 
     def push(time: float, value: float) -> float:

@@ -1,17 +1,18 @@
-"""The thermal model of one camera: interior orientation as a function of the temperature history.
+"""The thermal model of a camera: its interior orientation as a function of temperature history.
 
 The base model is linear: the interior orientation at the reference temperature T₀ plus rates times
-(T - T₀), T at the frame's time. Effects of the catalogue are added to it; those of kind `drive`
+(T - T₀), with T at the frame's time. Effects of the catalogue are added; those of kind `drive`
 replace the T of the linear terms, one after the other in the order of the list.
 
-While the principal distance changes, the distortion does too. A lens that moves along its axis
-keeps its rays' angles: with r = c tan θ the displacement x̄ A_i r^(2i) is c times a function of the
-angle only where A_i c^(2i) and B c are constant, so that
+With the principal distance, the distortion changes too. A lens that moves along its axis keeps the
+angles of its rays. With r = c tan θ, the displacement x̄ A_i r^(2i) is c times a function of the
+angle alone if A_i c^(2i) and B c are constant, so that
 
     A_i(t) = A_i (c₀ / c(t))^(2i),    B_i(t) = B_i c₀ / c(t),
 
-as OpenCV's k_i and p_i have it; C1 and C2 are such functions already. The other basis keeps A and B
-as functions of the image in mm. Linear values are those at c₀: of `angle` they are carried to c.
+like OpenCV's k_i and p_i; C1 and C2 are such functions already. In the other basis, A and B stay
+functions of the place in the image, in mm. Linear values refer to c₀; with the basis `angle` they
+are converted to c.
 """
 
 from __future__ import annotations
@@ -45,21 +46,21 @@ if TYPE_CHECKING:
 Distortion = Literal["angle", "image"]
 BASES: tuple[Distortion, ...] = ("angle", "image")
 
-SURE = 3.0  # standard deviations: an angle that holds is denied in 0.1 % of all series
+SURE = 3.0  # standard deviations: a true `angle` is rejected in 0.1 % of all series
 
 _POWERS = np.array([0, 0, 0, 2, 4, 6, 1, 1, 0, 0])  # of c, in the order of IOP_NAMES
 
 
 def follow_angle(linear: Array, c0: float) -> Array:
-    """Return interior orientations (…, 10) whose distortion keeps the angles it has at c0 mm."""
+    """Return interior orientations (…, 10) whose distortion, valid at c0 mm, follows the angle."""
     out: Array = linear * (c0 / linear[..., :1]) ** _POWERS
     return out
 
 
 def angle_derivatives(linear: Array, c0: float, J: Array, by_c0: int | None = None) -> Array:
-    """Carry ∂ linear / ∂ unknowns (…, 10, p) to the orientations of `follow_angle`.
+    """Propagate ∂ linear / ∂ unknowns (…, 10, p) to the orientations of `follow_angle`.
 
-    by_c0: the unknown that is c0 itself, if any.
+    by_c0: index of the unknown that is c0 itself, if any.
     """
     carried = follow_angle(linear, c0)
     factors = carried * _POWERS
@@ -71,35 +72,35 @@ def angle_derivatives(linear: Array, c0: float, J: Array, by_c0: int | None = No
 
 
 def distortion_along(iop: Array) -> Array:
-    """Return ∂ interior orientation / ∂ linear one (10, 10) at its c₀: c takes A and B along."""
+    """Return ∂ interior orientation / ∂ linear one (10, 10) at its c₀, where c changes A and B."""
     out = np.eye(10)
     out[:, 0] -= _POWERS * iop / iop[0]
     return out
 
 
 def choose_basis(left: Mapping[Distortion, float]) -> tuple[Distortion, float]:
-    """Return what the distortion follows, of the sums of squares that are left with either, and by
-    how many standard deviations the data say so.
+    """Choose the distortion's basis by the sum of squares left with each; return it and its sigmas.
 
-    The angle, unless the data deny it by 3 of them: where they cannot tell, the cameras that are
-    known keep their angles.
+    The choice is the angle unless the data reject it by 3 standard deviations: if they do not
+    decide, the angle is what known cameras keep.
     """
     better = left["image"] - left["angle"]
     sigmas = float(np.sign(better) * np.sqrt(abs(better)))
     return ("image", -sigmas) if sigmas < -SURE else ("angle", sigmas)
 
 
-_LEFT_OVER = 1.5  # times the noise: what an untested model may leave and state a band
+_LEFT_OVER = 1.5  # times the noise: up to this misfit, an untested model's sds are stated
 
 RATED = ("c", "x0", "y0")
-"""The parameters that are linear in temperature in every model."""
+"""The parameters that are linear in the temperature in every model."""
 
 
 @dataclass(frozen=True)
 class ModelEffect:
-    """An effect in a model: its name, parameter values, and their standard deviations.
+    """An effect in a model.
 
-    values: {parameter: number, or text for a channel, or names of targets}; sds: where known.
+    values: {parameter: a number, the name of a channel, or names of targets}; sds: standard
+    deviations, where known.
     """
 
     name: str
@@ -112,16 +113,15 @@ class ModelEffect:
 
 @dataclass(frozen=True)
 class ThermalModel:
-    """One camera's thermal model; immutable, written to and read from YAML by `model_file`.
+    """A camera's thermal model; immutable; `model_file` reads and writes it as YAML.
 
     camera: its name; interior: at T0 °C; rates: {parameter of RATED: mm/K}; sds: standard
-    deviations of `interior.c`, `rates.c`, … (those of effects stand with them); covariance_names,
-    covariance: the full matrix where the model was fitted (`interior.c`, `thermal_lag.tau`, …), or
-    () and None;
-    distortion: what it follows while c changes, the `angle` or the place in the `image`;
-    image_sigma: px, of one coordinate of an image point; exterior: of the set-up, or None;
-    validity: {channel: (low, high)} °C that it was fitted on; fitted_on: what it was fitted on,
-    free mappings; evidence: free text and numbers, e.g. of a discovery.
+    deviations of `interior.c`, `rates.c`, … (effects hold their own); covariance_names, covariance:
+    the full matrix of a fitted model (`interior.c`, `thermal_lag.tau`, …), else () and None;
+    distortion: whether it follows the `angle` or the place in the `image` while c changes;
+    image_sigma: px, of an image coordinate; exterior: of the set-up, or None; validity: {channel:
+    (low, high)} °C of the data; fitted_on: the data, as free mappings; evidence: free text and
+    numbers, e.g. of a discovery.
     """
 
     camera: str
@@ -159,40 +159,38 @@ class ThermalModel:
 
     @property
     def drives(self) -> list[tuple[str, Mapping[str, Any]]]:
-        """The effects that replace T, in their order, with their values."""
+        """The effects that replace T, in order, with their values."""
         return [(e.name, e.values) for e in self.effects if catalogue.get(e.name).is_drive]
 
     def drive(self, history: History) -> Array:
-        """Return the temperature (E,) °C behind the linear terms: T through all drives of the
-        model.
-        """
+        """Return the temperature (E,) °C in the linear terms: T passed through all drives."""
         return drive(history, self.drives)
 
     def predict(self, history: History, test_field: TestField | None = None) -> Prediction:
-        """Return everything the model says of the history's times.
+        """Return the model's prediction for the history's times.
 
-        Raises DataError where a temperature column is missing, ConfigurationError where the test
-        field lacks a target that an effect names.
+        Raises DataError if a temperature column is missing, ConfigurationError if the test field
+        lacks a target that an effect names.
         """
         history = replace(history, T0=self.T0)
-        found = Prediction.none(len(history.times), test_field)
+        prediction = Prediction.none(len(history.times), test_field)
         for effect in self.effects:
-            catalogue.get(effect.name).influence(history, effect.values, found)
-        found.drive = self.drive(history)
-        linear = self.interior.as_array() + (found.drive - self.T0)[:, None] * self.rate_vector
-        found.iop = self.carried(linear + found.iop)
+            catalogue.get(effect.name).influence(history, effect.values, prediction)
+        prediction.drive = self.drive(history)
+        linear = self.interior.as_array() + (prediction.drive - self.T0)[:, None] * self.rate_vector
+        prediction.iop = self.carried(linear + prediction.iop)
         if self.exterior:
-            found.eop += self.exterior.as_array()
-        return found
+            prediction.eop += self.exterior.as_array()
+        return prediction
 
     def carried(self, linear: Array) -> Array:
-        """Return the interior orientations (…, 10) of those that rates and effects add up to."""
+        """Return the interior orientations (…, 10) for linear ones, in the distortion's basis."""
         return follow_angle(linear, self.interior.c) if self.distortion == "angle" else linear
 
     def carried_derivatives(self, linear: Array, J: Array, names: Sequence[str] = ()) -> Array:
-        """Return ∂ interior orientation / ∂ unknowns (…, 10, p) of those of the linear ones.
+        """Return ∂ interior orientation / ∂ unknowns (…, 10, p), given J = ∂ linear / ∂ unknowns.
 
-        names: of the unknowns, where `interior.c` may be among them.
+        names: of the unknowns, if `interior.c` may be among them.
         """
         if self.distortion == "image":
             return J
@@ -200,26 +198,27 @@ class ThermalModel:
         return angle_derivatives(linear, self.interior.c, J, place)
 
     def with_effect(self, effect: ModelEffect) -> ThermalModel:
-        """Return the next version of the model, with one effect more."""
+        """Return the next version of the model, with a further effect."""
         return replace(self, effects=(*self.effects, effect), version=self.version + 1)
 
     def without(self, *names: str) -> ThermalModel:
-        """Return the next version of the model, without some of its effects."""
+        """Return the next version of the model, without the named effects."""
         kept = tuple(e for e in self.effects if e.name not in names)
         return replace(self, effects=kept, version=self.version + 1)
 
     @property
     def misses_an_effect(self) -> bool:
-        """Whether its fit found that an effect is missing, or could not be tested and left more
-        than noise; then its numbers hold no band.
+        """Whether the fit found that an effect is missing; the standard deviations are then void.
+
+        A fit that could not be tested counts if it left more than noise.
         """
-        found = self.evidence.get("fit") or {}
-        if found.get("effect_missing", False) is None:
-            return bool(found.get("left_over_in_noise", 1.0) > _LEFT_OVER)
-        return bool(found.get("effect_missing", False))
+        fit = self.evidence.get("fit") or {}
+        if fit.get("effect_missing", False) is None:
+            return bool(fit.get("left_over_in_noise", 1.0) > _LEFT_OVER)
+        return bool(fit.get("effect_missing", False))
 
     def parameter_names(self) -> tuple[str, ...]:
-        """List the names of all numbers, as `sds` and `covariance_names` use them."""
+        """Return the names of all numbers, as in `sds` and `covariance_names`."""
         numbers = [f"interior.{n}" for n in IOP_NAMES] + [f"rates.{n}" for n in RATED]
         if self.exterior is not None:
             numbers += [f"exterior.{n}" for n in EOP_NAMES]
@@ -232,8 +231,8 @@ class ThermalModel:
         return tuple(numbers)
 
     def value(self, name: str) -> float:
-        """Return one of its numbers, called as in `parameter_names`."""
-        group, key = name.split(".", 1)
+        """Return a number by its name in `parameter_names`; not of the exterior orientation."""
+        group, key = name.rsplit(".", 1)  # a formula may hold dots
         if group == "interior":
             return float(getattr(self.interior, key))
         if group == "rates":
@@ -241,17 +240,17 @@ class ThermalModel:
         return float(next(e for e in self.effects if e.name == group).values[key])
 
     def sd(self, name: str) -> float:
-        """Return the standard deviation of one of its numbers, 0 where none is known."""
-        group, key = name.split(".", 1)
+        """Return the standard deviation of a number by its name, 0 if unknown."""
+        group, key = name.rsplit(".", 1)
         if group in ("interior", "rates"):
             return float(self.sds.get(name, 0.0))
         return float(next(e for e in self.effects if e.name == group).sds.get(key, 0.0))
 
     def with_values(self, numbers: Mapping[str, float]) -> ThermalModel:
-        """Return the model with other values of some numbers of rates and effects."""
+        """Return the model with other values for some rates and effects' parameters."""
         own: dict[str, dict[str, float]] = {}
         for name, value in numbers.items():
-            group, key = name.split(".", 1)
+            group, key = name.rsplit(".", 1)
             own.setdefault(group, {})[key] = value
         effects = tuple(
             replace(e, values={**e.values, **own[e.name]}) if e.name in own else e
@@ -260,11 +259,11 @@ class ThermalModel:
         return replace(self, rates={**self.rates, **own.get("rates", {})}, effects=effects)
 
     def covariance_of(self, names: Sequence[str]) -> Array:
-        """Return the covariance (k, k) of some numbers, from their sds where there is no matrix."""
-        if self.covariance is None or not set(names) & set(self.covariance_names):
-            return np.diag([self.sd(name) ** 2 for name in names])
-        place = {name: i for i, name in enumerate(self.covariance_names)}
-        rows = np.array([place.get(name, -1) for name in names])
-        known = rows >= 0
-        full = np.array(self.covariance)[np.ix_(rows, rows)]
-        return np.where(np.outer(known, known), full, 0.0)
+        """Return the covariance (k, k) of some numbers; those outside the matrix have their sds."""
+        place = {name: i for i, name in enumerate(self.covariance_names) if self.covariance}
+        out = np.diag([0.0 if name in place else self.sd(name) ** 2 for name in names])
+        known = [i for i, name in enumerate(names) if name in place]
+        if known:
+            rows = [place[names[i]] for i in known]
+            out[np.ix_(known, known)] = np.array(self.covariance)[np.ix_(rows, rows)]
+        return out

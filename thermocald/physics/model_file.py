@@ -1,33 +1,35 @@
-"""The YAML file of a thermal model: readable by hand, every number with its unit.
+"""The YAML file of a thermal model, in which every number has its unit; and files of effects.
 
-format: thermocald-model/1
-name: my camera
-version: 2                                   # goes up with every change
-camera: {name: rpi-v2.1, width: 3280, height: 2464, pixel_pitch: 0.00112}     # px, px, mm
-reference_temperature: {value: 25.0, unit: degC}                              # T₀
-interior:                                    # at T₀
-c: {value: 3.04, sd: 0.0002, unit: mm}
-distortion: angle                            # or image: what A and B follow while c changes
-rates:                                       # the base model
-x0: {value: -0.0004, sd: 2.0e-06, unit: mm/K}
-effects:                                     # names and parameters of the catalogue
-- effect: thermal_lag
-parameters: {tau: {value: 84.0, sd: 1.9, unit: s}}
-exterior: {X0: {value: 600.0, unit: mm}, …}  # optional: the set-up
-image_sigma: {value: 0.04, unit: px}
-validity: {temperature: [21.0, 52.0]}        # °C it was fitted on
-fitted_on: […]
-covariance: {parameters: [interior.c, …], matrix: [[…], …]}                   # optional
+The model file:
 
-Effects in files: entries of a model file, and files of their own, such as a proposal.
+    format: thermocald-model/1
+    name: my camera
+    version: 2                                   # increases with every change
+    camera: {name: rpi-v2.1, width: 3280, height: 2464, pixel_pitch: 0.00112}     # px, px, mm
+    reference_temperature: {value: 25.0, unit: degC}                              # T₀
+    interior:                                    # at T₀
+      c: {value: 3.04, sd: 0.0002, unit: mm}
+    distortion: angle                            # or image: what A and B follow while c changes
+    rates:                                       # of the base model
+      x0: {value: -0.0004, sd: 2.0e-06, unit: mm/K}
+    effects:                                     # names and parameters of the catalogue
+    - effect: thermal_lag
+      parameters: {tau: {value: 84.0, sd: 1.9, unit: s}}
+    exterior: {X0: {value: 600.0, unit: mm}, …}  # of the set-up; optional
+    image_sigma: {value: 0.04, unit: px}
+    validity: {temperature: [21.0, 52.0]}        # °C, of the data
+    fitted_on: […]
+    covariance: {parameters: [interior.c, …], matrix: [[…], …]}                   # optional
 
-format: thermocald-effect/1
-statement: x0 follows ∫ (T − 30.2 °C)₊ dt    # for people
-effects:                                     # as in a model file
-- effect: integral(above(temperature, k))    # a name of the catalogue, or a formula
-  parameters: {k: {value: 30.2, sd: 0.1, unit: degC}, x0: {value: 1.1e-06, unit: mm/(K s)}}
+Effects are entries of a model file, or have a file of their own, such as a proposal:
 
-A formula is plain text that is read and never executed.
+    format: thermocald-effect/1
+    statement: x0 follows ∫ (T − 30.2 °C)₊ dt    # for people
+    effects:                                     # as in a model file
+    - effect: integral(above(temperature, k))    # a name of the catalogue, or a formula
+      parameters: {k: {value: 30.2, sd: 0.1, unit: degC}, x0: {value: 1.1e-06, unit: mm/(K s)}}
+
+A formula is plain text that is parsed and never executed.
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ EFFECT_FORMAT = "thermocald-effect/1"
 
 
 def read_effects(path: Path) -> list[ModelEffect]:
-    """Read the effects of an effect file; ConfigurationError names file and key."""
+    """Read the effects of an effect file; ConfigurationError names the file and the key."""
     top = QuantityReader(path, read_yaml(path))
     top.require_format(EFFECT_FORMAT, "an effect file is")
     top.only(("format", "statement", "effects", "evidence"))
@@ -72,7 +74,7 @@ def read_effects(path: Path) -> list[ModelEffect]:
 def write_effects(
     path: Path, found: Sequence[ModelEffect], statement: str, evidence: Mapping[str, Any]
 ) -> None:
-    """Write an effect file, as a whole or not at all."""
+    """Write an effect file, completely or not at all."""
     document = {
         "format": EFFECT_FORMAT,
         "statement": statement,
@@ -83,7 +85,7 @@ def write_effects(
 
 
 def effect_of(reader: QuantityReader) -> ModelEffect:
-    """Read one entry of a list of effects; ConfigurationError names file and key."""
+    """Read one entry of a list of effects; ConfigurationError names the file and the key."""
     reader.only(("effect", "parameters", "evidence"))
     name = reader.text("effect")
     try:
@@ -110,7 +112,7 @@ def effect_of(reader: QuantityReader) -> ModelEffect:
 
 
 def effect_document(effect: ModelEffect) -> dict[str, Any]:
-    """Return the mapping that a file holds for an effect."""
+    """Return an effect's mapping for a file."""
     units = catalogue.get(effect.name).units()
     parameters = {
         key: list(value) if isinstance(value, tuple | list)
@@ -130,17 +132,17 @@ _KEYS = (
 
 
 def read_model(path: Path) -> ThermalModel:
-    """Read a model file; ConfigurationError names file and key."""
+    """Read a model file; ConfigurationError names the file and the key."""
     return parse_model(read_yaml(path), path)
 
 
 def write_model(path: Path, model: ThermalModel) -> None:
-    """Write a model file, as a whole or not at all."""
+    """Write a model file, completely or not at all."""
     write_text(path, dump_yaml(model_document(model)))
 
 
 def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> ThermalModel:
-    """Read the model in a file's mapping; `path` is for the messages."""
+    """Read a model from a file's mapping; `path` is for messages."""
     top = QuantityReader(path, document)
     top.require_format(MODEL_FORMAT)
     top.only(_KEYS)
@@ -167,10 +169,10 @@ def parse_model(document: Mapping[str, Any], path: Path | str = "model") -> Ther
         if exterior and name not in exterior:
             raise top.fail(f"exterior.{name}", "is missing")
     rates = group("rates", RATED, "/K")
-    said = top.text("distortion", BASES[0])
-    distortion = next((basis for basis in BASES if basis == said), None)
+    given = top.text("distortion", BASES[0])
+    distortion = next((basis for basis in BASES if basis == given), None)
     if distortion is None:
-        raise top.fail("distortion", f"is {said[:40]!r}; it follows the {' or the '.join(BASES)}")
+        raise top.fail("distortion", f"is {given[:40]!r}; it must be {' or '.join(BASES)}")
     names, matrix = _read_covariance(top)
     return ThermalModel(
         camera=camera.text("name", "camera"),
@@ -227,7 +229,7 @@ def _read_validity(top: QuantityReader) -> dict[str, tuple[float, float]]:
 
 
 def model_document(model: ThermalModel) -> dict[str, Any]:
-    """Return the mapping that a model file holds."""
+    """Return a model's mapping for a file."""
 
     def numbers(key: str, values: Mapping[str, float], per: str = "") -> dict[str, Any]:
         return {

@@ -1,11 +1,11 @@
-"""Operators on a temperature polygon, and the table of those that formulas are made of.
+"""Operators on a temperature polygon, and the table of the operators in formulas.
 
-Every operator is exact for a polygon, works on whole vectors, and comes with the matrix of its
-derivatives by the values at the knots, so that a thermometer's error can be carried through it.
-Knots are (K,) s ascending, values (K,) °C, `at` (E,) s; beyond the ends the values are held.
+Every operator is exact for a polygon, works on whole vectors, and has the matrix of its derivatives
+with respect to the values at the knots, to propagate a thermometer's error. Knots are (K,) s
+ascending, values (K,) °C, `at` (E,) s; beyond the ends, values are constant.
 
-The operators of formulas are of two kinds. Pointwise operators take values at one time; those with
-memory take a polygon of values and give it back at any times:
+The operators in formulas are of two kinds. Pointwise operators take values at one time; operators
+with memory take a polygon of values and return values at any times:
 
     offset(x, a)          x - a
     above(x, k)           max(x - k, 0)
@@ -21,9 +21,9 @@ memory take a polygon of values and give it back at any times:
     integral(x)           ∫ x dt from the first frame, s
     lag(x, tau)           first-order lag
     play(x, r)            backlash of half-width r
-    change(x)             x less what it was at the first frame
+    change(x)             x minus its value at the first frame
     maximum(x), minimum(x)   the highest, the lowest value so far
-    peak(x, tau)          the highest value so far, which fades towards x with a time constant
+    peak(x, tau)          the highest value so far, which decays towards x with a time constant
 """
 
 from __future__ import annotations
@@ -41,14 +41,11 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-# Weights of a lag below this share of the reading's own are left out of its matrix.
-_LAG_CUT = 14.0
+_LAG_CUT = 14.0  # time constants after which a reading's weight in a lag is left out
 
 
 def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Find left knot, right knot, and share of the right one, at times (E,); held beyond the
-    ends.
-    """
+    """Return the left knot, the right knot and the right one's share at times (E,)."""
     last = len(knots) - 1
     left = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, max(last - 1, 0))
     right = np.minimum(left + 1, last)
@@ -57,8 +54,8 @@ def _edges(knots: Array, at: Array) -> tuple[NDArray[np.int64], NDArray[np.int64
     return left, right, share
 
 
-def _input(knots: Array, values: Array, at: Array) -> tuple[NDArray[np.int64], Array]:
-    """Find the left knot of times, and the polygon's value there, (E,) both."""
+def _interpolate(knots: Array, values: Array, at: Array) -> tuple[NDArray[np.int64], Array]:
+    """Return the left knot and the polygon's value at times (E,), both (E,)."""
     left, right, share = _edges(knots, at)
     return left, values[left] * (1.0 - share) + values[right] * share
 
@@ -70,7 +67,7 @@ def interpolation_matrix(
 ) -> csr_array:
     """Return the matrix (E, K) that interpolates knots (K,) linearly at times (E,).
 
-    held: which times (E,) have the value of a former knot instead, and of which (E,).
+    held: the times (E,) that have an earlier knot's value instead, and that knot (E,).
     """
     from scipy.sparse import csr_array
 
@@ -88,7 +85,7 @@ def interpolation_matrix(
 
 
 def _lag_weights(knots: Array, tau: float) -> tuple[Array, Array, Array]:
-    """Return decay a, weight of the old and of the new value over each edge, (K-1,) each.
+    """Return each edge's decay a and the weights of its old and new value, (K-1,) each.
 
     L₊ = a L + (g - a) T + (1 - g) T₊ with a = exp(-h/τ), g = (1 - a) τ/h: the exact response of
     τ L' = T - L to a straight line.
@@ -110,7 +107,7 @@ def decayed_sums(kept: Array, driven: Array) -> Array:
 
 
 def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
-    """Send a polygon through a first-order lag `tau` L' = T - L, L = T at the first knot.
+    """Pass a polygon through a first-order lag: `tau` L' = T - L, L = T at the first knot.
 
     knots (K,) s, values (K,) or (K, m), at (E,) s; returns (E,) or (E, m).
     """
@@ -137,7 +134,7 @@ def lag(knots: Array, values: Array, tau: float, at: Array) -> Array:
 
 
 def lag_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:  # noqa: ARG001
-    """Return the matrix (E, K) of `lag`; weights older than 14 tau are left out (below 1e-6)."""
+    """Return the matrix (E, K) of `lag`, without weights older than 14 tau (below 1e-6)."""
     from scipy.sparse import csr_array
 
     n = len(knots)
@@ -176,17 +173,17 @@ def lag_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:
 
 
 def play(knots: Array, values: Array, half_width: float, at: Array) -> Array:
-    """Send a polygon through a play: the output rests until the input is `half_width` away.
+    """Pass a polygon through a play: the output rests until the input is `half_width` away.
 
     P = min(max(P, T - r), T + r), P = T at the first knot. knots, values (K,), at (E,); (E,).
     Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis.
     """
-    left, now = _input(knots, values, at)
+    left, now = _interpolate(knots, values, at)
     return np.clip(_play_states(values, half_width)[left], now - half_width, now + half_width)
 
 
 def _play_states(values: Array, half_width: float) -> Array:
-    """Compute the states at the knots by a prefix scan: clipping after clipping is clipping."""
+    """Compute the states at the knots by a prefix scan, as two clippings in turn are one."""
     low, high = values - half_width, values + half_width
     low[0] = high[0] = values[0]
     step = 1
@@ -198,7 +195,7 @@ def _play_states(values: Array, half_width: float) -> Array:
 
 
 def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> csr_array:
-    """Return ∂ play / ∂ values (E, K): each output depends on the reading that moved it last."""
+    """Return ∂ play / ∂ values (E, K): an output depends on the reading that last moved it."""
     moving, source, _ = _play_moves(knots, values, half_width, at)
     return interpolation_matrix(knots, at, (~moving, source))
 
@@ -206,24 +203,26 @@ def play_matrix(knots: Array, values: Array, half_width: float, at: Array) -> cs
 def _play_moves(
     knots: Array, values: Array, half_width: float, at: Array
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
-    """Whether the play moves since the knot before each time (E,), the knot that moved it last
-    until then (E,), and whether the time is that very knot (E,).
+    """Find how the play moves at times (E,).
+
+    Returns whether it moves between the previous knot and the time, the knot that last moved it
+    before, and whether the time is this very knot, (E,) each.
     """
     states = _play_states(values, half_width)
     moved = np.append(True, states[1:] != states[:-1])
     source = np.maximum.accumulate(np.where(moved, np.arange(len(values)), 0))
-    left, now = _input(knots, values, at)
+    left, now = _interpolate(knots, values, at)
     moving = (states[left] < now - half_width) | (states[left] > now + half_width)
     return moving, source[left], (at == knots[left]) & moved[left]
 
 
 def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDArray[np.bool_]:
-    """Find where the play rests after a turn and is near either end of that rest, (E,).
+    """Find the times (E,) near either end of a rest of the play after a turn.
 
-    Which reading was the highest, and when the play is used up, is not sure there.
+    There it is uncertain which reading was the extreme, and when the play is used up.
     """
     moving, source, just_moved = _play_moves(knots, values, half_width, at)
-    resting = ~moving & ~just_moved & (source > 0)  # at the start it has not turned
+    resting = ~moving & ~just_moved & (source > 0)  # a rest at the start follows no turn
     near = np.zeros(len(at), dtype=bool)
     begins = np.flatnonzero(np.diff(resting.astype(int), prepend=0) > 0)
     ends = np.flatnonzero(np.diff(resting.astype(int), append=0) < 0)
@@ -235,24 +234,24 @@ def play_turns(knots: Array, values: Array, half_width: float, at: Array) -> NDA
 
 def running_maximum(knots: Array, values: Array, at: Array) -> Array:
     """Return the highest value from the first knot to each time, (E,)."""
-    left, now = _input(knots, values, at)
+    left, now = _interpolate(knots, values, at)
     return np.asarray(np.maximum(np.maximum.accumulate(values)[left], now))
 
 
 def running_maximum_matrix(knots: Array, values: Array, at: Array) -> csr_array:
-    """Return ∂ running_maximum / ∂ values (E, K): by the highest reading so far."""
+    """Return ∂ running_maximum / ∂ values (E, K): it depends on the highest reading so far."""
     highest = np.maximum.accumulate(values)
     risen = np.append(True, values[1:] > highest[:-1])
     source = np.maximum.accumulate(np.where(risen, np.arange(len(values)), 0))
-    left, now = _input(knots, values, at)
+    left, now = _interpolate(knots, values, at)
     return interpolation_matrix(knots, at, (now <= highest[left], source[left]))
 
 
 def slope_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: ARG001
     """Return the matrix (E, K) of the rate dT/dt at times (E,).
 
-    At the knots the slope of the parabola through three neighbours (second order, also for uneven
-    steps; one-sided at the ends), linear in between.
+    At a knot, it is the slope of the parabola through three neighbours (second order, for uneven
+    steps too; one-sided at the ends); between knots it is linear.
     """
     from scipy.sparse import csr_array
 
@@ -262,7 +261,7 @@ def slope_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: 
     if n == 2:
         h = knots[1] - knots[0]
         return csr_array(np.tile([-1.0 / h, 1.0 / h], (len(at), 1)))
-    # each row has three neighbours: NumPy's derivatives of combs that hold every third knot
+    # a row has weights on three neighbours: NumPy's derivatives of combs, 1 at every third knot
     combs = (np.arange(n)[:, None] % 3 == np.arange(3)).astype(float)
     columns = np.clip(np.arange(n) - 1, 0, n - 3)[:, None] + np.arange(3)
     weights = np.take_along_axis(np.gradient(combs, knots, axis=0, edge_order=2), columns % 3, 1)
@@ -271,16 +270,17 @@ def slope_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa: 
 
 
 Role = Literal["threshold", "width", "time_constant", "exponent", "phase", "scale"]
-# knots beyond which the error of a single reading in an integral is left out: it is below 1/√1500
-# of the sum's, and its matrix is full
+# knots above which an integral's matrix, which is full, is left out: the readings' errors average
+# out to below 1/√1500
 _LONG = 1500
 
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A constant of an operator: its usual name, what it means, and whether it is above 0.
+    """A constant of an operator.
 
-    same_unit: it has the unit of what the operator is applied to.
+    name: the usual one; role: its meaning; positive: whether it is above 0; same_unit: whether it
+    has the unit of the operator's input.
     """
 
     name: str
@@ -291,13 +291,15 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """One operator.
+    """An operator of formulas.
 
-    inputs: how many; constants: in order; powers: exponent of the input's unit in the result's (0:
-    a pure number), seconds: exponent of s that is multiplied; keeps: the result is a value of
-    the input's own kind (°C stays °C); remembers: it depends on the past. value, derivatives: of
-    pointwise ones (inputs…, constants…) → values, partial derivatives by each input; of those with
-    memory (knots, values, constants, times) → values at the times, ∂ by the values at the knots.
+    inputs: their number; constants: in order; words: its text, with inputs and constants as fields;
+    value, derivatives: of a pointwise operator (inputs…, constants…) → values, partial derivatives
+    with respect to each input; of one with memory (knots, values, constants…, times) → values at
+    the times, derivatives with respect to the values at the knots; remembers: whether it has a
+    memory; powers: exponent of the input's unit in the result's (0: a pure number); seconds:
+    exponent of s as a further factor; keeps: whether the result is of the input's kind (°C remains
+    °C).
     """
 
     inputs: int
@@ -352,7 +354,9 @@ def _change_matrix(knots: Array, values: Array, at: Array) -> csr_array:  # noqa
 
 
 def _peak(knots: Array, values: Array, tau: float, at: Array) -> Array:
-    """Source: the diode and leaky capacitor of a peak detector (Horowitz, Hill (2015): The Art of
+    """Return the highest value so far, which decays towards the input with a time constant.
+
+    Source: the diode and leaky capacitor of a peak detector (Horowitz, Hill (2015): The Art of
     Electronics, 3rd ed., section 4.5.1).
     """
     decay = np.exp(-np.diff(knots) / tau)
@@ -366,7 +370,7 @@ def _peak(knots: Array, values: Array, tau: float, at: Array) -> Array:
 
 
 def _peak_matrix(knots: Array, values: Array, tau: float, at: Array) -> csr_array:
-    """Return ∂ peak / ∂ values: of the input where it leads, of a lag since the peak elsewhere."""
+    """Return ∂ peak / ∂ values: 1 where the input is the peak, else a lag's since the peak."""
     from scipy.sparse import csr_array
 
     n = len(knots)
@@ -403,7 +407,7 @@ OPERATORS: dict[str, Operator] = {
     "power": Operator(
         1, (Constant("p", "exponent", True, same_unit=False),), "[{0}]^({1})",
         lambda x, p: np.asarray(np.maximum(x, 0.0) ** p),
-        # a root is vertical at its foot: held where the reading's error ends
+        # a root is vertical at 0: its slope is limited to that at a reading's error
         lambda x, p: (p * np.maximum(x, 1e-2) ** (p - 1.0) * (x > 0),), powers=0,
     ),
     "square": Operator(1, (), "[{0}]²", lambda x: np.asarray(x**2), lambda x: (2.0 * x,),

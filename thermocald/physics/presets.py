@@ -1,21 +1,21 @@
 """Presets: the cameras of the reference study, with the drift that it reports.
 
 Elias, Eltner, Liebold, Maas (2020): Assessing the Influence of Temperature Changes on the Geometric
-Stability of Smartphone- and Raspberry Pi Cameras, Sensors 20, 643, sections 4.1 and 4.2. What the
-text states is put in: size and direction of the drift of principal point and principal distance
-between the first and the last of 150 epochs (the RPi: at the highest temperature), σ0 growing to
-3.5 times, the RPi's way back that is not complete. The rates per kelvin follow from that and from
-the course of the temperature. What it does not state is of usual size: temperatures, distortion
-(its drift is small, as the text says), image noise, and the proportion of x to y in the drift.
+Stability of Smartphone- and Raspberry Pi Cameras, Sensors 20, 643, sections 4.1 and 4.2. Taken from
+the text: size and direction of the drift of principal point and principal distance between the
+first and the last of 150 epochs (the RPi: at the highest temperature), the growth of σ0 to 3.5
+times, and the RPi's incomplete return. The rates per kelvin follow from these and from the course
+of the temperature. Assumed, with usual sizes: temperatures, distortion (its drift is small,
+according to the text), image noise, and the ratio of x to y in the drift.
 
 Sensor and lens data:
 
 * RPi camera v2.1: Raspberry Pi documentation, camera, hardware specification: IMX219,
   3280 × 2464 px of 1.12 µm, focal length 3.04 mm, f/2.0.
 * LG Google Nexus 5: sensor Sony IMX179 (1/3.2 inch, 3264 × 2448 px of 1.4 µm), f/2.4; focal length
-  3.97 mm as the phone writes it into EXIF.
+  3.97 mm according to the phone's EXIF.
 * Samsung Galaxy S8: sensor Sony IMX333 or Samsung S5K2L2 (1/2.55 inch, 4032 × 3024 px of 1.4 µm),
-  f/1.7; focal length 4.2 mm as the phone writes it into EXIF.
+  f/1.7; focal length 4.2 mm according to the phone's EXIF.
 """
 
 from __future__ import annotations
@@ -59,13 +59,14 @@ _HEATED_S = 750.0  # the RPi's lamp is on for the first half
 
 @dataclass(frozen=True)
 class Preset:
-    """One camera in one state, as the reference reports it.
+    """A camera in one state, as reported by the reference study.
 
-    interior at T0; drift_px, drift_c_mm: of principal point and principal distance over the whole
-    warming; direction_deg: of the principal point's way, in the image (x right, y up); begin_degc,
+    interior: at T0; drift_px, drift_c_mm: of principal point and principal distance over the whole
+    warming; direction_deg: of the principal point's drift in the image (x right, y up); begin_degc,
     end_degc: temperature at power-on and in equilibrium; noise_ratio: σ0 at the highest temperature
-    over σ0 at the start; set_share: share of the principal point's way that does not come back;
-    lamp: heated from outside, then left to cool; distortion_drift: A1, B1, B2 over the warming.
+    over σ0 at the start; set_share: share of the principal point's drift that remains; lamp:
+    whether it is heated from outside and then left to cool; distortion_drift: of A1, B1, B2 over
+    the warming.
     """
 
     name: str
@@ -130,11 +131,11 @@ PRESETS: Mapping[str, Preset] = {
         ),
     )
 }  # fmt: skip
-"""The presets by name."""
+"""The presets, by name."""
 
 
-def _device(preset: Preset) -> CameraDevice:
-    """Return a module close to a body that gives its heat to the air: 63 % of the way in 300 s."""
+def _make_device(preset: Preset) -> CameraDevice:
+    """Return a camera module in a housing that cools in air: 63 % of the change in 300 s."""
     loss = 0.2375
     network = HeatNetwork(
         {"board": 15.0, "housing": 52.0, "lens": 0.8, "sensor": 0.4},
@@ -148,7 +149,7 @@ def _device(preset: Preset) -> CameraDevice:
     return CameraDevice(preset.camera, preset.sensor, network, distance=preset.distance_mm)
 
 
-def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
+def _make_programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
     (loss,) = (g for _, second, g in device.network.links if second == "ambient")
     duration = (_EPOCHS - 1) * _INTERVAL_S
     ambient = preset.begin_degc if preset.lamp else 23.0
@@ -171,16 +172,16 @@ def _programme(preset: Preset, device: CameraDevice, series: str) -> Programme:
 def preset_simulation(
     name: str, seed: int = 0, series: str = "M1", field: TestField | None = None
 ) -> Simulation:
-    """Return a preset ready to run, by default before a corner field of 147 circles.
+    """Return a preset's simulation, by default of a corner field of 147 circles.
 
-    Raises ConfigurationError for a name that is not among the presets.
+    Raises ConfigurationError for an unknown name.
     """
     if name not in PRESETS:
         raise ConfigurationError(f"unknown preset {name!r}; known are: {', '.join(PRESETS)}")
     preset = PRESETS[name]
-    device = _device(preset)
-    programme = _programme(preset, device, series)
-    test_field = field if field is not None else corner_field("circles", 7, 90.0)
+    device = _make_device(preset)
+    programme = _make_programme(preset, device, series)
+    test_field = corner_field() if field is None else field
     bare = ThermalModel(
         preset.camera,
         preset.sensor,
@@ -190,7 +191,7 @@ def preset_simulation(
         image_sigma=device.measuring.sigma,
         name=preset.name,
     )
-    # without jitter the temperature at the frames hangs neither on the seed nor on the drift
+    # without jitter, the temperature at the frames depends neither on the seed nor on the drift
     course = Simulation(bare, device, test_field, programme).true_history.temperature()
     warming = float(np.max(np.abs(course - course[0])))
     angle = np.deg2rad(preset.direction_deg)
@@ -199,12 +200,12 @@ def preset_simulation(
     model = replace(
         bare,
         rates={"c": preset.drift_c_mm / warming, "x0": x0, "y0": y0},
-        effects=tuple(_effects(preset, way, warming)),
+        effects=tuple(_make_effects(preset, way, warming)),
     )
     return Simulation(model, device, test_field, programme, seed)
 
 
-def _effects(preset: Preset, way: Array, warming: float) -> list[ModelEffect]:
+def _make_effects(preset: Preset, way: Array, warming: float) -> list[ModelEffect]:
     x0, y0 = (way * preset.set_share / warming).tolist()
     a1, b1, b2 = (change / warming for change in preset.distortion_drift)
     wanted: list[tuple[Callable[[Effect], bool], dict[str, float]]] = [
@@ -227,13 +228,13 @@ def given_simulation(
     seed: int = 0,
     series: str = "M1",
 ) -> Simulation:
-    """Return the simulation that a preset and files describe.
+    """Return the simulation described by a preset, by files, or by both.
 
-    Raises UsageError where neither preset nor model and programme are given.
+    Raises UsageError if neither a preset nor model and programme are given.
     """
     if preset is not None:
         usual = preset_simulation(preset, seed, series, field)
-        return replace(  # together: a model and a camera of one's own need not fit the preset's
+        return replace(  # both at once: a given model and camera need not fit the preset's
             usual,
             device=usual.device if camera is None else read_camera_device(camera),
             programme=usual.programme if programme is None else read_programme(programme),
@@ -242,7 +243,7 @@ def given_simulation(
     if model is None or programme is None:
         raise UsageError(
             f"give --preset ({', '.join(PRESETS)}), or --model and --programme "
-            "(--camera and --testfield as well, where the usual ones do not fit)"
+            "(and --camera and --testfield where the defaults do not fit)"
         )
     thermal = read_model(model)
     plain = CameraDevice(thermal.camera, thermal.sensor)
@@ -252,10 +253,10 @@ def given_simulation(
 
 
 class Catalogue:
-    """The presets, and the effects of model files."""
+    """The list of the presets, and of the effects for model files."""
 
     def as_dict(self) -> dict[str, list[dict[str, Any]]]:
-        """Return what `simulate --list --json` writes."""
+        """Return the document that `simulate --list --json` writes."""
         return {
             "presets": [{"preset": one.name, "about": one.about} for one in PRESETS.values()],
             "effects": [

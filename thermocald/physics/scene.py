@@ -1,22 +1,21 @@
-"""Rendered frames: what a camera sees of a test field, in grey values.
+"""Rendered frames: the grey values of a test field in a camera.
 
-The outline of every target is projected with its distortion, filled by exact area coverage of half
-pixels, blurred by a Gaussian, averaged over the pixels, darkened towards the corners, given noise,
-and rounded to 8 bit. Blurred on the pixel grid itself, edges along rows or columns would lie up to
-0.02 px off, in step with where in a pixel they are, which no lens does.
+Every target's outline is projected with distortion, filled by its exact area coverage of half
+pixels, blurred by a Gaussian, averaged over pixels, darkened towards the corners, given noise, and
+rounded to 8 bit. If the blur worked on the pixel grid itself, edges along rows or columns would be
+up to 0.02 px off, depending on their place in a pixel, which no lens does.
 
-A frame is the same on every machine, bit for bit: positions, coverage and blur are made of IEEE
-operations alone (`portable`), the noise comes from PCG64's raw bits through integer tables, and the
-rest is fixed-point with 6 fractional bits, always odd, so that nothing is ever half-way.
+A frame is the same on every machine, bit for bit: positions, coverage and blur consist of IEEE
+operations alone (`shapes`); the noise comes from PCG64's raw bits through integer tables; the rest
+is fixed-point with 6 fractional bits, always odd, so that no value is half-way when rounded.
 
 Source: blur, vignetting and noise as in Luhmann, T. et al. (2014): Close-Range Photogrammetry and
 3D Imaging, 2nd ed., chapter 3; vignetting is the first term of the cos⁴ law.
 
-Exact area coverage: which share of each half pixel, a cell, lies inside polygons.
-
-Every edge is cut at the cells' borders; a piece inside one cell adds the area to its right to the
-cell, and its height to all cells to the right of it, which one running sum along the rows turns
-into coverage. Nothing is sampled. Many polygons are done at once, in windows of their own.
+The area coverage is the share of each half pixel, a cell, inside polygons. Every edge is cut at the
+cells' borders. A piece inside a cell adds the area to its right to this cell, and its height to all
+cells further right, which one running sum along the rows turns into coverage. Nothing is sampled.
+Many polygons are filled at once, each in its own window.
 
 Source: the signed-area accumulation of scan converters, e.g. FreeType's smooth rasteriser.
 """
@@ -49,10 +48,10 @@ _FINER = 2  # cells in a pixel, along both axes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
-    """Windows of one width, stacked below each other.
+    """Windows of one width around shapes, stacked one below the other.
 
-    members (k,): which shapes; left, top, height (k,) px: where they lie in the image;
-    row (k,): the first row of each in the stack; width px; rows: height of the stack.
+    members (k,): the shapes; left, top, height (k,) px: of the windows in the image; row (k,): the
+    first row of each in the stack; width px; rows: height of the stack.
     """
 
     members: Integers
@@ -65,7 +64,7 @@ class Windows:
 
 
 def windows_around(low: Array, high: Array, margin: int) -> list[Windows]:
-    """Lay windows around shapes with bounds low, high (n, 2) px, with a margin px; by width."""
+    """Lay windows around shapes with bounds low, high (n, 2) px and a margin px; group by width."""
     first = np.floor(low + 0.5).astype(np.int64) - margin
     last = np.floor(high + 0.5).astype(np.int64) + margin + 1
     width = -(-(last[:, 0] - first[:, 0] + 1) // _WIDTH_STEP) * _WIDTH_STEP
@@ -80,7 +79,7 @@ def windows_around(low: Array, high: Array, margin: int) -> list[Windows]:
 
 
 def _cut_edges(a: Array, b: Array, axis: int) -> tuple[Array, Array, Integers, Integers]:
-    """Cut edges a → b (n, 2) at whole numbers of one axis: pieces a, b, cell, edge of each."""
+    """Cut edges a → b (n, 2) at integers of an axis; return each piece's a, b, cell and edge."""
     fa = np.floor(a[:, axis]).astype(np.int64)
     fb = np.floor(b[:, axis]).astype(np.int64)
     pieces = np.abs(fb - fa) + 1
@@ -106,11 +105,11 @@ def _cut_edges(a: Array, b: Array, axis: int) -> tuple[Array, Array, Integers, I
 
 
 def coverage_steps(a: Array, b: Array, sign: Array, shape: Integers, windows: Windows) -> Array:
-    """Return by how much the signed coverage of each cell, the rows and columns of the windows
-    halved, is less than that of the one to its left.
+    """Return the signed coverage of the cell to the left minus that of each cell, (rows, width).
 
-    a, b (e, 2) px: the polygons' edges; sign (e,): +1 for polygons that run clockwise in the image
-    (y down) and are to be added; shape (e,): the member (place in `windows`) each belongs to.
+    The cells are half pixels of the windows. a, b (e, 2) px: the polygons' edges; sign (e,): +1 for
+    polygons to be added, which run clockwise in the image (y down); shape (e,): each edge's member
+    of `windows`.
     """
     # a pixel is [i, i+1) after the shift by half a pixel
     origin = np.stack([windows.left, windows.top - windows.row], axis=1)[shape] - 0.5
@@ -118,7 +117,7 @@ def coverage_steps(a: Array, b: Array, sign: Array, shape: Integers, windows: Wi
     a2, b2, cx, edge2 = _cut_edges(a1, b1, 0)
     dy = (b2[:, 1] - a2[:, 1]) * sign[edge1[edge2]]
     right = 0.5 * (a2[:, 0] + b2[:, 0]) - cx
-    # the row is the first cut's: the second one's rounding cannot move it
+    # the row is that of the first cut: rounding in the second one cannot change it
     rows, width = _FINER * windows.rows, _FINER * windows.width
     cell = cy[edge2] * width + cx
     area = (
@@ -135,8 +134,9 @@ def fill(steps: Array | NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def average(cells: NDArray[np.float32], kernel: Array, axis: int) -> NDArray[np.float32]:
-    """Average cells along one axis to pixels, half as many, with a symmetric kernel of an even
-    length; the margins must hold zeros.
+    """Average cells along one axis to half as many pixels, with a symmetric kernel of even length.
+
+    The margins must hold zeros.
     """
     n, k = len(kernel) // 2, kernel.astype(np.float32)
     moved = np.moveaxis(cells, axis, 0)
@@ -160,8 +160,10 @@ _FRACTION = 64  # fixed-point steps per DN
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Grey values and optics: paper and ink DN, blur (Gaussian sigma) px, noise sigma DN, and the
-    share of light that the image corners lose.
+    """The look of frames: grey values and optics.
+
+    Paper and ink DN, blur (Gaussian sigma) px, noise sigma DN; vignetting: share of light lost at
+    the image corners.
     """
 
     paper_dn: float = 200.0
@@ -173,7 +175,7 @@ class Look:
 
 @lru_cache(maxsize=2)
 def _compute_gain(sensor: Sensor, vignetting: float) -> NDArray[np.float32]:
-    """Return the share of light (H, W) that arrives: 1 - v (r / r_corner)²."""
+    """Return the transmitted share of light (H, W), 1 - v (r / r_corner)²."""
     cx, cy = (sensor.width - 1) / 2, (sensor.height - 1) / 2
     x2 = (np.arange(sensor.width) - cx) ** 2
     y2 = (np.arange(sensor.height) - cy) ** 2
@@ -191,7 +193,7 @@ def _draw_paper(sensor: Sensor, paper_dn: float, vignetting: float) -> NDArray[n
 
 @lru_cache(maxsize=8)
 def _make_noise_tables(sigma_dn: float) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Make two tables (256,) whose sum over two random bytes is normal with this sigma, and odd."""
+    """Make two tables (256,); their sum for two random bytes is normal with this sigma, and odd."""
     from scipy.special import ndtri
 
     quantiles = ndtri((np.arange(256) + 0.5) / 256)
@@ -203,7 +205,7 @@ def _make_noise_tables(sigma_dn: float) -> tuple[NDArray[np.int16], NDArray[np.i
 
 
 class Scene:
-    """A test field to be photographed; keeps what does not change between frames."""
+    """A test field to be rendered; stores what does not change between frames."""
 
     def __init__(self, sensor: Sensor, field: TestField, look: Look | None = None) -> None:
         self.sensor = sensor
@@ -214,7 +216,7 @@ class Scene:
         self._outlines: Outlines | None = None
 
     def _shapes(self, centre: Array) -> Outlines | None:
-        """Return the outlines seen from a point (3,) mm: its side decides how ring codes run."""
+        """Return the outlines seen from a point (3,) mm; its side sets the sense of ring codes."""
         facing = np.sum(self._normals * (centre - self.field.points), axis=1) > 0
         if self._facing is None or not np.array_equal(facing, self._facing):
             self._facing = facing
@@ -230,12 +232,12 @@ class Scene:
         seed: int | Sequence[int] = 0,
         blur_factor: float = 1.0,
     ) -> NDArray[np.uint8]:
-        """Render a frame (H, W) 8 bit.
+        """Render a frame (H, W), 8 bit.
 
-        iop (10,), eop (6,); points (n, 3) mm: where the targets are now (default: the field's);
-        seed: of the noise; blur_factor: how much the blur has grown.
+        iop (10,), eop (6,); points (n, 3) mm: of the targets (default: the field's); seed: of the
+        noise; blur_factor: factor on the look's blur.
         """
-        # what comes from outside may differ in its last bits; what is rounded away is below 1e-5 px
+        # rounded (by less than 1e-5 px), as arguments may differ in their last bits by machine
         iop, eop = np.round(iop, 10), np.concatenate([np.round(eop[:3], 10), np.round(eop[3:], 6)])
         where = self.field.points if points is None else np.round(points, 6)
         look = self.look
@@ -269,7 +271,7 @@ class Scene:
         with np.errstate(invalid="ignore"):
             edge = np.array([self.sensor.width, self.sensor.height])
             seen &= np.all((high > -0.5) & (low < edge - 0.5), axis=1)
-            # a shape far larger than the image would need a window to match: it is behind or beside
+            # a shape larger than the image, behind or beside the camera, would need a huge window
             seen &= np.all(high - low < edge, axis=1)
         if not seen.any():
             return
@@ -296,7 +298,7 @@ class Scene:
             ):
                 y0, y1 = max(0, top), min(self.sensor.height, top + height)
                 x0, x1 = max(0, left), min(self.sensor.width, left + windows.width)
-                if y0 < y1 and x0 < x1:  # the ink is taken off the canvas
+                if y0 < y1 and x0 < x1:
                     ink = stack[row + y0 - top : row + y1 - top, x0 - left : x1 - left]
                     taken = np.rint(ink * gain[y0:y1, x0:x1] * depth).astype(np.int16)
                     canvas[y0:y1, x0:x1] -= taken + taken

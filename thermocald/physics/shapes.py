@@ -1,14 +1,12 @@
-"""What targets look like: the outlines of discs, coded rings and markers, in object space.
+"""The outlines of discs, coded rings and markers in object space; arithmetic equal on all machines.
 
 Outlines are polygons in the target's plane that move with the target. The plane of a circle is not
-in the test field's file: it is the plane through the target that holds most of the others.
+in the test field's file: it is the plane through the target that contains most other targets.
 
-Arithmetic whose last bit is the same on every machine.
-
-Libraries of mathematical functions, fused multiply-add and vectorised sums differ in their last
-bits between machines, and a pixel value on the verge of rounding would flip. IEEE 754 fixes
-addition, multiplication, division and square root alone; NumPy's element-wise operations on arrays
-round each of them separately. What a rendered frame depends on is made of these.
+Mathematical libraries, fused multiply-add and vectorised sums differ in their last bits between
+machines, and a pixel value on the verge of rounding would flip. IEEE 754 defines only addition,
+multiplication, division and square root exactly, and NumPy's element-wise operations on arrays
+round each of them separately. Rendered frames depend on these operations alone.
 """
 
 from __future__ import annotations
@@ -83,11 +81,11 @@ def project(sensor: Sensor, iop: Array, eop: Array, points: Array) -> Array:
 
 
 def gaussian_kernel(sigma: float) -> Array:
-    """Return a normalised Gaussian (2n+1,) on the pixel grid, n = ⌈4 σ⌉; just [1] where σ is 0."""
+    """Return a normalised Gaussian (2n+1,) on the pixel grid, n = ⌈4 σ⌉; [1] if σ is 0."""
     if sigma <= 0:
         return np.ones(1)
     n = int(np.ceil(4.0 * sigma))
-    # exp(-k²/2σ²) from the one number exp(-1/2σ²), itself from its series after halving 10 times
+    # exp(-k²/2σ²) from exp(-1/2σ²), which is summed as a series after halving 10 times
     x = -0.5 / (sigma * sigma) / 1024.0
     e = 1.0
     for k in range(14, 0, -1):
@@ -107,18 +105,18 @@ def gaussian_kernel(sigma: float) -> Array:
 
 
 _CIRCLE_EDGES = 96
-_EDGES_PER_MODULE = 3  # a straight edge is bent by the distortion
+_EDGES_PER_MODULE = 3  # as the distortion bends a straight edge
 _NEIGHBOURS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outlines:
-    """Polygons of all targets, as vertices that hang on the targets.
+    """The polygons of all targets, as vertices that move with the targets.
 
     A vertex is Σ weights × points[rows] + offset. rows (v, 4), weights (v, 4), offset (v, 3) mm;
-    following (v,): the next vertex of the same polygon; sign (v,): +1 ink, -1 paper again;
-    shape (v,): which target (or marker) it belongs to;
-    centre (s,), normal (s, 3): row of a target and plane of each shape.
+    following (v,): the next vertex of the same polygon; sign (v,): +1 for ink, -1 for paper in it;
+    shape (v,): the vertex's target or marker; centre (s,), normal (s, 3): of each shape a target's
+    row, and the normal of its plane.
     """
 
     rows: Integers
@@ -131,7 +129,7 @@ class Outlines:
     normal: Array
 
     def vertices(self, points: Array) -> Array:
-        """Return the vertices (v, 3) mm, with the targets at points (n, 3)."""
+        """Return the vertices (v, 3) mm for targets at points (n, 3) mm."""
         p = self.offset.copy()
         for k in range(4):
             p += self.weights[:, k : k + 1] * points[self.rows[:, k]]
@@ -139,10 +137,10 @@ class Outlines:
 
 
 def surface_normals(field: TestField) -> Array:
-    """Find unit normals (n, 3) of the planes the targets lie in; the sign is arbitrary.
+    """Find the unit normals (n, 3) of the targets' planes; their sign is arbitrary.
 
-    Candidates are the planes through a target and two of its neighbours; the one that holds most
-    targets wins, of several the one whose targets are nearest.
+    Candidates are the planes through a target and two of its neighbours. The one that contains most
+    targets is chosen; of several, the one whose targets are nearest.
     """
     p = field.points
     n = len(p)
@@ -167,10 +165,10 @@ def surface_normals(field: TestField) -> Array:
         score = inside.sum(axis=0) - 1e-3 * (inside * (distance / spread)[:, None]).mean(axis=0)
         best = candidates[int(np.argmax(score))]
         members = p[inside[:, int(np.argmax(score))]]
-        # the plane of all its targets: grid planes come out exact to the coordinates' last digits
+        # fitted to all targets of the plane: grid planes are exact to the coordinates' last digits
         _, _, axes = np.linalg.svd(members - members.mean(axis=0))
         refined = axes[2] * np.sign(axes[2] @ best)
-        # rounding keeps the last bits of the decomposition, which differ between machines, out
+        # rounded, as the last bits of the decomposition differ between machines
         normals[i] = np.round(refined, 9)
     return normals
 
@@ -181,9 +179,9 @@ def _lay_arc(turns: Array) -> Array:
 
 
 def _disc_polygons(diameter: float, code: str) -> list[Array]:
-    """Return the outlines (k, 2) mm of a plain or ring-coded disc in (right, down)."""
+    """Return the outlines (k, 2) mm of a plain or ring-coded disc, as (right, down)."""
     angle = 2.0 * np.pi / _CIRCLE_EDGES
-    # the polygon has the area of the circle
+    # so that the polygon has the circle's area
     radius = 0.5 * diameter * float(np.round(np.sqrt(angle / np.sin(angle)), 12))
     disc = radius * _lay_arc(np.arange(_CIRCLE_EDGES) / _CIRCLE_EDGES)
     polygons = [disc]
@@ -199,7 +197,7 @@ def _disc_polygons(diameter: float, code: str) -> list[Array]:
 
 @lru_cache(maxsize=1024)
 def _marker_polygons(dictionary: str, marker: int) -> tuple[tuple[float, Array], ...]:
-    """Return (sign, outline (k, 2) in sides, from corner 0 to 1 and to 3) of a marker."""
+    """Return a marker's polygons: sign, outline (k, 2) in sides from corner 0 to 1 and 0 to 3."""
     pattern = ~marker_cells(dictionary, marker)
     modules = len(pattern)
     result = [(1.0, _lay_box(0, 0, modules, modules) / modules)]
@@ -220,10 +218,10 @@ def _lay_box(x0: int, y0: int, x1: int, y1: int) -> Array:
 
 
 def outlines(field: TestField, normals: Array) -> Outlines | None:
-    """Return the outlines of all targets that can be drawn; normals (n, 3) point at the viewer.
+    """Return the outlines of the targets; normals (n, 3) point at the viewer.
 
-    Circles without a diameter, and markers of which the field lacks a corner, are left out; None
-    where nothing is left.
+    Circles without a diameter and markers without all four corners are left out; None if no target
+    remains.
     """
     centre: list[int] = []
     normal: list[Array] = []
@@ -252,7 +250,7 @@ def outlines(field: TestField, normals: Array) -> Outlines | None:
 
 
 def _shapes(field: TestField, normals: Array) -> Iterator[tuple[int, Array, list[_Polygon]]]:
-    """Yield the row and the plane of each disc, then of each marker, and its polygons."""
+    """Yield the row, the normal and the polygons of each disc, and then of each marker."""
     markers: dict[tuple[str, int], dict[int, int]] = {}
     for i, (kind, code) in enumerate(zip(field.kinds, field.codes, strict=True)):
         if kind == "marker_corner":
@@ -261,7 +259,7 @@ def _shapes(field: TestField, normals: Array) -> Iterator[tuple[int, Array, list
                 if corner is not None:
                     markers.setdefault((dictionary, marker), {})[corner] = i
         elif field.diameters[i] > 0:
-            # right and down in the plane, for a viewer whom the normal points at
+            # right and down in the plane, for a viewer at whom the normal points
             up = normals[i]
             helper = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
             right = np.cross(helper, up)
@@ -281,5 +279,5 @@ def _shapes(field: TestField, normals: Array) -> Iterator[tuple[int, Array, list
                 weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1)
                 polygons.append((sign, order, weights, np.zeros((len(u), 3))))
             a, b, _, d = field.points[order]
-            # corners run clockwise for the viewer: right × down points away from him
+            # corners run clockwise for the viewer, so that right × down points away from the viewer
             yield order[0], -np.cross(b - a, d - a), polygons

@@ -1,13 +1,13 @@
-"""From a model and a programme to a recording: temperatures, image points, and frames if wanted.
+"""Simulated recordings: temperatures and image points, or frames, of a model and a programme.
 
-What is simulated in order: the heat network's temperatures on the true time axis; from the true
-temperature at the reference thermometer's place, through the model, orientation and object points
-at each frame's time; the image points with their noise, targets that are missed, and gross
-errors; the thermometers' readings at their own times. The image noise that is written alongside
-each point is the nominal one: where heat defocuses, the points scatter more than they say.
+The steps are: the heat network's temperatures on the true time axis; the model's orientation and
+object points at each frame's time, from the true temperature at the reference thermometer; the
+image points with noise, missed targets and gross errors; the thermometers' readings at their own
+times. The standard deviations written with the image points are nominal: an effect that defocuses
+makes the points scatter more than that.
 
-Each kind of chance has its own stream of random numbers, so that changing one (more missing
-readings) leaves the others (the image noise) as they were.
+Each random quantity has its own stream of random numbers, so that a change of one (more missing
+readings) does not change the others (the image noise).
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 _CHUNK = 64  # epochs at a time
 _MARGIN_PX = 5.0  # a target nearer to the image's edge is not measured
 _FINEST_STEPS = 10  # knots of the true temperature per interval
-_LONG = 20_000  # epochs from which one knot per interval has to do
+_LONG = 20_000  # epochs above which there is one knot per interval
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """One series of one camera, simulated; everything random depends on `seed`."""
+    """A simulated series of a camera; everything random depends on `seed`."""
 
     model: ThermalModel
     device: CameraDevice
@@ -68,7 +68,7 @@ class Simulation:
 
     @cached_property
     def frame_times(self) -> Array:
-        """When frames are taken, (E,) s from the start, the first at 0, ascending."""
+        """The frames' times (E,) s from the start, ascending from 0."""
         p, rng = self.programme, self._rng(0)
         limit = 0.4 * p.interval
         shift = np.clip(p.jitter * rng.standard_normal(p.epochs), -limit, limit)
@@ -77,14 +77,14 @@ class Simulation:
 
     @cached_property
     def reading_times(self) -> Array:
-        """When thermometers are read, (E,) s from the start, ascending."""
+        """The thermometers' reading times (E,) s from the start, ascending."""
         p = self.programme
         spread = p.reading_spread * self._rng(1).uniform(-1.0, 1.0, p.epochs)
         return np.asarray(np.maximum.accumulate(self.frame_times + p.reading_offset + spread))
 
     @cached_property
     def exterior(self) -> ExteriorOrientation:
-        """Where the camera stands: by the model, else by the camera file, else before the field."""
+        """The exterior orientation of the model, of the camera file, or before the field."""
         return (
             self.model.exterior
             or self.device.exterior
@@ -93,7 +93,7 @@ class Simulation:
 
     @cached_property
     def true_history(self) -> History:
-        """The true temperatures at the thermometers' places; `times` are the frames'."""
+        """The true temperatures at the thermometers, for the frames' times."""
         frames, p = self.frame_times, self.programme
         steps = _FINEST_STEPS if p.epochs <= _LONG else 1
         last = max(float(frames[-1]), float(self.reading_times[-1]))
@@ -108,13 +108,13 @@ class Simulation:
 
     @cached_property
     def truth(self) -> Prediction:
-        """What the model says at the frames' times."""
+        """The model's prediction for the frames' times."""
         model = replace(self.model, exterior=self.exterior)
         return model.predict(self.true_history, self.field)
 
     @cached_property
     def readings(self) -> dict[str, Array]:
-        """What the thermometers said, {channel: (E,) °C}, NaN where one failed."""
+        """The thermometers' readings {channel: (E,) °C}, NaN where missing."""
         true = self.true_history
         return {
             name: thermometer.read(
@@ -125,7 +125,7 @@ class Simulation:
 
     @property
     def head(self) -> Head:
-        """The recording's head; the model it was made with stands in it."""
+        """The recording's head, which names the model and the seed."""
         sensor = self.model.sensor
         return Head(
             f"{self.device.name}-{self.programme.series}",
@@ -148,9 +148,9 @@ class Simulation:
         return project(self.model.sensor, t.iop[epochs], t.eop[epochs], points)
 
     def observations(self) -> Iterator[Observations]:
-        """Yield the measured image points of each epoch; memory does not grow with their number.
+        """Yield each epoch's measured image points; memory does not grow with the epochs.
 
-        Raises GeometryError where the camera sees fewer than 3 targets at the start.
+        Raises GeometryError if the camera sees fewer than 3 targets at the start.
         """
         measuring, rng = self.device.measuring, self._rng(2)
         n = len(self.field)
@@ -169,19 +169,19 @@ class Simulation:
             measured = true + factor[:, None, None] * noise + gross[..., None] * wrong
             if begin == 0 and int(seen[0].sum()) < 3:
                 raise GeometryError(
-                    f"the camera sees {int(seen[0].sum())} of {n} targets; let it look at the "
-                    "field (exterior or distance in the camera file)"
+                    f"the camera sees {int(seen[0].sum())} of {n} targets; point it at the field "
+                    "(exterior or distance in the camera file)"
                 )
             for k in range(count):
                 rows = np.flatnonzero(seen[k])
                 yield Observations(rows, measured[k, rows], stated[rows])
 
     def epochs(self, observed: bool = True) -> Iterator[Epoch]:
-        """Yield the epochs of the recording, with their observations or bare."""
+        """Yield the epochs of the recording, with or without their observations."""
         begin = self.programme.begin
         readings = list(self.readings.items())
-        found = self.observations() if observed else repeat(None, self.programme.epochs)
-        for i, observations in enumerate(found):
+        measured = self.observations() if observed else repeat(None, self.programme.epochs)
+        for i, observations in enumerate(measured):
             yield Epoch(
                 number=i + 1,
                 frame_time=float(begin + self.frame_times[i]),
@@ -191,7 +191,7 @@ class Simulation:
             )
 
     def frames(self) -> Iterator[NDArray[np.uint8]]:
-        """Render the frames (H, W), one after the other."""
+        """Yield the rendered frames (H, W)."""
         from thermocald.physics.scene import Scene
 
         scene = Scene(self.model.sensor, self.field, self.device.look)
@@ -208,7 +208,7 @@ class Simulation:
         with_frames: bool = False,
         advance: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Write the recording: observations, or with frames those alone (they are to be measured).
+        """Write the recording: either observations, or frames that are yet to be measured.
 
         advance: called with the number of epochs done. Raises RecordingError if `path` exists.
         """
@@ -257,12 +257,12 @@ class Simulation:
 
     def lines(self) -> list[str]:
         """Return the line that `simulate` prints."""
-        found = self.as_dict()
-        drift, degrees = found["drift"], found["temperature"]
+        document = self.as_dict()
+        drift, T = document["drift"], document["temperature"]
         return [
             (
-                f"{found['epochs']} epochs, {found['targets']} targets, {degrees['first']:.1f} to "
-                f"{degrees['highest']:.1f} °C, principal point moved by up to "
+                f"{document['epochs']} epochs, {document['targets']} targets, {T['first']:.1f} to "
+                f"{T['highest']:.1f} °C, principal point moved by up to "
                 f"{drift['principal_point_px']:.1f} px, principal distance by "
                 f"{drift['c_mm'] * 1000:.1f} µm"
             )

@@ -1,13 +1,12 @@
 """The set-up of the demo and of the rendering mock camera: a known camera before a known field.
 
-The camera is a Raspberry Pi camera v2.1 (sensor data: `presets`); its drift is of the size the
-reference reports (Elias et al. 2020, section 4.2).
+The camera is a Raspberry Pi camera v2.1 (sensor data: `presets`); its drift is of the size reported
+by the reference study (Elias et al. 2020, section 4.2).
 
-Test fields to simulate with: three mutually perpendicular planes that meet in a corner.
-
-The corner is the origin, the planes are X = 0, Y = 0 and Z = 0, the targets lie where all
-coordinates are positive. Depth in all directions is what separates principal distance and
-principal point from the orientation (Luhmann et al. 2014, section 7.3).
+The simulated test fields are three mutually perpendicular planes that meet in a corner. The corner
+is the origin, the planes are X = 0, Y = 0 and Z = 0, and the targets have positive coordinates.
+Depth in all directions separates principal distance and principal point from the exterior
+orientation (Luhmann et al. 2014, section 7.3).
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ from thermocald.store.recording.reader import read_testfield
 RPI_INTERIOR = InteriorOrientation(
     c=3.04, x0=0.012, y0=-0.018, A1=-0.0040, A2=5.0e-4, B1=1.0e-4, B2=-2.0e-4
 )
-"""Of a Raspberry Pi camera v2.1; the distortion is of usual size."""
-# In-plane directions (right, down) of a viewer in front of each plane.
+"""The interior orientation of a Raspberry Pi camera v2.1, with a distortion of usual size."""
+# In-plane directions (right, down) for a viewer in front of each plane.
 _PLANES = {
     "x": (np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])),
     "y": (np.array([-1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])),
@@ -48,19 +47,21 @@ def corner_field(
 ) -> TestField:
     """Lay out a corner field of per_side² targets on each of three planes, `pitch_mm` apart.
 
-    markers: per_side² square markers per plane, four targets each, of 0.7 pitch; circles: circular
-    targets of 0.22 pitch, every fourth with a 12-bit ring code; plain: all without. Standard
-    deviations of all coordinates 0.02 mm. 7 a side are 147 circles; 4 a side are 192 marker
-    corners.
+    markers: square markers of 0.7 pitch with four targets each; circles: circular targets of 0.22
+    pitch, every fourth with a 12-bit ring code; plain: circles without codes. The standard
+    deviation of all coordinates is 0.02 mm. With per_side 7 there are 147 circles; with per_side 4,
+    192 marker corners.
     """
     if per_side < 1 or pitch_mm <= 0:
-        raise ConfigurationError("a corner field needs at least one target a side, and a pitch > 0")
+        raise ConfigurationError(
+            "a corner field needs at least one target per side, and a pitch above 0 mm"
+        )
     size = (0.7 if kind == "markers" else 0.22) * pitch_mm
     names, points, codes = [], [], []
     number = 0
     ring = ring_code.codes(12)
     for plane, (right, down) in _PLANES.items():
-        # the middle of the plane, half a pitch away from the edges it shares with the others
+        # the centre of the targets, which stay half a pitch away from the corner's edges
         middle = 0.5 * per_side * pitch_mm * (np.abs(right) + np.abs(down))
         for j in range(per_side):
             for i in range(per_side):
@@ -88,9 +89,9 @@ def corner_field(
 
 
 def corner_view(field: TestField, distance_mm: float) -> ExteriorOrientation:
-    """Return the orientation of a camera that looks into the corner along its diagonal.
+    """Return the exterior orientation of a camera that looks into the corner along its diagonal.
 
-    From `distance_mm` it looks at the middle of the targets; Z is up in the image.
+    The camera is `distance_mm` away from the centre of the targets; Z is up in the image.
     """
     middle = field.points.mean(axis=0)
     backward = np.ones(3) / np.sqrt(3.0)
@@ -106,18 +107,18 @@ def demonstration_field(kind: FieldKind = "markers") -> TestField:
     """Lay out a corner field that fills the image: 192 marker corners, or 147 circles."""
     if kind == "markers":
         return corner_field("markers", per_side=4, pitch_mm=150.0)
-    return corner_field(kind, per_side=7, pitch_mm=90.0)
+    return corner_field(kind)
 
 
 def load_field(kind_or_path: str) -> TestField:
-    """Return one of the demonstration's fields by its kind, or read a testfield.csv."""
+    """Return a demonstration field by its kind, or read a testfield.csv."""
     if kind_or_path in ("markers", "circles", "plain"):
         return demonstration_field(cast("FieldKind", kind_or_path))
     return read_testfield(Path(kind_or_path))
 
 
 def demonstration_model(field: TestField) -> ThermalModel:
-    """Return a camera 1.3 m before a corner field: half a pixel of drift per kelvin, T₀ = 25 °C."""
+    """Return a camera 1.3 m from a corner field: T₀ = 25 °C, half a pixel of drift per kelvin."""
     return ThermalModel(
         camera="rpi-v2.1",
         sensor=RASPBERRY_PI_V2.sensor,

@@ -1,3 +1,3 @@
-"""A series reduced to small normal equations, and the hypotheses that are fitted to it."""
+"""Series reduced to small normal equations, and the hypotheses that are fitted to them."""
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """The fit of hypotheses to series: generalised least squares and Gauss-Newton.
 
-Linear coefficients come from generalised least squares under the likelihood of `likelihood`,
-non-linear ones by Gauss-Newton on the same normal equations.
+Linear coefficients are estimated by generalised least squares with the likelihood of `likelihood`,
+non-linear parameters by Gauss-Newton with the same normal equations.
 
-What the distortion of a camera follows while it warms, its angles or places in the image, is the
-same number of unknowns. The series are asked before any hypothesis is: camera and, if that is worth
-its unknowns, mount move as a straight line in the temperature and some cosines in time, and the
-basis that leaves less is the camera's, where the difference is significant.
+The distortion of a warming camera follows either the angle or the place in the image; both bases
+have equally many unknowns. The basis is chosen before any hypothesis is fitted: the camera and, if
+that pays for its unknowns, the mount move along a straight line in the temperature and some cosines
+in time, and the basis that leaves less is chosen if the difference is significant.
 """
 
 from __future__ import annotations
@@ -41,66 +41,66 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# relative standard deviation with which the readings themselves tell their noise
+# relative standard deviation of the readings' noise, as estimated from the readings alone
 _NOISE_KNOWN = 0.05
 
-_RIDGE = 1e-12  # of a unit diagonal: holds coefficients that no series determines
+_RIDGE = 1e-12  # of a unit diagonal: constrains coefficients that no series determines
 
 _PERIODS = 1.6  # least number of periods in a series; a scan begins at 1.8
 
 
 class HypothesisFitter:
-    """The series under examination, and everything that is computed once for all hypotheses."""
+    """The fitter of hypotheses to some series, with what all hypotheses have in common."""
 
     def __init__(self, series: Sequence[ReducedSeries]) -> None:
         self.series = tuple(series)
         self.thermometer_factor = 1.0
         self.held: frozenset[str] = frozenset()  # non-linear parameters, such as `effect.tau`
-        self.priors: dict[str, tuple[float, float]] = {}  # of these: value known beforehand, sd
-        self._kept: dict[str, dict[Any, Any]] = {}
+        self.priors: dict[str, tuple[float, float]] = {}  # {non-linear parameter: value, sd}
+        self._caches: dict[str, dict[Any, Any]] = {}
 
     def share_trajectories(self, other: HypothesisFitter) -> None:
-        """Use the trajectories that a fitter of the same histories has computed."""
-        self._kept = other._kept
+        """Share the trajectories that a fitter of the same histories has computed."""
+        self._caches = other._caches
 
     def _once(self, what: str, key: Any, compute: Callable[[], T], most: int = 60) -> T:
-        """Compute something once; of more than `most` nothing before is kept."""
-        kept = self._kept.setdefault(what, {})
-        if key not in kept:
-            if len(kept) > most:
-                kept.clear()
-            kept[key] = compute()
-        found: T = kept[key]
-        return found
+        """Compute a value once; a cache with more than `most` values is emptied first."""
+        cache = self._caches.setdefault(what, {})
+        if key not in cache:
+            if len(cache) > most:
+                cache.clear()
+            cache[key] = compute()
+        value: T = cache[key]
+        return value
 
     # -- trajectories ---------------------------------------------------------------------------
 
     def drive(self, terms: Sequence[Term], series: int) -> tuple[Array, Array]:
-        """Return the trajectory (E,) that drives the linear terms, and its operator (E, states)."""
+        """Return the trajectory (E,) of the linear terms, and its operator (E, states)."""
         drives = _drives(terms, series)
 
         def compute() -> tuple[Array, Array]:
             reduced = self.series[series]
             operator = drive_matrix(reduced.history, drives)
             assert operator is not None
-            return (
-                reduced.averaged(drive(reduced.history, drives)),
-                reduced.states(reduced.history.reference, operator),
-            )
+            states = reduced.states(reduced.history.reference, operator)
+            return self.drive_trajectory(terms, series), states
 
         key = (series, tuple((name, tuple(values.items())) for name, values in drives))
         return self._once("drive", key, compute)
 
     def drive_trajectory(self, terms: Sequence[Term], series: int) -> Array:
-        """Return the trajectory (E,) alone: for scanning, where no operator is needed."""
+        """Return the trajectory (E,) of the linear terms without its operator, for scans."""
         reduced = self.series[series]
         return reduced.averaged(drive(reduced.history, _drives(terms, series)))
 
     def trajectories(
         self, term: Term, series: int, terms: Sequence[Term] = (), operators: bool = True
     ) -> tuple[Array, Array | None, str]:
-        """Return trajectories (E, m) of a signal, operator (E, states) of the first or None,
-        channel.
+        """Return a signal's trajectories (E, m), the first one's operator (E, states), the channel.
+
+        The operator is None if there are several trajectories, if the readings' errors do not reach
+        the signal, or without `operators`.
         """
         effect = catalogue.get(term.effect)
         values = term.values(series)
@@ -134,7 +134,7 @@ class HypothesisFitter:
         return self._once("trajectory", key, compute, 600)
 
     def further_operators(self, term: Term, series: int) -> list[tuple[Array, str]]:
-        """Return operators (E, states) and channels of the further columns that a signal reads."""
+        """Return operator (E, states) and channel of each further column that a signal reads."""
         values = term.values(series)
         if values is None:
             return []
@@ -150,7 +150,7 @@ class HypothesisFitter:
     def list_operators(
         self, terms: Sequence[Term], blocks: Sequence[Block], series: int
     ) -> Iterator[tuple[Block, Array | None, str]]:
-        """Yield how the readings' errors reach each block: operator or None, channel."""
+        """Yield each block with the operator (or None) and channel of the readings' errors."""
         for block in blocks:
             if block.series not in (None, series) or block.trajectories > 1:
                 continue
@@ -179,11 +179,10 @@ class HypothesisFitter:
     def design(
         self, terms: Sequence[Term], blocks: Sequence[Block], series: int, centred: bool = True
     ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Return trajectories (E, K), directions (P, K) and places in the unknowns (K,) of one
-        series.
+        """Return a series' trajectories (E, K), directions (P, K) and indices of unknowns (K,).
 
-        centred: without their means, for conditioning, where the levels are eliminated anyway;
-        otherwise as the model has them, 0 at T0.
+        centred: whether the means are subtracted, for conditioning, as the levels are eliminated
+        anyway; otherwise the trajectories are the model's, 0 at T0.
         """
         columns: list[Array] = []
         names: list[str] = []
@@ -206,7 +205,7 @@ class HypothesisFitter:
     def weighting(
         self, terms: Sequence[Term], blocks: Sequence[Block], x: Array, series: int
     ) -> Weighting:
-        """Fix the covariance of a series at some coefficients."""
+        """Return the weighting of a series with the covariance for some coefficients."""
         carried: list[ReadingErrorTerm] = []
         for block, operator, channel in self.list_operators(terms, blocks, series):
             d = np.zeros(len(COLUMNS))
@@ -222,10 +221,10 @@ class HypothesisFitter:
         return prepare(self.series[series], carried, self.thermometer_factor)
 
     def _unresolved(self, terms: Sequence[Term], block: Block, series: int) -> Array | None:
-        """Return the sd of a trajectory at single epochs (E,) beyond the readings' errors; or None.
+        """Return the sd (E,) of a trajectory beyond the readings' errors, None if it is 0.
 
-        The rate next to a switched lamp, and the temperature between the readings there; where a
-        play turns, which reading was the extreme.
+        It is that of the rate next to a switched lamp, of the temperature between the readings
+        there, and of the extreme reading where a play turns.
         """
         evidence = self.series[series]
         history = evidence.history
@@ -233,21 +232,21 @@ class HypothesisFitter:
         if block.term >= 0:
             term = terms[block.term]
             values = term.values(series) or {}
-            # averaged times stand for the frames of long series
+            # the rows' times represent the frames of a long series
             here = history.at(evidence.times)
             left = term.kind.unresolved(here, self._slope_jump(series), **values)
             return left if left.any() else None
         drives = _drives(terms, series)
-        late = [
+        delays = [
             float(values[key])
             for name, values in drives
             for key, p in catalogue.get(name).nonlinear.items()
             if p.role == "delay"
         ]
-        if len(late) == len(drives):  # a memory smooths what happens between two readings
+        if len(delays) == len(drives):  # a memory smooths what happens between two readings
             if evidence.slope_jumps is None:
                 return None
-            left = instrument.between(evidence.times, evidence.slope_jumps, sum(late))
+            left = instrument.between(evidence.times, evidence.slope_jumps, sum(delays))
             return left if left.any() else None
         before = driven_history(history, drives[:-1])
         name, values = drives[-1]
@@ -261,7 +260,7 @@ class HypothesisFitter:
         return out
 
     def _slope_jump(self, series: int) -> Array:
-        """Return how uncertain the rate (E,) of the reference is where it jumps."""
+        """Return the sd (E,) of the reference temperature's rate due to its jumps."""
         evidence = self.series[series]
         instrument = evidence.thermometers[evidence.history.reference]
         return self._once("slope", series, lambda: instrument.slope_jump(evidence.times))
@@ -273,9 +272,9 @@ class HypothesisFitter:
         max_iterations: int = 3,
         only: Sequence[int] | None = None,
     ) -> Fit:
-        """Fit the linear coefficients of a hypothesis; the covariance follows them, `turns` times.
+        """Fit a hypothesis's linear coefficients; the covariance is updated in each iteration.
 
-        only: the series that decide (default all); the others are evaluated.
+        only: the series to fit (default: all); the others are only evaluated.
         """
         terms = tuple(terms)
         blocks, K = self._layout(terms)
@@ -305,32 +304,32 @@ class HypothesisFitter:
         )
 
     def suit_thermometers(self, fit: Fit) -> float:
-        """Return the objective under the readings' noise that makes a hypothesis most likely.
+        """Return a hypothesis's objective with the readings' noise that makes it most likely.
 
-        Hypotheses that smooth the readings more than others are separated by nothing else but an
-        error of the noise.
+        An error of that noise alone could otherwise decide between hypotheses that smooth the
+        readings differently.
         """
         from scipy.optimize import minimize_scalar
 
-        kept = self.thermometer_factor
+        factor = self.thermometer_factor
 
         def objective(log_factor: float) -> float:
-            self.thermometer_factor = kept * float(np.exp(log_factor))
+            self.thermometer_factor = factor * float(np.exp(log_factor))
             here = self.fit(fit.terms, fit.coefficients, 1).objective
             return here + (log_factor / _NOISE_KNOWN) ** 2
 
         try:
-            found = minimize_scalar(
+            best = minimize_scalar(
                 objective, bounds=(-0.5, 0.5), method="bounded", options={"xatol": 0.02}
             )
         finally:
-            self.thermometer_factor = kept
-        return float(found.fun)
+            self.thermometer_factor = factor
+        return float(best.fun)
 
     # -- non-linear parameters ------------------------------------------------------------
 
     def searched(self, terms: Sequence[Term]) -> list[tuple[int, str]]:
-        """List the shared numeric non-linear parameters of a hypothesis."""
+        """Return the non-linear parameters to search, [(term, name)]: shared, numeric, not held."""
         return [
             (i, name)
             for i, term in enumerate(terms)
@@ -341,8 +340,10 @@ class HypothesisFitter:
     def tangent(
         self, fit: Fit, searched: Sequence[tuple[int, str]], series: int, centred: bool = True
     ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Return the design with ∂(prediction)/∂(non-linear) beside it: trajectories (E, R),
-        directions (P, R) and places (R,) among the coefficients (K) and searched parameters (L).
+        """Return the design extended by ∂ prediction / ∂ non-linear parameters.
+
+        Trajectories (E, R), directions (P, R), and indices (R,) among the K coefficients and L
+        searched parameters.
         """
         C, V, index = self.design(fit.terms, fit.blocks, series, centred)
         trajectories, directions, places = [C], [V], [index]
@@ -364,7 +365,7 @@ class HypothesisFitter:
     def normal_equations(
         self, fit: Fit, only: Sequence[int] | None = None
     ) -> tuple[Array, Array, list[tuple[int, str]]]:
-        """Return A (K + L, K + L), gradient (K + L,) with non-linear parameters as unknowns."""
+        """Return A (K + L, K + L), gradient (K + L,) and the L searched parameters."""
         searched = self.searched(fit.terms)
         K, L = len(fit.coefficients), len(searched)
         A, g = np.zeros((K + L, K + L)), np.zeros(K + L)
@@ -380,21 +381,21 @@ class HypothesisFitter:
         return A, g, searched
 
     def prior_terms(self, fit: Fit) -> list[tuple[float, float]]:
-        """Return prior minus value of each searched parameter, and its information (0: none)."""
-        found = []
+        """Return prior minus value of each searched parameter, and the prior's weight (0: none)."""
+        out = []
         for i, name in self.searched(fit.terms):
             term = fit.terms[i]
             value, sd = self.priors.get(f"{term.effect}.{name}", (0.0, np.inf))
-            found.append((value - float(dict(term.nonlinear)[name]), 1.0 / sd**2))
-        return found
+            out.append((value - float(dict(term.nonlinear)[name]), 1.0 / sd**2))
+        return out
 
-    def _with_prior(self, fit: Fit) -> float:
+    def _objective_with_prior(self, fit: Fit) -> float:
         return fit.objective + sum(w * left**2 for left, w in self.prior_terms(fit) if w)
 
     def refine(self, fit: Fit, max_iterations: int = 6, only: Sequence[int] | None = None) -> Fit:
-        """Improve the non-linear parameters by Gauss-Newton; never makes the objective worse."""
+        """Improve the non-linear parameters by Gauss-Newton, without increasing the objective."""
         searched = self.searched(fit.terms)
-        # what is seen less often in each series is a wander
+        # fewer periods than _PERIODS cannot be told from a slow drift
         longest = max(float(e.times[-1]) for e in self.series) / _PERIODS
         if searched:
             for _ in range(max_iterations):
@@ -411,11 +412,11 @@ class HypothesisFitter:
                         if parameter.role == "period":
                             value = min(value, max(old, longest))
                         terms[i] = terms[i].with_value(name, value)
-                    if terms == tried:  # every parameter at its bound again
+                    if terms == tried:  # all parameters are still at their bounds
                         continue
                     tried = terms
                     trial = self.fit(terms, fit.coefficients, 2, only)
-                    gain = self._with_prior(fit) - self._with_prior(trial)
+                    gain = self._objective_with_prior(fit) - self._objective_with_prior(trial)
                     if gain > 0:
                         fit, improved = trial, True
                         break
@@ -426,18 +427,16 @@ class HypothesisFitter:
 
 
 def _drives(terms: Sequence[Term], series: int) -> list[tuple[str, dict[str, Any]]]:
-    """List the drives among some terms, as `catalogue.drive` takes them."""
+    """Return the drives among some terms, as `catalogue.drive` takes them."""
     return [(t.effect, t.values(series) or {}) for t in terms if t.is_drive]
 
 
-_ORDERS = 8  # of cosines over a series, with which the camera may move
-_MOVING = (np.arange(3), np.r_[0:3, EOP.start : EOP.stop])  # c, x0, y0; with the mount
+_ORDERS = 8  # of the cosines, over a series, of the camera's movement
+_MOVING = (np.arange(3), np.r_[0:3, EOP.start : EOP.stop])  # c, x0, y0; also the mount
 
 
 def choose_distortion(series: Sequence[ReducedSeries]) -> tuple[Distortion, float]:
-    """Return what the distortion follows in all series of a camera together, and how sure that is
-    in standard deviations.
-    """
+    """Choose the distortion's basis for all series of a camera; return it and its sigmas."""
     sums = {basis: np.sum([_squares(s.in_basis(basis)) for s in series], axis=0) for basis in BASES}
     unknowns = sum(min(_ORDERS, len(s.times) // 4) + 1 for s in series)
     cost = np.minimum(*(sums[b] for b in BASES)) + 2.0 * unknowns * np.array(
@@ -451,7 +450,7 @@ def choose_distortion(series: Sequence[ReducedSeries]) -> tuple[Distortion, floa
 
 
 def _squares(series: ReducedSeries) -> Array:
-    """Return what smooth movement leaves of a series' sum of squares, for either of `_MOVING`."""
+    """Return a series' sum of squares after a smooth movement, for each of `_MOVING`."""
     T = series.averaged(series.history.temperature())
     orders = np.arange(1, min(_ORDERS, len(T) // 4) + 1)
     t = (series.times - series.times[0]) / max(float(np.ptp(series.times)), 1e-9)
@@ -460,11 +459,11 @@ def _squares(series: ReducedSeries) -> Array:
     normal = np.einsum("ekl,epq->kplq", products, series.N, optimize=True)
     right = smooth.T @ series.b
     K, P = right.shape
-    found = []
+    explained = []
     for moving in _MOVING:
         chosen = np.concatenate([np.arange(P), *(k * P + moving for k in range(1, K))])
         own = np.ix_(chosen, chosen)
         scaled, scale = unit_diagonal(normal.reshape(K * P, K * P)[own])
         rest = right.ravel()[chosen] * scale
-        found.append(float(rest @ np.linalg.lstsq(scaled, rest, rcond=1e-10)[0]))
-    return float(series.yy.sum()) - np.array(found)
+        explained.append(float(rest @ np.linalg.lstsq(scaled, rest, rcond=1e-10)[0]))
+    return float(series.yy.sum()) - np.array(explained)

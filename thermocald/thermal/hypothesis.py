@@ -1,25 +1,24 @@
-"""A hypothesis: the base model with some effects added; and the candidates to be added next.
+"""Hypotheses, that is, the base model with some effects, and candidates for a further effect.
 
-Physical constants are shared by the series; levels belong to each series, and so do the times
-and phases that an effect calls fresh.
+Physical constants are shared by the series. Levels belong to one series, and so do the times and
+phases that are `fresh` parameters of an effect.
 
-The grid of trial values of a non-linear parameter: one for fit and discovery.
+Fit and discovery have the same grid of trial values for a non-linear parameter. It covers whatever
+the recordings can show, as finely as they can resolve it, so that no result depends on a lucky
+start value.
 
-The grid replaces a lucky start: each parameter is scanned over everything that the recordings
-could show, as finely as they can resolve it.
+For a fit, a user gives an effect as `--effect NAME[:PARAMETER=VALUE,…]`:
 
-As people write an effect for a fit, `--effect NAME[:PARAMETER=VALUE,…]`:
-
-thermal_lag                                          start values and coefficients as usual
-thermal_lag:tau=80                                   another start value
-radial_distortion_drift:A1,A2                        these coefficients
-second_heat_source:channel=board_temperature         a temperature column
-target_displacement:targets=x33+y52                  targets of the test field
+    thermal_lag                                          default start values and coefficients
+    thermal_lag:tau=80                                   another start value
+    radial_distortion_drift:A1,A2                        these coefficients
+    second_heat_source:channel=board_temperature         a temperature column
+    target_displacement:targets=x33+y52                  targets of the test field
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -43,18 +42,19 @@ if TYPE_CHECKING:
 BASE = ("c", "x0", "y0")
 
 Unknowns = dict[str, tuple[float, "Array"]]
-"""Numbers of a model by their names there: value, and row (K + L,) of the fit's unknowns.
+"""{name of a number in the model: its value, and its row (K + L,) over the fit's unknowns}.
 
-A name ends with `@k` where the number belongs to series k > 0.
+A name ends with `@k` if the number belongs to series k > 0.
 """
 
 
 @dataclass(frozen=True)
 class Term:
-    """One effect of a hypothesis.
+    """An effect in a hypothesis.
 
-    parameters: the columns it acts on; nonlinear: shared values; fresh: per series, None where
-    the effect does not occur; through_drive: a trajectory of T that follows the drive instead of T.
+    parameters: the columns on which it acts; nonlinear: values shared by the series; fresh: values
+    of each series, None where the effect does not occur; through_drive: whether its trajectory
+    follows the drive instead of T.
     """
 
     effect: str
@@ -70,7 +70,7 @@ class Term:
 
     @property
     def is_drive(self) -> bool:
-        """Whether it replaces the temperature behind the linear terms."""
+        """Whether it replaces the temperature in the linear terms."""
         return self.kind.is_drive
 
     @property
@@ -79,16 +79,14 @@ class Term:
         return self.kind.is_event or self.kind.is_periodic
 
     def values(self, series: int) -> dict[str, Any] | None:
-        """Return the non-linear values in one series; None where the effect does not occur
-        there.
-        """
+        """Return the non-linear values in a series, None if the effect does not occur there."""
         if not self.fresh:
             return dict(self.nonlinear)
         own = self.fresh[series]
         return None if own is None else {**dict(self.nonlinear), **dict(own)}
 
     def with_value(self, name: str, value: float) -> Term:
-        """Change one shared non-linear value."""
+        """Return the term with another value for a shared non-linear parameter."""
         return replace(
             self, nonlinear=tuple((k, value if k == name else v) for k, v in self.nonlinear)
         )
@@ -96,7 +94,7 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Where the coefficients of one term stand: columns of trajectories and of the unknowns."""
+    """A term's coefficients among the unknowns: (trajectories, parameters), from `start` on."""
 
     term: int  # -1: the base's rates
     series: int | None  # None: shared
@@ -113,9 +111,10 @@ class Block:
 class Fit:
     """A fitted hypothesis.
 
-    coefficients (K,) px-scaled; covariance (K + L, K + L) of coefficients and the L shared
-    non-linear parameters `searched` [(term, name)]; chi2, logdet: sums over series; reduced: A, c,
-    yy per series after its levels; objective: -2 log L but for a constant.
+    coefficients (K,), px-scaled; covariance (K + L, K + L): of the coefficients and the L shared
+    non-linear parameters `searched` [(term, name)]; chi2, logdet: sums over the series; weightings,
+    designs: of each series; reduced: its A, c, yy after elimination of its levels; objective: -2
+    log L up to a constant.
     """
 
     terms: tuple[Term, ...]
@@ -127,21 +126,21 @@ class Fit:
     weightings: tuple[Weighting, ...]
     designs: tuple[tuple[Array, Array, NDArray[np.int64]], ...]
     reduced: tuple[tuple[Array, Array, float], ...]
-    searched: tuple[tuple[int, str], ...] = field(default=())
+    searched: tuple[tuple[int, str], ...] = ()
 
     @property
     def objective(self) -> float:
         return self.chi2 + self.logdet
 
     def direction(self, block: Block) -> Array:
-        """Return the coefficients of one block as (trajectories, P) in px-scaled columns."""
+        """Return the coefficients of a block (trajectories, P) in px-scaled columns."""
         out = np.zeros((block.trajectories, len(COLUMNS)))
         part = self.coefficients[block.start : block.stop].reshape(block.trajectories, -1)
         out[:, [COLUMNS.index(p) for p in block.parameters]] = part
         return out
 
     def parameters(self, series: int) -> Array:
-        """Return the movement (E, P) of the parameters that the hypothesis makes, px-scaled."""
+        """Return the movement (E, P) of the parameters according to the hypothesis, px-scaled."""
         C, V, index = self.designs[series]
         moved: Array = (C * self.coefficients[index]) @ V.T
         return moved
@@ -157,22 +156,22 @@ class Fit:
         return A, c
 
     def forget(self) -> None:
-        """Let go of what was whitened for scans: of a long series, much."""
+        """Free the memory of what was whitened for scans, which is large for a long series."""
         for weighting in self.weightings:
             weighting.kept.clear()
 
     def chi2_of(self, series: int, coefficients: Array | None = None) -> float:
-        """Return χ² of one series at some coefficients (default: the fitted)."""
+        """Return χ² of a series at some coefficients (default: the fitted ones)."""
         x = self.coefficients if coefficients is None else coefficients
         part, (A, c, yy) = x[self.designs[series][2]], self.reduced[series]
         return float(yy - 2 * part @ c + part @ A @ part)
 
 
 def coefficients_of(fit: Fit, blocks: Sequence[Block], scale: Array) -> Unknowns:
-    """Return the coefficients of one term's blocks by their columns, and of an oscillation `phase`.
+    """Return the coefficients of a term's blocks by column; of an oscillation also each `phase`.
 
-    scale (19,): px per unit of the columns. All series share the amplitudes of an oscillation, and
-    each has a phase, from its pair of sine and cosine.
+    scale (19,): px per unit of the columns. All series share the amplitudes of an oscillation; each
+    has its own phase, from its pair of sine and cosine.
     """
     size = len(fit.covariance)
     found, phases = Unknowns(), Unknowns()
@@ -191,7 +190,7 @@ def coefficients_of(fit: Fit, blocks: Sequence[Block], scale: Array) -> Unknowns
             continue
         u, s, v = np.linalg.svd(x, full_matrices=False)
         side, shape = u[:, 0], v[0]
-        # the amplitude's sign is the first series'; there the phase lies within half a turn
+        # the first series sets the amplitude's sign, with a phase within half a turn
         if shape @ amplitudes[0] < 0 if amplitudes else side[0] < 0:
             side, shape = -side, -shape
         own[np.arange(len(own)), place[0]], own[np.arange(len(own)), place[1]] = side
@@ -209,9 +208,9 @@ def coefficients_of(fit: Fit, blocks: Sequence[Block], scale: Array) -> Unknowns
 
 
 def make_known_term(name: str, values: Mapping[str, Any], series: int) -> Term:
-    """Make a term of an effect whose values are known; series: how many there are.
+    """Make a term of an effect with known values; series: the number of series.
 
-    An event is the first series'; what a cycle has of its own is not searched.
+    An event belongs to the first series; a cycle's phases are not searched.
     """
     effect = catalogue.get(name)
     parameters = tuple(effect.column(p) for p in effect.linear if p in values)
@@ -228,7 +227,7 @@ def make_known_term(name: str, values: Mapping[str, Any], series: int) -> Term:
 
 
 def trial_values(parameter: Parameter, series: Sequence[ReducedSeries]) -> Array:
-    """Choose values to scan by the parameter's role; the first series decides."""
+    """Choose the values to scan by the parameter's role, for the first series' times and range."""
     first = series[0]
     duration = float(first.times[-1])
     step = float(np.median(np.diff(first.times)))
@@ -236,7 +235,7 @@ def trial_values(parameter: Parameter, series: Sequence[ReducedSeries]) -> Array
     low, high = float(T.min()), float(T.max())
     match parameter.role:
         case "period":
-            # at least two periods, and two frames in each; four frequencies to one resolution
+            # at least 1.8 periods, with two frames in each; three frequencies per resolution step
             frequencies = np.arange(1.8 / duration, 1.0 / (2.1 * step), 1.0 / (3.0 * duration))
             return np.asarray(1.0 / frequencies[:4000])
         case "threshold":
@@ -250,7 +249,7 @@ def trial_values(parameter: Parameter, series: Sequence[ReducedSeries]) -> Array
         case "delay":
             reach = min(parameter.high, 0.25 * duration)
             coarse = np.arange(max(parameter.low, -reach), reach, min(0.5 * step, reach / 20)) + 0.1
-            fine = np.linspace(-step, step, 21) + 0.001 * step  # small delays are the usual ones
+            fine = np.linspace(-step, step, 21) + 0.001 * step  # as most delays are small
             return np.unique(np.concatenate([coarse, fine]))
     if parameter.log:
         return np.geomspace(parameter.low, parameter.high, 40)
@@ -259,10 +258,10 @@ def trial_values(parameter: Parameter, series: Sequence[ReducedSeries]) -> Array
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One effect acting on one set of parameters.
+    """An effect on a set of parameters, proposed for a hypothesis.
 
-    parameters: columns of the reduced series; name: of the searched non-linear parameter, "" where
-    there is none; grid: its trial values; fixed: non-linear values that are given.
+    parameters: columns of the reduced series; name: of the non-linear parameter to search, or "";
+    grid: its trial values; fixed: given non-linear values.
     """
 
     effect: str
@@ -278,11 +277,11 @@ class Candidate:
 
     @property
     def directions(self) -> Array:
-        """Its parameters as unit vectors (P, k)."""
+        """Unit vectors (P, k) along its parameters."""
         return unit_directions(self.parameters)
 
     def term(self, value: float | None, series: int) -> Term:
-        """Return the term at one value of the grid; `series`: how many series there are."""
+        """Return the term for a value of the grid; series: the number of series."""
         if self.kind.is_event:
             return Term(self.effect, self.parameters, self.fixed, ((),) * series)
         own = () if value is None else ((self.name, float(value)),)
@@ -297,11 +296,10 @@ def make_candidate(
     *,
     plain: bool = False,
 ) -> Candidate:
-    """Offer an effect on some of its coefficients; of what belongs to a series, events alone are
-    searched.
+    """Make a candidate of an effect on some of its coefficients.
 
-    fixed: non-linear values that are given; plain: without the parameters that a model may leave
-    out.
+    Of the parameters that belong to one series, only an event's time is searched. fixed: given
+    non-linear values; plain: whether to omit the parameters that a model may leave out.
     """
     given = dict(fixed)
     columns = tuple(effect.column(p) for p in parameters)
@@ -314,27 +312,24 @@ def make_candidate(
 
 
 def parse_effect(text: str) -> ModelEffect:
-    """An effect with start values. UsageError says what is wrong, and what it might have been."""
+    """Parse an effect with its start values; UsageError names the fault and a correction."""
     name, _, rest = text.partition(":")
     try:
         kind = catalogue.get(name)
     except ConfigurationError as error:
         raise UsageError(f"--effect {text}: {error}") from error
-    values: dict[str, Any] = {k: p.default for k, p in kind.nonlinear.items() if not p.text}
-    chosen: list[str] = []
+    values: dict[str, Any] = {}
     for part in filter(None, rest.split(",")):
         key, equals, value = (w.strip() for w in part.partition("="))
         if key not in kind.units():
             raise UsageError(
-                f"--effect {text}: {name} has no parameter {key!r}; {_nearest(key, kind.units())}"
+                f"--effect {text}: {name} has no parameter {key!r}; {_suggest(key, kind.units())}"
             )
-        if key in kind.linear:
-            chosen.append(key)
-        elif not equals:
-            raise UsageError(f"--effect {text}: write {key}=VALUE")
+        if not equals and key not in kind.linear:
+            raise UsageError(f"--effect {text}: {key} has no value; give {key}=VALUE")
         if not equals:
-            continue
-        if key in kind.nonlinear and kind.nonlinear[key].text:
+            values.setdefault(key, 0.0)
+        elif key in kind.nonlinear and kind.nonlinear[key].text:
             names = kind.nonlinear[key].unit == "names"
             values[key] = tuple(value.split("+")) if names else value
         else:
@@ -345,18 +340,20 @@ def parse_effect(text: str) -> ModelEffect:
     for key, parameter in kind.nonlinear.items():
         if parameter.text and not values.get(key):
             example = "x33+y52" if parameter.unit == "names" else "board_temperature"
-            raise UsageError(f"--effect {text}: say which: --effect {name}:{key}={example}")
-    coefficients = dict.fromkeys(chosen or kind.usual, 0.0)
+            raise UsageError(
+                f"--effect {text}: {key} is missing; give it, as in --effect {name}:{key}={example}"
+            )
     try:
-        return ModelEffect(name, {**coefficients, **values})
+        return effect_with(name, values)
     except ConfigurationError as error:
         raise UsageError(f"--effect {text}: {error}") from error
 
 
 def effect_with(name: str, values: Mapping[str, Any]) -> ModelEffect:
-    """Return an effect with some values given, the others as usual.
+    """Return an effect with some values given and defaults for the others.
 
-    Of its coefficients those that are given, or the usual ones. Raises ConfigurationError.
+    Its coefficients are the given ones, or the usual ones if none is given. Raises
+    ConfigurationError for an unknown effect or a wrong value.
     """
     kind = catalogue.get(name)
     usual: dict[str, Any] = {k: p.default for k, p in kind.nonlinear.items() if not p.text}
@@ -366,7 +363,7 @@ def effect_with(name: str, values: Mapping[str, Any]) -> ModelEffect:
 
 
 def check_names(listed: Iterable[ModelEffect], series: Iterable[ReducedSeries]) -> None:
-    """UsageError where an effect names a channel or a target that a series does not have."""
+    """Raise UsageError if an effect names a channel or a target that a series does not have."""
     effects = list(listed)
     for s in series:
         for effect in effects:
@@ -374,18 +371,18 @@ def check_names(listed: Iterable[ModelEffect], series: Iterable[ReducedSeries]) 
             if channel is not None and channel not in s.source.readings:
                 raise UsageError(
                     f"effect {effect.name}: {s.source.name} has no temperature column {channel!r}; "
-                    f"{_nearest(channel, s.source.readings)}"
+                    f"{_suggest(channel, s.source.readings)}"
                 )
             targets = effect.values.get("targets", ())
             for target in (targets,) if isinstance(targets, str) else targets:
                 if target not in s.source.field.index:
                     raise UsageError(
                         f"effect {effect.name}: the test field of {s.source.name} has no target "
-                        f"{target!r}; {_nearest(target, s.source.field.index)}"
+                        f"{target!r}; {_suggest(target, s.source.field.index)}"
                     )
 
 
-def _nearest(name: str, known: Iterable[str]) -> str:
+def _suggest(name: str, known: Iterable[str]) -> str:
     names = list(known)
     near = get_close_matches(name, names, 1)
     if near:

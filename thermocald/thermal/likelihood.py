@@ -1,27 +1,23 @@
-"""The likelihood of a hypothesis about one series, with the thermometer's error in it.
+"""The likelihood of a hypothesis for a series, including the thermometers' errors.
 
-Per epoch the evidence is a small normal matrix N_e over camera parameters. A hypothesis moves the
-parameters along directions v (P,) with trajectories c (E,): Σ v c(t). Trajectories that are made
-from temperatures carry the thermometer's error δ (R,) through their own operator O (E, R): what is
-observed is d·O δ alongside the image noise. δ is integrated out exactly (Woodbury), so neither
-white nor lagged thermometer noise is mistaken for an effect:
+For each epoch, the evidence is a small normal matrix N_e of the camera's parameters. A hypothesis
+moves the parameters along directions v (P,) with trajectories c (E,): Σ v c(t). A trajectory
+computed from temperatures propagates the thermometer's error δ (R,) through its operator O (E, R),
+which adds d·O δ to the image noise. δ is integrated out exactly (Woodbury), so that neither white
+nor lagged thermometer noise is mistaken for an effect:
 
     S = N⁻¹ + J C Jᵀ,  J = Σ_k d_k ⊗ O_k,   S⁻¹ = N - N J (C⁻¹ + JᵀN J)⁻¹ JᵀN
 
-The level of every parameter belongs to the series and is eliminated here; offsets of targets that
-are hidden for long, and the mount's movement, are integrated out with δ (`random_effects`).
+The level of every parameter belongs to the series and is eliminated here. The offsets of targets
+that are hidden for long and the mount's movement are integrated out with δ (`random_effects`).
+Random shifts of single epochs, due to trembling or to a temperature between two readings, are part
+of the noise.
+
+All that is integrated out forms one triangular factor, which whitens trajectories: one by one if
+they are few, otherwise through the epochs, which all trajectories share.
 
 Source: Fuller (1987), Measurement Error Models, section 3.2; Rasmussen, Williams (2006), Gaussian
 Processes for Machine Learning, section 2.7 for marginalised linear terms.
-
-One series under a fixed covariance: inner products of trajectories, alone or many at once.
-
-What is integrated out (`likelihood`) stands in one triangular factor; trajectories are whitened by
-it, one by one where they are few, else through the epochs, which all trajectories share.
-
-Normal equations of the epochs' parameters, of the random effects (movement of the mount, offsets of
-hidden targets), and their couplings; with shifts of single epochs, which trembling or a temperature
-was not read makes, as part of the noise.
 """
 
 from __future__ import annotations
@@ -41,10 +37,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """The sums of a series before anything is integrated out, those of its hidden targets included.
+    """The normal equations of a series, and of its hidden targets, before the integration.
 
-    N (E, P, P), b (E, P), yy: of the epochs' parameters; cross (S, E, P), normal (S, S), right
-    (S,): of the offsets of hidden targets.
+    N (E, P, P), b (E, P), yy: of the epochs' parameters; logdet: of the epochs' random shifts;
+    cross (S, E, P), normal (S, S), right (S,): of the offsets of hidden targets.
     """
 
     N: Array
@@ -56,7 +52,7 @@ class Sums:
     right: Array
 
     def blurred(self, D: Array, epochs: NDArray[np.int64]) -> Sums:
-        """Let some epochs (n,) shift at random with unit variance along D (n, P, t): Woodbury."""
+        """Add random shifts of some epochs (n,), of unit variance, along D (n, P, t): Woodbury."""
         N, b = self.N[epochs], self.b[epochs]
         Dt = np.swapaxes(D, 1, 2)
         DtN = Dt @ N
@@ -82,7 +78,7 @@ class Sums:
 
 @lru_cache(maxsize=4)
 def sum_series(evidence: ReducedSeries) -> Sums:
-    """Sum a series with its hidden targets, and with what trembles from epoch to epoch."""
+    """Sum a series with its hidden targets and its tremble from epoch to epoch."""
     hidden = evidence.hidden
     E, P = evidence.b.shape
     cross, normal, right = np.zeros((0, E, P)), np.zeros((0, 0)), np.zeros(0)
@@ -95,14 +91,14 @@ def sum_series(evidence: ReducedSeries) -> Sums:
     return sums.blurred(D, np.arange(E))
 
 
-_MANY = 0.15  # trajectories per epoch above which epochs are whitened, for all that follow
+_MANY = 0.15  # trajectories per epoch above which the epochs are whitened, once for all
 
 
 @dataclass(frozen=True, eq=False)
 class Weighting:
-    """One series with a fixed covariance S: inner products of hypotheses under S⁻¹.
+    """A series with a fixed covariance S: inner products of trajectories under S⁻¹.
 
-    b (E, P), yy: data with the readings' own deviations put in; logdet: log |C| + log |M|. The
+    b (E, P), yy: data, corrected for the readings' deviations; logdet: log |C| + log |M|. The
     states are the S offsets of hidden targets, the amplitudes of the mount's movement (`moving`),
     and the errors of the readings.
     """
@@ -112,25 +108,25 @@ class Weighting:
     yy: float
     logdet: float
     cross: Array  # couplings (S, E, P) of the offsets of hidden targets
-    # of each direction of the movement and each reading error: operator (E, states), places of its
+    # for each direction of the movement and each error term: operator (E, states), slice of its
     # states, d (P,), dᵀN_e (E, P)
     errors: tuple[tuple[Array, slice, Array, Array], ...]
     moving: slice
     factor: Array  # L (states, states), lower
     data: Array  # L⁻¹ Jᵀ b (R,)
     level: Array  # L⁻¹ Jᵀ constants (R, P)
-    level_normal: Array  # inverse-ready (P, P) of the constants, thermometer included
+    level_normal: Array  # normal matrix (P, P) of the constants, with the thermometers' errors
     level_b: Array
     level_factor: Array
-    kept: dict[bytes, Array] = field(default_factory=dict)  # of `by_epoch`
+    kept: dict[bytes, Array] = field(default_factory=dict)  # the cache of `by_epoch`
 
     def left(self, parameters: Array) -> Array:
-        """Return what a movement (E, P) of the parameters leaves of the right-hand sides (E, P)."""
+        """Return the right-hand sides (E, P) after a movement (E, P) of the parameters."""
         rest: Array = self.b - np.einsum("epq,eq->ep", self.N, parameters)
         return rest
 
     def carried(self, trajectories: Array, directions: Array) -> Array:
-        """Return L⁻¹ Jᵀ of regressors: trajectories (E, R), directions (P, R) → (states, R)."""
+        """Return L⁻¹ Jᵀ (states, R) of trajectories (E, R) along directions (P, R)."""
         total = np.zeros((len(self.factor), trajectories.shape[1]))
         for operator, at, _, dN in self.errors:
             total[at] += operator.T @ ((dN @ directions) * trajectories)
@@ -140,7 +136,7 @@ class Weighting:
         return whiten(self.factor, total)
 
     def carried_stack(self, s: Array, directions: Array) -> Array:
-        """Return L⁻¹ Jᵀ of every trajectory (E, G) along every direction (P, k) → (states, G k)."""
+        """Return L⁻¹ Jᵀ (states, G k) of every trajectory (E, G) along every direction (P, k)."""
         E, G = s.shape
         if G < _MANY * E:
             columns = np.repeat(s, directions.shape[1], axis=1)
@@ -149,7 +145,7 @@ class Weighting:
         return np.stack(parts, axis=2).reshape(len(parts[0]), -1)
 
     def by_epoch(self, direction: Array) -> Array:
-        """Return L⁻¹ Jᵀ (states, E) of shifts of single epochs along a direction (P,); keep it."""
+        """Return L⁻¹ Jᵀ (states, E), cached, of shifts of single epochs along a direction (P,)."""
         key = direction.tobytes()
         if key not in self.kept:
             total = np.zeros((len(self.factor), len(self.N)))
@@ -160,8 +156,9 @@ class Weighting:
         return self.kept[key]
 
     def weighted(self, parameters: Array) -> Array:
-        """Return images (E, P, R) of trajectories of all parameters (E, P, R) under S⁻¹ after the
-        levels: their sums along other trajectories are inner products.
+        """Return S⁻¹ times movements (E, P, R) of all parameters, after the levels, (E, P, R).
+
+        Their sums along other movements are inner products.
         """
         from scipy.linalg import cho_solve
 
@@ -180,10 +177,10 @@ class Weighting:
         return b - np.tensordot(self.cross, states[:few], axes=(0, 0))
 
     def joint(self, trajectories: Array, directions: Array) -> tuple[Array, Array, Array]:
-        """Return normal equations alongside the levels: A (R, R), c (R,), K (P, R).
+        """Return normal equations A (R, R), c (R,) and their coupling K (P, R) with the levels.
 
-        trajectories (E, R), directions (P, R); K couples them with the levels, whose own normal
-        equations are `level_normal` and `level_b`.
+        trajectories (E, R), directions (P, R); the levels' own normal equations are `level_normal`
+        and `level_b`.
         """
         NV = self.N @ directions
         VNV = directions.T @ NV
@@ -194,8 +191,9 @@ class Weighting:
         return A - U.T @ U, c - U.T @ self.data, K - self.level.T @ U
 
     def reduce(self, trajectories: Array, directions: Array) -> tuple[Array, Array, float]:
-        """Return normal equations after the levels, A (R, R), c (R,), yy, of trajectories (E, R),
-        directions (P, R).
+        """Return normal equations A (R, R), c (R,), yy after elimination of the levels.
+
+        trajectories (E, R), directions (P, R).
         """
         A, c, K = self.joint(trajectories, directions)
         Q = whiten(self.level_factor, np.column_stack([K, self.level_b]))
@@ -205,10 +203,11 @@ class Weighting:
     def scan(
         self, trajectories: Array, directions: Array, base: tuple[Array, Array]
     ) -> tuple[Array, Array, Array]:
-        """Try many candidates: trajectories (G, E, m), directions (P, k); m·k columns each.
+        """Return the normal equations of many candidates, after elimination of the levels.
 
-        base: trajectories (E, R), directions (P, R) of what the model holds already.
-        Returns, after the levels: A (G, mk, mk), c (G, mk), cross with the base (G, mk, R).
+        trajectories (G, E, m), directions (P, k): of the candidates, with m·k columns each; base:
+        trajectories (E, R), directions (P, R) of the model so far. Returns A (G, mk, mk), c (G,
+        mk), and the coupling with the base (G, mk, R).
         """
         G, E, m = trajectories.shape
         P, k = directions.shape
@@ -244,11 +243,12 @@ class Weighting:
 
 @dataclass(frozen=True, eq=False)
 class ReadingErrorTerm:
-    """How a thermometer's error reaches the camera: d (P,) px per K·operator, O (E, R) from the
-    column's independent errors (`ReducedSeries.states`), channel.
+    """The effect of a thermometer's error on the camera.
 
-    unresolved (E,): standard deviation of the trajectory itself where the temperature bends within
-    one interval, in the trajectory's unit; None where the operator resolves it.
+    direction (P,): px per unit of the trajectory; operator (E, R): ∂ trajectory / ∂ independent
+    errors of the channel (`ReducedSeries.states`); unresolved (E,): standard deviation of the
+    trajectory, in its unit, where the temperature bends between two readings; None if the operator
+    covers that.
     """
 
     direction: Array
@@ -258,7 +258,7 @@ class ReadingErrorTerm:
 
 
 def add_error_term(terms: list[ReadingErrorTerm], new: ReadingErrorTerm) -> list[ReadingErrorTerm]:
-    """Add a term; two that carry the readings in the same way become one direction."""
+    """Add a term; terms with the same operator are merged, their directions added."""
     for i, old in enumerate(terms):
         alike = old.channel == new.channel and old.operator.shape == new.operator.shape
         plain = old.unresolved is None and new.unresolved is None
@@ -271,15 +271,15 @@ def add_error_term(terms: list[ReadingErrorTerm], new: ReadingErrorTerm) -> list
 def prepare(
     evidence: ReducedSeries, carried: list[ReadingErrorTerm], thermometer_factor: float = 1.0
 ) -> Weighting:
-    """Fix the covariance of a series: image noise, the movement of the epochs, and the
-    thermometers' noise carried by `carried`.
+    """Return the weighting of a series by image noise, movement, and thermometers' errors.
 
-    thermometer_factor: multiplies the standard deviations of the readings.
+    carried: the propagation of the thermometers' errors; thermometer_factor: multiplies the
+    standard deviations of the readings.
     """
     from scipy.linalg import cholesky
 
     sums = sum_series(evidence)
-    # what no reading resolves is noise of single epochs
+    # an error that no reading resolves is noise of single epochs
     for c in carried:
         if c.unresolved is not None and c.unresolved.any():
             bent = np.flatnonzero(c.unresolved)
@@ -304,7 +304,7 @@ def prepare(
         sds.append(sd)
         start += len(sd)
     whole = np.concatenate(sds)
-    # the readings' own deviation from the smooth trajectory, carried to the camera
+    # the readings' deviation from the smooth trajectory, propagated to the camera
     shift = np.zeros((E, P))
     for item in carried:
         operator = item.operator[:, touched[item.channel]]
@@ -331,10 +331,10 @@ def prepare(
     right = whiten(factor, right)
     level, data = right[:, :P], right[:, P]
     N0 = sums.N.sum(axis=0) - level.T @ level
-    # levels that the field cannot tell apart are held by 1000 px, or as loosely as rounding allows
+    # levels that the field cannot separate have a prior of 1000 px, or as weak as rounding allows
     held = 1e-6 + 1e-13 * float(np.trace(N0))
     level_factor = np.linalg.cholesky(N0 + held * np.eye(P))
-    if movement is not None:  # its size is estimated: the levels' share counts (restricted)
+    if movement is not None:  # its size is estimated: restricted likelihood, with the levels' share
         logdet += 2 * float(np.sum(np.log(np.diag(level_factor))))
     return Weighting(
         sums.N, b, yy - float(data @ data), logdet, sums.cross, tuple(errors), moving, factor,
@@ -357,9 +357,7 @@ def whiten(factor: Array, right: Array, transposed: bool = False) -> Array:
 def _find_touched(
     N: Array, carried: list[ReadingErrorTerm]
 ) -> dict[str, NDArray[np.int64] | slice]:
-    """Find the errors of each channel that reach an epoch with weight; the others change
-    nothing.
-    """
+    """Return the errors of each channel that reach an epoch with weight; others have no effect."""
     seen = N.any(axis=(1, 2))
     if seen.all():
         return {c.channel: slice(None) for c in carried}
@@ -367,15 +365,15 @@ def _find_touched(
     for c in carried:
         before = reached.get(c.channel, np.zeros(c.operator.shape[1], dtype=bool))
         reached[c.channel] = np.logical_or(before, np.any(c.operator[seen] != 0.0, axis=0))
-    # one at least, where there are no epochs at all
+    # at least one, even if no epoch has any weight
     return {name: np.flatnonzero(r) if r.any() else slice(1) for name, r in reached.items()}
 
 
 def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> None:
     """Add JᵀN J of movement and readings' errors to the upper half of M.
 
-    Operators on the same states are combined by the root of what they weigh together, epoch by
-    epoch: a product of a matrix with itself takes half the work.
+    Operators on the same states are combined, epoch by epoch, by the root of their joint weights,
+    as the product of a matrix with itself takes half the work.
     """
     groups: dict[int, list[tuple[Array, slice, Array, Array]]] = {}
     for error in errors:
@@ -383,7 +381,7 @@ def _add_products(M: Array, errors: list[tuple[Array, slice, Array, Array]]) -> 
     own = list(groups.values())
     for g, group in enumerate(own):
         weights = np.stack([[dN @ d for _, _, d, _ in group] for _, _, _, dN in group])  # (k, k, E)
-        size, turn = np.linalg.eigh(np.moveaxis(weights, 2, 0))  # it may be singular
+        size, turn = np.linalg.eigh(np.moveaxis(weights, 2, 0))  # not Cholesky: it may be singular
         root = turn * np.sqrt(np.maximum(size, 0.0))[:, None, :]
         here = group[0][1]
         for r in range(len(group)):

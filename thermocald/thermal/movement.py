@@ -1,16 +1,16 @@
-"""The camera's movement on its mount, as variance components alongside a hypothesis.
+"""The camera's movement on its mount, as variance components beside a hypothesis.
 
-A camera on a tripod wanders. The amplitudes of cosines in the well-determined combinations of the
-camera's parameters are random, with a covariance Sigma / (corner² + k²) at the k-th half-wave: a
-random walk where the corner is zero, else one that is bounded. Sigma is found by restricted maximum
-likelihood (EM), both series together, with each hypothesis by itself: what a hypothesis explains
-is not a movement.
+A camera on a tripod drifts. The amplitudes of cosines in the well-determined combinations of the
+camera's parameters are random, with the covariance Sigma / (corner² + k²) at the k-th half-wave: a
+random walk, bounded unless the corner is zero. Sigma is estimated by restricted maximum likelihood
+(EM) from all series together, and anew for each hypothesis, as what a hypothesis explains is not a
+movement.
 
 Source: Patterson, Thompson (1971), Biometrika 58, 545-554 (restricted maximum likelihood);
 Dempster, Laird, Rubin (1977), J. Royal Statistical Society B 39, 1-38 (EM).
 
-What moves from epoch to epoch is found in differences, which slow effects do not touch, and becomes
-a movement of each epoch by itself, or noise.
+Movement from epoch to epoch is estimated from differences, in which slow effects cancel. It is
+treated as an independent movement of each epoch, or as noise.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 WAVES = 24
-_LEAST = 0.2  # variance of a half-wave, in units of the image noise, that is worth a state
+_LEAST = 0.2  # variance of a half-wave, in units of the image noise, from which it is a state
 _TINY = 1e-6
 _FLOOR = 3.0
-_LITTLE = 1e-3  # of what is known of the best known direction
-_FAST = 8  # order of differences that leaves little but what jumps
+_LITTLE = 1e-3  # of the best determined direction's gain in precision
+_FAST = 8  # order of differences that leaves little but jumps
 
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """A movement estimated: covariance (m, m) of the combinations W (P, m), corner in half-waves.
+    """A movement of the mount: covariance (m, m) of combinations (P, m), corner in half-waves.
 
-    The combinations have unit variance where the image noise is all.
+    The combinations have unit variance if there is image noise only.
     """
 
     combinations: Array
@@ -59,14 +59,14 @@ class Mount:
     corner: float
 
     def modes(self) -> tuple[Array, Array]:
-        """Return variances and directions (P, ·) of the independent movements that matter."""
+        """Return the variances and directions (P, ·) of the independent movements that matter."""
         size, U = np.linalg.eigh(self.covariance)
         kept = size > _LEAST
-        kept[-1] = True  # one at least, so that likelihoods remain comparable
+        kept[-1] = True  # at least one, so that likelihoods remain comparable
         return np.maximum(size[kept], _TINY), self.combinations @ U[:, kept]
 
     def on(self, series: Sequence[ReducedSeries]) -> list[ReducedSeries]:
-        """Add the movement to the noise of the series."""
+        """Return the series with the movement as part of their noise."""
         size, directions = self.modes()
         out = []
         for e in series:
@@ -77,10 +77,9 @@ class Mount:
         return out
 
     def smoothness(self, fitter: HypothesisFitter, fit: Fit) -> float:
-        """Compare the slowest half-waves' power with that of the fast, in this movement's own
-        units.
+        """Return the power of the slowest half-waves over that of the fast ones, for this movement.
 
-        About 1 for a random walk; an influence without rough parts has much more.
+        It is about 1 for a random walk, and much larger for a smooth influence.
         """
         slow, fast = 0.0, 0.0
         for e, (mean, root) in zip(fitter.series, _estimate_amplitudes(fit), strict=True):
@@ -99,7 +98,7 @@ class Mount:
         return slow / max(fast, 1e-12)
 
     def size_px(self, e: ReducedSeries) -> float:
-        """Return the RMS over image points and time, px, that the movement is expected to have."""
+        """Return the movement's expected RMS, px, over image points and time."""
         size, _ = self.modes()
         K = min(WAVES, len(e.times) // 2)
         falling = 1.0 / (self.corner**2 + np.arange(1, K + 1) ** 2)
@@ -109,21 +108,22 @@ class Mount:
 
 
 def find_combinations(series: Sequence[ReducedSeries]) -> Array:
-    """Find the determined combinations (P, m) of parameters, orthonormal under the mean normals."""
+    """Return the determined combinations (P, m) of parameters, orthonormal in the mean normals."""
     W, good = orthonormal_combinations(np.mean([e.N.mean(axis=0) for e in series], axis=0))
     return W[:, good]
 
 
 def solve_combinations(N: Array, b: Array, W: Array) -> tuple[Array, Array]:
-    """Solve each epoch for the combinations W (P, m), held by a weak prior: their normal equations
-    (E, m, m) and values (E, m).
+    """Solve each epoch for combinations W (P, m) with a weak prior.
+
+    Returns normal matrices (E, m, m) and values (E, m).
     """
     normal = np.einsum("pi,epq,qj->eij", W, N, W) + 0.1 * np.eye(W.shape[1])
     return normal, np.linalg.solve(normal, (b @ W)[..., None])[..., 0]
 
 
 def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
-    """Guess the covariance (m, m) from the power of the misfit's half-waves beyond the noise."""
+    """Return an initial covariance (m, m) from the power of the misfit's half-waves above noise."""
     total = np.zeros((W.shape[1], W.shape[1]))
     count = 0
     for s, e in enumerate(fitter.series):
@@ -134,16 +134,16 @@ def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
         total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * np.eye(len(total))
         count += len(A)
     size, U = np.linalg.eigh(total / count)
-    # what starts at zero stays there: a slow drift hides in the moments among rough half-waves
+    # EM leaves a zero variance at zero, and rough half-waves can hide a slow drift in the moments
     out: Array = (U * np.maximum(size, _FLOOR)) @ U.T
     return out
 
 
 def weight_leaps_down(fitter: HypothesisFitter, fit: Fit, W: Array) -> list[ReducedSeries]:
-    """Give less weight to epochs that leap out of their neighbours and come back.
+    """Return the series with less weight for single epochs that leap away from their neighbours.
 
-    Somebody leans on the mount, or a board is seen badly: one epoch, of which a fit by squares
-    would make much.
+    Someone touches the mount, or a board is measured badly: one epoch, but with much influence on a
+    least-squares fit.
     """
     out = []
     for s, e in enumerate(fitter.series):
@@ -167,10 +167,10 @@ def estimate_mount_motion(
     start: Array | None,
     max_iterations: int,
 ) -> tuple[HypothesisFitter, Fit, Mount]:
-    """Estimate the movement alongside a hypothesis: a fitter that has it, the fit in it, the
-    estimate.
+    """Estimate the movement together with a hypothesis.
 
-    fitter: of the series, with or without a movement; mount: where the iteration starts.
+    fitter: of the series, with or without a movement; mount: start of the iteration. Returns a
+    fitter of the series with the movement, the fit, and the movement.
     """
     for turn in range(max_iterations + 1):
         own = HypothesisFitter(mount.on(fitter.series))
@@ -184,7 +184,7 @@ def estimate_mount_motion(
 
 
 def _improve_mount(fitter: HypothesisFitter, fit: Fit, mount: Mount) -> Mount:
-    """Take one step: the covariance whose moments the amplitudes have, given the data."""
+    """Take one EM step: set the covariance to the amplitudes' moments, given the data."""
     size, directions = mount.modes()
     power = np.zeros((len(size), len(size)))
     known = np.zeros((len(size), len(size)))
@@ -193,21 +193,21 @@ def _improve_mount(fitter: HypothesisFitter, fit: Fit, mount: Mount) -> Mount:
         a, k = e.movement.moments(mean, root)
         power += a
         known += k
-    # of each amplitude the data determine 1 - its variance: so many count (MacKay)
+    # the data determine 1 - variance of each amplitude: the effective number of them (MacKay)
     value, V = np.linalg.eigh(known)
     root = (V / np.sqrt(np.maximum(value, _LITTLE * value[-1]))) @ V.T
     change = root @ power @ root
-    # directions = W U: the covariance in W's coordinates again
+    # directions = W U: back to the covariance in W's coordinates
     U = np.linalg.lstsq(mount.combinations, directions * np.sqrt(size), rcond=None)[0]
     new = U @ change @ U.T
     return replace(mount, covariance=0.5 * (new + new.T))
 
 
 def _estimate_amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
-    """Estimate the movement's amplitudes (F,) of each series given the data, and a root (·, F) of
-    their covariance: the product of its transpose with itself.
+    """Estimate each series' amplitudes (F,) of the movement, given the data.
 
-    Levels and coefficients are unknown too: their uncertainty is in the covariance.
+    Returns them with a root R (·, F) of their covariance RᵀR, which includes the uncertainty of
+    levels and coefficients.
     """
     known = scaled_inverse(fit.normals()[0], 1e-10)
     out = []
@@ -228,15 +228,15 @@ def _estimate_amplitudes(fit: Fit) -> list[tuple[Array, Array]]:
     return out
 
 
-# -- what moves from epoch to epoch ----------------------------------------------------------------
+# -- movement from epoch to epoch ------------------------------------------------------------------
 
 
 def measure_jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Array, Array]:
-    """Measure the variance of jumps over its expectation (P,), in combinations W (P, P).
+    """Return the variance of jumps over its expectation (P,), in combinations W (P, P).
 
-    The columns of W are orthonormal under the mean normal matrix; the thermometer's noise, which
-    jumps too, is in the expectation. What trembles as a whole has a direction of its own: where one
-    is clear, the combinations are turned to it.
+    The columns of W are orthonormal in the mean normal matrix; the expectation includes the
+    thermometer's noise, which jumps too. A common tremble has its own direction: if one is clear,
+    the combinations are rotated to it.
     """
     e = fitter.series[series]
     W, good = orthonormal_combinations(e.N.mean(axis=0))
@@ -266,21 +266,19 @@ def measure_jumps(fitter: HypothesisFitter, fit: Fit, series: int) -> tuple[Arra
 
 
 def _subtract_fit(fitter: HypothesisFitter, fit: Fit, series: int) -> Array:
-    """Return what a fit and one level leave of the right-hand sides (E, P) of a series."""
+    """Return the right-hand sides (E, P) of a series after a fit and one level."""
     e = fitter.series[series]
     return subtract_level(e.N, e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(series)))
 
 
 def detect_tremble(evidence: ReducedSeries) -> bool:
-    """Test whether all targets jump together from epoch to epoch.
+    """Return whether all targets jump together from epoch to epoch.
 
-    From differences of so high an order that nothing is left of what follows a temperature: no
-    effect is assumed, and no thermometer's errors come in.
+    The test uses differences of an order so high that nothing that follows a temperature remains:
+    no effect is assumed, and no thermometer's error matters.
     """
-    M = evidence.N.mean(axis=0)
-    W, good = orthonormal_combinations(M)
-    W = W[:, good]
-    d = np.diff((evidence.values @ M @ W)[evidence.n > 0], _FAST, axis=0)
+    W = find_combinations([evidence])
+    d = np.diff((evidence.values @ evidence.N.mean(axis=0) @ W)[evidence.n > 0], _FAST, axis=0)
     if len(d) < criteria.FEWEST:
         return False
     spread = mad_sd(d, axis=0)
@@ -292,15 +290,15 @@ def detect_tremble(evidence: ReducedSeries) -> bool:
 def _find_directions(
     d: Array, white: float, carried: Array, order: int
 ) -> tuple[Array, Array] | None:
-    """Find factors (m,) along orthonormal directions (m, m) in which differences d (n, m) of an
-    order are clearly larger than expected; None where there are none.
+    """Find directions in which differences d (n, m) are clearly larger than expected, or None.
 
-    white: the mean square that image noise gives, carried (m, m): that of thermometers.
+    white: the mean square due to image noise; carried (m, m): due to the thermometers; order: of
+    the differences. Returns variance factors (m,) and orthonormal directions (m, m).
     """
     n, m = d.shape
     if n < criteria.FEWEST:
         return None
-    # differences repeat each other: of n second ones 18/35 are independent
+    # differences are correlated: of n second ones, 18/35 are independent
     shared = np.array([comb(2 * order, k) for k in range(2 * order + 1)], dtype=float)
     independent = n * shared[order] ** 2 / np.sum(shared**2)
     edge = (1.0 + np.sqrt(m / independent)) ** 2
@@ -311,12 +309,12 @@ def _find_directions(
     clear = own > criteria.UNUSUAL * edge * expected
     if not clear.any():
         return None
-    # what thermometers carry is an upper bound: trajectories are smoothed
+    # `carried` is an upper bound, as the trajectories are smoothed
     return np.where(clear, own / white, 1.0), U
 
 
 def weight_jumps_down(evidence: ReducedSeries, factors: Array, W: Array) -> ReducedSeries | None:
-    """Add unusual jumps to the noise of a series; None where there are none."""
+    """Return the series with unusual jumps as part of its noise; None if there are none."""
     factors = np.where(factors > criteria.UNUSUAL, factors, 1.0)
     if np.all(factors == 1.0):
         return None
@@ -329,16 +327,16 @@ def weight_jumps_down(evidence: ReducedSeries, factors: Array, W: Array) -> Redu
 
 
 def add_tremble(fitter: HypothesisFitter, fit: Fit, slower: int) -> list[ReducedSeries]:
-    """Add what moves from epoch to epoch as a movement of each epoch by itself.
+    """Return the series with the movement from epoch to epoch as a random movement of each epoch.
 
-    slower: how many of the slowest half-waves are accounted for otherwise.
+    slower: the number of slowest half-waves, which are accounted for otherwise.
     """
     out = []
     for s, e in enumerate(fitter.series):
         M, W = _measure_fast_power(fitter, fit, s, slower)
         edge = (1.0 + np.sqrt(len(M) / max(len(e.times) - slower, 1))) ** 2
         factors, U = np.linalg.eigh(M)
-        clear = factors > criteria.BEYOND * edge  # what so few half-waves cannot show by chance
+        clear = factors > criteria.BEYOND * edge  # more than so few half-waves show by chance
         D = W @ (U[:, clear] * np.sqrt(factors[clear] - 1.0))
         rest = np.diag(M - (U[:, clear] * (factors[clear] - 1.0)) @ U[:, clear].T)
         more = rest > criteria.UNUSUAL
@@ -350,13 +348,13 @@ def add_tremble(fitter: HypothesisFitter, fit: Fit, slower: int) -> list[Reduced
 def _measure_fast_power(
     fitter: HypothesisFitter, fit: Fit, series: int, slower: int
 ) -> tuple[Array, Array]:
-    """Measure the mean power (m, m) of fast half-waves that a fit leaves in the determined
-    combinations W (P, m) of the parameters: the unit matrix where the image noise is all. What the
-    thermometers' noise makes is taken off.
+    """Return the mean power (m, m) of the fast half-waves of a fit's misfit, and W (P, m).
+
+    W are the determined combinations of the parameters. The power is the unit matrix if there is
+    image noise only; the thermometers' share is subtracted.
     """
     e = fitter.series[series]
-    W, good = orthonormal_combinations(e.N.mean(axis=0))
-    W = W[:, good]
+    W = find_combinations([e])
     fast = waves(e.times, len(e.times) - 1)[:, slower:].T
     z = fast @ (_subtract_fit(fitter, fit, series) @ W)
     power: Array = z.T @ z / len(fast)
@@ -365,7 +363,7 @@ def _measure_fast_power(
             continue
         carried = fast @ operator
         noise = np.mean(np.sum((carried * e.state_sd(channel)) ** 2, axis=1))
-        # the fit has smoothed readings: what smoothing took off them is not in the rest
+        # the fit uses smoothed readings: the noise that smoothing removed is not in the misfit
         taken = np.mean((carried @ e.state_deviation(channel)) ** 2)
         left = max(np.sqrt(noise) - np.sqrt(taken), 0.0) ** 2
         along = W.T @ e.N.mean(axis=0) @ fit.direction(block)[0]
@@ -374,7 +372,7 @@ def _measure_fast_power(
 
 
 def add_jumps_to_noise(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
-    """Add what still jumps from epoch to epoch to the noise; None where nothing does."""
+    """Return the series with remaining jumps as part of their noise; None if there are none."""
     if any(len(e.times) < criteria.FEWEST for e in fitter.series):
         return None
     out = [

@@ -1,24 +1,21 @@
-"""Noise that the images' own sigmas do not know: correlated in time, or shared by neighbours.
+"""Noise beyond the images' sigmas, noise that follows the temperature, and thermometers' noise.
 
-Correlation in time is seen in the residuals of single targets and makes slow trajectories less
-certain than their number of epochs says; corners of a marker, or of a board, err slowly together,
-and pull at some combinations of the parameters more than at others. Noise that neighbours share
-from epoch to epoch goes into the camera's parameters; it is seen in their jumps, once the
-trajectories have been explained.
+Noise that is correlated in time shows in the residuals of single targets; it makes slow
+trajectories less certain than their number of epochs suggests. The corners of a marker or of a
+board have slow errors in common, which bias some combinations of the parameters more than others.
+Noise that neighbours share from epoch to epoch enters the camera's parameters and shows in their
+jumps, once the trajectories have been explained.
 
-Source: Liang, Zeger (1986), Biometrika 73, 13-22, for covariances from clusters that err together;
-Bell, McCaffrey (2002), Survey Methodology 28, 169-181, for what the fit takes off their residuals.
+Source: Liang, Zeger (1986), Biometrika 73, 13-22, for covariances from clusters with common errors;
+Bell, McCaffrey (2002), Survey Methodology 28, 169-181, for the reduction of residuals by the fit.
 
-A measuring noise that follows the temperature.
+Measuring noise that follows the temperature is estimated from the variances of the epochs' free
+cameras, which no movement of the camera affects. Source: variances as a generalised linear model,
+McCullagh and Nelder (1989), Generalized Linear Models, chapter 10.
 
-It is looked for in the variances of the epochs' free cameras, which no movement of the camera
-touches. Source: variances as a generalised linear model, McCullagh and Nelder (1989), Generalized
-Linear Models, chapter 10.
-
-The noise of the reference thermometer as the images confirm it.
-
-The readings' own roughness is the estimate of `thermometer`; the images follow the temperature
-through the linear terms and are sharper than most thermometers, so that they can confirm it.
+The noise of the reference thermometer is estimated by `thermometer` from the roughness of the
+readings. The images follow the temperature through the linear terms; they are more precise than
+most thermometers and so can confirm the estimate.
 """
 
 from __future__ import annotations
@@ -43,17 +40,17 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Mask
     from thermocald.thermal.hypothesis import Fit
 
-_JUMP_SD = 4.0  # of a slope that the images show
+_JUMP_SD = 4.0  # standard deviations of the images' slope, from which its change is a jump
 
-_LEAST = 0.005  # fraction of the noise at T0 that is left where it is coldest
+_LEAST = 0.005  # least noise, as a fraction of that at T0
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseGrowth:
-    """Noise 1 + factor (T - T0): factor per K and its sd; gain in -2 log L; noise (E,) per series.
+    """A measuring noise 1 + factor (T - T0).
 
-    other_gain: of the best trajectory that is not the reference temperature (time, another
-    channel).
+    factor, sd: per K; gain: in -2 log L over constant noise; other_gain, other: of the best
+    trajectory other than the reference temperature (time, another channel); noise (E,): per series.
     """
 
     factor: float
@@ -65,11 +62,10 @@ class NoiseGrowth:
 
 
 def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
-    """Test whether the measuring noise follows the reference temperature; None where it does not.
+    """Estimate how the measuring noise follows the reference temperature; None if it does not.
 
-    None also where another thermometer explains it better, or time does as well.
-
-    The variances of the epochs' adjustments are χ² distributed about (1 + k (T - T0))².
+    None also if another thermometer explains it better, or time explains it as well. The variances
+    of the epochs' adjustments are χ² distributed about (1 + k (T - T0))².
     """
     data = _list_variances(series)
     temperature = [e.history.temperature() - e.T0 for e in series]
@@ -79,7 +75,7 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
         if name != series[0].history.reference and all(name in e.history.readings for e in series):
             trajectory = [e.history.temperature(name) for e in series]
             others.append((_estimate_slope([c - c.mean() for c in trajectory], data)[1], name))
-    # two thermometers of a camera rise together: another one is in the way only where it is better
+    # two thermometers of a camera rise together: only a clearly better one excludes the reference
     if others and gain < max(others)[0] - criteria.CLEAR:
         return None
     time = [(e.times - e.times.mean()) / max(float(np.ptp(e.times)), 1.0) for e in series]
@@ -87,10 +83,10 @@ def noise_growth(series: Sequence[ReducedSeries]) -> NoiseGrowth | None:
     other_gain, other = max([*others, (by_time, "time")])
     if gain < criteria.GROWTH or gain < by_time + criteria.CLEAR:
         return None
-    found = estimate_noise_slope(series)
-    if found.gain < criteria.GROWTH:
+    growth = estimate_noise_slope(series)
+    if growth.gain < criteria.GROWTH:
         return None
-    return replace(found, other_gain=other_gain * found.gain / gain, other=other)
+    return replace(growth, other_gain=other_gain * growth.gain / gain, other=other)
 
 
 def estimate_noise_slope(series: Sequence[ReducedSeries]) -> NoiseGrowth:
@@ -106,7 +102,7 @@ def estimate_noise_slope(series: Sequence[ReducedSeries]) -> NoiseGrowth:
 def _list_variances(
     series: Sequence[ReducedSeries],
 ) -> list[tuple[NDArray[np.bool_], Array, Array]]:
-    """Return of each series the epochs that count, their degrees of freedom, their variances."""
+    """Return for each series which epochs count, and their degrees of freedom and variances."""
     free = [np.maximum(2.0 * e.n - e.N.shape[1], 1.0) for e in series]
     return [(e.n > 0, f, e.sigma0**2) for e, f in zip(series, free, strict=True)]
 
@@ -114,7 +110,7 @@ def _list_variances(
 def _measure_roughness(
     trajectories: Sequence[Array], data: Sequence[tuple[NDArray[np.bool_], Array, Array]], k: float
 ) -> float:
-    """Measure by how much the variances scatter more, and slower, than χ² does; at least 1."""
+    """Return the factor, at least 1, by which the variances scatter more and slower than χ²."""
     total = []
     for trajectory, (ok, free, v) in zip(trajectories, data, strict=True):
         f = free[ok]
@@ -132,14 +128,14 @@ def _estimate_slope(
     trajectories: Sequence[Array],
     data: Sequence[tuple[NDArray[np.bool_], Array, Array]],
 ) -> tuple[float, float, float]:
-    """Estimate k of the noise 1 + k trajectory: k, gain in -2 log L, sd; a level per series."""
+    """Estimate the noise 1 + k trajectory, with a level per series; return k, -2 log L gain, sd."""
     from scipy.optimize import minimize_scalar
 
     def objective(k: float) -> float:
         total = 0.0
         for trajectory, (ok, free, v) in zip(trajectories, data, strict=True):
             s2 = np.maximum(1.0 + k * trajectory[ok], _LEAST) ** 2
-            # the targets' offsets are means over all epochs, and bring their noise into each
+            # the targets' offsets, as means over all epochs, bring the mean noise into each epoch
             s2 = s2 + (s2.mean() - s2) / len(s2)
             f = free[ok]
             level = np.sum(f * v[ok] / s2) / np.sum(f)
@@ -155,17 +151,17 @@ def _estimate_slope(
     gain = objective(0.0) - float(start.fun)
     h = 0.01 / reach
     curvature = (objective(k + h) - 2 * objective(k) + objective(k - h)) / h**2
-    # log variances scatter a little more than χ² does: gross errors near the limit
+    # log variances scatter slightly more than χ², because of gross errors near the limit
     sd = float(np.sqrt(2.0 / curvature)) if curvature > 0 else float("inf")
     return k, gain, sd
 
 
 def calibrate_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSeries]:
-    """Estimate the noise of the reference thermometer as the images confirm it.
+    """Return the series with the reference thermometer's noise estimated from readings and images.
 
-    The images tell the temperature too, through the linear terms: with an unknown slow error, but
-    sharper than most thermometers. Where a fast effect spoils that, the readings alone count. One
-    thermometer has one noise.
+    The images measure the temperature too, through the linear terms: with an unknown slow error,
+    but more precisely than most thermometers. If a fast effect prevents that, the readings alone
+    count. The thermometer has the same noise in all series.
     """
     fitter = HypothesisFitter([in_blocks(e) for e in series])
     fit = fitter.fit(())
@@ -173,7 +169,7 @@ def calibrate_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSerie
     d = fit.direction(fit.blocks[0])[0]
     variances, weights, jumps = [], [], []
     for s, e in enumerate(series):
-        # a mount that trembles bends the trajectory too
+        # a tremble of the mount would bend the trajectory too
         jumps.append(np.zeros(len(e.times)) if detect_tremble(e) else _slope_jumps(e, d))
         instrument = e.thermometers[e.history.reference]
         precision = np.einsum("p,epq,q->e", d, e.N, d)
@@ -184,17 +180,17 @@ def calibrate_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSerie
             trajectory = fitter.drive_trajectory((), s)
             matrix = e.history.temperature_matrix() @ instrument.mixing
             shown = trajectory + matrix @ instrument.deviation
-            # what the image says of T beyond its level, in K
+            # the images' T, but for its level, minus the readings', K
             rest = (e.b @ d)[ok] / precision[ok] - shown[ok]
             image = 6.0 * float(np.mean(1.0 / precision[ok][1:-1][alike]))
-            # between two readings the error is less than that of one, and neighbours share it
+            # between two readings, the error is smaller than a reading's and correlated
             rows = matrix[ok]
             second = (rows[2:] - 2.0 * rows[1:-1] + rows[:-2])[alike]
             share = float(second.multiply(second).sum()) / second.shape[0]
             power = _estimate_clipped_sd(np.diff(rest, 2)[alike]) ** 2 - image
             shown_by_image = power / max(share, 1e-9)
             if shown_by_image < 1.5 * own:
-                weight = share / (share + 6.0)  # a half where frames and readings coincide
+                weight = share / (share + 6.0)  # 1/2 if frames and readings coincide
                 own = max((1.0 - weight) * own + weight * shown_by_image, 0.25 * own)
         variances.append(own)
         weights.append(float(ok.sum()))
@@ -210,10 +206,10 @@ def calibrate_thermometers(series: Sequence[ReducedSeries]) -> list[ReducedSerie
 
 
 def _slope_jumps(series: ReducedSeries, direction: Array) -> Array:
-    """Return by how much (E,) K/s the slope of the temperature that the images show jumps."""
+    """Return the jumps (E,) K/s of the temperature's slope, as measured by the images."""
     precision = np.einsum("p,epq,q->e", direction, series.N, direction)
     rows = np.flatnonzero(precision > 0)
-    rows = rows[np.diff(series.times[rows], prepend=-np.inf) > 0]  # one epoch of each time
+    rows = rows[np.diff(series.times[rows], prepend=-np.inf) > 0]  # one epoch for each time
     out = np.zeros(len(precision))
     if len(rows) < 4:
         return out
@@ -222,18 +218,17 @@ def _slope_jumps(series: ReducedSeries, direction: Array) -> Array:
     variance = (1.0 / precision[rows][1:] + 1.0 / precision[rows][:-1]) / step**2
     jump = np.abs(slope[2:] - slope[:-2])
     jump[jump**2 < _JUMP_SD**2 * (variance[2:] + variance[:-2])] = 0.0
-    # around the interval between two epochs
+    # at both epochs of the interval around which the slope changes
     out[rows[1:-2]] = jump
     out[rows[2:-1]] = np.maximum(out[rows[2:-1]], jump)
     return out
 
 
 def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
-    """Take as the point of linearisation what readings and images together say of the temperature.
+    """Return the series linearised at the temperature estimated from readings and images together.
 
-    The readings and their errors stay the data. A delay moves the smoothed readings along, and what
-    noise the smoothing has left in their slope would pass for knowledge of it. None where no effect
-    changes what drives the camera.
+    The readings and their errors remain the data. A delay shifts the smoothed readings, and noise
+    that is left in their slope would seem to determine it. None if the hypothesis has no drive.
     """
     if not any(term.is_drive for term in fit.terms):
         return None
@@ -248,7 +243,7 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
         precision = np.einsum("p,epq,q->e", direction, e.N, direction)
         left = e.b - np.einsum("epq,eq->ep", e.N, fit.parameters(s))
         operator, sd = fitter.drive(fit.terms, s)[1], old.sd
-        # normal equations of the states and of one level
+        # normal equations of the states and one level
         A = np.column_stack([operator, np.ones(len(operator))])
         normal = A.T @ (precision[:, None] * A)
         normal[:-1, :-1] += np.diag(1.0 / sd**2)
@@ -263,10 +258,10 @@ def sharpen_trajectories(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeri
 
 
 def _find_alike(series: ReducedSeries, ok: Mask) -> Mask:
-    """Find the rows with a result (n - 2,) that are like both neighbours.
+    """Return which rows with a result (n - 2,), without both ends, are like their neighbours.
 
-    In a long series that was condensed the usual mean among its like: short means are as noisy as
-    their neighbours are sharp.
+    In a condensed series, these are means over the usual number of epochs with neighbours of the
+    same kind, as shorter means are noisier.
     """
     counts = series.source.counts
     if counts is None:
@@ -276,7 +271,7 @@ def _find_alike(series: ReducedSeries, ok: Mask) -> Mask:
 
 
 def _estimate_clipped_sd(values: Array) -> float:
-    """Estimate the sd of a normal distribution whose tails are spoiled."""
+    """Estimate the sd of a normal distribution with contaminated tails."""
     scale = float(np.sqrt(np.mean(values**2)))
     for _ in range(20):
         kept = values[np.abs(values) <= 2.2 * scale]
@@ -285,7 +280,7 @@ def _estimate_clipped_sd(values: Array) -> float:
 
 
 def weight_slow_noise(evidence: ReducedSeries) -> ReducedSeries:
-    """Give a series the weights that its slow trajectories deserve."""
+    """Return the series with weights that are correct for slow trajectories."""
     k = evidence.correlation
     if k <= 1.0:
         return evidence
@@ -295,12 +290,11 @@ def weight_slow_noise(evidence: ReducedSeries) -> ReducedSeries:
 
 
 def measure_slow_noise(evidence: ReducedSeries) -> tuple[Array, Array]:
-    """Measure the variance of slow trajectories over white noise (P,), in combinations W (P, P).
+    """Return the variance of slow trajectories over white noise (P,), in combinations W (P, P).
 
-    The combinations are orthonormal under the mean normal matrix.
-
-    From what clusters of neighbouring targets leave over together in slow trajectories; what the
-    fit has taken off a cluster's residuals is put back, so that white noise gives 1.
+    The combinations are orthonormal in the mean normal matrix. The variances are those of the
+    common residuals of clusters of neighbouring targets in slow trajectories, corrected for the
+    part that the fit absorbs, so that white noise gives 1.
     """
     M = evidence.N.mean(axis=0)
     W, good = orthonormal_combinations(M)
@@ -314,7 +308,7 @@ def measure_slow_noise(evidence: ReducedSeries) -> tuple[Array, Array]:
         A = (evidence.columns[rows] @ W).reshape(-1, len(M))
         left, V = np.linalg.eigh(np.eye(len(M)) - A.T @ (A * mean[rows].reshape(-1, 1)))
         pull = (trajectories @ v[:, rows].reshape(len(v), -1)) @ A
-        # what a cluster determines alone cannot be told from its residuals at all
+        # the residuals of a cluster do not show a combination that it alone determines
         pull = pull @ (V / np.sqrt(np.maximum(left, 0.05))) @ V.T
         total += pull.T @ pull / len(trajectories)
     total[~good] = 0.0
@@ -324,7 +318,7 @@ def measure_slow_noise(evidence: ReducedSeries) -> tuple[Array, Array]:
 
 
 def _group_targets(evidence: ReducedSeries) -> list[NDArray[np.int64]]:
-    """Group neighbouring targets of the field, markers whole: some thirty clusters."""
+    """Group neighbouring targets into at most 30 clusters, without dividing markers."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
     field = evidence.source.field

@@ -1,8 +1,8 @@
-"""Random effects of a series: unknowns of no hypothesis, integrated out of its likelihood.
+"""The random effects of a series, which belong to no hypothesis and are integrated out.
 
-The offsets of targets that are hidden for long: where they are taken for known, a target that comes
-back pulls at the camera. The slow movement of the camera on its mount: a random walk, or a bounded
-one, in the well-determined combinations of the camera's parameters.
+They are the offsets of targets that are hidden for long (if these were fixed, a target that
+reappears would bias the camera), and the slow movement of the camera on its mount (a random walk,
+possibly bounded, in the well-determined combinations of the camera's parameters).
 
 Source: Patterson, Thompson (1971), Biometrika 58, 545-554 (variance components); Rasmussen,
 Williams (2006), Gaussian Processes for Machine Learning, section 2.7.
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-_OFTEN = 0.9  # share of the epochs that show a target whose offset needs no unknown of its own
-_SEEN = 0.05  # variance of an amplitude, in units of the image noise, that is worth an unknown
-_LOOSE = 1e-4  # px⁻², of an offset a priori
+_OFTEN = 0.9  # share of the epochs with a target from which its offset needs no unknown
+_SEEN = 0.05  # variance of an amplitude, in units of the image noise, from which it is an unknown
+_LOOSE = 1e-4  # px⁻², prior weight of an offset
 
 
 @dataclass(frozen=True, eq=False)
 class HiddenTargets:
-    """Offsets of hidden targets, S combinations that the camera's parameters could take up.
+    """The offsets of hidden targets, as S combinations that the camera's parameters could absorb.
 
-    patterns (G, E) px⁻²: weights of the targets that are seen together; members: per pattern the
-    targets' rows (n,) and the combinations (2n, s) of their coordinates; group (S,): the pattern of
-    each combination; vectors (S, P): its products with scaled parameters; right (S, E): with the
-    misclosures.
+    patterns (G, E) px⁻²: weights of the targets that are seen at the same epochs; members: for each
+    pattern the targets' rows (n,) and the combinations (2n, s) of their coordinates; group (S,):
+    the pattern of each combination; vectors (S, P): its products with the scaled parameters' design
+    matrix; right (S, E): its products with the weighted misclosures.
     """
 
     patterns: Array
@@ -44,22 +44,22 @@ class HiddenTargets:
 
     @property
     def cross(self) -> Array:
-        """Their part of the normal equations alongside the epochs' parameters, (S, E, P)."""
+        """The normal equations' block (S, E, P) with the epochs' parameters."""
         out: Array = self.patterns[self.group][:, :, None] * self.vectors[:, None, :]
         return out
 
     @property
     def normal(self) -> Array:
-        """The diagonal (S,) of their own normal matrix."""
+        """The diagonal (S,) of the offsets' own normal matrix."""
         out: Array = self.patterns.sum(axis=1)[self.group] + _LOOSE
         return out
 
     def scaled(self, factor: Array | float) -> HiddenTargets:
-        """Multiply all weights by a factor, or by one (E,) for each epoch."""
+        """Multiply the weights by a factor, or by a factor (E,) for each epoch."""
         return replace(self, patterns=self.patterns * factor, right=self.right * factor)
 
     def in_blocks(self, starts: NDArray[np.int64]) -> HiddenTargets:
-        """Sum over blocks of neighbouring epochs that start at some rows."""
+        """Sum over blocks of neighbouring epochs, which begin at the rows `starts`."""
         return replace(
             self,
             patterns=np.add.reduceat(self.patterns, starts, axis=1),
@@ -67,14 +67,14 @@ class HiddenTargets:
         )
 
     def turned(self, T: Array, values: Array) -> HiddenTargets:
-        """Follow normal matrices taken to T N Tᵀ about the epochs' own values (E, P)."""
+        """Transform the offsets with normal matrices to T N Tᵀ, about the epochs' values (E, P)."""
         vectors = self.vectors @ T.T
         change = (vectors - self.vectors) @ values.T
         right = self.right + self.patterns[self.group] * change
         return replace(self, vectors=vectors, right=right)
 
     def less(self, change: Array) -> HiddenTargets:
-        """Take changes (E, T, 2) px off the image points."""
+        """Subtract changes (E, T, 2) px from the image points."""
         parts = [
             self.patterns[k] * (change[:, rows].reshape(len(change), -1) @ U).T
             for k, (rows, U) in enumerate(self.members)
@@ -83,9 +83,9 @@ class HiddenTargets:
 
 
 def group_hidden_targets(w: Array, left: Array, A: Array) -> HiddenTargets | None:
-    """Group the targets that are hidden for long by when they are seen; None where none is.
+    """Group the targets that are hidden for long by the epochs that show them; None if none is.
 
-    w (E, T, 3) px⁻², left (E, T, 2) px: misclosures, A (T, 2, P): partials.
+    w (E, T, 3) px⁻²: weights; left (E, T, 2) px: misclosures; A (T, 2, P): partial derivatives.
     """
     there = w[..., 0] > 0
     epochs = there.any(axis=1)
@@ -112,10 +112,10 @@ def group_hidden_targets(w: Array, left: Array, A: Array) -> HiddenTargets | Non
 
 @dataclass(frozen=True, eq=False)
 class Movement:
-    """Slow movement of the epochs' parameters that no hypothesis explains.
+    """A slow movement of the epochs' parameters that no hypothesis explains.
 
-    directions (P, m) in px-scaled columns; trajectories (E, K): orthonormal cosines; sd (m, K): of
-    their amplitudes in units of the image noise. Those that the noise hides are left out.
+    directions (P, m): in px-scaled columns; trajectories (E, K): orthonormal cosines; sd (m, K): of
+    their amplitudes, in units of the image noise. Amplitudes below the noise are left out.
     """
 
     directions: Array
@@ -124,7 +124,7 @@ class Movement:
 
     @cached_property
     def states(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Direction and cosine of each amplitude that counts."""
+        """The direction and the cosine of each amplitude that counts, indices (F,) each."""
         seen = self.sd**2 > _SEEN
         if not seen.any():
             seen[-1, 0] = True
@@ -133,9 +133,7 @@ class Movement:
 
     @property
     def operators(self) -> list[tuple[Array, Array]]:
-        """Directions (P,) that count, and trajectories (E, ·) of their amplitudes for unit
-        variance.
-        """
+        """The directions (P,) that count, each with its trajectories (E, ·) of unit variance."""
         mode, wave = self.states
         return [
             (self.directions[:, i], self.trajectories[:, k] * self.sd[i, k])
@@ -144,9 +142,10 @@ class Movement:
         ]
 
     def moments(self, mean: Array, root: Array) -> tuple[Array, Array]:
-        """Sum products of amplitudes over the cosines, and their gain in precision, (m, m).
+        """Return the amplitudes' products and their gain in precision, (m, m), summed over cosines.
 
-        mean (F,), root (·, F) of the covariance given the data; 0 and 1 of those left out.
+        mean (F,), root (·, F): of the amplitudes and of their covariance, given the data; the
+        amplitudes that are left out have mean 0 and variance 1.
         """
         mode, wave = self.states
         m, K = self.sd.shape
@@ -161,7 +160,7 @@ class Movement:
 
 
 def waves(times: Array, count: int) -> Array:
-    """Return cosines (E, K) over a series, orthonormal where the epochs are at even intervals."""
+    """Return cosines (E, K) over a series, orthonormal for epochs at even intervals."""
     E = len(times)
     u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
     u = (u * (E - 1) + 0.5) / E

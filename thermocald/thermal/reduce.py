@@ -1,20 +1,19 @@
 """The reduction of a series: linearisation, gross errors, offsets of targets, normal equations.
 
-What is constant over the series says nothing about heat: one offset per target (errors of the
-field's coordinates) is taken out here, together with the cameras, so that a target that is hidden
-now and then is not mistaken for a drift.
+A recording is first checked for what a discovery or a fit requires; an error states what is
+missing.
 
-What a recording must hold to carry a discovery; the refusals say what is missing.
+Whatever is constant over the series has no information about heat. One offset per target (from
+errors of the field's coordinates) is eliminated together with the cameras, so that a target that is
+hidden now and then is not mistaken for a drift.
 
-Gross errors of a series, found in time: a target that leaps out of its own neighbours.
+Gross errors are detected in time: a target leaps away from its own neighbours. The series is
+processed in parts, so that a long one needs no more memory than its points.
 
-All is done in parts of the series, so that a long one needs no more memory than its points.
-
-Where a series is linearised: one camera for its mean image, and what the partials leave.
-
-The normal equations of a series hold partial derivatives at one point. An error of that point is
-one of the rates: the point is as sharp as the mean image is. Where the distortion follows the
-angle, the image follows the principal distance in straight lines.
+The series is linearised at one camera, adjusted to its mean image. The partial derivatives of the
+normal equations refer to this camera, so that its errors become errors of the rates; it is as
+precise as the mean image. If the distortion follows the angle, the image is linear in the principal
+distance.
 """
 
 from __future__ import annotations
@@ -60,8 +59,9 @@ if TYPE_CHECKING:
 
 
 def require(source: SeriesInput, strict: bool) -> None:
-    """Raise DataError where temperature, epochs, duration or field do not carry a discovery; where
-    not `strict`, the fit of a thermal model.
+    """Raise DataError if temperature, epochs, duration or field do not suffice for a discovery.
+
+    Without `strict`, they need only suffice for the fit of a thermal model.
     """
     if not source.readings:
         raise DataError(
@@ -93,7 +93,7 @@ def require(source: SeriesInput, strict: bool) -> None:
     if duration < criteria.MIN_DURATION:
         raise DataError(
             f"{source.name}: the recording lasts {duration:.0f} s; heat needs minutes to reach a "
-            "camera, and what moves faster is not a thermal effect. Record at least "
+            "camera, and a faster movement is not a thermal effect. Record at least "
             f"{criteria.MIN_DURATION:.0f} s, better half an hour"
         )
     rows = source.grid.observed.any(axis=0)
@@ -105,7 +105,7 @@ def require(source: SeriesInput, strict: bool) -> None:
 
 
 def _no_temperature(source: SeriesInput, reference: str) -> DataError:
-    """Make the error for a reference temperature that was hardly ever read."""
+    """Make the error for a reference temperature with too few readings."""
     return DataError(
         f"{source.name}: the recording has no temperature: the column {reference!r} holds fewer "
         f"than {criteria.MIN_EPOCHS} readings. Record the camera's temperature with its frames"
@@ -113,13 +113,13 @@ def _no_temperature(source: SeriesInput, reference: str) -> DataError:
 
 
 def require_change(source: SeriesInput, reference: str, channel: Thermometer) -> None:
-    """Raise DataError where the reference temperature does not change."""
+    """Raise DataError if the reference temperature does not change enough."""
     trajectory = channel.trajectory[np.isfinite(channel.trajectory)]
     change = float(np.ptp(trajectory))
     if change < max(criteria.LEAST_CHANGE_K, criteria.LEAST_CHANGE * channel.noise):
         raise DataError(
             f"{source.name}: the temperature {reference!r} is constant within "
-            f"{change:.2f} K; what follows it cannot be told from what does not. "
+            f"{change:.2f} K; thermal effects cannot be separated from others. "
             "Record a series in which it changes by 5 K or more"
         )
 
@@ -137,9 +137,9 @@ def _parts(epochs: int) -> Iterator[slice]:
 def _take_running_median(
     values: Array, part: slice, mask: Mask | None = None, *, itself: bool = True
 ) -> Array:
-    """Return the median over time of up to five neighbours (e, T, 2) in a part, NaN ignored.
+    """Return the running median over five epochs (e, T, 2) of a part, ignoring NaN.
 
-    mask (E, T): points that do not count; itself: whether an epoch is among its neighbours.
+    mask (E, T): points to ignore; itself: whether the epoch itself is among the five.
     """
     first, last = max(part.start - _HALF, 0), min(part.stop + _HALF, len(values))
     near = values[first:last]
@@ -153,7 +153,7 @@ def _take_running_median(
 
 
 def _take_median(values: ArrayLike, axis: int) -> Array:
-    """Return the median along an axis, NaN ignored; NaN where there is nothing else."""
+    """Return the median along an axis, ignoring NaN; NaN where all values are."""
     ordered = np.sort(values, axis=axis)  # NaN go to the end
     count = np.isfinite(ordered).sum(axis=axis, keepdims=True)
     low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, ordered.shape[axis] - 1)
@@ -162,14 +162,15 @@ def _take_median(values: ArrayLike, axis: int) -> Array:
 
 
 def find_spikes(misclosure: Array, seen: Mask) -> Mask:
-    """Find points (E, T) that leap out of their own neighbours in time while the others do not.
+    """Find points (E, T) that leap away from their own neighbours in time while others do not.
 
-    Found before any adjustment, where a gross error of many pixels would hide itself and others.
+    This precedes any adjustment, in which a gross error of many pixels would mask itself and
+    others.
     """
     size, own = np.zeros(seen.shape), np.zeros(len(seen))
     for part in _parts(len(seen)):
-        # Without the epoch itself: where all move one way it would be its own median, and what
-        # is usual would be nothing.
+        # Without the epoch itself: in a steady movement it would be its own median, and the usual
+        # deviation would be zero.
         d = misclosure[part] - _take_running_median(misclosure, part, itself=False)
         for k in range(2):
             d[..., k] -= _take_median(d[..., k], 1)[:, None]  # the whole image may move
@@ -182,10 +183,10 @@ def find_spikes(misclosure: Array, seen: Mask) -> Mask:
 
 
 def find_outliers(v: Array, weights: Array, seen: Mask, bad: Mask) -> Mask:
-    """Find points (E, T) whose residuals v (E, T, 2) px are gross against their neighbours in time.
+    """Find points (E, T) with residuals v (E, T, 2) px far from their neighbours' in time.
 
-    bad: those that were so far, which do not count. Noise may grow with heat: each epoch is
-    assessed by its own spread, or the series' where that is larger.
+    bad: the points found so far, which are ignored. As noise may grow with heat, the limit is
+    relative to the epoch's own spread, or to the series' if that is larger.
     """
     size, own = np.zeros(seen.shape), np.zeros(len(seen))
     good = seen & ~bad
@@ -206,8 +207,8 @@ _MEAN_IMAGE_PX, _SHARPEST_PX = 0.1, 1e-4  # standard deviation of the mean image
 _ANY_GEOMETRY = GeometryBounds(0, 2.0, 1e9, 1e9, 0.0, 0.0)
 
 
-def _free(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSettings:
-    """Free some parameters of the interior orientation. Weak ones stay near zero."""
+def _make_settings(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSettings:
+    """Return settings that free some interior parameters, with priors near zero for weak ones."""
     c = source.principal_distance or source.sensor.width * source.sensor.pixel_pitch
     spreads = (0.3 / c**2, 0.3 / c**4, 0.3 / c**6, 0.02 / c, 0.02 / c, 0.02, 0.02)
     priors = {n: (0.0, sd) for n, sd in zip(IOP_NAMES[3:], spreads, strict=True) if n in names}
@@ -215,16 +216,16 @@ def _free(source: SeriesInput, names: tuple[str, ...]) -> AdjustmentSettings:
 
 
 def linearise_series(source: SeriesInput) -> Partials:
-    """Linearise at one camera for the mean image of the series."""
+    """Linearise a series at the camera that is adjusted to its mean image."""
     mean = median_known(source.grid.points)
-    # targets seen in half of the epochs that show any carry the orientation
+    # the orientation uses targets that are in at least half of the epochs with any
     looked = int(source.grid.observed.any(axis=1).sum())
     often = source.grid.observed.sum(axis=0) >= 0.5 * max(looked, 1)
     rows = np.flatnonzero(np.isfinite(mean[:, 0]) & often)
     seen = Observations(rows, mean[rows], np.full((len(rows), 2), _MEAN_IMAGE_PX))
-    # where C1 or C2 is held, the principal point makes up for it, and the partials are those of
-    # another camera; but before one wall all together may lead nowhere
-    settings, held = _free(source, IOP_NAMES), _free(source, IOP_NAMES[:-2])
+    # all parameters first: with C1 and C2 fixed, the principal point absorbs them, and the partials
+    # are those of another camera; but for a single wall, all together may not converge
+    settings, held = _make_settings(source, IOP_NAMES), _make_settings(source, IOP_NAMES[:-2])
     c = source.principal_distance
     found = cold_start(source.sensor, source.field, seen, settings, c)
     if found.interior is None:
@@ -233,7 +234,7 @@ def linearise_series(source: SeriesInput) -> Partials:
         raise DataError(
             f"{source.name}: the camera cannot be oriented on its mean image: {found.reason}"
         )
-    # as sharp as it is, else the weak priors pull at the camera: 1e-4 of a year's rates
+    # with the actual precision, or the weak priors would bias the camera: 1e-4 of a year's rates
     rejected = np.isin(seen.targets, found.rejected)
     left = float(np.sqrt(np.mean(np.square(found.residuals[~rejected]))))
     sigmas = np.full((len(rows), 2), np.clip(left, _SHARPEST_PX, _MEAN_IMAGE_PX))
@@ -256,10 +257,10 @@ def reduce_series(
     """Check a series and reduce it.
 
     T0 °C: the reference temperature, by default the mean of the series; scale (19,): px per unit of
-    the columns, of another series of the camera; strict: whether the series must carry a
-    discovery, else only a fit.
+    the columns, of another series of the camera; strict: whether the series must suffice for a
+    discovery, not only for a fit.
 
-    Raises DataError where the data cannot carry it: it says what is missing.
+    Raises DataError, which states what is missing, if the data do not suffice.
     """
     least = criteria.MIN_EPOCHS if strict else criteria.LEAST_EPOCHS
     require(source, strict)
@@ -279,7 +280,7 @@ def reduce_series(
     if source.noises is not None:
         noises = {name: source.noises[name][usable] for name in present}
     knots, instruments = thermometers(reading_times, present, source.resolutions, noises)
-    # on a curve between two readings nothing was read
+    # without the knots on curves between readings
     trajectory = instruments[reference].trajectory[instruments[reference].mixing.diagonal() > 0]
     trajectory = trajectory[np.isfinite(trajectory)]
     history = History(
@@ -301,17 +302,16 @@ def reduce_series(
 
 
 def mean_misclosure(source: SeriesInput, at: Partials) -> Array:
-    """Return by how much each target (T, 2) px is seen elsewhere than the mean camera expects."""
-    return often_shown(source.grid.points - at.predicted)  # of points without weight too
+    """Return each target's misclosure (T, 2) px against the mean camera."""
+    return often_shown(source.grid.points - at.predicted)  # points without weight included
 
 
 def reduce_together(inputs: Sequence[SeriesInput], T0: float | None = None) -> list[ReducedSeries]:
-    """Reduce series in common units; T0 is the mean of the first unless a model has one."""
+    """Reduce series in common units; T0 °C is by default the mean of the first series."""
     first = reduce_series(inputs[0], T0)
     out = [first, *(reduce_series(i, first.T0, first.scale) for i in inputs[1:])]
     for e in out[1:]:
-        low = float(np.min(e.at.iop[0] / first.at.iop[0]))
-        if not 0.9 < low < 1.1:
+        if not 0.9 < e.at.iop[0] / first.at.iop[0] < 1.1:
             raise DataError(
                 f"{e.source.name}: the principal distance is {e.at.iop[0]:.3f} mm, in "
                 f"{first.source.name} {first.at.iop[0]:.3f} mm: another camera, or refocused"
@@ -358,8 +358,8 @@ def _reduce(
     enough = count >= criteria.MIN_TARGETS
     if not enough.any():
         raise DataError(
-            f"without gross errors no epoch has {criteria.MIN_TARGETS} targets or more: show more "
-            "targets"
+            f"{source.name}: without gross errors, no epoch has {criteria.MIN_TARGETS} targets or "
+            "more; use a field with more targets in the image"
         )
     variance = float(np.median(sigma0[enough]) ** 2)
     v = np.where((seen & ~bad)[..., None], v, np.nan)
@@ -383,9 +383,9 @@ def _reduce(
         n=count,
         sigma0=sigma0 / np.sqrt(variance),
         variance=variance,
-        correlation=_measure_slowness(v),
+        correlation=_measure_correlation(v),
         gross=int(bad.sum()),
-        # epochs without weight say nothing of what is hidden in others either
+        # epochs without weight do not count for the offsets of hidden targets either
         hidden=group_hidden_targets(
             np.where(enough[:, None, None], w, 0.0) / variance, misclosure - offsets, A
         ),
@@ -396,8 +396,10 @@ def _reduce(
 def _improve_offsets(
     w: Array, N: Array, A: Array, misclosure: Array, offsets: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Improve the offsets (T, 2) px by one step; then right-hand sides (E, k), values (E, k)
-    and the residuals (E, T, 2) px that go with them.
+    """Improve the offsets (T, 2) px by one step.
+
+    Returns the offsets, and with them right-hand sides (E, k), values (E, k) and residuals (E, T,
+    2) px.
     """
 
     def cameras(offsets: Array) -> tuple[Array, Array, Array]:
@@ -412,10 +414,10 @@ def _improve_offsets(
 
 
 def _solve_offsets(weights: Array, v: Array, N: Array, A: Array) -> Array:
-    """Solve for one offset per target (T, 2) that residuals v (E, T, 2) of free cameras ask for.
+    """Solve for one offset per target (T, 2) from residuals v (E, T, 2) of free cameras.
 
-    Targets hidden for long pull at the cameras of the other epochs: offsets and cameras are solved
-    together, by conjugate gradients on the offsets alone.
+    As targets that are hidden for long bias the cameras, offsets and cameras are solved together,
+    by conjugate gradients on the offsets alone.
     """
     k = A.shape[-1]
     flat = A.reshape(-1, k)
@@ -444,10 +446,10 @@ def _solve_offsets(weights: Array, v: Array, N: Array, A: Array) -> Array:
     return out
 
 
-def _measure_slowness(v: Array) -> float:
-    """Measure by how much slow variances exceed white noise: 1 + 2 Σ autocorrelations.
+def _measure_correlation(v: Array) -> float:
+    """Return the variance of slow noise over white noise: 1 + 2 Σ autocorrelations.
 
-    From the residuals of all targets together; the mean of each target has been taken out.
+    The residuals of all targets are used together; their means have been removed as offsets.
     """
     E = len(v)
     lags = min(_LAGS, E // 4)
@@ -465,7 +467,7 @@ def _measure_slowness(v: Array) -> float:
 
 
 def reweight(evidence: ReducedSeries, noise: Array) -> ReducedSeries:
-    """Weight a series for a measuring noise of each epoch of `noise` (E,) times the usual."""
+    """Return the series weighted for a measuring noise that is `noise` (E,) times the usual."""
     free = np.maximum(2.0 * evidence.n - evidence.N.shape[1], 0.0)
     level = np.sum(free * (evidence.sigma0 / noise) ** 2) / max(float(free.sum()), 1.0)
     noise = noise * np.sqrt(level)
@@ -478,7 +480,7 @@ def reweight(evidence: ReducedSeries, noise: Array) -> ReducedSeries:
 
 
 def without_targets(evidence: ReducedSeries, rows: NDArray[np.int64]) -> ReducedSeries:
-    """Reduce the series as if some targets of the field had never been observed."""
+    """Reduce the series as if some targets of the field, by their rows, had not been observed."""
     mask = np.zeros(evidence.source.grid.observed.shape, dtype=bool)
     mask[:, rows] = True
     reduced = with_points(evidence, evidence.source.grid.reject(mask))

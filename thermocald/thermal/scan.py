@@ -1,23 +1,21 @@
-"""What a candidate would add to a hypothesis, what the hypothesis leaves, and what curvature does.
+"""The scan of candidates beside a hypothesis, the absolute test of a model, and curvature.
 
-The scan: how much χ² each trial value of a candidate would explain beyond a hypothesis.
+A scan returns the χ² that each trial value of a candidate would explain in addition to a
+hypothesis. Over a candidate's whole grid it takes one matrix product with the epochs' normal
+equations.
 
-A scan over a candidate's whole grid costs one matrix product on the epochs' normal equations.
-
-The absolute test: does a model leave smooth trajectories in any parameter?
-
-An improvement is not honesty: a flexible surrogate improves M1 and even M2. What tells it from the
-cause is what it leaves. Cosines of growing order are offered to every independent combination of
-the camera's parameters, under the same covariance as the fit, in each series by itself.
+The absolute test is whether a model leaves smooth trajectories in any parameter. An improvement is
+no proof: a flexible surrogate improves the fit of one series and even the prediction of another,
+but unlike the cause it leaves a misfit. Cosines of growing order are fitted to every independent
+combination of the camera's parameters, with the covariance of the fit, in each series separately.
 
 Source: the smooth goodness-of-fit test of Neyman (1937), Skandinavisk Aktuarietidskrift 20,
 149-199, in the parameters of the camera.
 
-The second linearisation: what the image does beyond first order.
-
-A drift of several pixels leaves some thousandths of a pixel to the curvature of the projection,
-which is more than a discovery has to see. The trajectories found so far say how much, epoch by
-epoch.
+The second linearisation accounts for the image's movement beyond first order. With a drift of
+several pixels, the curvature of the projection amounts to some thousandths of a pixel, which is
+more than the misfit that a discovery has to detect. It is computed, epoch by epoch, from the
+trajectories estimated so far.
 """
 
 from __future__ import annotations
@@ -49,12 +47,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What a scan found.
+    """The result of a scan.
 
-    gains (G,): χ² that each trial value explains, all series together; events [(G,)]: of an event,
-    in each series, at each of its epochs but the first; coefficients: how many are fitted; stacks,
-    parts: of each series the trajectories (G, E, m), and A (G, mk, mk), c (G, mk), B (G, mk, K)
-    alongside the whole hypothesis.
+    gains (G,): χ² that each trial value explains in all series together; events [(G,)]: of an
+    event, for each series, at each epoch but the first; coefficients: their number; stacks, parts:
+    of each series the trajectories (G, E, m), and A (G, mk, mk), c (G, mk), B (G, mk, K) beside the
+    whole hypothesis.
     """
 
     gains: Array
@@ -65,20 +63,22 @@ class Scan:
 
     @property
     def best(self) -> int:
-        """Index of the best trial value."""
+        """The index of the best trial value."""
         return int(np.argmax(self.gains))
 
 
 class Scanner:
-    """The trajectories of candidates over their grids, computed once."""
+    """A scanner of candidates; it computes their trajectories over the grids once.
+
+    like: a scanner of the same histories with other noise, whose trajectories are shared.
+    """
 
     def __init__(self, fitter: HypothesisFitter, like: Scanner | None = None) -> None:
-        """like: a scanner of the same histories under other noise."""
         self.fitter = fitter
         self._stacks: dict[tuple[Candidate, int], Array] = like._stacks if like else {}
 
     def stack(self, candidate: Candidate, series: int, fit: Fit) -> Array:
-        """Return trajectories (G, E, m) of a candidate over its grid in one series."""
+        """Return a candidate's trajectories (G, E, m) over its grid in a series."""
         fitter = self.fitter
         drives = [t for t in fit.terms if t.is_drive]
         chained = candidate.kind.is_drive and bool(drives)
@@ -102,7 +102,7 @@ class Scanner:
         return stack
 
     def scan(self, candidate: Candidate, fit: Fit) -> Scan:
-        """Try one candidate over its grid beside a fitted hypothesis."""
+        """Scan a candidate over its grid beside a fitted hypothesis."""
         every = range(len(self.fitter.series))
         stacks = tuple(self.stack(candidate, s, fit) for s in every)
         parts = []
@@ -123,7 +123,7 @@ class Scanner:
         return Scan(np.sum(gains, axis=0), (), count, stacks, tuple(parts))
 
     def trials(self, candidate: Candidate) -> float:
-        """Count the independent trajectories of the grid: its length in angles over 90°."""
+        """Return the number of independent trajectories of a grid: its length in angles / 90°."""
         stack = self._stacks.get((candidate, 0))
         if stack is None or len(stack) < 2:
             return max(float(len(candidate.grid)), 1.0)
@@ -140,14 +140,14 @@ def gains_beside(
     base_A: Array,
     base_c: Array,
 ) -> list[Array]:
-    """Return the χ² (G, n) that a candidate explains beyond a base, for n sets of data at once.
+    """Return the χ² (G, n) that a candidate explains beside a base, for n sets of data at once.
 
-    parts: of each series A (G, k, k), c (G, k, n) of the candidate, B (G, k, K) alongside the
-    base's unknowns, whose normal equations are base_A (K, K), base_c (K, n). A list with one
-    element, or with one for each series where every series has coefficients of its own.
+    parts: of each series A (G, k, k), c (G, k, n) of the candidate, B (G, k, K) with the base's
+    unknowns, whose normal equations are base_A (K, K), base_c (K, n). The list has one element, or
+    one for each series if every series has its own coefficients.
     """
     change: Array | float = 0.0
-    if candidate.kind.is_drive:  # it takes the place of T: the base's own rates leave
+    if candidate.kind.is_drive:  # it replaces T: the base's own rates are dropped
         whole, rest = explained(base_A, base_c, _RIDGE), slice(len(BASE), None)
         base_A, base_c = base_A[rest, rest], base_c[rest]
         parts = [(A, c, B[..., rest]) for A, c, B in parts]
@@ -164,11 +164,11 @@ def normals_beside(
     weightings: Sequence[Weighting] | None = None,
     leave: frozenset[int] = frozenset(),
 ) -> tuple[Array, Array]:
-    """Return normal equations A (size, size), c (size,) of further trajectories beside a fit's.
+    """Return normal equations A (size, size), c (size,) of further trajectories beside a fit.
 
     The fit's own coefficients are eliminated. further: of each series trajectories (E, R),
-    directions (P, R) and places (R,) among the unknowns, or None; weightings: other covariances
-    than the fit's; leave: terms of the fit (-1: the base's rates) that are left out.
+    directions (P, R) and indices (R,) of the unknowns, or None; weightings: if not the fit's own;
+    leave: terms of the fit (-1: the base's rates) to be left out.
     """
     A = np.zeros((size + len(fit.coefficients),) * 2)
     c = np.zeros(len(A))
@@ -195,9 +195,9 @@ def normals_of_term(
     weightings: Sequence[Weighting] | None = None,
     leave: frozenset[int] = frozenset(),
 ) -> tuple[Array, Array]:
-    """Return normal equations A (k, k), c (k,) of a term's trajectory in some columns.
+    """Return normal equations A (k, k), c (k,) of a term's trajectory in the named columns.
 
-    The fit's own coefficients are eliminated, as `normals_beside` does.
+    The fit's own coefficients are eliminated, as in `normals_beside`.
     """
     k = len(names)
     further: list[tuple[Array, Array, Index] | None] = []
@@ -215,7 +215,7 @@ def normals_of_term(
 
 
 def _sum_gains(parts: Sequence[tuple[Array, Array, Array]], base_A: Array, base_c: Array) -> Array:
-    """Sum the parts, eliminate the base: χ² (G, n), -inf where a trajectory is next to nothing."""
+    """Sum the parts and eliminate the base; return χ² (G, n), -inf for negligible trajectories."""
     A, c, B = (np.asarray(sum(p[i] for p in parts)) for i in range(3))
     K, n = base_c.shape
     if K:
@@ -227,19 +227,19 @@ def _sum_gains(parts: Sequence[tuple[Array, Array, Array]], base_A: Array, base_
 
 
 _RIDGE = 1e-12  # of a unit diagonal
-_FAINT = 1e-6  # χ² of a trajectory of unit size below which it is taken for none
+_FAINT = 1e-6  # χ² of a trajectory of unit size, below which it is negligible
 
 ORDERS = 14
 
 
 @dataclass(frozen=True, eq=False)
 class Adequacy:
-    """What a model leaves in one series.
+    """The absolute test of a model in a series.
 
-    scores (ORDERS, D): unit normal where nothing is left; amplitudes (ORDERS, P): of the
-    trajectories in px-scaled columns, which take the rest up; directions (P, D): combinations of
-    px-scaled columns; excess: χ² beyond its expectation; significance: in standard deviations;
-    misfit_px: RMS over image coordinates of the smooth rest.
+    scores (ORDERS, D): standard normal for an adequate model; amplitudes (ORDERS, P): of the
+    misfit's trajectories in px-scaled columns; directions (P, D): combinations of px-scaled
+    columns; trajectories (ORDERS, E); excess: χ² beyond its expectation; significance: in standard
+    deviations; misfit_px: RMS over image coordinates of the smooth misfit.
     """
 
     JSON: ClassVar = {
@@ -257,12 +257,12 @@ class Adequacy:
 
     @property
     def adequate(self) -> bool:
-        """Nothing significant is left, or nothing that matters."""
+        """Whether the misfit is insignificant or negligible."""
         return self.significance < criteria.SIGNIFICANT or self.misfit_px < criteria.NEGLIGIBLE_PX
 
 
 def cosines(times: Array, orders: int) -> Array:
-    """Smooth trajectories (orders, E) over a series, order 1 being half a wave."""
+    """Return smooth trajectories (orders, E) over a series; order 1 is half a wave."""
     u = (times - times[0]) / max(float(times[-1] - times[0]), 1e-9)
     rows: Array = np.cos(np.pi * np.arange(1, orders + 1)[:, None] * u[None])
     rows -= rows.mean(axis=1, keepdims=True)
@@ -270,12 +270,12 @@ def cosines(times: Array, orders: int) -> Array:
 
 
 def examine_all(fitter: HypothesisFitter, fit: Fit) -> tuple[Adequacy, ...]:
-    """Test each series."""
+    """Test a fit in each series."""
     return tuple(examine(fitter, fit, s) for s in range(len(fitter.series)))
 
 
 def examine(fitter: HypothesisFitter, fit: Fit, series: int) -> Adequacy:
-    """Test one series; a short one for fewer orders than ORDERS."""
+    """Test a fit in a series, with fewer orders than ORDERS if it is short."""
     evidence, weighting = fitter.series[series], fit.weightings[series]
     C, V, index = fit.designs[series]
     x = fit.coefficients[index]
@@ -288,7 +288,7 @@ def examine(fitter: HypothesisFitter, fit: Fit, series: int) -> Adequacy:
     scores = np.zeros(rest.shape)
     amplitudes = np.zeros((orders, len(directions)))
     for j in range(orders):
-        # whitened, so that directions that share the thermometer's error count once
+        # whitened, so that directions with the thermometer's error in common count once
         L = np.linalg.cholesky(A[j] + 1e-9 * np.eye(len(A[j])) * np.trace(A[j]) / len(A[j]))
         scores[j] = np.linalg.solve(L, rest[j])
         amplitudes[j] = directions @ np.linalg.solve(L.T, scores[j])
@@ -311,7 +311,7 @@ _WORTH_PX = 0.0005
 
 
 def remove_curvature(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] | None:
-    """Take the curvature off all series; None where it matters in none."""
+    """Return the series without the projection's curvature; None if it matters in none."""
     out = [relinearise(fitter, fit, s) for s in range(len(fitter.series))]
     if all(e is None for e in out):
         return None
@@ -321,10 +321,10 @@ def remove_curvature(fitter: HypothesisFitter, fit: Fit) -> list[ReducedSeries] 
 def relinearise(
     fitter: HypothesisFitter, fit: Fit, series: int, beyond: Array | None = None
 ) -> ReducedSeries | None:
-    """Take the curvature off the observations of one series; None where it does not matter.
+    """Return a series with the curvature subtracted from its observations; None if negligible.
 
-    What was taken off before is taken into account. beyond (E, P): trajectories that the hypothesis
-    leaves, px-scaled.
+    A curvature that was subtracted before is replaced. beyond (E, P): movement in addition to the
+    hypothesis, px-scaled.
     """
     e = fitter.series[series]
     if e.blocks is not None:
@@ -347,11 +347,11 @@ def relinearise(
 
 
 def _compute_bend(fitter: HypothesisFitter, fit: Fit, series: int, beyond: Array | None) -> Array:
-    """Return what the image (E, T, 2) px of a series does beyond first order, but for its mean."""
+    """Return the image's movement (E, T, 2) px beyond first order, without its mean."""
     e = fitter.series[series]
     moved = fit.parameters(series) + (0.0 if beyond is None else beyond)
     rest = np.einsum("epq,eq->p", e.N, e.values - moved)
-    # levels along combinations that the field cannot determine stay where they were
+    # levels of combinations that the field cannot determine stay unchanged
     level = np.linalg.lstsq(e.N.sum(axis=0), rest, rcond=1e-6)[0]
     step = moved + level
     parameters = step / e.scale

@@ -1,14 +1,13 @@
-"""The evidence of one series: every epoch reduced to normal equations, once; on blocks if long.
+"""The evidence of a series: every epoch reduced once to normal equations, or blocks of epochs.
 
 The unknowns of an epoch are the 16 parameters of the camera and three scales of the test field.
-A hypothesis about the whole series is then a sum over 19 × 19 matrices, and no image point is
-touched again; `reduction` makes the evidence, `condensing` puts the epochs of long series together.
+For a hypothesis about the whole series it then suffices to sum 19 × 19 matrices, without the image
+points; `reduce` makes the evidence, `source` condenses the epochs of a long series.
 
-Where a long series needs short blocks: greedy halving where most happens within a block.
-
-What happens is χ² of the cameras of a block's epochs about their mean: first of all what does not
-follow the temperature in a straight line, where an effect hides that the base model lacks; to a
-hundredth of its weight all movement, where lags and delays show.
+A long series has short blocks where the camera moves fast: a block with a large χ² of its epochs'
+cameras about their mean is halved, the largest first. This χ² is that of the movement that is not
+linear in the temperature, in which effects beyond the base model show, plus a hundredth of that of
+all movement, in which lags and delays show.
 """
 
 from __future__ import annotations
@@ -46,14 +45,14 @@ COLUMNS = PARAMETER_NAMES + FIELD_SCALES
 
 @dataclass(frozen=True, eq=False)
 class SeriesInput:
-    """What was recorded.
+    """The recorded data of a series.
 
-    frame_times (E,) s; reading_times (R,) s; readings {channel: (R,)} °C, the first the reference;
-    resolutions {channel: K or None}; grid: image points on epochs × targets; numbers (E,): the
-    epochs' own numbers; series: its name; interior: what is known of the camera, for a start;
-    columns {name: (E,)}: what else was recorded with each frame, NaN where it is missing; counts
-    (E,): of how many epochs each row is the mean, None where rows are epochs; noises {channel:
-    (R,)} K: standard deviations of readings that are means, None where they are not.
+    name: of the recording or store; frame_times (E,) s; reading_times (R,) s; readings {channel:
+    (R,)} °C, the first is the reference; resolutions {channel: K or None}; grid: image points,
+    epochs × targets; numbers (E,): of the epochs; series: its name; interior: a start value;
+    columns {name: (E,)}: other recorded quantities at each frame, NaN where missing; counts (E,):
+    numbers of epochs averaged in the rows, None if rows are epochs; noises {channel: (R,)} K:
+    standard deviations of readings that are means, else None.
     """
 
     name: str
@@ -74,9 +73,7 @@ class SeriesInput:
     noises: Mapping[str, Array] | None = None
 
     def polygons(self) -> dict[str, tuple[Array, Array]]:
-        """Return times s from the start and values of each column that was recorded often
-        enough.
-        """
+        """Return the times, s from the start, and values of each column with enough values."""
         t = self.frame_times - self.frame_times[0]
         out = {}
         for name, values in (self.columns or {}).items():
@@ -86,23 +83,23 @@ class SeriesInput:
         return out
 
     def epochs(self, rows: NDArray[np.bool_]) -> int:
-        """Count the epochs that some rows (E,) stand for."""
+        """Return the number of epochs in some rows (E,)."""
         return int(rows.sum() if self.counts is None else self.counts[rows].sum())
 
     @property
     def per_row(self) -> Array:
-        """Of how many epochs each row (E,) is the mean."""
+        """The number of epochs in each row (E,)."""
         ones: Array = np.ones(len(self.frame_times))
         return ones if self.counts is None else self.counts.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Neighbouring epochs of a long series as one row.
+    """The blocks of neighbouring epochs that are the rows of a long series.
 
-    average (B, E): weights of the epochs in each block; pool (K, S): knots to states, the readings
-    of a block being one; within_free: degrees of freedom of the epochs about their blocks; first
-    (B,): index of each block's first epoch.
+    average (B, E): weights of the epochs in each block; pool (K, S): knots to states, where the
+    readings of a block have one state; within_free: degrees of freedom of the epochs about their
+    blocks; first (B,): index of each block's first epoch.
     """
 
     average: csr_array
@@ -113,25 +110,25 @@ class Blocks:
 
 @dataclass(frozen=True, eq=False)
 class ReducedSeries:
-    """One series, reduced.
+    """A series, reduced to normal equations.
 
-    source: what was recorded; times (E,) s from its start; history: smoothed readings;
-    thermometers: the columns as instruments; at: linearisation; scale (19,): px per unit of each
-    column; columns (T, 2, 19): ∂ image points / ∂ scaled columns; distortion: what it follows in
-    the column of c, which takes A and B along (`angle`) or leaves them.
+    source: the recorded data; times (E,) s from the start; history: smoothed readings;
+    thermometers: the temperature columns as instruments; at: linearisation; scale (19,): px per
+    unit of each column; columns (T, 2, 19): ∂ image points / ∂ scaled columns; distortion: whether
+    the column of c changes A and B too (`angle`) or not (`image`).
 
-    N (E, 19, 19), b (E, 19): normal equations in px-scaled columns, weighted by the noise found; yy
-    (E,): bᵀN⁻¹b; values (E, 19): the free camera of each epoch, scaled; residuals (E, T, 2) px:
-    what the free camera leaves, offsets (T, 2) px taken out, NaN where unseen or gross; weights (E,
-    T, 3) px⁻²; n (E,) image points; sigma0 (E,).
+    N (E, 19, 19), b (E, 19): normal equations in px-scaled columns, weighted by the estimated
+    noise; yy (E,): bᵀN⁻¹b; values (E, 19): the free camera of each epoch, scaled; residuals (E, T,
+    2) px: of the free camera, without the offsets (T, 2) px, NaN where unseen or gross; weights (E,
+    T, 3) px⁻²; n (E,): numbers of image points; sigma0 (E,).
 
-    variance: factor by which the given variances were too small; correlation: how much larger the
-    variance of slow trajectories is than that of white noise; gross: rejected points; excluded:
-    rows of targets left out; blocks: the epochs behind each row of a long series, or None; hidden,
-    movement: what the likelihood integrates out (`random_effects`), or None; tremble (P, t):
-    directions in which each epoch moves by itself, of unit variance; bend (E, T, 2) px: curvature
-    of the projection that was taken off the observations, or None; slope_jumps (E,) K/s: where the
-    images show that the temperature's slope jumps, None where they were not asked.
+    variance: factor by which the given variances were too small; correlation: variance of slow
+    trajectories over that of white noise; gross: number of rejected points; excluded: rows of
+    targets left out; blocks: the epochs in each row of a long series, or None; hidden, movement:
+    random effects (`random_effects`), or None; tremble (P, t): directions of each epoch's random
+    movement, of unit variance, or None; bend (E, T, 2) px: curvature of the projection that was
+    subtracted from the observations, or None; slope_jumps (E,) K/s: jumps of the temperature's
+    slope as measured by the images, or None.
     """
 
     source: SeriesInput
@@ -164,7 +161,7 @@ class ReducedSeries:
 
     @property
     def readings_history(self) -> History:
-        """The temperature as it was read, without smoothing, at the rows' times."""
+        """The history of the temperature as read, without smoothing, at the rows' times."""
         s = self.source
         there = np.isfinite(s.reading_times)
         readings = {n: np.asarray(r, dtype=float)[there] for n, r in s.readings.items()}
@@ -174,11 +171,11 @@ class ReducedSeries:
         return History(frames, times, readings, self.history.reference, self.T0, columns)
 
     def rescaled(self, scale: Array) -> ReducedSeries:
-        """Change the px per unit of each column (19,)."""
+        """Return the series with other px per unit of each column (19,)."""
         return self._in_columns(np.diag(self.scale / scale), scale=scale)
 
     def _in_columns(self, M: Array, **changes: Any) -> ReducedSeries:
-        """Express movements in other columns: M (19, 19) takes new values to present ones."""
+        """Return the series in other columns; M (19, 19) converts new values to present ones."""
         return replace(
             self,
             columns=self.columns @ M,
@@ -195,7 +192,7 @@ class ReducedSeries:
         return scaled_basis(self.at.iop, self.scale, self.distortion)
 
     def in_basis(self, distortion: Distortion) -> ReducedSeries:
-        """Let the distortion follow the angle, or the image."""
+        """Return the series with a distortion that follows the `angle` or the `image`."""
         if distortion == self.distortion:
             return self
         new = scaled_basis(self.at.iop, self.scale, distortion)
@@ -203,14 +200,14 @@ class ReducedSeries:
         return self._in_columns(M, distortion=distortion)
 
     def orientations(self, parameters: Array) -> Array:
-        """Return the interior orientations (E, 10) of movements (E, 19) in the columns' units."""
+        """Return the interior orientations (E, 10) for movements (E, 19) in the columns' units."""
         linear = self.at.iop + parameters[:, :10]
         return follow_angle(linear, self.at.iop[0]) if self.distortion == "angle" else linear
 
     def weighted(self, factor: Array | float) -> ReducedSeries:
-        """Multiply the weight of each epoch by a factor (E,), or of all by one.
+        """Return the series with the epochs' weights multiplied by a factor, or by factors (E,).
 
-        The weights of the image points stay as they are.
+        The image points' weights are unchanged.
         """
         f: Array = np.broadcast_to(factor, self.yy.shape)
         hidden = self.hidden.scaled(f) if self.hidden else None
@@ -218,26 +215,24 @@ class ReducedSeries:
         return replace(self, N=N, b=b, yy=self.yy * f, hidden=hidden)
 
     def squares(self, rest: Array) -> Array:
-        """Square a movement (E, P) of the parameters, less one level, in image noise: (E,)."""
+        """Return the squares (E,) of a movement (E, P) without its level, per image noise."""
         r = rest - best_level(self.N, np.einsum("epq,eq->ep", self.N, rest))
         squares: Array = np.einsum("ep,epq,eq->e", r, self.N, r)
         return squares
 
     def with_values(self, values: Array) -> ReducedSeries:
-        """Replace the free cameras by others (E, 19)."""
+        """Return the series with other free cameras (E, 19)."""
         b = np.einsum("epq,eq->ep", self.N, values)
         return replace(self, values=values, b=b, yy=np.einsum("ep,ep->e", values, b))
 
     @property
     def numbers(self) -> NDArray[np.int64]:
-        """The number of the epoch of each row; of a block, of its first epoch."""
+        """Each row's epoch number; for a block, that of its first epoch."""
         every = self.source.numbers
         return every if self.blocks is None else every[self.blocks.first]
 
     def states(self, channel: str, operator: csr_array) -> Array:
-        """Return ∂ trajectory / ∂ independent errors, dense, from ∂ trajectory / ∂ knots (epochs,
-        K).
-        """
+        """Return ∂ trajectory / ∂ independent errors, dense, from ∂ trajectory / ∂ knots (E, K)."""
         result = operator @ self.thermometers[channel].mixing
         if self.blocks is not None:
             result = self.blocks.average @ result @ self.blocks.pool
@@ -248,11 +243,11 @@ class ReducedSeries:
         sd = self.thermometers[channel].sd
         if self.blocks is None:
             return sd
-        pool = self.blocks.pool  # the sd of the mean over the knots of a state
+        pool = self.blocks.pool  # a state's sd is that of the mean over its knots
         return np.asarray(np.sqrt(pool.T @ sd**2) / pool.sum(axis=0))
 
     def state_deviation(self, channel: str) -> Array:
-        """Return readings minus smooth trajectory as far as the independent errors hold it, K."""
+        """Return the independent errors' part of readings minus smooth trajectory, K."""
         deviation = self.thermometers[channel].deviation
         if self.blocks is None:
             return deviation
@@ -260,11 +255,14 @@ class ReducedSeries:
         return np.asarray((pool.T @ deviation) / pool.sum(axis=0))
 
     def averaged(self, trajectory: Array) -> Array:
-        """Average a trajectory (epochs, …) over the rows of the normal equations."""
+        """Return the averages of a trajectory (epochs, …) over the rows of the normal equations."""
         return trajectory if self.blocks is None else np.asarray(self.blocks.average @ trajectory)
 
     def locate(self, time: float) -> tuple[int, float, float]:
-        """Find an event from a time s on: the first row after it, its time and its sd, s."""
+        """Return the first row after an event, the event's time and its sd, s.
+
+        time: of the first row after it, s.
+        """
         first = int(np.searchsorted(self.times, time - 1e-6))
         before = float(self.times[max(first - 1, 0)])
         return first, 0.5 * (before + time), max(time - before, 1e-3) / float(np.sqrt(12.0))
@@ -276,19 +274,19 @@ class ReducedSeries:
 
     @property
     def rank(self) -> float:
-        """How many levels of the parameters the series determines."""
+        """The number of the parameters' levels that the series determines."""
         size = np.linalg.eigvalsh(self.N.sum(axis=0))
         return float(np.sum(size > 1e-9 * size[-1]))
 
     @property
     def sigma_px(self) -> float:
-        """The noise of an image coordinate, px, as the weights have it."""
+        """The noise of an image coordinate, px, according to the weights."""
         weights = self.weights[..., :2]
         return float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
 
 
 def scaled_basis(iop: Array, scale: Array, distortion: Distortion) -> Array:
-    """Return ∂ camera and field scales / ∂ columns (19, 19), both px-scaled, at an orientation."""
+    """Return ∂ camera and field scales / ∂ columns (19, 19), both px-scaled, at `iop`."""
     out = np.eye(len(scale))
     if distortion == "angle":
         out[:10, :10] = distortion_along(iop)
@@ -296,52 +294,52 @@ def scaled_basis(iop: Array, scale: Array, distortion: Distortion) -> Array:
 
 
 def unit_directions(names: Sequence[str]) -> Array:
-    """Return unit vectors (P, k) along some columns."""
+    """Return unit vectors (P, k) along the named columns."""
     out = np.zeros((len(COLUMNS), len(names)))
     out[[COLUMNS.index(name) for name in names], np.arange(len(names))] = 1.0
     return out
 
 
 def solve(N: Array, b: Array) -> Array:
-    """Solve in batches; a camera of too few targets is held by a weak prior of 1000 px."""
+    """Solve all epochs at once; a prior of 1000 px constrains a camera with too few targets."""
     k = N.shape[-1]
     return np.asarray(np.linalg.solve(N + 1e-6 * np.eye(k), b[..., None])[..., 0], dtype=float)
 
 
 _ALL_MOVEMENT = 0.01
 _DAY_S = 86_400.0
-_DAYS = 30.0  # of a series whose long blocks are whole days: what a day repeats averages out
+_DAYS = 30.0  # from which a series' long blocks are whole days, as daily cycles average out
 
 
 def choose_blocks(evidence: ReducedSeries, rows: int) -> NDArray[np.int64]:
-    """Choose the first epochs (B,) of at most `rows` blocks."""
+    """Choose at most `rows` blocks; return their first epochs (B,)."""
     E = len(evidence.times)
-    apart = _scatter(evidence, _remove_rates(evidence))
+    nonlinear = _scatter(evidence, _remove_rates(evidence))
     every = _scatter(evidence, evidence.values)
 
-    def worth(start: int, stop: int) -> float:
-        return apart(start, stop) + _ALL_MOVEMENT * every(start, stop)
+    def gain(start: int, stop: int) -> float:
+        return nonlinear(start, stop) + _ALL_MOVEMENT * every(start, stop)
 
     first = _cut_evenly(evidence.times, rows // 2)
     heap: list[tuple[float, int, int]] = []
     for start, stop in zip(first, np.append(first[1:], E), strict=True):
-        heapq.heappush(heap, (-worth(int(start), int(stop)), int(start), int(stop)))
+        heapq.heappush(heap, (-gain(int(start), int(stop)), int(start), int(stop)))
     done: list[int] = []
     while heap and len(heap) + len(done) < rows:
         _, start, stop = heapq.heappop(heap)
         if stop - start < 2:
             done.append(start)
             continue
-        times = evidence.times[start:stop]  # halved in time; one epoch at least on either side
+        times = evidence.times[start:stop]  # halved in time, with at least one epoch on either side
         half = np.searchsorted(times, 0.5 * (times[0] + times[-1]))
         middle = start + int(np.clip(half, 1, len(times) - 1))
         for part in ((start, middle), (middle, stop)):
-            heapq.heappush(heap, (-worth(*part), *part))
+            heapq.heappush(heap, (-gain(*part), *part))
     return np.array(sorted([*done, *(start for _, start, _ in heap)]), dtype=np.int64)
 
 
 def _cut_evenly(times: Array, most: int) -> NDArray[np.int64]:
-    """Return the first epochs of blocks of equal times; of a series of months, of whole days."""
+    """Return the first epochs of blocks of equal duration, in whole days for a long series."""
     span = float(times[-1] - times[0])
     length = span / max(most, 1)
     if span > _DAYS * _DAY_S:
@@ -351,7 +349,7 @@ def _cut_evenly(times: Array, most: int) -> NDArray[np.int64]:
 
 
 def _remove_rates(evidence: ReducedSeries) -> Array:
-    """Take levels and rates of the temperature off the cameras (E, P), by least squares."""
+    """Return the cameras (E, P) without levels and temperature rates, by least squares."""
     N, T = evidence.N, evidence.history.temperature() - evidence.T0
     P = N.shape[1]
     A = np.empty((2 * P, 2 * P))
@@ -366,9 +364,11 @@ def _remove_rates(evidence: ReducedSeries) -> Array:
 
 
 def _scatter(evidence: ReducedSeries, values: Array) -> Callable[[int, int], float]:
-    """χ² of cameras about the mean of a run of epochs `start` to `stop`, less its expectation."""
+    """Return a function of `start` and `stop`: these epochs' χ² about their mean, minus its
+    expectation.
+    """
 
-    def running(each: Array) -> Array:  # (E + 1, …) sums of all before each epoch
+    def running(each: Array) -> Array:  # (E + 1, …) sums of all epochs before each
         out = np.zeros((len(each) + 1, *each.shape[1:]))
         np.cumsum(each, axis=0, out=out[1:])
         return out
@@ -388,11 +388,11 @@ def _scatter(evidence: ReducedSeries, values: Array) -> Callable[[int, int], flo
 
 
 def in_blocks(evidence: ReducedSeries, rows: int = 720) -> ReducedSeries:
-    """Put a long series on at most `rows` blocks of neighbouring epochs; leave a short one.
+    """Return a long series in at most `rows` blocks of neighbouring epochs, a short one unchanged.
 
-    Heat is slow: over twelve epochs of 10 s a trajectory of parameters loses what is faster than
-    some minutes, and nothing else. Trajectories are computed on all epochs and then averaged. The
-    blocks of a series of weeks and more are short where the camera moves fast, and days elsewhere.
+    Heat is slow: averaged over twelve epochs of 10 s, a trajectory of parameters loses only what is
+    faster than some minutes. Trajectories are computed for all epochs and then averaged. In a
+    series of weeks or more, blocks are short where the camera moves fast, and up to days elsewhere.
     """
     from scipy.sparse import csr_array
 

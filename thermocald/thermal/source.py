@@ -1,15 +1,15 @@
-"""From a recording to the arrays that a reduction reads.
+"""The arrays for a reduction, read from a recording or a store; long series are condensed.
 
-A long series condensed while it is read: means of epochs, short where something is fast.
+A long series is condensed while it is read: its rows are means of epochs, over shorter times where
+the camera moves fast.
 
-Heat is slow. Over a year the camera's trajectories are carried by means over an hour or so; what is
-faster is looked for in the image itself: its shift and scale, epoch by epoch, less what follows the
-temperature in a straight line. The few windows (a day each, say) in which most is left, or in which
-the temperature itself changes fastest, keep short means. A mean of image points that a camera moves
-alike has the sum of their weights: for the normal equations of a camera that stands still within a
-row nothing is lost.
+Heat is slow. Over a year, means over about an hour represent the camera's trajectories. Faster
+movement is searched in the image: in its shift and scale, epoch by epoch, minus a straight line in
+the temperature. Short means remain in the few windows (of about a day) in which most is left, or in
+which the temperature itself changes fastest. A mean of image points has the sum of their weights,
+so that the normal equations lose nothing if the camera does not move within a row.
 
-Does not hold: what is faster than a row outside these windows is averaged over.
+Limit: outside these windows, movement faster than a row is averaged out.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ if TYPE_CHECKING:
 
 _POINTS = 1_300_000  # image points of all rows: 300 MB while they are reduced
 _FEWEST, _MOST = 2_000, 10_000  # rows
-_COARSE = 0.8  # of the rows are long means
-_SHORTEST, _LONGEST = 4, 24  # long means of a window
-_FINER = 12  # short means in a long one
-_NEIGHBOURS = 5  # epochs that tell a gross error
+_COARSE = 0.8  # share of the rows that are long means
+_SHORTEST, _LONGEST = 4, 24  # long means per window
+_FINER = 12  # short means per long mean
+_NEIGHBOURS = 5  # epochs, at least, for the detection of gross errors
 _AT_ONCE = 4_000  # epochs
-_MEMORY_S = 3600.0  # before the first frame: what a lag may remember
+_MEMORY_S = 3600.0  # before the first frame, for lags
 _READINGS_A_FRAME = 10
 
 
 def limit_rows(targets: int) -> int:
-    """Return how many epochs of so many targets are reduced one by one."""
+    """Return the largest number of epochs with some targets that are reduced one by one."""
     return min(max(_POINTS // max(targets, 1), _FEWEST), _MOST)
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Rows of a condensed series: their first epochs (R,), of how many each is, and the grid."""
+    """The rows of a condensed series: their first epochs (R,), epoch counts (R,), and grid."""
 
     first: Index
     count: Index
@@ -71,10 +71,10 @@ class _Rows:
 def condensed(
     series: SeriesInput, source: ObservationBlocks, most: int | None = None
 ) -> SeriesInput:
-    """Condense a series of all epochs to at most `most` rows.
+    """Condense a series to at most `most` rows.
 
-    series: all epochs, its grid not looked at; source: their observations. Memory is that of the
-    rows and a block.
+    series: all epochs (its grid is not used); source: their observations. The memory needed is that
+    of the rows and one block.
     """
     E, T = len(source), len(series.field)
     most = most or limit_rows(T)
@@ -83,7 +83,7 @@ def condensed(
     size = fine * int(np.ceil(size / fine))
     rows, trajectory = _average_epochs(source.blocks(), 0, E, T, size, fine)
     if size > 1:
-        spare = (1.0 - _COARSE) * most * fine  # epochs that may stand on short means
+        spare = (1.0 - _COARSE) * most * fine  # epochs that may be in short means
         length = size * int(np.clip(0.5 * spare / size, _SHORTEST, _LONGEST))
         count = max(int(spare / length), 1)
         chosen = _choose_fast_windows(
@@ -103,19 +103,16 @@ def condensed(
         begins = np.concatenate([p.first for p in parts])
         rows = _Rows(begins, np.concatenate([p.count for p in parts]), merged)
         rows = rows.at(np.argsort(begins, kind="stable"))
-    rows = rows.at(rows.grid.observed.any(axis=1) | (rows.count > 0))
-    return _put_on_rows(series, rows.first, rows.count, rows.grid)
+    return _put_on_rows(series, rows)
 
 
-def _put_on_rows(
-    series: SeriesInput, first: Index, count: Index, grid: ObservationGrid
-) -> SeriesInput:
-    """Average times and readings over rows, their noise as it is of means."""
+def _put_on_rows(series: SeriesInput, rows: _Rows) -> SeriesInput:
+    """Return the series with times, readings and columns averaged over rows, and their noise."""
 
     def mean(values: Array) -> Array:
         there = np.isfinite(values)
-        n = np.add.reduceat(there.astype(float), first)
-        total = np.add.reduceat(np.where(there, values, 0.0), first)
+        n = np.add.reduceat(there.astype(float), rows.first)
+        total = np.add.reduceat(np.where(there, values, 0.0), rows.first)
         return np.asarray(np.where(n > 0, total / np.maximum(n, 1.0), np.nan))
 
     noises = {}
@@ -123,8 +120,8 @@ def _put_on_rows(
         values = np.asarray(readings, dtype=float)
         resolution = series.resolutions.get(name)
         one = estimate_reading_noise(series.reading_times, values, resolution)
-        n = np.add.reduceat(np.isfinite(values).astype(float), first)
-        # errors of the step of a display do not average out
+        n = np.add.reduceat(np.isfinite(values).astype(float), rows.first)
+        # errors due to the resolution do not average out
         floor = (resolution or 0.0) / np.sqrt(12.0) / 3.0
         noises[name] = np.maximum(one / np.sqrt(np.maximum(n, 1.0)), floor)
     return replace(
@@ -132,16 +129,16 @@ def _put_on_rows(
         frame_times=mean(series.frame_times),
         reading_times=mean(series.reading_times),
         readings={n: mean(np.asarray(r, dtype=float)) for n, r in series.readings.items()},
-        grid=grid,
-        numbers=series.numbers[first],
+        grid=rows.grid,
+        numbers=series.numbers[rows.first],
         columns={n: mean(c) for n, c in (series.columns or {}).items()},
-        counts=count,
+        counts=rows.count,
         noises=noises,
     )
 
 
 def _fill_temperature(series: SeriesInput) -> Array:
-    """Return the reference temperature (E,) of the epochs, gaps closed by straight lines."""
+    """Return the reference temperature (E,) of the epochs, interpolated linearly across gaps."""
     if not series.readings:
         return np.zeros(len(series.frame_times))
     values = np.asarray(next(iter(series.readings.values())), dtype=float)
@@ -153,7 +150,7 @@ def _fill_temperature(series: SeriesInput) -> Array:
 
 
 def _average_neighbours(values: Array, size: int) -> Array:
-    """Average (⌈E / size⌉, …) neighbours."""
+    """Return averages (⌈E / size⌉, …) over `size` neighbours each."""
     starts = np.arange(0, len(values), size)
     count = np.diff(np.append(starts, len(values)))
     total = np.add.reduceat(values, starts, axis=0)
@@ -164,7 +161,10 @@ def _average_epochs(
     blocks: Iterable[tuple[int, ObservationGrid]], start: int, epochs: int, targets: int,
     size: int, fine: int = 0,
 ) -> tuple[_Rows, Array]:  # fmt: skip
-    """Average over `size` epochs each, from epoch `start` on; gross errors are left out."""
+    """Average `size` epochs per row from epoch `start` on, without gross errors.
+
+    Returns the rows, and shift and scale (F, 3) px of means over `fine` epochs.
+    """
     R = -(-epochs // size)
     normal, right = np.zeros((R, targets, 3)), np.zeros((R, targets, 2))
     short = fine or size
@@ -206,7 +206,7 @@ def _average_epochs(
 
 
 def _locate_targets(grid: ObservationGrid) -> Array:
-    """Return where each target (T, 2) is; the image's middle for those that were not seen."""
+    """Return each target's mean position (T, 2); that of all targets for those not seen."""
     there = grid.observed[..., None]
     n = there.sum(axis=0)
     total = np.where(there, grid.points, 0.0).sum(axis=0)
@@ -217,33 +217,34 @@ def _locate_targets(grid: ObservationGrid) -> Array:
 
 
 def _find_gross(p: Array, seen: NDArray[np.bool_], short: int) -> NDArray[np.bool_]:
-    """Find points (E, T) far from the median of their short mean."""
+    """Find points (E, T) far from the median over their short mean."""
     out = np.zeros(seen.shape, dtype=bool)
     short = max(short, _NEIGHBOURS)
     n = len(p) // short * short
     if not n:
         return out
-    if n < len(p):  # the last ones, beside their neighbours
+    if n < len(p):  # the last epochs, with their neighbours
         out[-short:] = _find_gross(p[-short:], seen[-short:], short)
     values = np.where(seen[..., None], p, np.nan)[:n]
     runs = values.reshape(-1, short, *p.shape[1:])
-    ordered = np.sort(runs, axis=1)  # NaN go to the end
-    count = np.isfinite(ordered).sum(axis=1)
-    pick = np.maximum(count - 1, 0) // 2
-    median = np.take_along_axis(ordered, pick[:, None], axis=1)
-    off = (runs - median).reshape(n, *p.shape[1:])
+    off = (runs - _take_lower_median(runs)).reshape(n, *p.shape[1:])
     # the whole image may move within a short mean
-    ordered = np.sort(off, axis=1)
-    pick = np.maximum(np.isfinite(ordered).sum(axis=1) - 1, 0) // 2
-    off = np.abs(off - np.take_along_axis(ordered, pick[:, None], axis=1))
+    off = np.abs(off - _take_lower_median(off))
     known = np.isfinite(off)
     scale = float(mad_sd(off[known])) if known.any() else 0.0
     out[:n] |= (np.where(known, off, 0.0) > criteria.GROSS_OF_MEAN * max(scale, 1e-6)).any(axis=-1)
     return out
 
 
+def _take_lower_median(values: Array) -> Array:
+    """Return the lower median over axis 1, which stays with length 1, ignoring NaN."""
+    ordered = np.sort(values, axis=1)  # NaN go to the end
+    count = np.isfinite(ordered).sum(axis=1, keepdims=True)
+    return np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=1)
+
+
 def _shift_and_scale(p: Array, w: Array, middle: Array) -> Array:
-    """Sum of each epoch (E, 4), weighted: shift in x, y, stretch px, and weights."""
+    """Return each epoch's weighted sums (E, 4): shift in x and y, stretch px, and weights."""
     centre = middle.mean(axis=0)
     arm = middle - centre
     arm = arm / max(float(np.sqrt((arm**2).sum(axis=1).mean())), 1e-9)
@@ -255,10 +256,10 @@ def _shift_and_scale(p: Array, w: Array, middle: Array) -> Array:
 def _choose_fast_windows(
     trajectory: Array, temperature: Array, length: int, count: int
 ) -> list[int]:
-    """Choose the windows of `length` short means that hold most of what is fast, in order of time.
+    """Choose `count` windows of `length` short means with most fast movement, in order of time.
 
-    trajectory (F, 3) px, temperature (F,) °C, of short means. Half of them for what does not follow
-    the temperature, half for what the temperature does.
+    trajectory (F, 3) px, temperature (F,) °C: of short means. Half of the windows are chosen for
+    movement that is not linear in the temperature, half for changes of the temperature.
     """
     n = min(len(trajectory), len(temperature))
     T = temperature[:n] - temperature[:n].mean()
@@ -277,7 +278,7 @@ def _choose_fast_windows(
 
 
 def _roughness(values: Array) -> float:
-    """Sum of squares about a straight line, less that of neighbours' differences: their noise."""
+    """Return the sum of squares about a straight line, minus the noise of the differences."""
     if len(values) < 8:
         return 0.0
     t = np.linspace(-1.0, 1.0, len(values))
@@ -288,7 +289,7 @@ def _roughness(values: Array) -> float:
 
 
 def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: str) -> SeriesInput:
-    """Put some epochs into arrays; name: of their recording or store, for messages."""
+    """Return the arrays of some epochs; name: of their recording or store, for messages."""
     readings = {
         channel: np.array([e.temperatures.get(channel, np.nan) for e in epochs], dtype=float)
         for channel in head.channels
@@ -312,8 +313,8 @@ def series_input(
 ) -> SeriesInput:
     """Read the arrays of a recording, or of a series in a store.
 
-    Frames are measured where they have not been, on `jobs` processes, with the same bits for any
-    number. A long series with observations is condensed while it is read.
+    Frames without observations are measured in `jobs` processes, with the same bits for any number.
+    A long series with observations is condensed while it is read.
     """
     source.head.require_calibrated(source.title)
     if source.has_observations and len(source) > limit_rows(len(source.testfield)):
@@ -335,7 +336,7 @@ def series_input(
         epochs = list(source.epochs)
     found = epochs_input(source.head, source.testfield, epochs, source.title)
     log = source.columns.readings
-    if log is not None:  # of a log what matters: from one hour before the series, some a frame
+    if log is not None:  # from one hour before the series on, and some readings per frame
         begin, end = float(found.frame_times[0]), float(found.frame_times[-1])
         step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
         rows = np.flatnonzero((log.times >= begin - _MEMORY_S) & (log.times <= end + step))
@@ -346,13 +347,13 @@ def series_input(
 
 
 def _read_columns(source: Recording | StoredRecording) -> dict[str, NDArray[np.float64]]:
-    """Read the further columns of epochs.csv that hold numbers, such as a humidity."""
+    """Read the further numeric columns of epochs.csv, such as a humidity."""
     out = {}
     for name, texts in source.columns.extra.items():
         try:
             values = np.array([float(t) if t.strip() else np.nan for t in texts])
         except ValueError:
-            continue  # text: a note
+            continue  # a column of text, such as notes
         out[name] = np.where(np.isfinite(values), values, np.nan)
     return out
 

@@ -1,8 +1,8 @@
-"""The thermometer as an instrument: its noise, and the smooth trajectory behind its readings.
+"""The thermometer as an instrument: its noise, and the smooth trajectory of its readings.
 
-The smooth trajectory is only where non-linear operators are linearised; the readings themselves
-stay the data and their error is carried through each operator (`likelihood`). So a kink that the
-smoothing rounds off is not mistaken for an effect.
+The smooth trajectory is only the point at which non-linear operators are linearised. The readings
+themselves remain the data, and their error is propagated through each operator (`likelihood`), so
+that a kink that the smoothing has rounded is not mistaken for an effect.
 
 Source: Eilers (2003), A perfect smoother, Analytical Chemistry 75, 3631-3636; generalised
 cross-validation as Golub, Heath, Wahba (1979), Technometrics 21, 215-223.
@@ -28,22 +28,22 @@ if TYPE_CHECKING:
 
 _SMOOTHING = np.logspace(-1, 5, 19)
 _MOST_FOR_NOISE = 200_000  # readings, in a dozen runs
-_OFTEN_SHARP = 0.2  # share of the intervals above which bends are no kinks by themselves
-_KINK = 1.5  # times the usual bend that a kink then has
-_ALIKE = 0.75  # of the sharpest bend around: it may be this one's kink
-_STRAIGHT = 0.25  # of a reading's noise: what straight lines may miss in a series, root of the sum
-_PARTS = 4  # of an interval between two readings that a straight line does not carry
+_OFTEN_SHARP = 0.2  # share of sharp intervals above which a sharp bend need not be a kink
+_KINK = 1.5  # times the usual sharp bend, which a kink must then exceed
+_ALIKE = 0.75  # of the sharpest bend near it, which a kink must then reach
+_STRAIGHT = 0.25  # of a reading's noise: root-sum-square that straight lines may miss in a series
+_PARTS = 4  # of an interval between two readings in which a straight line is not accurate enough
 
 
 @dataclass(frozen=True, eq=False)
 class Thermometer:
-    """A temperature column as an instrument, on knots: its readings and latent times between.
+    """A temperature column as an instrument, on knots: its reading times and latent times between.
 
-    times (K,) s; trajectory (K,) °C: smoothed, filled in, the point of linearisation; NaN at knots
-    of other columns; deviation (K,) K: reading minus trajectory; sd (K,) K of the independent
-    errors; mixing (K, K), sparse: errors of the knots = mixing @ independent errors: a latent time
-    carries the errors of the readings next to it and its own; real (K,): where a knot is a time of
-    reading; noise: K of one reading.
+    times (K,) s; trajectory (K,) °C: smoothed, without gaps, the point of linearisation; NaN at
+    knots of other columns; deviation (K,) K: reading minus trajectory; sd (K,) K: of the
+    independent errors; mixing (K, K), sparse: errors of the knots = mixing @ independent errors,
+    where a latent time has the errors of the readings next to it and its own; real (K,): whether a
+    knot is a reading time; noise K: of one reading.
     """
 
     times: Array
@@ -56,8 +56,9 @@ class Thermometer:
 
     @property
     def bulge(self) -> float:
-        """By how much the curves between readings run ahead of straight lines between them, as a
-        share of the time from one reading to the next: h/12τ where the temperature settles with τ.
+        """The lead of the curves between readings over straight lines, in intervals of readings.
+
+        It is h/12τ for a temperature that settles with the time constant τ.
         """
         from scipy.integrate import trapezoid  # NumPy's has another name in 1.26 than in 2
 
@@ -69,8 +70,9 @@ class Thermometer:
         return abs(float(trapezoid(ahead * slope, t))) / power if power > 0 else 0.0
 
     def _jumps(self) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the readings' times (R,) s, by how much the slope K/s changes around each interval
-        (R - 1,) beyond noise, and whether that is significant.
+        """Return the reading times (R,) s and the slope's jumps K/s around each interval (R - 1,).
+
+        The noise is subtracted from the jumps; a third value tells which are significant.
         """
         t, y = self.times[self.real], (self.trajectory + self.deviation)[self.real]
         bend, limit = _measure_bends(t, y, self.noise)
@@ -78,14 +80,14 @@ class Thermometer:
         return t, size, np.abs(bend) > limit
 
     def between(self, times: Array, seen: Array, late: float) -> Array:
-        """Return how uncertain the temperature (E,) K is at some times between two readings where
-        the slope jumps at an instant that nobody knows.
+        """Return the sd (E,) K of the temperature at some times due to jumps of its slope.
 
-        seen (E,) K/s: jumps of the slope that the images show; late s: of the readings they follow.
-        The straight line between two readings misses an eighth of the jump times the interval.
-        Where the readings show the jump themselves, the value in the middle of the interval is an
-        unknown of its own (`find_times_between`); from the lines to it a kink anywhere differs by
-        up to 0.05 of that, half way between.
+        seen (E,) K/s: jumps of the slope as measured by the images; late s: the camera's delay. A
+        jump at an unknown instant between two readings makes the straight line between them wrong
+        by an eighth of the jump times the interval. If the readings themselves show the jump, the
+        value in the middle of the interval is an unknown (`find_times_between`); a kink anywhere
+        then differs from the lines to this value by up to 0.05 of jump times interval, half way
+        between.
         """
         t, size, sharp = self._jumps()
         i = np.clip(np.searchsorted(t, times - late, side="right") - 1, 0, len(t) - 2)
@@ -98,22 +100,22 @@ class Thermometer:
         return out
 
     def slope_jump(self, times: Array) -> Array:
-        """Return how uncertain the rate (E,) K/s is at some times because it jumps next to them."""
+        """Return the sd (E,) K/s of the rate at some times due to jumps next to them."""
         t, size, _ = self._jumps()
-        width = np.diff(t)
-        middle = 0.5 * (t[:-1] + t[1:])
-        near = np.abs(times[:, None] - middle[None]) < 1.1 * np.median(width)
-        out: Array = 0.5 * np.max(np.where(near, size[None], 0.0), axis=1)
-        return out
+        middle, reach = 0.5 * (t[:-1] + t[1:]), 1.1 * float(np.median(np.diff(t)))
+        first = np.searchsorted(middle, times - reach, side="right")
+        last = np.searchsorted(middle, times + reach)
+        near = (size[i:j].max(initial=0.0) for i, j in zip(first, last, strict=True))
+        return 0.5 * np.fromiter(near, dtype=float, count=len(times))
 
 
 def estimate_reading_noise(times: Array, readings: Array, resolution: float | None) -> float:
-    """Estimate the standard deviation in K of one reading, quantisation included.
+    """Estimate the standard deviation of a reading, K, including quantisation.
 
-    From third divided differences, as thermometers are not read at even intervals, cut at 2.2 sigma
-    again and again, so that a switched lamp, which spoils four of them, does not count as noise. A
-    thermometer that repeats one step for long has the error of the step. Of very many readings runs
-    from the first to the last are taken.
+    It is computed from third divided differences, as thermometers are not read at even intervals,
+    clipped iteratively at 2.2 sigma, so that a switched lamp, which affects four of them, does not
+    count as noise. It is at least the error due to the resolution. Of very many readings, runs
+    spread over the series are used.
     """
     if len(readings) > _MOST_FOR_NOISE:
         runs = spread_windows(len(readings), _MOST_FOR_NOISE)
@@ -125,13 +127,13 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
     if len(values) < 8:
         return max(float(floor), 1e-6)
     d = _third_differences(t, values)
-    # of few readings two kinks spoil four in ten, and a mean square would never be rid of them
+    # with few readings, two kinks affect four in ten, which clipping alone would never remove
     spread = mad_sd(d)
     kept = np.abs(d) <= 4.0 * spread if spread > 0.0 else np.ones(len(d), dtype=bool)
     scale = 0.0
     for _ in range(20):
         scale = float(np.sqrt(np.mean(d[kept] ** 2)))
-        scale /= 0.9156  # what a normal distribution cut at 2.2 sigma has left
+        scale /= 0.9156  # sd of a standard normal distribution clipped at 2.2 sigma
         now = np.abs(d) <= max(2.2 * scale, 1e-12)
         if np.array_equal(now, kept):
             break
@@ -140,7 +142,7 @@ def estimate_reading_noise(times: Array, readings: Array, resolution: float | No
 
 
 def _third_differences(t: Array, y: Array) -> Array:
-    """Return third divided differences of four neighbours, with the variance of one reading."""
+    """Return third divided differences of neighbours, scaled to the variance of one reading."""
     n = len(t) - 3
     at = [t[k : k + n] for k in range(4)]
     total, square = np.zeros(n), np.zeros(n)
@@ -161,13 +163,14 @@ def find_times_between(
 ) -> tuple[Array, Array]:
     """Find instants between two readings at which the temperature leaves the straight line.
 
-    Returns latent ones: where a lamp was switched the trajectory bends within one interval, by up
-    to a quarter of the bend; a maximum that lies between two readings is seen by no reading.
+    Returns latent and curved instants. Latent ones are in intervals with a kink: where a lamp was
+    switched, the trajectory differs from the straight line by up to a quarter of the bend, and the
+    maximum may be between two readings.
 
-    And others, where it follows its neighbours' curve: a straight line lies below a warming that
-    slows down, by a twelfth of h² T'' in the mean: little in one interval, but it has one sign, and
-    is a delay of h²/12τ in all. None where all lines together miss less than a quarter of the noise
-    of one reading; none beside a kink.
+    Curved ones are on the curve through neighbouring readings. For a warming that slows down, the
+    straight line is too low by a twelfth of h² T'' on average: little in one interval, but always
+    of one sign, so that it acts like a delay of h²/12τ. There are none beside a kink, and none at
+    all if the lines miss less than a quarter of a reading's noise in total.
     """
     valid = np.isfinite(readings)
     t, y = times[valid], readings[valid]
@@ -176,9 +179,9 @@ def find_times_between(
     size = np.abs(bend)
     sharp = size > limit
     if sharp.any() and sharp.mean() > _OFTEN_SHARP:
-        # it bends everywhere: a kink is where it bends most
+        # with bends everywhere, a kink is a particularly sharp one
         padded = np.pad(size, 2)
-        # at a reading it bends in both intervals alike, and noise says in which more
+        # a kink at a reading bends both intervals equally, and noise decides which one more
         sharp &= size >= _ALIKE * np.max([padded[k : k + len(size)] for k in range(5)], axis=0)
         sharp &= size > _KINK * np.median(size[size > limit])
     latent = 0.5 * (t[:-1] + t[1:])[sharp]
@@ -190,9 +193,7 @@ def find_times_between(
 
 
 def _measure_bends(t: Array, y: Array, noise: float) -> tuple[Array, float]:
-    """Return the change of slope around each interval times its length (K - 1,) K, and three
-    sigma.
-    """
+    """Return the change of slope around each interval times its length (K - 1,) K, and 3 sigma."""
     if len(t) < 4:
         return np.zeros(max(len(t) - 1, 0)), np.inf
     h = np.diff(t)
@@ -212,12 +213,11 @@ def smooth_channel(
     resolution: float | None,
     noises: Array | None = None,
 ) -> Thermometer:
-    """Smooth one column on knots: its times, its latent ones, and those of other columns (NaN),
-    which carry nothing.
+    """Smooth a column on knots: its own times, and other columns' knots, which stay NaN.
 
-    times (K,) s ascending, readings (K,) °C with NaN where missing; own, latent, curved (K,): True
-    where a knot is a time at which this column was read, a latent one of it, or one on the curve
-    through its neighbours; noises (K,) K: where readings are means of many.
+    times (K,) s ascending, readings (K,) °C with NaN where missing; own, latent, curved (K,):
+    whether a knot is a reading time of this column, a latent time of it, or a time on the curve
+    through its neighbours; noises (K,) K: of readings that are means of many.
     """
     from scipy.sparse import csr_array, lil_array
 
@@ -235,7 +235,7 @@ def smooth_channel(
     trajectory[own] = smooth
     sd[own] = noise if noises is None else noises[own]
     if not there.all():
-        # what may happen between two readings: a share of the step across the gap
+        # a gap is as uncertain as the change of the temperature across it
         missing = np.flatnonzero(own)[~there]
         sd[missing] = (2.0 * noise + np.abs(np.gradient(smooth)))[~there]
     mixing = lil_array((len(times), len(times)))
@@ -254,8 +254,8 @@ def smooth_channel(
             share = (times[row] - t[i]) / (t[i + 1] - t[i])
             mixing[row, knot[i]], mixing[row, knot[i + 1]] = 1 - share, share
             size = abs(bend[i]) if abs(bend[i]) > limit else 0.0
-            # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; its
-            # neighbours bend too and do not bulge
+            # a kink at a random place bulges by 1/8 of the bend in the middle, ± 0.07; intervals
+            # next to it have a bend too, but no bulge
             top = size > 0 and size >= np.max(np.abs(bend[max(i - 1, 0) : i + 2]))
             trajectory[row] = (1 - share) * smooth[i] + share * smooth[i + 1]
             trajectory[row] -= bend[i] / 8 * top
@@ -265,9 +265,9 @@ def smooth_channel(
 
 
 def _weigh_neighbours(t: Array, at: float, sharp: NDArray[np.bool_]) -> tuple[Index, Array]:
-    """Return the readings, two on either side, and their weights in the curve through them.
+    """Return the readings, up to two on either side, and their weights in the curve through them.
 
-    sharp (K - 1,): intervals across which no curve goes.
+    sharp (K - 1,): intervals that no curve may cross.
     """
     i = int(np.searchsorted(t, at)) - 1
     first = i - 1 if i > 0 and not sharp[i - 1] else i
@@ -281,11 +281,11 @@ def _weigh_neighbours(t: Array, at: float, sharp: NDArray[np.bool_]) -> tuple[In
 
 
 def extend(channel: Thermometer) -> Thermometer:
-    """Add knots before its begin and after its end, as uncertain as they are.
+    """Add knots with their uncertainty before the start and after the end.
 
-    Before the start the temperature is taken as it was at the start (EFFECTS: the past begins
-    with the series), after the end it goes on along its slope; both within half of what the slope
-    makes of the time elapsed. A delay asks for such times, and so does the state at the start.
+    Delays need such times, and so does the state at the start. Before the start, the temperature is
+    constant (the past begins with the series); after the end, it continues along its slope. The sd
+    is about half the slope times the time elapsed.
     """
     t = channel.times
     k = np.flatnonzero(np.isfinite(channel.trajectory))
@@ -323,7 +323,7 @@ def extend(channel: Thermometer) -> Thermometer:
 
 
 def _smooth(values: Array, weights: Array, noise: float) -> Array:
-    """Penalise second differences, but for kinks; the penalty by generalised cross-validation."""
+    """Smooth by a penalty on second differences but for kinks, set by cross-validation."""
     from scipy.linalg import solveh_banded
 
     n = len(values)
@@ -355,9 +355,10 @@ def thermometers(
     resolutions: Mapping[str, float | None],
     noises: Mapping[str, Array] | None = None,
 ) -> tuple[Array, dict[str, Thermometer]]:
-    """Put all columns on common knots: the readings' times and the latent ones of each column.
+    """Return common knots (K,) s, and all columns on them as instruments.
 
-    noises {column: (R,)} K: of readings that are means of many; between those nothing is latent.
+    The knots are the reading times and the latent and curved times of each column. noises {column:
+    (R,)} K: of readings that are means of many; there are no times between those.
     """
     between = {
         name: (np.zeros(0), np.zeros(0))

@@ -1,3 +1,3 @@
-"""The effects that thermocald brings along, by their cause; `catalogue` finds them."""
+"""The built-in effects, by their cause; `catalogue` finds them."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Effects of how heat reaches the camera, and of when it is measured."""
+"""Effects of the heat flow to the camera, and of the time at which temperature is measured."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 
 class ThermalLag(Operated):
-    """The linear terms follow L instead of T, with τ dL/dt = T - L and L = T at the start.
+    """A first-order lag: L replaces T in the linear terms; τ dL/dt = T - L, L = T at the start.
 
-    The lumped-capacity body: τ = heat capacity × thermal resistance to where T is measured.
+    The body has a lumped capacity: τ = heat capacity × thermal resistance to the thermometer.
     Source: Incropera, DeWitt (2007): Fundamentals of Heat and Mass Transfer, 6th ed., section 5.1.
     """
 
@@ -45,7 +45,7 @@ class ThermalLag(Operated):
     }
     behaviour: Mapping[str, str] = {
         "hold": "settles",
-        "rate": "opens the loop more when fast, and rounds its tips",
+        "rate": "opens a wider loop when fast, and rounds its tips",
         "cycle": "returns to the same line each time",
         "idle": "does nothing",
     }
@@ -55,9 +55,9 @@ class ThermalLag(Operated):
 
 
 class TimeOffset(Effect):
-    """The linear terms follow T(t - d): a pure delay d; d < 0 where T is stamped late.
+    """A pure delay d: T(t - d) replaces T in the linear terms; d < 0 if T is stamped late.
 
-    Before the first frame the temperature has always been the one of the first frame.
+    Before the first frame, the temperature is taken as constant.
     """
 
     name = "time_offset"
@@ -67,7 +67,7 @@ class TimeOffset(Effect):
     nonlinear: Mapping[str, Parameter] = {"d": Parameter("s", -300.0, 300.0, 10.0, role="delay")}
     behaviour: Mapping[str, str] = {
         "hold": "stops at once after the delay",
-        "rate": "shifts the whole curve by the same time, its tips stay sharp",
+        "rate": "shifts the whole curve by the same time and keeps its tips sharp",
         "cycle": "returns to the same line each time",
         "idle": "does nothing",
     }
@@ -79,18 +79,18 @@ class TimeOffset(Effect):
         return history.polygon().at(history.times - d)
 
     def unresolved(self, history: History, rate_jump: Array, d: float = 0.0, **_: Any) -> Array:  # noqa: ARG002
-        """Return what is not known after the last reading, where the thermometer is ahead.
+        """Return the uncertainty after the last reading, if a negative delay looks ahead of it.
 
-        As much as the temperature usually changes over the time that is missing.
+        It is the RMS change of the temperature over a time as long as the missing one.
         """
         p = history.polygon()
         missing = np.maximum(history.times - d - p.times[-1], 0.0)
-        open_ = np.zeros(len(missing))
+        change = np.zeros(len(missing))
         for e in np.flatnonzero(missing):
             begun = p.times[p.times + missing[e] <= p.times[-1]]
             if len(begun):
-                open_[e] = np.sqrt(np.mean((p.at(begun + missing[e]) - p.at(begun)) ** 2))
-        return open_
+                change[e] = np.sqrt(np.mean((p.at(begun + missing[e]) - p.at(begun)) ** 2))
+        return change
 
     def sensitivity(self, history: History, d: float = 0.0, **_: Any) -> csr_array:
         p = history.polygon()
@@ -98,10 +98,10 @@ class TimeOffset(Effect):
 
 
 class ThermalGradient(Operated):
-    """Adds a dT/dt: the difference across a plate that heat flows through, so its bow.
+    """A signal a dT/dt: the temperature difference across a plate through which heat flows.
 
-    In a body that warms steadily the difference between its faces is proportional to the rate:
-    Carslaw, Jaeger (1959): Conduction of Heat in Solids.
+    The difference bows the plate; in a body that warms steadily it is proportional to the rate.
+    Source: Carslaw, Jaeger (1959): Conduction of Heat in Solids.
     """
 
     name = "thermal_gradient"
@@ -114,21 +114,21 @@ class ThermalGradient(Operated):
     steady_signal = Steady()
     of_now = True
     behaviour: Mapping[str, str] = {
-        "hold": "vanishes as soon as the temperature stands",
+        "hold": "vanishes as soon as the temperature is constant",
         "rate": "grows in proportion to the rate",
         "cycle": "changes its sign between up and down",
         "idle": "does nothing",
     }
 
     def unresolved(self, history: History, rate_jump: Array, **_: Any) -> Array:  # noqa: ARG002
-        """Return by how much the rate jumps where a lamp is switched between two readings."""
+        """Return the jump of the rate, as of a lamp that is switched between two readings."""
         return rate_jump
 
 
 class SelfHeating(OfTime):
-    """Adds a (1 - exp(-t/τ)), t from the start of the series.
+    """A signal a (1 - exp(-t/τ)), t from the start of the series.
 
-    The step response of one body with capacity C and conductance G to its own power: τ = C/G.
+    It is the step response of a body of capacity C and conductance G to its own power: τ = C/G.
     Source: Incropera, DeWitt (2007): Fundamentals of Heat and Mass Transfer, 6th ed., section 5.3.
     """
 
@@ -141,9 +141,9 @@ class SelfHeating(OfTime):
     linear: Mapping[str, str] = coefficient_units("1")
     steady_signal = Steady((1.0, 0.0, 0.0))
     behaviour: Mapping[str, str] = {
-        "idle": "rises and settles although the thermometer stands",
+        "idle": "rises and settles although the thermometer is constant",
         "restart": "comes again after each power-on",
-        "hold": "goes on with its own time constant",
+        "hold": "continues with its own time constant",
         "cycle": "does not repeat with the cycles",
     }
 
@@ -152,7 +152,7 @@ class SelfHeating(OfTime):
 
 
 class SecondHeatSource(Proportional):
-    """Adds a (T_channel - T₀), linear in another temperature column of the recording."""
+    """A signal a (T_channel - T₀), linear in another temperature column of the recording."""
 
     name = "second_heat_source"
     noun = "a second heat source"

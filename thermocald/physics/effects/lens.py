@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class NonlinearExpansion(Proportional):
-    """Adds a (T - T₀)² to c, x0, y0.
+    """A signal a (T - T₀)² in c, x0, y0.
 
-    Source: the second coefficient of length and of refractive index against temperature, e.g.
-    Schott TIE-19: Temperature Coefficient of the Refractive Index.
+    Source: the second-order temperature coefficients of length and of refractive index, e.g. Schott
+    TIE-19: Temperature Coefficient of the Refractive Index.
     """
 
     name = "nonlinear_expansion"
@@ -28,7 +28,7 @@ class NonlinearExpansion(Proportional):
     linear: Mapping[str, str] = coefficient_units("K2")
     steady_signal = Steady((0.0, 0.0, 1.0))
     behaviour: Mapping[str, str] = {
-        "hold": "does not move while the temperature stands",
+        "hold": "does not move while the temperature is constant",
         "cycle": "runs along the same curve up and down",
         "hotter": "keeps bending at every temperature",
         "rate": "shows the same curve at any rate",
@@ -37,7 +37,7 @@ class NonlinearExpansion(Proportional):
 
 
 class RadialDistortionDrift(Proportional):
-    """Adds a (T - T₀) to A1 (A2, A3)."""
+    """A signal a (T - T₀) in A1 (A2, A3)."""
 
     name = "radial_distortion_drift"
     noun = "a drift of the radial distortion"
@@ -50,7 +50,7 @@ class RadialDistortionDrift(Proportional):
 
 
 class DecenteringDrift(Proportional):
-    """Adds a (T - T₀) to B1, B2."""
+    """A signal a (T - T₀) in B1, B2."""
 
     name = "decentering_drift"
     noun = "a drift of the decentering distortion"
@@ -60,7 +60,7 @@ class DecenteringDrift(Proportional):
 
 
 class AffinityDrift(Proportional):
-    """Adds a (T - T₀) to C1, C2: scale difference of the axes and their shear."""
+    """A signal a (T - T₀) in C1, C2: the axes' difference in scale, and their shear."""
 
     name = "affinity_drift"
     noun = "a drift of the affinity"
@@ -72,11 +72,11 @@ class AffinityDrift(Proportional):
 
 
 class Defocus(Proportional):
-    """Measuring noise and blur are multiplied by max(1 + k (T - T₀), 0.1); positions stay unbiased.
+    """A factor max(1 + k (T - T₀), 0.1) on measuring noise and blur; positions stay unbiased.
 
-    Noise and blur share the factor: the precision of an edge falls between the root of its blur
-    (Cramér-Rao) and in proportion to it (an operator of fixed width), and an instrument of fixed
-    windows lies at the latter.
+    Noise and blur share the factor: the standard deviation of an edge grows between the root of its
+    blur (Cramér-Rao) and in proportion to it (an operator of fixed width), and an instrument with
+    fixed windows is close to the latter.
     """
 
     name = "defocus"
@@ -87,8 +87,8 @@ class Defocus(Proportional):
     usual = ("factor",)
     seen_in = "noise"
     behaviour: Mapping[str, str] = {
-        "hold": "leaves positions alone; noise stays as large as it is",
-        "cycle": "makes noise come and go with the temperature",
+        "hold": "leaves the positions unchanged and the noise constant",
+        "cycle": "makes the noise rise and fall with the temperature",
     }
 
     def influence(self, history: History, values: Values, found: Prediction) -> None:

@@ -1,7 +1,7 @@
-"""Effects of mechanical parts and of what stands around the camera.
+"""Effects of mechanical parts and of the camera's surroundings.
 
-Friction, what gives way, what creeps or slips, the mount; appliances that cycle, the test field and
-its targets.
+Friction, softening, permanent set, creep, slips, the housing and the mount; appliances that cycle,
+the test field and its targets.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 
 class Hysteresis(Operated):
-    """The linear terms follow P = min(max(P, T - r), T + r): a play of half-width r on T.
+    """A play of half-width r: P = min(max(P, T - r), T + r) replaces T in the linear terms.
 
-    P rests until T is r away from it, then follows; the loop closes. P = T at the start.
+    P rests until T is r away from it, and then follows; the loop closes. P = T at the start.
     Source: Krasnosel'skii, Pokrovskii (1989): Systems with Hysteresis.
     """
 
@@ -65,9 +65,9 @@ class Hysteresis(Operated):
 
 
 class Softening(Operated):
-    """Adds a max(T - T_k, 0): a second slope above the knee T_k.
+    """A signal a max(T - T_k, 0): a second slope above the knee T_k.
 
-    Source: expansion of a polymer is two straight lines that meet at the glass transition (ISO
+    Source: the expansion of a polymer is two straight lines that meet at the glass transition (ISO
     11359-2: Thermomechanical analysis).
     """
 
@@ -82,9 +82,9 @@ class Softening(Operated):
     usual = ("c", "x0", "y0")
     of_now = True
     behaviour: Mapping[str, str] = {
-        "hold": "does not move while the temperature stands",
+        "hold": "does not move while the temperature is constant",
         "cycle": "runs along the same bent line up and down",
-        "hotter": "goes on along a straight line above its knee",
+        "hotter": "continues along a straight line above its knee",
         "rate": "shows the same curve at any rate",
         "idle": "does nothing",
     }
@@ -94,7 +94,7 @@ class Softening(Operated):
 
 
 class PermanentSet(Operated):
-    """Adds a (max over the past of T - T₀); the past begins with the series.
+    """A signal a (max of T so far - T₀), from the start of the series on.
 
     Source: the reference study found it in the RPi camera v2.1 (Elias et al. 2020, Sensors 20, 643,
     section 4.2: image points do not return to their starting position).
@@ -121,10 +121,9 @@ class PermanentSet(Operated):
 
 
 class Creep(OfTime):
-    """Adds a t, t in s from the start of the series: steady-state (secondary) creep.
+    """A signal a t, t in s from the start of the series: steady-state (secondary) creep.
 
     Source: Findley, Lai, Onaran (1976): Creep and Relaxation of Nonlinear Viscoelastic Materials.
-
     """
 
     name = "creep"
@@ -132,9 +131,9 @@ class Creep(OfTime):
     linear: Mapping[str, str] = coefficient_units("s")
     moves_mount = True
     behaviour: Mapping[str, str] = {
-        "idle": "goes on at the same rate and never settles",
-        "restart": "goes on from where it was, whether powered or not",
-        "hold": "goes on at the same rate",
+        "idle": "continues at the same rate and never settles",
+        "restart": "continues from where it was, whether powered or not",
+        "hold": "continues at the same rate",
         "cycle": "does not repeat with the cycles",
     }
 
@@ -143,9 +142,9 @@ class Creep(OfTime):
 
 
 class Slip(OfTime):
-    """Adds a from one time on: a step at `time` (s from the start of the series).
+    """A step of height a at `time` (s from the start of the series).
 
-    Each series has its own slip: the time does not carry over, nor does the height.
+    Each series has its own slip: neither its time nor its height carries over to another.
     """
 
     name = "slip"
@@ -156,8 +155,8 @@ class Slip(OfTime):
     fresh = ("time",)
     moves_mount = True
     behaviour: Mapping[str, str] = {
-        "hold": "does not come again",
-        "cycle": "does not come again at the same temperature",
+        "hold": "does not recur",
+        "cycle": "does not recur at the same temperature",
         "idle": "does nothing",
     }
 
@@ -166,7 +165,7 @@ class Slip(OfTime):
 
 
 class HousingTilt(Proportional):
-    """Adds a (T - T₀) to omega, phi, kappa; the projection centre stays."""
+    """A signal a (T - T₀) in omega, phi, kappa; the projection centre does not move."""
 
     name = "housing_tilt"
     noun = "a tilt of the housing"
@@ -178,11 +177,10 @@ class HousingTilt(Proportional):
 
 
 class MountMotion(Operated):
-    """Adds a (L - T₀) to the orientation and the projection centre; τ dL/dt = T - L, L = T at the
-    start. Without tau, or where it is 0, L is T.
+    """A signal a (L - T₀) in the exterior orientation; τ dL/dt = T - L, L = T at the start.
 
-    A bracket of length l and expansion α shifts the camera by l α per K; where one of its sides is
-    warmer by ΔT, it turns it by l α ΔT over its thickness.
+    Without tau, or with tau = 0, L is T. A bracket of length l and expansion α shifts the camera by
+    l α per K, and turns it by l α ΔT over its thickness if one side is warmer by ΔT.
     Source: Timoshenko (1925), J. Optical Society of America 11, 233-255 (bending by heat).
     """
 
@@ -201,12 +199,12 @@ class MountMotion(Operated):
         "turn": "keeps its direction in space",
         "hold": "settles",
         "rate": "opens a loop when fast",
-        "shade": "moves what is seen of every field by as much",
+        "shade": "moves the image of any field by the same amount",
     }
 
     def signal(self, history: History, tau: float = 0.0, **_: Any) -> Array:
-        late = self.drive(history, tau=tau) if tau > 0 else history.temperature()
-        return (late - history.T0)[:, None]
+        lagged = self.drive(history, tau=tau) if tau > 0 else history.temperature()
+        return (lagged - history.T0)[:, None]
 
     def sensitivity(self, history: History, tau: float = 0.0, **_: Any) -> csr_array:
         if tau > 0:
@@ -221,10 +219,10 @@ class MountMotion(Operated):
 
 
 class CyclicInterference(OfTime):
-    """Adds a sin(2πt/P + φ), t from the start of the series.
+    """A signal a sin(2πt/P + φ), t from the start of the series.
 
-    Its signals are sin(2πt/P) and cos(2πt/P): the phase φ is linear in a fit, is shared by all
-    parameters and belongs to one series.
+    In a fit it has two signals, sin(2πt/P) and cos(2πt/P), so that the phase φ is linear; the phase
+    is shared by all parameters and belongs to one series.
     """
 
     name = "cyclic_interference"
@@ -239,8 +237,8 @@ class CyclicInterference(OfTime):
     moves_mount = True
     behaviour: Mapping[str, str] = {
         "disconnect": "stops",
-        "idle": "goes on at the same period",
-        "hold": "goes on at the same period",
+        "idle": "continues with the same period",
+        "hold": "continues with the same period",
     }
 
     def signal(self, history: History, P: float = 120.0, **_: Any) -> Array:
@@ -253,9 +251,9 @@ class CyclicInterference(OfTime):
 
 
 class TestFieldExpansion(Proportional):
-    """Object coordinates times 1 + α (T - T₀), one α per axis, about the origin of the field.
+    """A factor 1 + α (T - T₀) on the object coordinates, one α per axis, about the field's origin.
 
-    Source: linear expansion as ISO 1:2022 uses it.
+    Source: linear expansion as in ISO 1:2022.
     """
 
     name = "test_field_expansion"
@@ -272,7 +270,7 @@ class TestFieldExpansion(Proportional):
 
 
 class TargetDisplacement(OfTime):
-    """The named targets are (dX, dY, dZ) mm off from `time` (s from the start) on."""
+    """A displacement (dX, dY, dZ) mm of the named targets from `time` (s from the start) on."""
 
     name = "target_displacement"
     noun = "displaced targets"
@@ -288,7 +286,7 @@ class TargetDisplacement(OfTime):
     seen_in = "targets"
     behaviour: Mapping[str, str] = {
         "turn": "concerns the same targets, wherever the camera looks",
-        "cycle": "does not come again",
+        "cycle": "does not recur",
         "idle": "does nothing",
     }
 
@@ -302,7 +300,7 @@ class TargetDisplacement(OfTime):
             if target not in field.index:
                 raise ConfigurationError(
                     f"effect {self.name}: the test field has no target {target!r}; it has "
-                    f"{len(field)}, {field.names[0]!r} the first"
+                    f"{len(field)} targets, the first is {field.names[0]!r}"
                 )
         rows = np.array([field.index[target] for target in named], dtype=np.int64)
         vector = np.array([float(values.get(axis, 0.0)) for axis in self.linear])

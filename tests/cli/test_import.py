@@ -107,7 +107,7 @@ def test_the_photographs_settle_day_and_month_and_footers_are_passed_over(place)
     for i in range(6):
         photograph(place / "photos" / f"{i}.jpg", f"2026:07:06 12:00:{10 * i:02d}")
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert "'06/07/2026 12:00:00' is day/month: so it lies next to the photographs" in result.stderr
+    assert "'06/07/2026 12:00:00' is day/month: this puts the log near" in result.stderr
     assert "1 rows hold no time: left out (line 4: 'Average')" in result.stderr
 
 
@@ -136,7 +136,7 @@ def test_clock_errors_and_zones_of_each_device(place):
 @pytest.mark.parametrize(
     ("more", "reason"),
     [
-        ((), "has no time zone: say which with --timezone"),
+        ((), "has no time zone: give it with --timezone"),
         (("--timezone", "Europe/Berlin", "--camera-clock", "+05:00:00"), "5.0 h apart"),
         (("--timezone", "Mars"), "time zone 'Mars'"),
         (("--timezone", "UTC", "--pixel-pitch", 0.002, "--unit", "R"), "--unit R"),

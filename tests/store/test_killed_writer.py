@@ -54,7 +54,7 @@ def fill(store, series, make_epoch, make_result) -> int:
             store.append(series, make_epoch(number + 1), make_result(number + 1))
             number += 1
 
-    with pytest.raises(StoreFullError, match="was not kept: the disk") as caught:
+    with pytest.raises(StoreFullError, match="was not stored: the disk") as caught:
         append_for_ever()
     assert f"epoch {number + 1} " in str(caught.value)
     return number

@@ -136,8 +136,11 @@ def test_a_log_is_the_same_in_every_dialect_without_an_option(tmp_path, name):
     ("name", "said"),
     [
         ("Testo", "3 rows hold no time: left out (line 5: 'Minimum')"),
-        ("Home Assistant", "2 readings of 'state' are none ('unavailable', 'unknown'): left empty"),
-        ("HOBO in °F", "is converted from degF, as its head says"),
+        (
+            "Home Assistant",
+            "2 values of 'state' are not readings ('unavailable', 'unknown'): left empty",
+        ),
+        ("HOBO in °F", "is converted from degF, the unit in its head"),
         ("kelvin", "is converted from K"),
     ],
 )
@@ -171,7 +174,7 @@ def test_photographs_settle_the_order_of_day_and_month(tmp_path, order, month):
     (tmp_path / "log.csv").write_text(AMBIGUOUS)
     found = read_log(tmp_path / "log.csv", LogOptions(clock=BERLIN), (first + 20, first + 40))
     assert found.times.tolist() == [first, first + 60]
-    assert any("so it lies next to the photographs" in note for note in found.notes)
+    assert any("this puts the log near the photographs" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(("rows", "first"), [
@@ -189,7 +192,7 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
 @pytest.mark.parametrize(
     ("data", "options", "reason"),
     [
-        (GERMAN, {"clock": DeviceClock()}, "no time zone: say which with --timezone"),
+        (GERMAN, {"clock": DeviceClock()}, "no time zone: give it with --timezone"),
         (b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n", {}, "--date-order dmy or mdy"),
         (b"time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
         (b"time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "20 K is -253"),
@@ -237,7 +240,7 @@ def test_the_hour_that_comes_twice(tmp_path):
     start = datetime(2026, 10, 24, 23, 50, tzinfo=UTC).timestamp()
     assert ((found.times - start) / 60).tolist() == [0, 30, 60, 90, 120, 140]
     once = hour((1, 50), (2, 20), (2, 50), (3, 10))
-    with pytest.raises(DataError, match="order of the rows does not tell"):
+    with pytest.raises(DataError, match="order of the rows does not show"):
         logged(tmp_path, once, clock=replace(BERLIN, ambiguous="order"))
     later = logged(tmp_path, once, clock=replace(BERLIN, ambiguous="later")).times
     assert ((later - start) / 60).tolist() == [0, 90, 120, 140]
@@ -304,10 +307,10 @@ def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_
     standard = HOBO.replace("GMT+02:00", "GMT+01:00")
     log = logged(tmp_path, standard)
     assert log.times.tolist() == [JUNE + 3600, JUNE + 3660]
-    assert any("the header says the time zone: GMT+01:00" in note for note in log.notes)
+    assert any("the header gives the time zone GMT+01:00" in note for note in log.notes)
     forced = logged(tmp_path, standard, clock=DeviceClock(time_zone("+02:00"), forced=True))
     assert forced.times.tolist() == [JUNE, JUNE + 60]
-    assert any("was given instead" in note for note in forced.notes)
+    assert any("is used instead" in note for note in forced.notes)
 
 
 @pytest.mark.parametrize(

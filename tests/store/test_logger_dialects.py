@@ -59,7 +59,7 @@ def test_fahrenheit_without_a_unit_is_doubtful(tmp_path, head):
 
     found = read(tmp_path / "log.csv", [f"time,{head}"], row)
     (note,) = [note for note in found.notes if "doubtful" in note]
-    assert "70.7 is taken as °C; if it is °F, it is 21.5 °C: say --unit" in note
+    assert "70.7 is taken as °C; if it is °F, it is 21.5 °C: give --unit" in note
     found = read(tmp_path / "log.csv", [f"time,{head}"], row, "degF")
     assert not [note for note in found.notes if "doubtful" in note]
     assert next(iter(found.channels.values()))[0] == pytest.approx(21.5)

@@ -98,7 +98,7 @@ def test_after_a_downgrade_the_copy_that_serves_is_named(version_1, monkeypatch)
     with monkeypatch.context() as newer:
         newer.setattr(schema, "FILE_STEPS", (*schema.FILE_STEPS, STEP))
         Store.open(version_1, "append").close()
-    with pytest.raises(StoreVersionError, match=r"go on with .*small\.db\.version-1, the copy"):
+    with pytest.raises(StoreVersionError, match=r"or use .*small\.db\.version-1, the backup"):
         Store.open(version_1)
     version_1.with_name("small.db.version-1").unlink()
     with pytest.raises(StoreVersionError, match=r"update thermocald$"):
@@ -135,7 +135,7 @@ def test_a_server_is_brought_up_to_date_as_a_whole_or_not_at_all(server, monkeyp
     place = address(server)
     with monkeypatch.context() as broken:
         broken.setattr(schema, "SERVER_STEPS", (*schema.SERVER_STEPS, FAILS))
-        with pytest.raises(ServerError, match="tables cannot be made"):
+        with pytest.raises(ServerError, match="tables cannot be created"):
             create_tables(place)
     with ServerStore(place) as store:
         assert store.all_series() == []

@@ -83,7 +83,7 @@ def test_replay_does_not_write_beside_a_daemon(daemon, path, tmp_path, recording
     else:
         done = call(*words, folder=tmp_path)
     assert done.returncode == 1
-    assert "another thermocald writes it" in done.stderr
+    assert "another thermocald process writes to it" in done.stderr
     assert "Traceback" not in done.stderr
     daemon.close()
     for name in {path, other} - {tmp_path / "other.db"}:
@@ -108,7 +108,7 @@ def test_every_command_that_writes_takes_the_lock(daemon, path, tmp_path, record
     arguments = [part.format(**places) for part in WRITERS[writer]]
     done = call(*arguments, folder=tmp_path)
     assert done.returncode == 1
-    assert "another thermocald writes it" in done.stderr
+    assert "another thermocald process writes to it" in done.stderr
 
 
 def test_a_command_that_writes_keeps_a_daemon_away(tmp_path):
@@ -169,7 +169,7 @@ def test_a_device_is_no_store_and_stays(tmp_path, recording, kind, command):
     words = ["replay", recording] if command == "replay" else ["run", "--recording", recording]
     done = call(*words, "--store", place)
     assert done.returncode in (1, 2)
-    assert "is a device or a pipe; a store is a file of its own" in done.stderr
+    assert "is a device or a pipe; a store must be a regular file" in done.stderr
     assert (node.lstat().st_ino, node.lstat().st_mode) == before
     assert {p.name for p in tmp_path.iterdir()} <= {"node", "link", "node.live", "link.live"}
 

@@ -268,8 +268,8 @@ def test_text_that_was_changed_is_parsed_again(recording_path, long_from_nothing
 @pytest.mark.parametrize(
     ("column", "value", "words"),
     [("x", "12,5e", "fields"), ("x", "", "is empty"), ("x", "nan", "finite"),
-     ("sx", "0", "above 0 px"), ("target", "nobody", "does not stand in testfield.csv"),
-     ("epoch", "99", "does not stand in epochs.csv"), ("epoch", "1.5", "not an integer")],
+     ("sx", "0", "above 0 px"), ("target", "nobody", "is not in testfield.csv"),
+     ("epoch", "99", "is not in epochs.csv"), ("epoch", "1.5", "not an integer")],
 )  # fmt: skip
 def test_a_copy_says_where_the_text_is_wrong(
     recording_path, long_from_nothing, column, value, words

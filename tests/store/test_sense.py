@@ -14,7 +14,12 @@ from tests.commands import call
 from thermocald.errors import RecordingError, TestFieldError
 from thermocald.output.thermal_model import render_certificate
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.recording.sense import find_spikes, find_unit_change, interior_doubts
+from thermocald.store.recording.sense import (
+    find_spikes,
+    find_unit_change,
+    interior_doubts,
+    time_doubts,
+)
 
 SIZE = "width: 3280, height: 2464"
 
@@ -162,7 +167,7 @@ def test_times_in_another_unit_are_named(recording, factor, unit):
 
 def test_one_time_for_all_epochs_is_refused(recording):
     change(recording, "epochs.csv", frame_time=lambda *_: "1600000000")
-    with pytest.raises(RecordingError, match="all epochs have one time"):
+    with pytest.raises(RecordingError, match="all epochs have the same time"):
         read_recording(recording)
 
 
@@ -316,6 +321,11 @@ def test_a_unit_that_changes_is_found_both_ways(words, other):
 @pytest.mark.parametrize("rise", [9.0, 15.0, 25.0, 35.0, 60.0])
 def test_a_camera_that_is_carried_changes_no_unit(rise):
     assert find_unit_change(np.r_[wave(30), wave(60)[30:] + rise]) is None
+
+
+def test_epochs_that_share_times_are_counted():
+    (doubt,) = time_doubts(np.arange(7), np.array([0, 0, 10, 20, 20, 20, 30.0]), 10.0)
+    assert doubt == "5 epochs have the time of another one, the first 0 and 1"
 
 
 def test_lenses_near_what_is_stated_are_not_doubted(recording):

@@ -1,4 +1,4 @@
-"""Writing a recording epoch by epoch; it appears as a whole or not at all."""
+"""Write a recording epoch by epoch; it appears as a whole or not at all."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 
 class RecordingWriter:
-    """Writes a recording as epochs come; memory does not grow with its length.
+    """A writer of a recording, epoch by epoch, in constant memory.
 
-    Use as a context manager. Everything goes into `.<name>.partial` next to `path`, which becomes
-    `path` at the end, and is removed where an error ends the block. Image points are written to
-    1e-5 px, times to 1e-6 s, temperatures and coordinates with all their digits. Raises
+    Use it as a context manager. Everything is written into `.<name>.partial` next to `path`, which
+    is renamed to `path` at the end, or removed if an error ends the block. Image points are written
+    to 1e-5 px, times to 1e-6 s, temperatures and coordinates with all their digits. Raises
     RecordingError if `path` exists and is not an empty folder, or if the disk is full.
     """
 
@@ -69,9 +69,9 @@ class RecordingWriter:
     def append(
         self, epoch: Epoch, image: bytes | NDArray[np.uint8] | NDArray[np.uint16] | None = None
     ) -> None:
-        """Add one epoch; `image` is its frame as JPEG bytes or as grey values (kept as PNG).
+        """Write one epoch; `image` is its frame as JPEG bytes or as grey values (written as PNG).
 
-        Without `image`, a frame that the epoch names is copied.
+        Without `image`, the frame that the epoch names is copied.
         """
         if self._epochs is None:
             raise RecordingError(f"{self.path}: the writer is not open")
@@ -91,7 +91,7 @@ class RecordingWriter:
             self._last_reading = epoch.temperature_time
 
     def keep_readings(self, readings: TemperatureLog) -> None:
-        """Keep every reading of a log, not only those next to the frames."""
+        """Write every reading of a log, not only those of the epochs."""
         try:
             write_readings(self._partial / READINGS, readings)
         except OSError as cause:
@@ -113,7 +113,7 @@ class RecordingWriter:
             raise self._failed(cause) from cause
 
     def _refuse_backwards(self, epoch: Epoch) -> None:
-        """What could not be read again is not written."""
+        """Raise RecordingError for an epoch that `open_recording` would refuse."""
         where = f"{self.path}: epoch {epoch.number}"
         if self._last is not None and epoch.number <= self._last.number:
             raise RecordingError(f"{where} comes after {self._last.number}; numbers must increase")
@@ -132,13 +132,13 @@ class RecordingWriter:
             if file is not None:
                 try:
                     file.close()
-                except OSError:  # a full disk also fails the flush; the file goes away anyhow
+                except OSError:  # a full disk fails the flush too; the file is removed below
                     file.close()
         shutil.rmtree(self._partial, ignore_errors=True)
 
     def _failed(self, cause: OSError) -> RecordingError:
         failed = cannot_write(self.path, cause)
-        error = RecordingError(f"{failed}; nothing was kept of it")
+        error = RecordingError(f"{failed}; the part written so far was removed")
         error.exit_status = failed.exit_status
         return error
 
@@ -194,9 +194,9 @@ class RecordingWriter:
 
 
 def write_recording(path: Path, head: Head, testfield: TestField, epochs: Iterable[Epoch]) -> None:
-    """Write a recording from an iterable of epochs, as a stream; frames are copied.
+    """Write a recording of some epochs in constant memory; their frames are copied.
 
-    Raises RecordingError if `path` exists, or the disk is full; then nothing is left behind.
+    Raises RecordingError, leaving nothing behind, if `path` exists or the disk is full.
     """
     with RecordingWriter(path, head, testfield) as writer:
         for epoch in epochs:

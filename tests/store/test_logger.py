@@ -11,6 +11,7 @@ import pytest
 from thermocald.errors import DataError, UsageError
 from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment, time_zone
 from thermocald.store.logger.dialect import stated_unit, without_unit
+from thermocald.store.logger.photographs import find_photographs
 from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
 
 BERLIN = DeviceClock(time_zone("Europe/Berlin"))
@@ -202,6 +203,11 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
         (b"time,temp\n2026-06-14 12:00,20\n2026-06-14 12:01,1e300\n", {}, "Another unit"),
         (b"a,b\n1,2\n3,4\n", {}, "no separator"),
         (b"", {}, "is empty"),
+        (b"\xef\xbb\xbf\n\n", {}, "is empty"),
+        (b"\xff\xfe", {}, "is empty"),
+        ("\u00a0\n", {}, "is empty"),
+        ((b"entity_id,state,last_changed\nsensor.humidity,45,2026-06-14T12:00:00Z\n"
+         b"sensor.humidity,46,2026-06-14T12:01:00Z\n"), {}, "no sensor .* has temperatures"),
         (b"\x7fELF\0\0\0\0", {}, "is not text"),
         (GERMAN, {"temperatures": ("Temp",)}, "there is no column 'Temp'"),
     ],
@@ -209,6 +215,16 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
 def test_what_is_not_certain_is_refused_with_the_remedy(tmp_path, data, options, reason):
     with pytest.raises((DataError, UsageError), match=reason):
         logged(tmp_path, data, **options)
+
+
+def test_blank_lines_after_the_rows_change_nothing(tmp_path):
+    long = PLAIN + "\n" * 900
+    assert logged(tmp_path, long).channels["temperature"].tolist() == [21.5, 21.75]
+
+
+def test_no_photographs_are_an_error():
+    with pytest.raises(DataError, match="no photographs are given"):
+        find_photographs([])
 
 
 def test_units_and_orders_that_are_said_are_used(tmp_path):

@@ -146,7 +146,9 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
     encoding = _detect_encoding(path)
     with path.open(encoding=encoding, errors="replace", newline="") as file:
         begin = list(islice(file, _SAMPLE))
-        end = list(deque(file, _SAMPLE))
+        end = list(deque(filter(str.strip, file), _SAMPLE))
+    if not any(map(str.strip, begin + end)):
+        raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
     try:
         mark = separator or _detect_separator(path, end if len(end) == _SAMPLE else begin + end)

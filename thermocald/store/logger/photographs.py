@@ -78,6 +78,8 @@ class Photograph:
 
 def find_photographs(paths: list[Path]) -> list[Path]:
     """Return the pictures among files and in folders, each once. Raises DataError if none."""
+    if not paths:
+        raise DataError("no photographs are given")
     found: list[Path] = []
     for path in paths:
         if path.is_dir():

@@ -332,6 +332,11 @@ def _split_by_label(table: _Table, values: Array, options: LogOptions) -> dict[s
     names = [n for n in every if n in options.wanted] or [
         n for n in every if not _OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
     ]
+    if not names:
+        raise DataError(
+            f"{table.file.path}: no sensor in column {_LABEL!r} has temperatures: "
+            f"{_quoted(every[:6])}; export one that has"
+        )
     return {_channel_name(name): np.where(labels == name, values, np.nan) for name in names}
 
 

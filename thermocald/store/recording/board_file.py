@@ -33,8 +33,8 @@ _SYNONYMS = {
 }  # fmt: skip
 """Keys for each quantity, in lower case, without underscores and unit."""
 _CALIB_IO = re.compile(
-    r"calib\.io_(checker|charuco)_[^_]+_(\d{1,3})x(\d{1,3})_([\d.]+?)"
-    r"(?:_([\d.]+))?(?:_(DICT_\w+?))?(?:\.\w+)?",
+    r"calib\.io_(checker|charuco)_[^_]+_(\d{1,3})x(\d{1,3})_(\d*\.?\d+)"
+    r"(?:_(\d*\.?\d+))?(?:_(DICT_\w+?))?(?:\.\w+)?",
     re.IGNORECASE,
 )
 """Names of calib.io's files: kind, page, rows x columns of squares, square, marker mm."""
@@ -62,7 +62,8 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
         columns, rows = board.count("columns"), board.count("rows")
         size = 1e3 * board.number("tagsize", "m", above=0.0, high=1e6)
         spacing = board.number("tagspacing", "1", above=0.0, high=1e6)
-        first = int(plain.get("startid", plain.get("lowid", 0)) or 0)
+        start = next((key for key in ("startid", "lowid") if plain.get(key) is not None), None)
+        first = 0 if start is None else int(board.number(start, "1", low=0, high=_MOST_ROWS))
         field = boards.aprilgrid(columns, rows, size, spacing, first=first, sigma=sigma)
         return field, (
             f"Kalibr's AprilGrid of {columns} × {rows} tags of {size:g} mm, "

@@ -234,7 +234,7 @@ class Chunk:
         wrong = (values != np.floor(values)) | (values < 0) | (values >= _MAX_EXACT_INTEGER)
         if wrong.any():
             row = int(np.argmax(wrong))
-            self.fail(row, name, f"{self._columns[name][row]!r} is not an integer of at least 0")
+            self.fail(row, name, f"{self.text(name)[row]!r} is not an integer of at least 0")
         return values.astype(np.int64)
 
     def places(self, name: str, index: Mapping[str, int]) -> NDArray[np.int64]:

@@ -236,7 +236,7 @@ def test_the_photograph_of_another_camera_is_refused(place, other):
                 TAKEN: f"2026:06:14 12:00:{10 * i:02d}", **(other if i == 3 else {})}  # fmt: skip
         known = {tag: value for tag, value in tags.items() if value is not None}
         save_photograph(place / "photos" / f"{i}.jpg", known, np.full((48, 64), 90 + i, np.uint8))
-    with pytest.raises(ThermocaldError, match=r"3\.jpg is of .*one recording is of one camera"):
+    with pytest.raises(ThermocaldError, match=r"3\.jpg is of .*a recording has one camera"):
         run(*arguments(place, "--timezone", "Europe/Berlin"))
     assert not (place / "M1").exists()
 

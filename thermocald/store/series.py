@@ -130,8 +130,7 @@ class LoggedReading:
 class StoredEpoch:
     """An epoch as stored: what was acquired, its latest calibration, and further columns.
 
-    revision: 0 for the first calibration, one more for each later one; extra: further columns by
-    name.
+    revision: 0, and one more with each later calibration; extra: further columns by name.
     """
 
     epoch: Epoch
@@ -157,7 +156,7 @@ class SeriesReader(ABC):
 
     @abstractmethod
     def all_series(self) -> list[StoredSeries]:
-        """Return all series, in the order in which they were started."""
+        """Return all series, in the order in which they were begun."""
 
     @abstractmethod
     def stamped_columns(
@@ -184,7 +183,7 @@ class SeriesReader(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close the store; may be called twice."""
+        """Close the store, and release its lock if it has one; may be called twice."""
 
     def __enter__(self) -> Self:
         return self
@@ -292,7 +291,7 @@ def series_times(source: SeriesReader, series: StoredSeries) -> SeriesTimes:
     stamped, reading = columns["frame_time"], columns["temperature_time"]
     corrections = clock_corrections(stamped, series.head.interval, columns["clock_trusted"], steps)
     frame = stamped + corrections
-    # a reading next to a clock step may bear the clock's other setting than its frame
+    # at a clock step, a reading and its frame may be stamped by different settings
     nearest = reading.copy()
     for shift in np.unique(corrections):
         moved = reading + shift
@@ -303,13 +302,13 @@ def series_times(source: SeriesReader, series: StoredSeries) -> SeriesTimes:
 def clock_corrections(
     frame_time: Array, interval: float, trusted: Array | None = None, steps: Sequence[float] = ()
 ) -> Array:
-    """Return seconds (E,) to add to times (E,) to bring them in order, and right where known.
+    """Return corrections (E,) s that make times (E,) ascend and, where known, right.
 
     trusted (E,): 0 if the clock was not synchronised; steps, s: those that time stamps followed.
-    First, epochs from before the clock was set are moved by that step. Then epochs between a step
-    forwards and the same step back, a glitch of the clock, are moved back. Last, at any other step
-    back, all earlier epochs are moved to end one interval before the next one, as the later
-    setting of the clock is the more reliable. Other epochs get zero.
+    First, epochs from before the clock was set are moved by the step that set it. Then epochs
+    between a step forwards and the same step back, a glitch of the clock, are moved back. Last, at
+    any other step back, all earlier epochs are moved to end one interval before the next one, as
+    the later setting of the clock is the more reliable. Other corrections are zero.
     """
     corrections = np.zeros(len(frame_time))
     tolerance = max(_CLOCK_TOLERANCE_S, 3.0 * interval)

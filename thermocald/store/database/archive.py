@@ -41,12 +41,12 @@ def archive_store(
     written: list[dict[str, Any]] = []
     readings: dict[str, Path] = {}
     with Store.open(path) as opened:
-        chosen = opened.all_series() if series is None else [opened.only_series(series)]
+        every = opened.all_series()
+        chosen = every if series is None else [opened.only_series(series)]
         if finished:
-            newest = {one.camera: one.id for one in opened.all_series()}
+            newest = {one.camera: one.id for one in every}
             chosen = [one for one in chosen if newest[one.camera] != one.id]
         make_folder(folder)
-        every = opened.all_series()
         for one in chosen:
             name = f"{one.camera}-{one.name}"
             if sum(f"{other.camera}-{other.name}" == name for other in every) > 1:
@@ -135,9 +135,7 @@ def back_up(store: Path, target: Path, keep: int = 0) -> dict[str, Any]:
     elif keep:
         raise UsageError(f"--keep is for a folder of backups; {target} is not a folder")
     if target.exists():
-        raise DataError(
-            f"{target}: exists already; a backup is never overwritten; choose another name"
-        )
+        raise DataError(f"{target}: exists already; choose another name for the backup")
     if not target.absolute().parent.is_dir():
         raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
     with Store.open(store) as opened:

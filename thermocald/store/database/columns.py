@@ -5,9 +5,9 @@ a number in its texts: `temperatures.<channel>` as read, `extra.<name>`.
 
 SQLite needs some microseconds per row, which would be seconds for a million epochs. So when CHUNK
 epochs of a series have accumulated, each of their columns is written again as one blob of float64,
-in the transaction of the last epoch. When MERGED such chunks have accumulated they are merged into
-one, since long blobs are read twice as fast. Reading joins the chunks and takes from the rows the
-epochs after the last chunk and those that were calibrated after their chunk was written.
+in the transaction of the last epoch; MERGED such chunks are merged into one, since long blobs are
+read twice as fast. Reading joins the chunks and takes from the rows the epochs after the last chunk
+and those that were calibrated after their chunk was written.
 
 Each row has a checksum, since SQLite's integrity check does not find a bit that changed inside a
 value: a CRC-32 of the row's numbers, as little-endian float64 with one NaN for NULL, and then of

@@ -5,10 +5,9 @@ deviations float32; 4 more for the covariance of x and y if it is given, 4 for e
 rounding error of 3e-6 px (rms) is a thousandth of the best sd and equals that of observations.csv.
 A covariance is the 136 float64 of its upper triangle. All numbers are little-endian.
 
-This module also reads and writes series, finds damaged or missing rows, and reads rows added since.
-SQLite's integrity check finds a broken structure, the checksums find a changed value, and the
-numbers of the epochs a missing row. Rows are never changed or deleted, so a forwarder only needs to
-remember the last id it sent.
+The module also has the rows of series, and reads damaged, missing and new rows. SQLite's integrity
+check finds a broken structure, the checksums a changed value, the epochs' numbers a missing row. As
+rows are never changed or deleted, a forwarder only needs to remember the last id it sent.
 """
 
 from __future__ import annotations
@@ -129,8 +128,7 @@ def unpack_observations(data: bytes) -> Observations:
 def unpack_rows(packed: Mapping[int, bytes]) -> ObservationRows:
     """Return the observations of many epochs {number: bytes}, without their quality.
 
-    The bytes of all epochs of one layout are converted at once. Raises StoreError for bytes that
-    `pack_observations` did not write.
+    The bytes of all epochs of one layout are converted at once. Raises StoreError for other bytes.
     """
     kinds: dict[int, list[tuple[int, int, int, bytes]]] = {}
     for number, data in packed.items():
@@ -260,8 +258,7 @@ def latest_epochs(
 ) -> Iterator[StoredEpoch]:
     """Yield each epoch in its latest revision from rows of a file or a server.
 
-    rows: ordered by number and revision; details: gives the packed covariance and observations of a
-    row, None leaves them out.
+    rows: by number and revision; details: gives a row's packed covariance, observations; or None.
     """
     for _, revisions in groupby(rows, key=itemgetter("number")):
         covariance = seen = b""
@@ -337,7 +334,7 @@ def read_details(connection: sqlite3.Connection, row: Mapping[str, Any]) -> tupl
 
 
 def _join_parts(number: int, kept: int, parts: list[tuple[int, bytes]]) -> tuple[bytes, bytes]:
-    """Join covariance and observations from their parts. Raises DamageError if these changed."""
+    """Join covariance and observations from their parts. Raises DamageError."""
     covariance = b"".join(bytes(data) for part, data in parts if part == 0)
     seen = b"".join(bytes(data) for part, data in parts if part)
     what = f"epoch {number}: its covariance or its observations"
@@ -394,9 +391,7 @@ def select_series(connection: sqlite3.Connection, path: Path) -> list[StoredSeri
     if not rows and connection.execute("SELECT 1 FROM epoch LIMIT 1").fetchone():
         known = connection.execute("SELECT 1 FROM series JOIN testfield LIMIT 1").fetchone()
         if known is None:
-            raise StoreError(
-                f"{path}: is damaged: its series or test fields are missing; restore a backup"
-            )
+            raise StoreError(f"{path}: is damaged: its series or test fields are missing")
     return [_read_series(path, *row) for row in rows]
 
 
@@ -407,9 +402,7 @@ def _read_series(
     what = f"{path}: series {camera}/{name}"
     require_checksum(kept, what, (created,), texts)
     if hashlib.sha256(csv.encode(errors="surrogateescape")).hexdigest() != digest:
-        raise StoreError(
-            f"{what}: its test field is damaged: its digest does not match; restore a backup"
-        )
+        raise StoreError(f"{what}: its test field does not match its digest; restore a backup")
     file_name(camera, f"{what}: camera", StoreError)
     file_name(name, f"{what}: series", StoreError)
     parsed = parse_head(json.loads(head), path)
@@ -438,10 +431,10 @@ class Gap:
     @property
     def text(self) -> str:
         """The gap in a sentence."""
-        if self.first == self.last:
-            return f"{self.camera}/{self.series}: epoch {self.first} is missing"
-        count = self.last - self.first + 1
         where = f"{self.camera}/{self.series}"
+        if self.first == self.last:
+            return f"{where}: epoch {self.first} is missing"
+        count = self.last - self.first + 1
         return f"{where}: epochs {self.first} to {self.last} are missing ({count})"
 
 
@@ -449,8 +442,8 @@ class Gap:
 class Examination:
     """The result of reading a whole store.
 
-    damaged: what is damaged, a phrase each; epochs: number of their rows; unfinished: the last
-    write to the -wal file was cut off, see `database.file.WalTail`.
+    damaged: phrases; epochs: number of their rows; unfinished: the last write to the -wal file was
+    cut off, see `WalTail`.
     """
 
     damaged: tuple[str, ...]

@@ -5,8 +5,8 @@ SQLite writes commits into the file `<store>-wal` and moves them into the store 
 the helper file `-shm` must exist or be created; a file opened with `immutable=1` is read without
 it and lacks those epochs.
 
-SQLite reads the frames of the -wal up to the first whose checksum does not match, and takes the
-rest for cut off by a crash. That is right for the last transaction, which may not have been
+SQLite reads the frames of the -wal up to the first whose checksum does not match, and treats the
+rest as cut off by a crash. That is right for the last transaction, which may not have been
 committed. A transaction that is followed by another, or counted by the index in the -shm file, was
 committed: a wrong checksum in it is damage.
 Formats: https://www.sqlite.org/fileformat2.html#the_write_ahead_log,
@@ -144,11 +144,11 @@ def helper(path: Path, kind: str) -> Path:
 
 
 def written_elsewhere(path: Path) -> bool:
-    """Return whether a file with several names is written under another one.
+    """Return whether a file is (or was, by a killed writer) written under another of its names.
 
-    It also is if that writer was killed. The latest commits are then in a -wal file that can be
-    found from this name only if the other one is in the same folder. The file is not opened here,
-    as closing it would end SQLite's locks of this process.
+    The latest commits are then in a -wal file that can be found from this name only if the other
+    one is in the same folder. The file is not opened here, as closing it would end SQLite's locks
+    of this process.
     """
     found = path.stat()
     wal = helper(path, "wal")

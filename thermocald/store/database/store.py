@@ -101,7 +101,6 @@ class Store(SeriesReader):
             raise
 
     def close(self) -> None:
-        """Close the file and release its lock; may be called twice."""
         with self._lock, in_words(self.path, "the store cannot be closed"):
             self.closed = True
             self._db.close()
@@ -115,7 +114,6 @@ class Store(SeriesReader):
         return str(self._value("SELECT identity FROM store"))
 
     def all_series(self) -> list[StoredSeries]:
-        """Return all series, in the order in which they were begun."""
         with self._reads("the series") as connection:
             return epochs.select_series(connection, self.path)
 
@@ -165,12 +163,10 @@ class Store(SeriesReader):
             )  # fmt: skip
 
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        """Return the observations of epochs `first` to `last` (numbers), without their quality."""
         with self._reads("observations") as connection:
             return epochs.select_observations(connection, series.id, first, last)
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
-        """Return covariances (E, 16, 16) of the epochs `numbers`, NaN without a result."""
         result = np.full((len(numbers), 16, 16), np.nan)
         with self._reads("covariances") as connection:
             for i, number in enumerate(map(int, numbers)):
@@ -182,7 +178,6 @@ class Store(SeriesReader):
     def stamped_columns(
         self, series: StoredSeries, names: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
-        """Return columns (E,) over all epochs by name, with times as stamped."""
         source = {name: _chunk_name(name, series) for name in names}
         with self._reads("columns") as connection:
             found = columns.read_columns(connection, series.id, [*dict.fromkeys(source.values())])

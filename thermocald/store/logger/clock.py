@@ -1,8 +1,7 @@
 """Convert dates and times of loggers and cameras to UTC.
 
 A time without a zone is taken neither as UTC nor as local time: the zone must be given. A time that
-daylight saving repeats is refused unless the caller says which one is meant, and one that it skips
-is always refused.
+daylight saving skips is refused, and one that it repeats too, unless it is given which is meant.
 """
 
 from __future__ import annotations
@@ -198,11 +197,7 @@ _MONTHS = {
 _WORD = re.compile(r"[A-Za-z]{3}")
 _CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
 _ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
-_PARTS = (
-    (1e17, 1e9),
-    (1e14, 1e6),
-    (1e11, 1e3),
-)  # smaller numbers are seconds: the year 5138 has 1e11
+_PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds are less until the year 5138
 
 
 def iso(seconds: float) -> str:

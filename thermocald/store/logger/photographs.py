@@ -241,9 +241,7 @@ def _exif_moment(path: Path, details: dict[int, Any]) -> datetime:
 def _name_moment(path: Path) -> datetime:
     found = _IN_NAME.search(path.stem)
     if found is None:
-        raise DataError(
-            f"{path}: no time in the name; a name with a time is IMG_20260614_120301.jpg"
-        )
+        raise DataError(f"{path}: no time in the name, as in IMG_20260614_120301.jpg")
     try:
         moment = parse_moment(f"{found[1]}T{found[2]}" + (f".{found[3]}" if found[3] else ""))
     except ValueError as cause:
@@ -307,13 +305,11 @@ def read_series(
         other = next(p for p in photographs if (p.width, p.height) != (one.width, one.height))
         raise DataError(
             f"{other.path}: has {other.width} × {other.height} px, {one.path.name} "
-            f"{one.width} × {one.height}: one recording is of one camera in one position; "
-            "import them separately"
+            f"{one.width} × {one.height}: a recording has one camera in one position; import "
+            "them separately"
         )
     if strange := other_camera(photographs):
-        raise DataError(
-            f"{strange}: one recording is of one camera with one lens; import them separately"
-        )
+        raise DataError(f"{strange}: a recording has one camera and lens; import them separately")
     copies = find_copies([p.path for p in photographs])
     notes = [
         f"photographs: {photographs[i].path.name} is a copy of {photographs[k].path.name}: left out"
@@ -385,7 +381,7 @@ def _require_overlap(frames: Array, log: Array) -> None:
 
 
 def _nearest_rows(frames: Array, log: Array) -> NDArray[np.int64]:
-    """Return the row of the log nearest to each frame, -1 if it is ten intervals away."""
+    """Return the row of the log nearest to each frame, -1 if it is over ten intervals away."""
     right = np.clip(np.searchsorted(log, frames), 1, len(log) - 1)
     left = right - 1
     row = np.where(frames - log[left] <= log[right] - frames, left, right)

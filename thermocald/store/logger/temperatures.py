@@ -160,9 +160,8 @@ def read_log(
     channels = {}
     for name in names:
         values, unit_note = _to_celsius_column(table, name, options)
-        channel = options.names.get(name) or (
-            name if name in options.wanted else _channel_name(name)
-        )
+        given = name if name in options.wanted else None
+        channel = options.names.get(name) or given or _channel_name(name)
         while channel in channels:  # `T (1)` and `T [1]` are two columns
             channel += "_"
         channels[channel] = values
@@ -257,10 +256,8 @@ class _Table:
         for name, words in self._words.items():
             if words:
                 shown = ", ".join(repr(word) for word, _ in words.most_common(3))
-                count = words.total()
-                notes.append(
-                    f"log: {count} values of {name!r} are not readings ({shown}): left empty"
-                )
+                what = f"{words.total()} values of {name!r} are not readings ({shown})"
+                notes.append(f"log: {what}: left empty")
         return notes
 
     def _moment(self, line: int, text: str) -> datetime | None:
@@ -532,7 +529,7 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
 def _drop_unmeasured(
     table: _Table, name: str, celsius: Array, options: LogOptions
 ) -> tuple[Array, list[str]]:
-    """Return a column (n,) °C without values that need no measurement, and notes.
+    """Return a column (n,) °C, NaN for values given without a measurement, and notes.
 
     Raises DataError if the unit changes midway and was not given.
     """

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from thermocald.store.recording.table import Chunk
 
 
-_GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # most of a grid: 12 MB
+_GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
 # A file of text or Parquet of this size (a day of 150 targets every 10 s) is read in parts.
 LONG_FROM_BYTES = 100_000_000
 _REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
@@ -156,10 +156,7 @@ class ObservationFile:
     def _blocks(
         self, windows: Sequence[slice] | None, quality: list[str]
     ) -> Iterator[tuple[ObservationRows, int, int]]:
-        """Yield rows of whole epochs, in order, and the range of epochs in them that is wanted.
-
-        The range is its first epoch and the one after its last.
-        """
+        """Yield rows of whole epochs, in order, with the first wanted one and the end."""
         columns = [*_REQUIRED, *(["sxy"] if self._has_covariances else []), *quality]
         every = [slice(0, len(self._numbers))]
         # text is read once for all windows
@@ -180,7 +177,7 @@ class ObservationFile:
     def _whole_epochs(
         self, chunks: Iterator[Chunk], quality: list[str]
     ) -> Iterator[tuple[ObservationRows, int, int]]:
-        """Yield rows of whole epochs, in order, with their first epoch and the one after."""
+        """Yield rows of whole epochs, in order, with their first epoch and the end (exclusive)."""
         done = 0
         pending = self._no_rows()
         for chunk in chunks:

@@ -4,9 +4,8 @@ It is read ten times as fast as CSV and has a third of its size; the numbers are
 bit. It needs pyarrow (`pip install 'thermocald[parquet]'`). A chunk has the interface of a CSV
 table's chunk, so both pass the same checks.
 
-A CSV file that is too long for memory is read several times in an analysis. Its text is parsed only
-once, into a Parquet copy in the user's cache, which is identified by the text's path, inode, size
-and time of modification.
+A CSV file that is too long for memory is read several times by an analysis. Its text is parsed only
+once, into a Parquet copy in the user's cache, found by the text's path, inode, size and time.
 """
 
 from __future__ import annotations

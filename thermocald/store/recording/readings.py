@@ -1,4 +1,4 @@
-"""Every reading of a log, and the temperature at the time of a frame between readings."""
+"""The readings of a log, and their interpolation at the times of frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 READINGS = "readings.csv"
 """The file with every reading of a log, in a recording of frames and a separate log."""
 _LARGEST_GAP_IN_INTERVALS = 10.0
-_AT_ONCE = 100_000  # frames: limits the memory of temporary arrays for a year of them
+_AT_ONCE = 100_000  # frames: a year of them must fit into memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,16 +30,16 @@ _NOT_MEASURED = (85.0, 127.9375, 127.94, 0.0, -40.0, -45.0, -46.85, 125.0, 130.0
 _LEAP_K = 5.0  # more than a camera warms in one interval
 _LONGEST_SPIKE = 3  # readings
 _AROUND = 3  # readings before and after a change of the unit
-_FEWEST = 20  # image points from which the unit can be judged
+_FEWEST = 20  # image points for a judgement on all
 _MOST_OUTSIDE = 0.02  # of the image points: gross errors are rarer
 _SMALLEST_EXTENT = 0.02  # of the image: smaller coordinates are in mm, not px
 _FARTHEST_PX = 1e6
 _SIGMAS_PX = (1e-6, 1e4)
-_RHYTHM = 5.0  # largest ratio of interval between frames to nominal one, or its inverse
-_APART, _APART_S = 5.0, 60.0  # most between a frame and its reading: intervals, s
+_RHYTHM = 5.0  # largest ratio of the frames' interval to the stated one, or its inverse
+_APART, _APART_S = 5.0, 60.0  # largest offset of a reading from its frame: intervals, s
 _HOT_C = 65.0  # no lens is made for more
 _DISTANCES = (0.8, 1.25)  # ratio of principal distances, estimated to stated, or of pitches
-_CENTRE = 0.1  # of the image's diagonal: most of the principal point from the centre
+_CENTRE = 0.1  # of the image's diagonal: largest offset of the principal point
 _MOST_NAMED = 6  # targets in a message
 _PITCH_OPTION = "--pixel-pitch, or pixel_pitch in recording.yaml or the camera file"
 
@@ -219,7 +219,7 @@ def reading_doubts(values: Array, label: str) -> Iterator[str]:
 
 
 def stuck_doubts(values: Array, label: str) -> Iterator[str]:
-    """Yield a doubt if all readings (n,) °C are one value that needs no measurement."""
+    """Yield a doubt if all readings (n,) °C are one value given without a measurement."""
     known = values[np.isfinite(values)]
     if len(known) < _AROUND or np.ptp(known) > 0:
         return

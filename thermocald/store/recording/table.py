@@ -110,10 +110,7 @@ class Table:
         message: Callable[[int], str] | str,
         first: int = 0,
     ) -> None:
-        """Raise for the first row marked wrong; `wrong` begins at row `first`.
-
-        message: the text, or a function that gives it for an index of `wrong`.
-        """
+        """Raise for the first row marked wrong, after `first` others; message may take the row."""
         if wrong.any():
             row = int(np.argmax(wrong))
             self.fail(first + row, name, message if isinstance(message, str) else message(row))

@@ -63,7 +63,6 @@ class ServerStore(Connected, SeriesReader):
 
     @property
     def where(self) -> str:
-        """The address without its password."""
         return str(self.address)
 
     @classmethod
@@ -97,7 +96,6 @@ class ServerStore(Connected, SeriesReader):
     def stamped_columns(
         self, series: StoredSeries, names: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
-        """Return columns (E,) over all epochs by name, with times as stamped."""
         from psycopg import sql
 
         wanted = {name: _expression(name, series) for name in ("epoch", "frame_time", *names)}
@@ -113,7 +111,6 @@ class ServerStore(Connected, SeriesReader):
         return {name: columns[name] for name in names}
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
-        """Return covariances (E, 16, 16) of the epochs `numbers`, NaN without a result."""
         rows = self._query(
             f"SELECT number, covariance {_LATEST} AND number = ANY(%s)",
             (_key(series), [int(n) for n in numbers]),
@@ -138,7 +135,6 @@ class ServerStore(Connected, SeriesReader):
         )
 
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        """Return the observations of epochs `first` to `last` (numbers), without their quality."""
         statement = (
             "SELECT number, observations FROM epoch WHERE series = %s AND number >= %s "
             "AND number <= %s AND observations IS NOT NULL ORDER BY number, revision"

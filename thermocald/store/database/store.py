@@ -118,7 +118,7 @@ class Store(SeriesReader):
             return epochs.select_series(connection, self.path)
 
     def last_epoch(self, series: StoredSeries) -> int | None:
-        """Return the number of the last epoch of a series, None if it has none."""
+        """Return the number of the last epoch, after which to resume; None without epochs."""
         found = self._value("SELECT max(number) FROM epoch WHERE series_id = ?", series.id)
         if found is not None and not isinstance(found, int):
             raise columns.DamageError(

@@ -207,7 +207,7 @@ _LOCAL = {"epoch": {"id", "series_id"}, "event": {"series_id"}, "reading": set[s
 
 
 def series_key(station: str, store: UUID, series: StoredSeries) -> UUID:
-    """Return the key of a series on the server: station, store, camera, name, time of its begin."""
+    """Return the key of a series on the server: station, store, camera, name, its beginning."""
     text = json.dumps([station, str(store), series.camera, series.name, series.created_utc])
     return uuid5(_NAMESPACE, text)
 

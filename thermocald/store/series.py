@@ -152,7 +152,7 @@ class SeriesReader(ABC):
     """Whether times are corrected, see `series_times`."""
     _times: dict[int, SeriesTimes | None] | None = None
     # ends the message of a selection that fits no series or several
-    _remedy = "; select one: --series CAMERA/SERIES, or thermocald archive makes recordings of all"
+    _remedy = "; select one with --series CAMERA/SERIES, or archive all with thermocald archive"
 
     @abstractmethod
     def all_series(self) -> list[StoredSeries]:

@@ -580,6 +580,6 @@ def _find_unit(table: _Table, name: str) -> tuple[str | None, str]:
         return "degF", "a line above the table"
     if len(found) > 1:
         raise DataError(
-            f"{file.path}, column {name!r}: is {' and '.join(found)} at once; give --unit"
+            f"{file.path}, column {name!r}: is in {' and '.join(found)} at once; give --unit"
         )
     return next(iter(found.items()), (None, ""))

@@ -77,7 +77,7 @@ def read_head(folder: Path) -> Head:
     """Read `recording.yaml` of a folder. Raises RecordingError naming file and key."""
     path = folder / "recording.yaml"
     if not folder.is_dir():
-        raise RecordingError(f"{folder}: is not a folder; a recording is one with recording.yaml")
+        raise RecordingError(f"{folder}: is not a folder with recording.yaml, as a recording is")
     if not path.is_file():
         raise RecordingError(f"{folder}: is not a recording: recording.yaml is missing")
     head = parse_head(read_yaml(path, RecordingError), path)

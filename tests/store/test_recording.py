@@ -86,6 +86,30 @@ def test_rows_in_any_order(recording_path):
         assert same(a.observations.select(order), b.observations)
 
 
+def test_epochs_of_different_columns_are_written_together(tmp_path, field, head, make_epoch):
+    """A frame that shows nothing, markers without circles, a value that one target lacks."""
+    seen = make_epoch(1).observations
+    n = len(seen)
+    blurred = replace(seen, quality={"blur": np.array([np.nan, *range(1, n)])})
+    all_of_it = replace(seen, covariances=np.full(n, 1e-4), quality={"misfit": np.arange(n) + 0.5})
+    shown = [seen.select(np.zeros(n, dtype=bool)), blurred, all_of_it, seen]
+    epochs = [replace(make_epoch(i + 1), observations=o) for i, o in enumerate(shown)]
+    write_recording(tmp_path / "mixed", head, field, epochs)
+    assert sorted(p.name for p in (tmp_path / "mixed").iterdir()) == [
+        "epochs.csv", "observations.csv", "recording.yaml", "testfield.csv",
+    ]  # fmt: skip
+    none, first, second, third = (e.observations for e in read_recording(tmp_path / "mixed").epochs)
+    assert len(none) == 0
+    assert same(first, blurred)
+    assert np.array_equal(first.quality["blur"], blurred.quality["blur"], equal_nan=True)
+    assert np.isnan(first.quality["misfit"]).all()
+    assert second.quality["misfit"].tolist() == all_of_it.quality["misfit"].tolist()
+    assert (second.covariances == 1e-4).all()
+    assert not first.covariances.any()
+    assert same(third, seen)
+    assert np.isnan(third.quality["blur"]).all()
+
+
 def test_covariances_and_quality_travel(tmp_path, field, head):
     rows = np.arange(4)
     seen = Observations(

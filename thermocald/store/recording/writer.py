@@ -8,6 +8,8 @@ import os
 import shutil
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
+
 from thermocald.errors import RecordingError
 from thermocald.files import cannot_write, dump_yaml
 from thermocald.names import require_channels
@@ -20,11 +22,12 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any, TextIO
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
+
+_ABSENT = {"sxy": "0"}  # in rows of an epoch without the column; others are empty
 
 
 class RecordingWriter:
@@ -165,32 +168,53 @@ class RecordingWriter:
         return f"frames/{name}"
 
     def _write_observations(self, number: int, seen: Observations) -> None:
-        columns: list[tuple[str, str, list[float]]] = [
-            ("x", "%.5f", seen.points[:, 0].tolist()),
-            ("y", "%.5f", seen.points[:, 1].tolist()),
-            ("sx", "%.6g", seen.sigmas[:, 0].tolist()),
-            ("sy", "%.6g", seen.sigmas[:, 1].tolist()),
-        ]
-        if seen.covariances is not None:
-            columns.append(("sxy", "%.6g", seen.covariances.tolist()))
-        columns += [(name, "%.6g", values.tolist()) for name, values in seen.quality.items()]
-        header = ["epoch", "target", *(name for name, _, _ in columns)]
+        """Write the rows of an epoch; a column that it lacks is empty, or 0 for the covariance."""
+        columns = dict(zip(("x", "y", "sx", "sy"), (*seen.points.T, *seen.sigmas.T), strict=True))
+        if len(seen) and seen.covariances is not None:
+            columns["sxy"] = seen.covariances
+        if len(seen):
+            columns |= seen.quality
         if self._observations is None:
             self._observations = self._new("observations.csv")
-            self._header = header
-            csv.writer(self._observations, lineterminator="\n").writerow(header)
-        elif header != self._header:
-            raise RecordingError(
-                f"{self.path}: epoch {number} has the columns {', '.join(header)}, the epochs "
-                f"before {', '.join(self._header)}; all must have the same"
+            self._columns = list(columns)
+            csv.writer(self._observations, lineterminator="\n").writerow(
+                ["epoch", "target", *columns]
             )
-        names = [_quoted(self._field.names[row]) for row in seen.targets.tolist()]
+        if added := [name for name in columns if name not in self._columns]:
+            self._add_columns(added)
+        forms: list[str] = []
+        values: list[list[Any]] = [[_quoted(self._field.names[i]) for i in seen.targets.tolist()]]
+        for name in self._columns:
+            if name not in columns:
+                forms.append(_ABSENT.get(name, ""))
+                continue
+            column = columns[name]
+            if (known := np.isfinite(column)).all():
+                forms.append("%.5f" if name in ("x", "y") else "%.6g")
+                values.append(column.tolist())
+            else:
+                forms.append("%s")
+                values.append(np.where(known, np.char.mod("%.6g", column), "").tolist())
         # one format for the whole epoch: three times as fast as csv.writer row by row
-        line = ",".join([f"{number},%s", *(form for _, form, _ in columns)]) + "\n"
-        rows = zip(names, *(values for _, _, values in columns), strict=True)
-        self._observations.write(
-            (line * len(names)) % tuple(value for row in rows for value in row)
-        )
+        line = ",".join([f"{number},%s", *forms]) + "\n"
+        rows = zip(*values, strict=True)
+        self._observations.write((line * len(seen)) % tuple(value for row in rows for value in row))
+
+    def _add_columns(self, names: list[str]) -> None:
+        """Add columns to the rows of observations written so far."""
+        assert self._observations is not None
+        self._observations.close()
+        before = self._partial / "observations.before"
+        (self._partial / "observations.csv").rename(before)
+        self._observations = self._new("observations.csv")
+        rows = csv.writer(self._observations, lineterminator="\n")
+        absent = [_ABSENT.get(name, "") for name in names]
+        with before.open(encoding="utf-8", newline="") as file:
+            written = csv.reader(file)
+            rows.writerow([*next(written), *names])
+            rows.writerows([*row, *absent] for row in written)
+        before.unlink()
+        self._columns += names
 
 
 def write_recording(path: Path, head: Head, testfield: TestField, epochs: Iterable[Epoch]) -> None:

@@ -110,6 +110,13 @@ def test_epochs_of_different_columns_are_written_together(tmp_path, field, head,
     assert np.isnan(third.quality["blur"]).all()
 
 
+def test_a_column_of_text_that_begins_empty_is_ignored(recording_path):
+    file = recording_path / "observations.csv"
+    header, first, *rows = file.read_text().splitlines()
+    file.write_text("\n".join([f"{header},comment", f"{first},", *(f"{r},a" for r in rows)]) + "\n")
+    assert "comment" not in read_recording(recording_path).epochs[0].observations.quality
+
+
 def test_covariances_and_quality_travel(tmp_path, field, head):
     rows = np.arange(4)
     seen = Observations(

@@ -209,7 +209,7 @@ def _parse(table: Table, target: Path) -> None:
     """Write a CSV table as Parquet with pyarrow's parser; its numbers are Python's to the bit."""
     from pyarrow import csv, float64, int64, string
 
-    first = next(table.chunks(1), None)
+    first = next(table.chunks(100), None)
     if first is None:
         raise ValueError("no rows")
     kinds = {

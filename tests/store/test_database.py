@@ -188,7 +188,7 @@ def test_rows_that_a_trigger_swallows_are_not_kept_and_said(
     with closing(sqlite3.connect(store_path)) as other:
         other.execute(f"CREATE TRIGGER x BEFORE INSERT ON {table} BEGIN SELECT RAISE(IGNORE); END")
     store, series = filled
-    with pytest.raises(StoreError, match=f"keeps rows out of the table {table}"):
+    with pytest.raises(StoreError, match=f"keeps rows out of {table}"):
         store.append(series, make_epoch(21), make_result(21))
 
 

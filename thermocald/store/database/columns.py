@@ -102,9 +102,7 @@ def insert_row(connection: sqlite3.Connection, table: str, row: Mapping[str, Any
     numbers, texts = ([row[name] for name in names] for names in KEPT[table])
     values = (*numbers, *texts, row_checksum(numbers, texts))
     if connection.execute(_INSERT[table], values).rowcount != 1:
-        raise sqlite3.IntegrityError(
-            f"a foreign trigger keeps rows out of the table {table}; drop that trigger"
-        )
+        raise sqlite3.IntegrityError(f"a foreign trigger keeps rows out of {table}; drop it")
 
 
 def examined_rows(

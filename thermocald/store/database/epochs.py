@@ -112,7 +112,7 @@ def pack_observations(seen: Observations) -> bytes:
 def unpack_observations(data: bytes) -> Observations:
     """Invert `pack_observations`. Raises StoreError for other bytes."""
     flags, n, start = _read_header(data)
-    rows = _unpack_layout(flags, [(0, n, start, data)])
+    rows = _unpack(flags, [(0, n, start, data)])
     try:
         names = data[_HEADER.size : start].decode()
         end = start + n * sum(_sizes(flags))
@@ -135,8 +135,7 @@ def unpack_rows(packed: Mapping[int, bytes]) -> ObservationRows:
         flags, n, start = _read_header(data)
         kinds.setdefault(flags, []).append((number, n, start, data))
     return ObservationRows.join(
-        [_unpack_layout(flags, epochs) for flags, epochs in kinds.items()]
-        or [_unpack_layout(0, [])]
+        [_unpack(flags, epochs) for flags, epochs in kinds.items()] or [_unpack(0, [])]
     )
 
 
@@ -157,7 +156,7 @@ def _sizes(flags: int) -> list[int]:
     return [*sizes, 4] if flags & _COVARIANCES else sizes
 
 
-def _unpack_layout(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> ObservationRows:
+def _unpack(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> ObservationRows:
     """Unpack epochs of one layout, each given as its number, rows, offset and bytes."""
     sizes = _sizes(flags)
     columns: list[list[bytes]] = [[] for _ in sizes]
@@ -216,9 +215,7 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     insert_row(connection, "epoch", row)
     kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts).rowcount
     if parts and kept != len(parts):
-        raise sqlite3.IntegrityError(
-            "a foreign trigger keeps rows out of the table detail; drop that trigger"
-        )
+        raise sqlite3.IntegrityError("a foreign trigger keeps rows out of detail; drop it")
 
 
 def _detail_rows(

@@ -399,9 +399,7 @@ def open_copy(
     if change is None and not (wal.exists() and wal.stat().st_size):
         return _connect(path, "ro&immutable=1")
     try:
-        with tempfile.TemporaryDirectory(
-            prefix="thermocald-", ignore_cleanup_errors=True
-        ) as folder:
+        with tempfile.TemporaryDirectory("", "thermocald-", ignore_cleanup_errors=True) as folder:
             copy = Path(folder) / "copy.db"
             _copy_files(path, wal, copy)
             with closing(_connect(copy, "rw")) as connection:
@@ -410,7 +408,8 @@ def open_copy(
                     change(connection)
                 connection.execute("PRAGMA journal_mode = DELETE")
             opened = _connect(copy, "ro&immutable=1")
-            opened.execute("SELECT 1 FROM sqlite_master").fetchone()  # opens the file
+            # SQLite opens the file only now, before the folder is removed
+            opened.execute("SELECT 1 FROM sqlite_master").fetchone()
             return opened
     except OSError as error:
         raise StoreError(f"{path}: no private copy can be made: {error}") from error

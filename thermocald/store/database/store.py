@@ -212,7 +212,7 @@ class Store(SeriesReader):
                 )
                 wanted = (after, thermometer, _READINGS_AT_ONCE)
                 page = list(columns.examined_rows(connection, "reading", condition, wanted))
-                for row in _undamaged(page):
+                for row in _intact(page):
                     name = file_name(row["thermometer"], "thermometer", StoreError)
                     values, trusted = json.loads(row["temperatures"]), bool(row["clock_trusted"])
                     yield LoggedReading(name, row["utc"], values, trusted)
@@ -231,7 +231,7 @@ class Store(SeriesReader):
                     row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
                     json.loads(row["data"]),
                 )
-                for row in _undamaged(rows)
+                for row in _intact(rows)
             ]  # fmt: skip
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
@@ -461,9 +461,7 @@ class Store(SeriesReader):
                 raise
 
 
-def _undamaged(
-    rows: Iterable[tuple[dict[str, Any], StoreError | None]],
-) -> Iterator[dict[str, Any]]:
+def _intact(rows: Iterable[tuple[dict[str, Any], StoreError | None]]) -> Iterator[dict[str, Any]]:
     """Yield undamaged rows; skip others with a warning, since no result depends on them."""
     for row, damage in rows:
         if damage is None:

@@ -1,4 +1,4 @@
-"""Stores and recordings made by somebody else: they name nothing outside their own folders."""
+"""Crafted stores and recordings cannot name files outside their own folders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thermocald.store.series import LoggedReading
 
 
 def change(path, statement: str, *values) -> None:
-    """Change rows as a clever hand would: with the checksums that belong to what they hold then."""
+    """Change rows as an attacker would, with matching checksums."""
     database = sqlite3.connect(path)
     for table in ("series", "epoch", "reading"):
         database.execute(f"DROP TRIGGER IF EXISTS {table}_update")

@@ -59,7 +59,7 @@ DIALECTS = {
 
 
 VENDORS = {
-    # EL-USB: day first, what belongs to the logger in the first row alone, constant alarm levels
+    # EL-USB: day first, the logger's data in the first row only, constant alarm levels
     "Lascar EasyLog": (
         "garden,Time,Celsius(°C),High Alarm,Low Alarm,Serial Number\n"
         "1,14/06/2026 12:00:00,21.5,30.0,0.0,10012345\n2,14/06/2026 12:01:00,21.75,30.0,0.0\n"
@@ -70,7 +70,7 @@ VENDORS = {
         "14.06.2026 12:01:00;21,75;45,0\n\nMinimum;21,50;45,0\nMaximum;21,75;45,1\n"
         "Mittelwert;21,63;45,1\n"
     ).encode("cp1252"),
-    # history as CSV: UTC, a sensor that was away, at the beginning too
+    # history as CSV: UTC, a sensor that was unavailable, also at the beginning
     "Home Assistant": (
         b"entity_id,state,last_changed\n"
         b"sensor.box_temperature,unavailable,2026-06-14T09:59:00.000Z\n"
@@ -119,7 +119,7 @@ VENDORS = {
     ),
     "kelvin": b"time,T [K]\n2026-06-14 12:00,294.65\n2026-06-14 12:01,294.9\n",
 }
-"""As the vendors' manuals and programs have them."""
+"""Tables as in vendors' manuals and programs."""
 
 
 @pytest.mark.parametrize("name", [*DIALECTS, *VENDORS])
@@ -150,7 +150,7 @@ def test_what_is_passed_over_or_converted_is_said(tmp_path, name, said):
 
 
 def test_sensors_below_one_another_are_channels(tmp_path):
-    """As Home Assistant writes them; a humidity is none."""
+    """As Home Assistant writes them; a humidity is no channel."""
     rows = [
         ("sensor.box_temperature", 21.5, "10:00:00"), ("sensor.box_humidity", 45.0, "10:00:10"),
         ("sensor.air_temperature", 19.5, "10:00:20"), ("sensor.box_temperature", 21.75, "10:01:00"),
@@ -184,7 +184,7 @@ def test_photographs_settle_the_order_of_day_and_month(tmp_path, order, month):
     (("07/07/2026 12:00", "07/07/2026 12:01"), datetime(2026, 7, 7, 10, 0, tzinfo=UTC)),
 ])  # fmt: skip
 def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
-    """A log that runs past midnight goes on by a day, not by a month."""
+    """A log past midnight continues on the next day, not the next month."""
     found = logged(tmp_path, "time,temp\n" + "".join(f"{row},21\n" for row in rows))
     assert found.times[0] == first.timestamp()
     assert found.times[-1] - found.times[0] <= 120
@@ -319,7 +319,7 @@ def test_times_with_a_zone_keep_it_unless_the_zone_is_forced():
 
 
 def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_path):
-    """Loggers stay on standard time in summer, and say so; the photographs' zone is not theirs."""
+    """Loggers stay on standard time in summer and state it; the photographs' zone differs."""
     standard = HOBO.replace("GMT+02:00", "GMT+01:00")
     log = logged(tmp_path, standard)
     assert log.times.tolist() == [JUNE + 3600, JUNE + 3660]
@@ -396,7 +396,7 @@ def test_a_name_that_cannot_be_given_is_refused(tmp_path, name, words):
     ],
 )
 def test_the_unit_is_found_in_any_head(tmp_path, head):
-    """A head that is not found is °F read as °C."""
+    """If the head is not found, °F is read as °C."""
     path = tmp_path / "log.csv"
     rows = "".join(f"2026-06-14 12:0{i}:00,{70 + i}.25\n" for i in range(6))
     path.write_text(f"{head}\n{rows}", encoding="utf-8")
@@ -407,7 +407,7 @@ def test_the_unit_is_found_in_any_head(tmp_path, head):
 
 
 def test_a_column_of_units_and_numbers_that_commas_cut(tmp_path):
-    """°F without its column's name is read as °C, and 21,5 cut at its comma as 21."""
+    """Without the column of units °F is read as °C, and 21,5 split at its comma as 21."""
     data = "Time,Temp,Temp Unit\n2026-06-14 12:00,34.7,F°\n2026-06-14 12:01,35.15,F°\n"
     (values,) = logged(tmp_path, data).channels.values()
     assert values == pytest.approx([1.5, 1.75])

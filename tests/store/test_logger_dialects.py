@@ -1,4 +1,4 @@
-"""Files of loggers as their makers' programs write them: read right, or called doubtful."""
+"""Files of loggers as the vendors' programs write them are read right, or called doubtful."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NEAR = (MOMENTS[0].timestamp(), MOMENTS[-1].timestamp())
 
 
 def read(path, head, row, unit=""):
-    """The log with head lines and a row of each moment, °C, and number."""
+    """Read a log of a head and one row per moment, °C and number."""
     rows = [row(m, t, i) for i, (m, t) in enumerate(zip(MOMENTS, CELSIUS, strict=True))]
     path.write_bytes("\r\n".join([*head, *rows, ""]).encode())
     options = LogOptions(clock=DeviceClock(zone=time_zone("UTC")), unit=unit or None)

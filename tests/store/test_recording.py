@@ -1,4 +1,4 @@
-"""Recordings: what is written is read again, whole or as a stream; real ones are accepted."""
+"""Recordings are read as they were written, whole or in parts; real ones are accepted."""
 
 from __future__ import annotations
 
@@ -268,7 +268,7 @@ def test_files_as_windows_writes_them(recording_path):
 
 @pytest.fixture
 def long_from_nothing(tmp_path, monkeypatch):
-    """Every recording counts as long; the user's cache, a folder of the test."""
+    """Treat every recording as long; return the test's folder for the user's cache."""
     monkeypatch.setattr(module, "LONG_FROM_BYTES", 0)
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -276,7 +276,7 @@ def long_from_nothing(tmp_path, monkeypatch):
 
 
 def test_long_text_is_parsed_once(recording_path, long_from_nothing, monkeypatch):
-    """The second reading does not see the text; every number is the text's to the bit."""
+    """The second reading does not read the text; every number equals the text's to the bit."""
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 10**9)
     from_text = list(open_recording(recording_path).iter_epochs())
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
@@ -305,7 +305,7 @@ def test_text_that_was_changed_is_parsed_again(recording_path, long_from_nothing
 def test_a_copy_says_where_the_text_is_wrong(
     recording_path, long_from_nothing, column, value, words
 ):
-    """What is found in the binary copy is said of the line of the text."""
+    """An error found in the binary copy names the line of the text."""
     set_field(recording_path / "observations.csv", 4, column, value)
     with pytest.raises(RecordingError, match=r"observations\.csv, line 4") as error:
         list(open_recording(recording_path).iter_epochs())

@@ -1,4 +1,4 @@
-"""What can be read and cannot have been meant: refused with one line, or called doubtful."""
+"""Implausible values are refused with one line, or called doubtful."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def head(path, old: str, new: str) -> None:
 
 
 def change(path, name: str, **columns) -> None:
-    """Columns of a table as functions of their values and the row from 0."""
+    """Replace columns of a table by functions of their values and the row (from 0)."""
     with (path / name).open(newline="") as file:
         names, *rows = csv.reader(file)
     for column, function in columns.items():
@@ -252,7 +252,7 @@ def test_what_is_doubtful_is_told(recording, name):
 
 
 def test_width_and_height_exchanged_in_the_middle_of_the_image(recording):
-    """Targets that lie where both images are: the points tell nothing, the principal point does."""
+    """Points within both images show nothing; the principal point shows the exchange."""
     file = recording / "observations.csv"
     header, *rows = file.read_text().splitlines()
     kept = [r for r in rows if float(r.split(",")[2]) < 2460]
@@ -352,7 +352,7 @@ def test_a_spike_beside_a_change_of_the_unit_hides_neither():
 
 
 def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_path):
-    """In the text, in `doubts` of the JSON, and among the notes of the report."""
+    """Doubts are in the text, in `doubts` of the JSON, and in the notes of the report."""
     messages = []
     for name in ("a principal distance of another lens", "85.00 of a DS18B20", "an epoch twice",
                  "an hour as the interval"):  # fmt: skip
@@ -376,7 +376,7 @@ def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_pat
 
 
 def test_two_series_of_which_one_is_doubtful(recording, simulated):
-    """Which one is said."""
+    """The doubt names the series."""
     DOUBTS["85.00 of a DS18B20"][0](recording)
     shutil.copytree(simulated, recording.parent / "N")
     change(recording.parent / "N", "epochs.csv", frame_time=scaled(1, 1e5),

@@ -107,7 +107,7 @@ def test_the_photographs_settle_day_and_month_and_footers_are_passed_over(place)
     for i in range(6):
         photograph(place / "photos" / f"{i}.jpg", f"2026:07:06 12:00:{10 * i:02d}")
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert "'06/07/2026 12:00:00' is day/month: so it lies next to the photographs" in result.stderr
+    assert "'06/07/2026 12:00:00' is day/month: this puts the log near" in result.stderr
     assert "1 rows hold no time: left out (line 4: 'Average')" in result.stderr
 
 
@@ -136,7 +136,7 @@ def test_clock_errors_and_zones_of_each_device(place):
 @pytest.mark.parametrize(
     ("more", "reason"),
     [
-        ((), "has no time zone: say which with --timezone"),
+        ((), "has no time zone: give it with --timezone"),
         (("--timezone", "Europe/Berlin", "--camera-clock", "+05:00:00"), "5.0 h apart"),
         (("--timezone", "Mars"), "time zone 'Mars'"),
         (("--timezone", "UTC", "--pixel-pitch", 0.002, "--unit", "R"), "--unit R"),
@@ -236,7 +236,7 @@ def test_the_photograph_of_another_camera_is_refused(place, other):
                 TAKEN: f"2026:06:14 12:00:{10 * i:02d}", **(other if i == 3 else {})}  # fmt: skip
         known = {tag: value for tag, value in tags.items() if value is not None}
         save_photograph(place / "photos" / f"{i}.jpg", known, np.full((48, 64), 90 + i, np.uint8))
-    with pytest.raises(ThermocaldError, match=r"3\.jpg is of .*one recording is of one camera"):
+    with pytest.raises(ThermocaldError, match=r"3\.jpg is of .*a recording has one camera"):
         run(*arguments(place, "--timezone", "Europe/Berlin"))
     assert not (place / "M1").exists()
 

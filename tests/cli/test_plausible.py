@@ -30,7 +30,7 @@ def test_a_wrong_pixel_pitch_is_seen_by_the_focal_length(tmp_path, pitch, share)
     head.write_text(head.read_text().replace("0.00112", pitch))
     for command in ("replay", "check"):
         (line,) = re.findall(r"doubtful: .*", invoke(command, tmp_path / "M1").output)
-        assert f"where 3.04 mm is stated, {share} times" in line
+        assert f"{share} times the stated 3.04 mm" in line
         assert "Pixels of 0.00112 mm would fit (--pixel-pitch" in line
 
 
@@ -86,6 +86,6 @@ def test_binned_photographs_are_flagged_at_import_where_exif_knows_the_focal_len
     for pitch, doubts in (("0.00112", 1), ("0.00448", 0)):
         result = run(*given, "--out", tmp_path / pitch, "--pixel-pitch", pitch)
         notes = json.loads(result.stdout)["notes"]
-        flagged = [note for note in notes if "where 3.04 mm is stated, 0.25 times" in note]
+        flagged = [note for note in notes if "0.25 times the stated 3.04 mm" in note]
         assert len(flagged) == doubts, notes
         assert ("Pixels of 0.00448 mm would fit (--pixel-pitch" in result.stderr) == bool(doubts)

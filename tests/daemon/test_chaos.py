@@ -114,7 +114,7 @@ class Chaos:
             with pytest.raises(StoreError, match="under another of its names"):
                 Store.open(other)
         for name in {store, other} if kind != "name" else {store}:
-            with pytest.raises(StoreError, match="another thermocald writes it"):
+            with pytest.raises(StoreError, match="another thermocald process writes to it"):
                 Store.open(name, "append")
         other.unlink(missing_ok=True)
         self.note(f"second writers by {kind}")

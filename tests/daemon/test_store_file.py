@@ -214,7 +214,7 @@ def test_a_store_that_cannot_be_made_leaves_nothing_behind(tmp_path):
     database = sqlite3.connect(tmp_path / "foreign.db")
     database.execute("CREATE TABLE x (y)")
     database.close()
-    with pytest.raises(StoreError, match="no thermocald store"):
+    with pytest.raises(StoreError, match="not a thermocald store"):
         StoreGuard(tmp_path / "foreign.db")
     with pytest.raises(StoreError, match="cannot be written"):
         StoreGuard(tmp_path / "away/t.db")

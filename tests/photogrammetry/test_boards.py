@@ -198,6 +198,7 @@ def test_files_that_describe_boards(tmp_path, text, expected):
          boards.charuco(11, 8, 34.0, 25.0, "DICT_5X5_1000")),
         ("calib.io_checker_200x150_8x11_15.pdf", boards.chessboard(10, 7, 15.0)),
         ("calib.io_checker_A4_7x8_18.5.png", boards.chessboard(7, 6, 18.5)),
+        ("calib.io_checker_A4_7x8_18.5", boards.chessboard(7, 6, 18.5)),
     ],
 )  # fmt: skip
 def test_boards_of_calib_io_by_the_name_of_their_file(tmp_path, name, expected):
@@ -205,6 +206,20 @@ def test_boards_of_calib_io_by_the_name_of_their_file(tmp_path, name, expected):
     assert "calib.io" in said
     assert field.codes == expected.codes
     assert field.points == pytest.approx(expected.points)
+
+
+def test_a_name_with_a_length_that_is_no_number_is_not_a_board(tmp_path):
+    (tmp_path / "calib.io_checker_A4_7x8_1.8.5.pdf").write_bytes(b"%PDF-1.4\n\xff")
+    with pytest.raises(TestFieldError, match=r"1\.8\.5\.pdf"):
+        read_board(tmp_path / "calib.io_checker_A4_7x8_1.8.5.pdf")
+
+
+@pytest.mark.parametrize("start", ["abc", "-3", "[1]"])
+def test_a_first_tag_that_is_no_number_is_refused(tmp_path, start):
+    text = "target_type: aprilgrid\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n"
+    (tmp_path / "target.yaml").write_text(f"{text}start_id: {start}\n")
+    with pytest.raises(TestFieldError, match=r"target\.yaml, key startid"):
+        read_board(tmp_path / "target.yaml")
 
 
 def test_a_name_that_does_not_state_the_markers_says_what_to_give(tmp_path):

@@ -1,4 +1,4 @@
-"""A small recording, built the way a user's would look, and a store with some epochs."""
+"""A small recording that looks like a user's, and a store with some epochs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def head() -> Head:
 
 @pytest.fixture
 def make_epoch():
-    """Epoch number → epoch: its numbers are functions of the number."""
+    """Epoch number → epoch, whose values are functions of the number."""
 
     def make(number: int, targets: int = N_TARGETS) -> Epoch:
         rng = np.random.default_rng([7, number])
@@ -93,7 +93,7 @@ def filled(store_path: Path, field: TestField, head: Head, make_epoch, make_resu
 
 @pytest.fixture
 def killed(store_path: Path, field: TestField, head: Head, make_epoch, make_result, tmp_path: Path):
-    """(n, last) → what a killed writer left: n epochs in the store, the others in its -wal."""
+    """(n, last) → the files of a killed writer: n epochs in the store, the others in its -wal."""
 
     def make(moved: int, last: int) -> Path:
         folder = tmp_path / "killed"

@@ -1,4 +1,4 @@
-"""The least that a store can hold: a series of one target, epochs as functions of a number."""
+"""A smallest store: a series of one target, with epochs that are functions of a number."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def small_result(number: int) -> EpochResult:
 
 
 def stored_numbers(path) -> list[int]:
-    """The epochs of the one series of a store that is sound, by its rows and by its columns."""
+    """Return the epochs' numbers of an undamaged store's one series, by rows and by columns."""
     with Store.open(path) as store:
         assert store.examine().damaged == ()
         series = store.find_series()

@@ -1,4 +1,4 @@
-"""Archiving: a series of the store becomes a recording that reads as it was taken."""
+"""Archiving: a stored series becomes a recording with the same content."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_clock_that_was_set_back_is_mended(filled, tmp_path, make_epoch):
 
 
 def test_several_steps_and_a_glitch_are_corrected():
-    """Found: 120 days ahead for some epochs, and it was the right ones that were moved."""
+    """Regression: the clock was 120 days ahead for some epochs, and the right ones were moved."""
     times = np.array([100.0, 110, 50, 60, 0, 10])
     corrected = times + clock_corrections(times, 10.0)
     assert corrected.tolist() == [-40, -30, -20, -10, 0, 10]
@@ -70,11 +70,11 @@ def test_several_steps_and_a_glitch_are_corrected():
 def test_what_was_taken_before_the_time_was_learned_moves_by_that_step():
     right = 1.75e9 + np.arange(20) * 10.0
     stamped, trusted = right.copy(), np.ones(20)
-    stamped[4:9] -= 1.0e7  # restarted with the time of the last shutdown, and then NTP came
+    stamped[4:9] -= 1.0e7  # restarted with the time of the last shutdown, then set by NTP
     trusted[4:9] = 0
     corrected = stamped + clock_corrections(stamped, 10.0, trusted, [1.0e7])
     assert corrected == pytest.approx(right)
-    # a camera that was off for as long is not a step
+    # a camera that was off for as long is no clock step
     off = right.copy()
     off[9:] += 1.0e7
     assert not clock_corrections(off, 10.0, trusted, []).any()
@@ -90,5 +90,5 @@ def test_two_series_never_share_a_folder(tmp_path, head, field, make_epoch):
         found = archive_store(
             tmp_path / "s.db", tmp_path / "out", None, None, False, True, lambda _: None
         )
-    assert found["recordings"] == []  # all are there
+    assert found["recordings"] == []  # all exist already
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a--b-c", "a-b", "a-b--c"]

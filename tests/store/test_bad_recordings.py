@@ -1,4 +1,4 @@
-"""Every broken recording: one error that names file, line and column, and says what to do."""
+"""Each broken recording gives one error that names file, line and column, and the remedy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def set_field(path, line: int, column: str, value: str) -> None:
     path.write_text("\n".join(lines))
 
 
-# file, line, column, value, what the message must hold
+# file, line, column, value, part of the message
 CELLS = [
     ("observations.csv", 5, "x", "NaN", "not a finite number"),
     ("observations.csv", 5, "y", "inf", "not a finite number"),
@@ -34,9 +34,9 @@ CELLS = [
     ("observations.csv", 7, "x", "", "is empty"),
     ("observations.csv", 9, "sx", "0", "above 0 px"),
     ("observations.csv", 9, "sy", "-0.1", "above 0 px"),
-    ("observations.csv", 4, "target", "t999", "'t999' does not stand in testfield.csv"),
+    ("observations.csv", 4, "target", "t999", "'t999' is not in testfield.csv"),
     ("observations.csv", 3, "target", "t0", "'t0' is duplicated in epoch 1"),
-    ("observations.csv", 6, "epoch", "77", "epoch 77 does not stand in epochs.csv"),
+    ("observations.csv", 6, "epoch", "77", "epoch 77 is not in epochs.csv"),
     ("observations.csv", 6, "epoch", "1.5", "not an integer"),
     ("epochs.csv", 3, "frame_time", "1599999999.0", "runs backwards"),
     ("epochs.csv", 3, "temperature_time", "1599999999.0", "runs backwards"),
@@ -104,7 +104,7 @@ def without_its_end(path) -> None:
     path.write_text(path.read_text().rpartition(",")[0])
 
 
-# a file, what happens to it, what is said
+# a file, its damage, part of the message
 FILES = {
     "kelvin": ("epochs.csv", in_kelvin, r"kelvin: subtract 273\.15"),
     "semicolons": (
@@ -198,7 +198,7 @@ def test_a_bad_head_is_named(recording_path, old, new, message):
 
 
 def test_a_field_in_metres_is_recognised_by_the_principal_distance(recording_path):
-    """A hall of 48 m in metres is 48 "mm": too near for a lens of 12 mm, whatever it is."""
+    """A hall of 48 m in metres is 48 "mm": too near for a lens of 12 mm."""
     field = recording_path / "testfield.csv"
     field.write_text(
         "target,X,Y,Z,diameter,sX,sY,sZ\n"

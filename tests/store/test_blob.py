@@ -33,7 +33,7 @@ def test_rounding_is_as_stated():
 
 
 def test_points_of_five_decimals_are_exact():
-    """What observations.csv says comes back digit by digit."""
+    """The numbers of observations.csv are returned digit by digit."""
     seen = observations(5000)
     rounded = Observations(
         seen.targets, np.array([[float(f"{v:.5f}") for v in p] for p in seen.points]), seen.sigmas

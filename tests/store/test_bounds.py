@@ -21,7 +21,7 @@ DAY = 8640
 @pytest.mark.slow
 @pytest.mark.parametrize("targets", [60, 500])
 def test_the_file_is_little_more_than_its_payload(tmp_path, targets):
-    """Of a day's third; the empty tables are 0.1 MB on top of it."""
+    """A third of a day; the empty tables add 0.1 MB."""
     assert benchmark.size_ratio(tmp_path, targets, 3000) <= benchmark.BOUNDS["size"]
 
 

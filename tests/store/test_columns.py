@@ -1,4 +1,4 @@
-"""Columns come whole from chunks, tail, and later calibrations."""
+"""Columns are complete from chunks, tail and later calibrations."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_of_a_broken_chunk_the_rows_are_read(store, series, data, caplog):
 
 
 def test_another_chunk_length_later_on(store_path, head, field, monkeypatch):
-    """A newer program may choose other chunks; the file's are read as they are."""
+    """Chunks of another length, as a newer version may write, are read."""
     with Store.open(store_path, "append", durable=False) as store:
         series = store.create_series(head, field)
         for i in range(2 * CHUNK + 5):
@@ -153,7 +153,7 @@ def test_only_calibrations_after_their_chunk_are_looked_up(store, series):
     for i in range(3 * CHUNK - 3, 3 * CHUNK):
         store.amend(series, i, result(i))
     assert read(store, series) == expected(range(3 * CHUNK))
-    assert late(store, series) == 3 * 4  # of each chunk, the three waiting and the one in hand
+    assert late(store, series) == 3 * 4  # of each chunk: three that waited and the current one
 
 
 def test_a_merged_chunk_holds_what_came_late(store, series):

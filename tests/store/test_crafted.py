@@ -1,4 +1,4 @@
-"""Stores and recordings made by somebody else: they name nothing outside their own folders."""
+"""Crafted stores and recordings cannot name files outside their own folders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thermocald.store.series import LoggedReading
 
 
 def change(path, statement: str, *values) -> None:
-    """Change rows as a clever hand would: with the checksums that belong to what they hold then."""
+    """Change rows as an attacker would, with matching checksums."""
     database = sqlite3.connect(path)
     for table in ("series", "epoch", "reading"):
         database.execute(f"DROP TRIGGER IF EXISTS {table}_update")
@@ -63,7 +63,7 @@ def test_a_head_of_another_name_is_refused(crafted):
     document = json.loads(head)
     document["camera"]["name"] = "../../x"
     change(crafted, "UPDATE series SET head = ?", json.dumps(document))
-    with Store.open(crafted) as store, pytest.raises(StoreError, match="its head is of"):
+    with Store.open(crafted) as store, pytest.raises(StoreError, match="its head names"):
         store.all_series()
 
 
@@ -125,5 +125,5 @@ def test_a_recording_names_frames_of_its_own_only(recording_path, tmp_path, fram
     lines = table.read_text().splitlines()
     lines[1] = lines[1].rsplit(",", 1)[0] + f",{frame.format(outside=outside)}"
     table.write_text("\n".join(lines) + "\n")
-    with pytest.raises(RecordingError, match="leads out of the recording"):
+    with pytest.raises(RecordingError, match="is missing or outside the recording"):
         read_recording(recording_path)

@@ -1,4 +1,4 @@
-"""Bits that flip on a card: a value that changed is never given out as if it were right."""
+"""Flipped bits on a card: a changed value is never returned as a right one."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def whole(store_path, head, field, make_epoch, make_result, monkeypatch) -> byte
 
 
 def change(path, *statements: str) -> None:
-    """Change the file as it does not let itself be changed."""
+    """Change the file without the triggers that forbid it."""
     with closing(sqlite3.connect(path)) as database, database:
         for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"):
             database.execute(f"DROP TRIGGER {name}")
@@ -40,7 +40,7 @@ def change(path, *statements: str) -> None:
 
 
 def content(path) -> tuple[dict, list, list]:
-    """Everything that a reader gets: columns, epochs, events."""
+    """Return all that a reader gets: columns, epochs, events."""
     with Store.open(path) as store:
         (series,) = store.all_series()
         read = store.series_columns(series, NAMES)

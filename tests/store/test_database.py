@@ -1,4 +1,4 @@
-"""The store: what goes in comes out, nothing changes afterwards, errors say what to do."""
+"""The store returns what was stored, changes nothing, and has errors with a remedy."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_an_epoch_without_a_whole_number_is_damage(filled, store_path):
     store, series = filled
     with closing(sqlite3.connect(store_path)) as other:
         other.executescript("DROP TRIGGER epoch_update; UPDATE epoch SET number = x'ff' WHERE id=2")
-    with pytest.raises(StoreError, match=r"has the number b'\\xff': the store is damaged"):
+    with pytest.raises(StoreError, match=r"damaged: an epoch of M1 has the number b'\\xff'"):
         store.last_epoch(series)
 
 
@@ -196,7 +196,7 @@ def test_a_failed_epoch_leaves_nothing(filled, make_epoch, make_result):
     store, series = filled
     before = list(store._db.iterdump())
     wrong = replace(make_epoch(21), frame_time=np.nan)  # a column that must not be empty
-    with pytest.raises(StoreError, match="epoch 21 of series 'M1' was not kept"):
+    with pytest.raises(StoreError, match="epoch 21 of series 'M1' was not stored"):
         store.append(series, wrong, make_result(21))
     assert list(store._db.iterdump()) == before
     store.append(series, make_epoch(21), make_result(21))
@@ -238,7 +238,7 @@ def test_threads_share_a_store(filled, head, field, make_epoch, make_result):
 
 
 def test_plain_sql_can_read_it(filled, store_path):
-    """Users look with the sqlite3 shell: parameters are columns, temperatures are JSON."""
+    """For users of the sqlite3 shell, parameters are columns and temperatures JSON."""
     with closing(sqlite3.connect(store_path)) as database, database:
         row = database.execute(
             "SELECT number, c, sd_c, centre_X0, json_extract(temperatures, '$.temperature') "
@@ -268,7 +268,7 @@ def test_not_ours(tmp_path, mode):
     with closing(sqlite3.connect(other)) as database, database:
         database.execute("CREATE TABLE recipes (id)")
     before = other.read_bytes()
-    with pytest.raises(StoreError, match="no thermocald store"):
+    with pytest.raises(StoreError, match="not a thermocald store"):
         Store.open(other, mode)
     assert other.read_bytes() == before
 
@@ -300,7 +300,7 @@ def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):
     assert wal.stat().st_size == 0
     with Store.open(store_path) as reader:
         epochs = reader.epochs(series)
-        next(epochs)  # who takes long over the epochs holds no writer up
+        next(epochs)  # a slow reader of epochs blocks no writer
         store._db.execute("PRAGMA busy_timeout = 50")
         store.append(series, make_epoch(21))
         assert store.checkpoint()
@@ -313,7 +313,7 @@ def test_checkpoint_empties_the_wal(filled, store_path, make_epoch):
 
 
 def test_a_camera_without_a_test_field(filled, head):
-    """One that is only acquired has a series all the same."""
+    """A camera that is only acquired has a series too."""
     store = filled[0]
     empty = parse_testfield("target,X,Y,Z,diameter,sX,sY,sZ\n", store.path)
     series = store.create_series(replace(head, series="acquired"), empty)

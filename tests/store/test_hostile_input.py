@@ -1,4 +1,4 @@
-"""Garbage in every file: only our own errors come out, and they name the file."""
+"""Garbage in any file gives only this program's errors, which name the file."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_any_bytes_within_a_good_file(recording_path, file, data):
         read_recording(recording_path)
     except ThermocaldError as error:
         message = str(error)
-        # a damaged table may show in the one that refers to it
+        # the error of a damaged table may be in one that refers to it
         assert any(name in message for name in FILES)
     (recording_path / file).write_bytes(whole)
 

@@ -1,4 +1,4 @@
-"""A killed writer loses at most the current epoch; a full disk loses nothing kept before."""
+"""A killed writer loses at most the current epoch; a full disk loses nothing stored before."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_killed_writer_loses_at_most_the_epoch_in_hand(forker, store_path, hea
             assert store.examine().damaged == ()
             series = store.find_series()
             last = store.last_epoch(series)
-            assert last in (said, said + 1)  # committed, and perhaps not yet said
+            assert last in (said, said + 1)  # committed, but perhaps not yet reported
             kept = [
                 (s.epoch.number, s.epoch.observations.points[0, 0]) for s in store.epochs(series)
             ]
@@ -35,7 +35,7 @@ def test_a_killed_writer_loses_at_most_the_epoch_in_hand(forker, store_path, hea
 
 @pytest.fixture
 def small_disk():
-    """Files may not grow beyond 400 kB: what a full disk looks like to one process."""
+    """Limit files to 400 kB, which acts on one process like a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, before[1]))
@@ -45,7 +45,7 @@ def small_disk():
 
 
 def fill(store, series, make_epoch, make_result) -> int:
-    """Append until it fails; the last epoch that was kept."""
+    """Append until it fails; return the last epoch stored."""
     number = 0
 
     def append_for_ever():
@@ -54,7 +54,7 @@ def fill(store, series, make_epoch, make_result) -> int:
             store.append(series, make_epoch(number + 1), make_result(number + 1))
             number += 1
 
-    with pytest.raises(StoreFullError, match="was not kept: the disk") as caught:
+    with pytest.raises(StoreFullError, match="was not stored: the disk") as caught:
         append_for_ever()
     assert f"epoch {number + 1} " in str(caught.value)
     return number
@@ -73,7 +73,7 @@ def test_a_full_disk(store_path, head, field, make_epoch, make_result, request):
 
 
 def test_space_again_after_a_full_disk(store_path, head, field, make_epoch, make_result):
-    """By SQLite's own bound, which gives the error of a full disk."""
+    """SQLite's own limit of pages gives the error of a full disk."""
     with Store.open(store_path, "append", durable=False) as store:
         series = store.create_series(head, field)
         store._db.execute("PRAGMA max_page_count = 60")

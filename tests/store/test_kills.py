@@ -1,6 +1,6 @@
-"""300 kills with everything beside the writer that can stand there: what was reported is kept.
+"""300 kills with all that can be beside a writer: what was reported as stored is stored.
 
-All processes are forked from one that has everything imported, which makes of an hour two minutes.
+All processes are forked from one with all imports done: two minutes instead of an hour.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from thermocald.store.database.store import Store
 pytestmark = pytest.mark.slow
 
 KILLS = 300
-_TAKEOVER_S = 0.2  # that a second daemon has when the first was killed: it writes ever on
-# As a daemon keeps epochs: through its guard; says after each what it has reported as kept.
+_TAKEOVER_S = 0.2  # for a second daemon after the first was killed, as it would write on for ever
+# As a daemon stores epochs: through its guard; prints after each what it reported as stored.
 DAEMON = textwrap.dedent(
     """
     import sys
@@ -55,7 +55,7 @@ def recording(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def other_device(tmp_path_factory):
-    """A folder on another device than that of the tests, or a reason to skip."""
+    """Return a folder on another device than that of the tests, or skip."""
     for place in ("/dev/shm", "/var/tmp", str(Path.home())):
         folder = Path(place)
         if folder.is_dir() and folder.stat().st_dev != tmp_path_factory.getbasetemp().stat().st_dev:
@@ -68,7 +68,7 @@ def other_device(tmp_path_factory):
 
 
 def beside(forker: Forker, kind: str, store: Path, recording: Path, k: int) -> list[Forked]:
-    """What stands beside the writer, and processes that try to write too."""
+    """Create the files beside the writer and start processes that try to write too."""
 
     def writes(*arguments: object, script: str = "") -> Forked:
         folder = store.parent / f"beside-{k}-{len(list(store.parent.glob(f'beside-{k}-*')))}"
@@ -103,13 +103,13 @@ KINDS = ["alone", "hard link", "soft link", "copies", "second daemon", "replay",
 
 
 def kill_one(forker: Forker, store: Path, start, rng) -> int:
-    """Start the writer, and what `start` begins once it writes; the last epoch it reported."""
+    """Start the writer, then `start`; kill it and return the last epoch that it reported."""
     folder = store.parent / f"writer-{len(list(store.parent.glob('writer-*')))}"
     folder.mkdir()
     writer = forker.start(folder, "daemon", str(store), script=DAEMON)
 
     def reported() -> list[str]:
-        # what follows the last line end is half a line
+        # the last line may be cut off
         return (folder / "log.txt").read_text().split("\n")[:-1]
 
     def until(count: int) -> None:
@@ -128,7 +128,7 @@ def kill_one(forker: Forker, store: Path, start, rng) -> int:
     for other in others:
         if rng.random() < 0.5:
             other.kill()
-        # a second daemon takes over where the first was killed: that is what it is for
+        # a second daemon takes over after the first was killed, as intended
         try:
             other.wait(_TAKEOVER_S)
         except subprocess.TimeoutExpired:
@@ -143,7 +143,7 @@ def test_what_was_reported_is_kept(forker, store_path, head, field, recording, k
 
 
 def test_links_over_devices(forker, other_device, tmp_path, head, field, recording):
-    """The store on one device, its name on another, and the writer knows the name alone."""
+    """The store is on one device, its name on another, and the writer only knows the name."""
     real = other_device / "real.db"
     name = tmp_path / "named.db"
     name.symlink_to(real)
@@ -175,7 +175,7 @@ def _kill_often(forker, store_path, head, field, recording, kind) -> None:
             assert len(numbers) >= said, f"{said - len(numbers)} reported epochs are missing"
             if kind != "second daemon":
                 assert len(numbers) <= said + 1
-            # those beside it were refused, or wrote once it was dead: theirs is another series
+            # the others were refused, or wrote after the kill into another series
             assert len(store.all_series()) <= 2
             values = store.series_columns(series, ["c"])["c"].tolist()
             assert values == [float(number) for number in numbers]
@@ -184,7 +184,7 @@ def _kill_often(forker, store_path, head, field, recording, kind) -> None:
 
 
 def test_a_name_that_lacks_the_wal_is_not_read_as_whole(forker, store_path, head, field):
-    """While the writer is dead and its -wal waits: a hard link shows the store without it."""
+    """After a kill, a hard link shows the store without the -wal of the other name."""
     with Store.open(store_path, "append", durable=False) as store:
         store.create_series(head, field)
     rng = np.random.default_rng(1)

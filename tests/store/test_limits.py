@@ -1,4 +1,4 @@
-"""What asks for more than there is: bounds before work, one line each, quickly."""
+"""Input of excessive size is refused before any work, quickly and in one line."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def recording(tmp_path):
 
 
 def png_of_nothing(width, height):
-    """The head of a PNG that says so many pixels, and hardly any bytes of them."""
+    """Return the header of a PNG of many pixels, with hardly any data."""
 
     def chunk(name, data):
         return (

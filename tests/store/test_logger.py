@@ -11,6 +11,7 @@ import pytest
 from thermocald.errors import DataError, UsageError
 from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment, time_zone
 from thermocald.store.logger.dialect import stated_unit, without_unit
+from thermocald.store.logger.photographs import find_photographs
 from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
 
 BERLIN = DeviceClock(time_zone("Europe/Berlin"))
@@ -58,7 +59,7 @@ DIALECTS = {
 
 
 VENDORS = {
-    # EL-USB: day first, what belongs to the logger in the first row alone, constant alarm levels
+    # EL-USB: day first, the logger's data in the first row only, constant alarm levels
     "Lascar EasyLog": (
         "garden,Time,Celsius(°C),High Alarm,Low Alarm,Serial Number\n"
         "1,14/06/2026 12:00:00,21.5,30.0,0.0,10012345\n2,14/06/2026 12:01:00,21.75,30.0,0.0\n"
@@ -69,7 +70,7 @@ VENDORS = {
         "14.06.2026 12:01:00;21,75;45,0\n\nMinimum;21,50;45,0\nMaximum;21,75;45,1\n"
         "Mittelwert;21,63;45,1\n"
     ).encode("cp1252"),
-    # history as CSV: UTC, a sensor that was away, at the beginning too
+    # history as CSV: UTC, a sensor that was unavailable, also at the beginning
     "Home Assistant": (
         b"entity_id,state,last_changed\n"
         b"sensor.box_temperature,unavailable,2026-06-14T09:59:00.000Z\n"
@@ -118,7 +119,7 @@ VENDORS = {
     ),
     "kelvin": b"time,T [K]\n2026-06-14 12:00,294.65\n2026-06-14 12:01,294.9\n",
 }
-"""As the vendors' manuals and programs have them."""
+"""Tables as in vendors' manuals and programs."""
 
 
 @pytest.mark.parametrize("name", [*DIALECTS, *VENDORS])
@@ -136,8 +137,11 @@ def test_a_log_is_the_same_in_every_dialect_without_an_option(tmp_path, name):
     ("name", "said"),
     [
         ("Testo", "3 rows hold no time: left out (line 5: 'Minimum')"),
-        ("Home Assistant", "2 readings of 'state' are none ('unavailable', 'unknown'): left empty"),
-        ("HOBO in °F", "is converted from degF, as its head says"),
+        (
+            "Home Assistant",
+            "2 values of 'state' are not readings ('unavailable', 'unknown'): left empty",
+        ),
+        ("HOBO in °F", "is converted from degF, the unit in its head"),
         ("kelvin", "is converted from K"),
     ],
 )
@@ -146,7 +150,7 @@ def test_what_is_passed_over_or_converted_is_said(tmp_path, name, said):
 
 
 def test_sensors_below_one_another_are_channels(tmp_path):
-    """As Home Assistant writes them; a humidity is none."""
+    """As Home Assistant writes them; a humidity is no channel."""
     rows = [
         ("sensor.box_temperature", 21.5, "10:00:00"), ("sensor.box_humidity", 45.0, "10:00:10"),
         ("sensor.air_temperature", 19.5, "10:00:20"), ("sensor.box_temperature", 21.75, "10:01:00"),
@@ -171,7 +175,7 @@ def test_photographs_settle_the_order_of_day_and_month(tmp_path, order, month):
     (tmp_path / "log.csv").write_text(AMBIGUOUS)
     found = read_log(tmp_path / "log.csv", LogOptions(clock=BERLIN), (first + 20, first + 40))
     assert found.times.tolist() == [first, first + 60]
-    assert any("so it lies next to the photographs" in note for note in found.notes)
+    assert any("this puts the log near the photographs" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(("rows", "first"), [
@@ -180,7 +184,7 @@ def test_photographs_settle_the_order_of_day_and_month(tmp_path, order, month):
     (("07/07/2026 12:00", "07/07/2026 12:01"), datetime(2026, 7, 7, 10, 0, tzinfo=UTC)),
 ])  # fmt: skip
 def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
-    """A log that runs past midnight goes on by a day, not by a month."""
+    """A log past midnight continues on the next day, not the next month."""
     found = logged(tmp_path, "time,temp\n" + "".join(f"{row},21\n" for row in rows))
     assert found.times[0] == first.timestamp()
     assert found.times[-1] - found.times[0] <= 120
@@ -189,7 +193,7 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
 @pytest.mark.parametrize(
     ("data", "options", "reason"),
     [
-        (GERMAN, {"clock": DeviceClock()}, "no time zone: say which with --timezone"),
+        (GERMAN, {"clock": DeviceClock()}, "no time zone: give it with --timezone"),
         (b"time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n", {}, "--date-order dmy or mdy"),
         (b"time,temp\n2026-06-14 12:00,294.5\n2026-06-14 12:01,294.6\n", {}, "--unit K"),
         (b"time,temp K (Kelvin)\n2026-06-14 12:00,20\n2026-06-14 12:01,20\n", {}, "20 K is -253"),
@@ -199,6 +203,11 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
         (b"time,temp\n2026-06-14 12:00,20\n2026-06-14 12:01,1e300\n", {}, "Another unit"),
         (b"a,b\n1,2\n3,4\n", {}, "no separator"),
         (b"", {}, "is empty"),
+        (b"\xef\xbb\xbf\n\n", {}, "is empty"),
+        (b"\xff\xfe", {}, "is empty"),
+        ("\u00a0\n", {}, "is empty"),
+        ((b"entity_id,state,last_changed\nsensor.humidity,45,2026-06-14T12:00:00Z\n"
+         b"sensor.humidity,46,2026-06-14T12:01:00Z\n"), {}, "no sensor .* has temperatures"),
         (b"\x7fELF\0\0\0\0", {}, "is not text"),
         (GERMAN, {"temperatures": ("Temp",)}, "there is no column 'Temp'"),
     ],
@@ -206,6 +215,16 @@ def test_rows_settle_the_order_of_day_and_month(tmp_path, rows, first):
 def test_what_is_not_certain_is_refused_with_the_remedy(tmp_path, data, options, reason):
     with pytest.raises((DataError, UsageError), match=reason):
         logged(tmp_path, data, **options)
+
+
+def test_blank_lines_after_the_rows_change_nothing(tmp_path):
+    long = PLAIN + "\n" * 900
+    assert logged(tmp_path, long).channels["temperature"].tolist() == [21.5, 21.75]
+
+
+def test_no_photographs_are_an_error():
+    with pytest.raises(DataError, match="no photographs are given"):
+        find_photographs([])
 
 
 def test_units_and_orders_that_are_said_are_used(tmp_path):
@@ -237,7 +256,7 @@ def test_the_hour_that_comes_twice(tmp_path):
     start = datetime(2026, 10, 24, 23, 50, tzinfo=UTC).timestamp()
     assert ((found.times - start) / 60).tolist() == [0, 30, 60, 90, 120, 140]
     once = hour((1, 50), (2, 20), (2, 50), (3, 10))
-    with pytest.raises(DataError, match="order of the rows does not tell"):
+    with pytest.raises(DataError, match="order of the rows does not show"):
         logged(tmp_path, once, clock=replace(BERLIN, ambiguous="order"))
     later = logged(tmp_path, once, clock=replace(BERLIN, ambiguous="later")).times
     assert ((later - start) / 60).tolist() == [0, 90, 120, 140]
@@ -300,14 +319,14 @@ def test_times_with_a_zone_keep_it_unless_the_zone_is_forced():
 
 
 def test_a_zone_in_the_header_is_not_overruled_by_that_of_times_without_one(tmp_path):
-    """Loggers stay on standard time in summer, and say so; the photographs' zone is not theirs."""
+    """Loggers stay on standard time in summer and state it; the photographs' zone differs."""
     standard = HOBO.replace("GMT+02:00", "GMT+01:00")
     log = logged(tmp_path, standard)
     assert log.times.tolist() == [JUNE + 3600, JUNE + 3660]
-    assert any("the header says the time zone: GMT+01:00" in note for note in log.notes)
+    assert any("the header gives the time zone GMT+01:00" in note for note in log.notes)
     forced = logged(tmp_path, standard, clock=DeviceClock(time_zone("+02:00"), forced=True))
     assert forced.times.tolist() == [JUNE, JUNE + 60]
-    assert any("was given instead" in note for note in forced.notes)
+    assert any("is used instead" in note for note in forced.notes)
 
 
 @pytest.mark.parametrize(
@@ -377,7 +396,7 @@ def test_a_name_that_cannot_be_given_is_refused(tmp_path, name, words):
     ],
 )
 def test_the_unit_is_found_in_any_head(tmp_path, head):
-    """A head that is not found is °F read as °C."""
+    """If the head is not found, °F is read as °C."""
     path = tmp_path / "log.csv"
     rows = "".join(f"2026-06-14 12:0{i}:00,{70 + i}.25\n" for i in range(6))
     path.write_text(f"{head}\n{rows}", encoding="utf-8")
@@ -388,7 +407,7 @@ def test_the_unit_is_found_in_any_head(tmp_path, head):
 
 
 def test_a_column_of_units_and_numbers_that_commas_cut(tmp_path):
-    """°F without its column's name is read as °C, and 21,5 cut at its comma as 21."""
+    """Without the column of units °F is read as °C, and 21,5 split at its comma as 21."""
     data = "Time,Temp,Temp Unit\n2026-06-14 12:00,34.7,F°\n2026-06-14 12:01,35.15,F°\n"
     (values,) = logged(tmp_path, data).channels.values()
     assert values == pytest.approx([1.5, 1.75])

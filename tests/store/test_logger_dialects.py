@@ -1,4 +1,4 @@
-"""Files of loggers as their makers' programs write them: read right, or called doubtful."""
+"""Files of loggers as the vendors' programs write them are read right, or called doubtful."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NEAR = (MOMENTS[0].timestamp(), MOMENTS[-1].timestamp())
 
 
 def read(path, head, row, unit=""):
-    """The log with head lines and a row of each moment, °C, and number."""
+    """Read a log of a head and one row per moment, °C and number."""
     rows = [row(m, t, i) for i, (m, t) in enumerate(zip(MOMENTS, CELSIUS, strict=True))]
     path.write_bytes("\r\n".join([*head, *rows, ""]).encode())
     options = LogOptions(clock=DeviceClock(zone=time_zone("UTC")), unit=unit or None)
@@ -59,7 +59,7 @@ def test_fahrenheit_without_a_unit_is_doubtful(tmp_path, head):
 
     found = read(tmp_path / "log.csv", [f"time,{head}"], row)
     (note,) = [note for note in found.notes if "doubtful" in note]
-    assert "70.7 is taken as °C; if it is °F, it is 21.5 °C: say --unit" in note
+    assert "70.7 is taken as °C; if it is °F, it is 21.5 °C: give --unit" in note
     found = read(tmp_path / "log.csv", [f"time,{head}"], row, "degF")
     assert not [note for note in found.notes if "doubtful" in note]
     assert next(iter(found.channels.values()))[0] == pytest.approx(21.5)

@@ -1,6 +1,6 @@
 """A store of an older version becomes one of this version, as a whole or not at all.
 
-Only one version was published, so the step to the next is made up here.
+There is only one version yet, so the step to the next is made up here.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FAILS = ("CREATE TABLE half_done (id INTEGER)", "INSERT INTO nowhere VALUES (1)"
 
 @pytest.fixture
 def version_1(filled, store_path):
-    """A file as this program writes it, of 20 epochs."""
+    """A file of 20 epochs as this program writes it."""
     store, _ = filled
     store.checkpoint()
     store.close()
@@ -69,7 +69,7 @@ def test_an_older_store_is_read_and_brought_up_to_date(version_1, version_2, mak
         assert np.array_equal(stored.epoch.observations.points, make_epoch(9).observations.points)
         assert store._db.execute("SELECT count(*) FROM weather").fetchone() == (0,)
         assert store.identity
-    # who reads changes nothing; who writes has kept a copy
+    # reading changes nothing; writing makes a backup first
     assert version(version_1) == (1 if mode == "read" else 2)
     copy = version_1.with_name("small.db.version-1")
     assert copy.exists() == (mode == "append")
@@ -98,7 +98,7 @@ def test_after_a_downgrade_the_copy_that_serves_is_named(version_1, monkeypatch)
     with monkeypatch.context() as newer:
         newer.setattr(schema, "FILE_STEPS", (*schema.FILE_STEPS, STEP))
         Store.open(version_1, "append").close()
-    with pytest.raises(StoreVersionError, match=r"go on with .*small\.db\.version-1, the copy"):
+    with pytest.raises(StoreVersionError, match=r"or use .*small\.db\.version-1, the backup"):
         Store.open(version_1)
     version_1.with_name("small.db.version-1").unlink()
     with pytest.raises(StoreVersionError, match=r"update thermocald$"):
@@ -135,7 +135,7 @@ def test_a_server_is_brought_up_to_date_as_a_whole_or_not_at_all(server, monkeyp
     place = address(server)
     with monkeypatch.context() as broken:
         broken.setattr(schema, "SERVER_STEPS", (*schema.SERVER_STEPS, FAILS))
-        with pytest.raises(ServerError, match="tables cannot be made"):
+        with pytest.raises(ServerError, match="tables cannot be created"):
             create_tables(place)
     with ServerStore(place) as store:
         assert store.all_series() == []

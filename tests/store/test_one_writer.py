@@ -1,4 +1,4 @@
-"""One writer of a store, whatever it is called and whoever writes: none of its epochs is lost."""
+"""A store has one writer, under any of its names, and loses none of its epochs."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ KINDS = [
 def test_replay_does_not_write_beside_a_daemon(daemon, path, tmp_path, recording, kind):
     other = as_called(path, tmp_path, kind)
     words = ["replay", recording, "--store", other]
-    if kind == "hard link in another folder":  # as a daemon's neighbour is: in a process of its own
+    if kind == "hard link in another folder":  # in a process of its own, like a second daemon
         done = subprocess.run(
             [sys.executable, "-m", "thermocald", *words],
             env=ENVIRONMENT, cwd=tmp_path, capture_output=True, text=True, check=False,
@@ -83,7 +83,7 @@ def test_replay_does_not_write_beside_a_daemon(daemon, path, tmp_path, recording
     else:
         done = call(*words, folder=tmp_path)
     assert done.returncode == 1
-    assert "another thermocald writes it" in done.stderr
+    assert "another thermocald process writes to it" in done.stderr
     assert "Traceback" not in done.stderr
     daemon.close()
     for name in {path, other} - {tmp_path / "other.db"}:
@@ -108,7 +108,7 @@ def test_every_command_that_writes_takes_the_lock(daemon, path, tmp_path, record
     arguments = [part.format(**places) for part in WRITERS[writer]]
     done = call(*arguments, folder=tmp_path)
     assert done.returncode == 1
-    assert "another thermocald writes it" in done.stderr
+    assert "another thermocald process writes to it" in done.stderr
 
 
 def test_a_command_that_writes_keeps_a_daemon_away(tmp_path):
@@ -133,7 +133,7 @@ def test_a_store_of_two_names_is_not_written_where_nobody_waits(daemon, path, tm
     done = call("replay", recording, "--store", tmp_path / "other.db", folder=tmp_path)
     assert done.returncode == 1
     assert "2 names (hard links)" in done.stderr
-    # a daemon must not stay away because of somebody's backup: it says so and goes on
+    # a daemon must not stop because of a user's backup: it reports it and goes on
     guard = StoreGuard(path)
     assert "2 names" in guard.status()["notice"]
     guard.close()
@@ -150,7 +150,7 @@ def test_a_copy_is_a_store_of_its_own(daemon, path, tmp_path, recording):
 @pytest.mark.parametrize("kind", ["null", "full", "pipe", "socket", "link to null"])
 @pytest.mark.parametrize("command", ["replay", "run"])
 def test_a_device_is_no_store_and_stays(tmp_path, recording, kind, command):
-    """Found by hand: as root the node of the null device was removed, being an empty file."""
+    """Regression: as root, the node of the null device was removed as an empty file."""
     place = node = tmp_path / "node"
     if kind == "pipe":
         os.mkfifo(node)
@@ -169,13 +169,13 @@ def test_a_device_is_no_store_and_stays(tmp_path, recording, kind, command):
     words = ["replay", recording] if command == "replay" else ["run", "--recording", recording]
     done = call(*words, "--store", place)
     assert done.returncode in (1, 2)
-    assert "is a device or a pipe; a store is a file of its own" in done.stderr
+    assert "is a device or a pipe; a store must be a regular file" in done.stderr
     assert (node.lstat().st_ino, node.lstat().st_mode) == before
     assert {p.name for p in tmp_path.iterdir()} <= {"node", "link", "node.live", "link.live"}
 
 
 def test_an_empty_file_that_was_there_stays_where_no_store_can_be_made(tmp_path):
-    """Its owner and its mode may have been chosen by whoever made it."""
+    """Its owner and mode may have been chosen on purpose."""
     path = tmp_path / "t.db"
     path.touch()
     (tmp_path / "t.db-wal").mkdir()  # no store can be opened beside it

@@ -65,6 +65,8 @@ def test_digits_beyond_ours_are_kept(recording_path):
         ("target", "nobody", "row 3, column target: target 'nobody'"),
         ("epoch", 77, "row 3, column epoch: epoch 77"),
         ("y", None, "row 3, column y: is empty"),
+        ("epoch", 1.5, "row 3, column epoch: '1.5' is not an integer"),
+        ("epoch", -1, "row 3, column epoch: '-1' is not an integer"),
     ],
 )
 def test_what_is_wrong_is_said_with_row_and_column(recording_path, column, value, words):
@@ -72,6 +74,8 @@ def test_what_is_wrong_is_said_with_row_and_column(recording_path, column, value
     path = recording_path / "observations.parquet"
     table = parquet.read_table(path).to_pydict()
     table[column][2] = value
+    if isinstance(value, float):
+        table[column] = list(map(float, table[column]))
     parquet.write_table(pyarrow.table(table), path)
     with pytest.raises(RecordingError, match=words):
         read_recording(recording_path)

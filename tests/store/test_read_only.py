@@ -1,4 +1,4 @@
-"""A store whose folder cannot be written: its -wal file is read too, and nothing is left behind."""
+"""A store in a read-only folder is read with its -wal file, and nothing is left behind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The temperature at the frame's instant."""
+"""The temperature at the time of a frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings: what is written is read again, whole or as a stream; real ones are accepted."""
+"""Recordings are read as they were written, whole or in parts; real ones are accepted."""
 
 from __future__ import annotations
 
@@ -84,6 +84,37 @@ def test_rows_in_any_order(recording_path):
     for a, b in zip(read_recording(recording_path).epochs, expected, strict=True):
         order = np.argsort(a.observations.targets)
         assert same(a.observations.select(order), b.observations)
+
+
+def test_epochs_of_different_columns_are_written_together(tmp_path, field, head, make_epoch):
+    """A frame that shows nothing, markers without circles, a value that one target lacks."""
+    seen = make_epoch(1).observations
+    n = len(seen)
+    blurred = replace(seen, quality={"blur": np.array([np.nan, *range(1, n)])})
+    all_of_it = replace(seen, covariances=np.full(n, 1e-4), quality={"misfit": np.arange(n) + 0.5})
+    shown = [seen.select(np.zeros(n, dtype=bool)), blurred, all_of_it, seen]
+    epochs = [replace(make_epoch(i + 1), observations=o) for i, o in enumerate(shown)]
+    write_recording(tmp_path / "mixed", head, field, epochs)
+    assert sorted(p.name for p in (tmp_path / "mixed").iterdir()) == [
+        "epochs.csv", "observations.csv", "recording.yaml", "testfield.csv",
+    ]  # fmt: skip
+    none, first, second, third = (e.observations for e in read_recording(tmp_path / "mixed").epochs)
+    assert len(none) == 0
+    assert same(first, blurred)
+    assert np.array_equal(first.quality["blur"], blurred.quality["blur"], equal_nan=True)
+    assert np.isnan(first.quality["misfit"]).all()
+    assert second.quality["misfit"].tolist() == all_of_it.quality["misfit"].tolist()
+    assert (second.covariances == 1e-4).all()
+    assert not first.covariances.any()
+    assert same(third, seen)
+    assert np.isnan(third.quality["blur"]).all()
+
+
+def test_a_column_of_text_that_begins_empty_is_ignored(recording_path):
+    file = recording_path / "observations.csv"
+    header, first, *rows = file.read_text().splitlines()
+    file.write_text("\n".join([f"{header},comment", f"{first},", *(f"{r},a" for r in rows)]) + "\n")
+    assert "comment" not in read_recording(recording_path).epochs[0].observations.quality
 
 
 def test_covariances_and_quality_travel(tmp_path, field, head):
@@ -237,7 +268,7 @@ def test_files_as_windows_writes_them(recording_path):
 
 @pytest.fixture
 def long_from_nothing(tmp_path, monkeypatch):
-    """Every recording counts as long; the user's cache, a folder of the test."""
+    """Treat every recording as long; return the test's folder for the user's cache."""
     monkeypatch.setattr(module, "LONG_FROM_BYTES", 0)
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -245,7 +276,7 @@ def long_from_nothing(tmp_path, monkeypatch):
 
 
 def test_long_text_is_parsed_once(recording_path, long_from_nothing, monkeypatch):
-    """The second reading does not see the text; every number is the text's to the bit."""
+    """The second reading does not read the text; every number equals the text's to the bit."""
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 10**9)
     from_text = list(open_recording(recording_path).iter_epochs())
     monkeypatch.setattr(observation_file, "LONG_FROM_BYTES", 0)
@@ -268,13 +299,13 @@ def test_text_that_was_changed_is_parsed_again(recording_path, long_from_nothing
 @pytest.mark.parametrize(
     ("column", "value", "words"),
     [("x", "12,5e", "fields"), ("x", "", "is empty"), ("x", "nan", "finite"),
-     ("sx", "0", "above 0 px"), ("target", "nobody", "does not stand in testfield.csv"),
-     ("epoch", "99", "does not stand in epochs.csv"), ("epoch", "1.5", "not an integer")],
+     ("sx", "0", "above 0 px"), ("target", "nobody", "is not in testfield.csv"),
+     ("epoch", "99", "is not in epochs.csv"), ("epoch", "1.5", "not an integer")],
 )  # fmt: skip
 def test_a_copy_says_where_the_text_is_wrong(
     recording_path, long_from_nothing, column, value, words
 ):
-    """What is found in the binary copy is said of the line of the text."""
+    """An error found in the binary copy names the line of the text."""
     set_field(recording_path / "observations.csv", 4, column, value)
     with pytest.raises(RecordingError, match=r"observations\.csv, line 4") as error:
         list(open_recording(recording_path).iter_epochs())

@@ -1,4 +1,4 @@
-"""What can be read and cannot have been meant: refused with one line, or called doubtful."""
+"""Implausible values are refused with one line, or called doubtful."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ from tests.commands import call
 from thermocald.errors import RecordingError, TestFieldError
 from thermocald.output.thermal_model import render_certificate
 from thermocald.store.recording.reader import read_recording
-from thermocald.store.recording.sense import find_spikes, find_unit_change, interior_doubts
+from thermocald.store.recording.sense import (
+    find_spikes,
+    find_unit_change,
+    interior_doubts,
+    time_doubts,
+)
 
 SIZE = "width: 3280, height: 2464"
 
@@ -45,7 +50,7 @@ def head(path, old: str, new: str) -> None:
 
 
 def change(path, name: str, **columns) -> None:
-    """Columns of a table as functions of their values and the row from 0."""
+    """Replace columns of a table by functions of their values and the row (from 0)."""
     with (path / name).open(newline="") as file:
         names, *rows = csv.reader(file)
     for column, function in columns.items():
@@ -162,7 +167,7 @@ def test_times_in_another_unit_are_named(recording, factor, unit):
 
 def test_one_time_for_all_epochs_is_refused(recording):
     change(recording, "epochs.csv", frame_time=lambda *_: "1600000000")
-    with pytest.raises(RecordingError, match="all epochs have one time"):
+    with pytest.raises(RecordingError, match="all epochs have the same time"):
         read_recording(recording)
 
 
@@ -247,7 +252,7 @@ def test_what_is_doubtful_is_told(recording, name):
 
 
 def test_width_and_height_exchanged_in_the_middle_of_the_image(recording):
-    """Targets that lie where both images are: the points tell nothing, the principal point does."""
+    """Points within both images show nothing; the principal point shows the exchange."""
     file = recording / "observations.csv"
     header, *rows = file.read_text().splitlines()
     kept = [r for r in rows if float(r.split(",")[2]) < 2460]
@@ -318,6 +323,11 @@ def test_a_camera_that_is_carried_changes_no_unit(rise):
     assert find_unit_change(np.r_[wave(30), wave(60)[30:] + rise]) is None
 
 
+def test_epochs_that_share_times_are_counted():
+    (doubt,) = time_doubts(np.arange(7), np.array([0, 0, 10, 20, 20, 20, 30.0]), 10.0)
+    assert doubt == "5 epochs have the time of another one, the first 0 and 1"
+
+
 def test_lenses_near_what_is_stated_are_not_doubted(recording):
     camera = read_recording(recording).camera
     for c in (2.6, 3.04, 3.6):
@@ -342,7 +352,7 @@ def test_a_spike_beside_a_change_of_the_unit_hides_neither():
 
 
 def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_path):
-    """In the text, in `doubts` of the JSON, and among the notes of the report."""
+    """Doubts are in the text, in `doubts` of the JSON, and in the notes of the report."""
     messages = []
     for name in ("a principal distance of another lens", "85.00 of a DS18B20", "an epoch twice",
                  "an hour as the interval"):  # fmt: skip
@@ -366,7 +376,7 @@ def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_pat
 
 
 def test_two_series_of_which_one_is_doubtful(recording, simulated):
-    """Which one is said."""
+    """The doubt names the series."""
     DOUBTS["85.00 of a DS18B20"][0](recording)
     shutil.copytree(simulated, recording.parent / "N")
     change(recording.parent / "N", "epochs.csv", frame_time=scaled(1, 1e5),

@@ -1,4 +1,4 @@
-"""The guard of a store whose disk has room for an event but for no row any more."""
+"""The guard of a store whose disk has space for an event but not for a row."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from thermocald.daemon.store_guard import Row, StoreGuard
 
 
 def test_a_row_that_found_no_room_waits(tmp_path, head, field, make_epoch, make_result):
-    """Found in the laboratory: an event still fitted into its page, so the row counted as bad."""
+    """Regression: an event still fitted into its page, so the row was taken for a bad one."""
     guard = StoreGuard(tmp_path / "t.db", durable=False)
     series = guard.store.create_series(head, field)
 

@@ -1,4 +1,4 @@
-"""Analyses of a store read times that are right although the clock was wrong for a while."""
+"""Analyses of a store read right times although the clock was wrong for a while."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thermocald.store.series import Event
 from thermocald.store.sources import open_source
 
 EPOCHS = 40
-# name → {first epoch, last epoch: seconds that its times are wrong by}; the step that was followed
+# name → {first epoch, last epoch: error of their times, s}; the step that was followed
 CLOCKS = {
     "a glitch of 120 days": ({(10, 14): 120 * 86400.0}, None),
     "a step back by an hour": ({(1, 20): 3600.0}, None),
@@ -28,7 +28,7 @@ CLOCKS = {
 
 @pytest.fixture
 def stores(tmp_path, head, field, make_epoch, make_result):
-    """clock → (a store as it was stamped by that clock, one stamped by a right clock)."""
+    """clock → (a store stamped by that clock, one stamped by a right clock)."""
 
     def make(name: str):
         wrong, followed = CLOCKS[name]

@@ -1,4 +1,4 @@
-"""A damaged -wal file is reported as damaged; one that a crash cut off is not."""
+"""A damaged -wal file is reported as damaged; one cut off by a crash is not."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def frames(wal) -> tuple[bytearray, int]:
 
 
 def test_a_write_that_a_kill_cut_off_is_no_damage(crashed, capsys):
-    """In a -wal file that is written again, the frame's end is of an earlier run."""
+    """In a -wal file that was restarted, the rest of the frame is from before."""
     wal = crashed.with_name(f"{crashed.name}-wal")
     data, step = frames(wal)
     data[-step // 2 :] = bytes(step // 2)
@@ -78,7 +78,7 @@ def test_a_write_that_a_kill_cut_off_is_no_damage(crashed, capsys):
 
 
 def test_what_the_index_counts_was_committed(store_path, head, field, make_epoch):
-    """The -shm file that a killed writer leaves tells what is damaged, or missing, at the end."""
+    """The -shm file of a killed writer shows what is damaged or missing at the end."""
     wal = store_path.with_name(f"{store_path.name}-wal")
     with Store.open(store_path, "append", durable=False) as store:
         series = store.create_series(head, field)
@@ -135,7 +135,7 @@ def test_the_daemon_says_so_and_keeps_a_copy(crashed):
 
 @pytest.mark.parametrize("part", [0.1, 1 / 3, 0.35, 0.5, 2 / 3, 0.8, 0.999])
 def test_what_a_copy_cut_off_is_said_with_how_many_epochs_are_left(crashed, capsys, part):
-    """Where the cut falls between two commits nothing tells of those that followed."""
+    """A cut between two commits leaves no trace of those that followed."""
     wal = crashed.with_name(f"{crashed.name}-wal")
     data, step = frames(wal)
     size = int(part * len(data))

@@ -1,1 +1,1 @@
-"""Recordings and the store."""
+"""Recordings, stores in files and on servers, and logs of other programs."""

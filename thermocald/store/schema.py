@@ -1,8 +1,8 @@
-"""The tables of a store, in its file (SQLite) and at a server (PostgreSQL), and their version.
+"""The tables of a store in a file (SQLite) and on a server (PostgreSQL), and their version.
 
-A database of version n has had the first n steps; a new one is made by the same steps that bring an
-old one up to date. A step is frozen once it was released: it depends on nothing that may change,
-and a change to the tables is a further step of both databases.
+A database of version n has had the first n steps. The same steps create a new database and upgrade
+an old one. A released step is frozen: it depends on nothing that may change, and each change of the
+tables is a further step for both databases.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ EPOCH_NUMBERS = tuple(name for name, types in _EPOCH if types != _TEXT)
 COLUMN_NAMES = tuple(
     name.replace("centre_", "") for name in EPOCH_NUMBERS if name not in ("revision", "measured")
 )
-"""Numbers of an epoch as the program calls them."""
+"""The numbers of an epoch by the names that the program uses."""
 
 
 def sql_name(name: str) -> str:
-    """The column of a number: SQL ignores case, and x0 must not be X0."""
+    """Return the column of a number: SQL ignores case, and X0 must differ from x0."""
     return f"{name[:-2]}centre_{name[-2:]}" if name[-2:] in ("X0", "Y0", "Z0") else name
 
 
@@ -57,7 +57,7 @@ def _epoch_columns(kind: int) -> str:
 _APPEND_ONLY = ("store", "testfield", "series", "epoch", "detail", "event", "reading")
 
 _FILE_1 = (
-    # who this is, whatever the file is called or copied to
+    # identifies the store whatever the file is called or copied to
     "CREATE TABLE store (id INTEGER PRIMARY KEY CHECK (id = 1), identity TEXT NOT NULL)",
     """CREATE TABLE testfield (
         id INTEGER PRIMARY KEY, digest TEXT NOT NULL UNIQUE, csv TEXT NOT NULL)""",
@@ -79,7 +79,7 @@ _FILE_1 = (
         id INTEGER PRIMARY KEY, thermometer TEXT NOT NULL, utc REAL NOT NULL,
         clock_trusted INTEGER NOT NULL, temperatures TEXT NOT NULL, checksum INTEGER NOT NULL)""",
     "CREATE INDEX reading_thermometer ON reading (thermometer, utc)",
-    # append-only is enforced by the file itself, not by this program alone
+    # the file itself, not only this program, refuses changes
     *(
         f"""CREATE TRIGGER {table}_{change} BEFORE {change.upper()} ON {table}
         BEGIN SELECT RAISE(ABORT, 'the store is append-only'); END"""
@@ -98,8 +98,8 @@ _FILE_1 = (
 
 _NOW = "extract(epoch FROM clock_timestamp())::double precision"
 
-# A month is made by whoever first writes into it; the role that forwards may only insert, so the
-# function runs with its owner's rights. What came before its month's table stays in epoch_other.
+# The first writer into a month creates its table. The role that forwards may only insert, so the
+# function runs with its owner's rights. Rows from before the month's table stay in epoch_other.
 _MONTH = """
 CREATE FUNCTION thermocald_month(at double precision) RETURNS void
 LANGUAGE plpgsql SECURITY DEFINER SET search_path = public, pg_temp AS $$
@@ -121,7 +121,7 @@ BEGIN
   END IF;
 END $$"""
 
-# A role that forwards may only insert; it may say how it is through this function alone.
+# The role that forwards may only insert; it reports its state through this function alone.
 _REPORT = f"""
 CREATE FUNCTION thermocald_report(name text, identity uuid, clock double precision,
   waiting bigint, refused bigint, version text)
@@ -130,12 +130,12 @@ RETURNS void LANGUAGE sql SECURITY DEFINER SET search_path = public, pg_temp AS 
   ON CONFLICT ON CONSTRAINT station_pkey DO UPDATE SET contact = excluded.contact,
     clock = excluded.clock, waiting = excluded.waiting, refused = excluded.refused,
     version = excluded.version
-  -- what was under way when a connection broke may come after what was said later
+  -- a report delayed by a broken connection may arrive after a later one
   WHERE excluded.clock >= station.clock OR excluded.contact > station.contact + 600
 $$"""
 
-# rows of epochs -> rows of the summary; {channel}: the name of the reference temperature; OFFSET 0:
-# JSON is parsed once an epoch and not in every aggregate
+# Rows of epochs to rows of the summary. OFFSET 0: JSON is parsed once per epoch, not in every
+# aggregate.
 _SUMMARY = """
 SELECT series, slot, count(*), count(*) FILTER (WHERE status = 'ok'),
     min(frame_time), max(frame_time), max(frame_time) FILTER (WHERE status = 'ok'),
@@ -169,8 +169,8 @@ BEGIN
   END LOOP;
 END $$"""
 
-# Runs in the transaction of the rows and sees only those that were inserted, so that what is sent
-# twice counts once. Of revised epochs the latest counts: their slots are made again.
+# Runs in the transaction that inserts and sees only the rows that were inserted, so that a row sent
+# twice counts once. Of a revised epoch only the latest revision counts: its slots are summed again.
 _ARRIVED = f"""
 CREATE FUNCTION thermocald_arrived() RETURNS trigger
 LANGUAGE plpgsql SECURITY DEFINER SET search_path = public, pg_temp AS $$
@@ -180,7 +180,7 @@ DECLARE
   revised boolean;
 BEGIN
   FOR one IN SELECT DISTINCT series FROM arrived ORDER BY series LOOP
-    -- who sends the same series at the same time counts after us, and sees our rows then
+    -- another sender of the same series waits for this one, and then sees its rows
     PERFORM pg_advisory_xact_lock(hashtextextended(one::text, 7496050));
     SELECT EXISTS (SELECT FROM epoch e WHERE e.series = one AND e.revision > 0 AND e.number
         BETWEEN (SELECT min(number) FROM arrived a WHERE a.series = one)
@@ -218,7 +218,7 @@ _SERVER_1 = (
     "CREATE TABLE epoch_other PARTITION OF epoch DEFAULT",
     "CREATE INDEX epoch_revised ON epoch (series, number) WHERE revision > 0",
     "CREATE INDEX epoch_latest ON epoch (series, frame_time DESC)",
-    # keyed by what they say: an id in a station's store is given anew by a new or restored store
+    # keyed by content: a new or restored store of a station assigns the same ids again
     """CREATE TABLE event (
         station text NOT NULL, id bigint NOT NULL, utc double precision NOT NULL,
         kind text NOT NULL, text text NOT NULL, series uuid, epoch bigint, data text NOT NULL)""",
@@ -240,9 +240,9 @@ _SERVER_1 = (
         name text, identity uuid, contact double precision NOT NULL,
         clock double precision NOT NULL, waiting bigint NOT NULL, refused bigint NOT NULL,
         version text NOT NULL, PRIMARY KEY (name, identity))""",
-    # sample: of the slot's first epoch with a result and a temperature: frame_time, number, °C of
-    # the reference, c, sd, x0, sd, y0, sd; arrays are compared element by element, so `least` is
-    # the first. A clock that was not set may say anything: the first and last slot hold the rest.
+    # sample: the slot's first epoch with a result and a temperature: frame_time, number, °C of the
+    # reference, c, sd, x0, sd, y0, sd. Arrays are compared element by element, so `least` gives
+    # the first. A clock that was not set may show any time: the outer slots hold the rest.
     """CREATE TABLE summary (
         series uuid NOT NULL, slot integer NOT NULL, epochs bigint NOT NULL, ok bigint NOT NULL,
         first double precision NOT NULL, last double precision NOT NULL, last_ok double precision,
@@ -264,7 +264,7 @@ SERVER_STEPS: Steps = (_SERVER_1,)
 
 
 def upgrade(execute: Callable[[str], object], version: int, steps: Steps) -> int:
-    """Run the steps that a database of `version` has not had (0: it is empty); its version then.
+    """Run the steps that a database of `version` (0: empty) lacks; return its new version.
 
     execute: runs one statement in the caller's transaction, which must be the only one.
     """

@@ -1,8 +1,8 @@
-"""A series in a store, of a file or of a server: what it is, what its epochs leave, how it is read.
+"""A series in a store, in a file or on a server: its records, and the interface that reads it.
 
-A store holds times as they were stamped: on a machine whose clock was stepped or did not know the
-time yet they run backwards, leap, or are wrong as a block. What is right is known afterwards, from
-the epochs that follow and from the steps that the daemon noted (`series_times`).
+A store holds times as they were stamped. On a machine whose clock was stepped or not yet set, they
+run backwards, jump, or are offset as a block. `series_times` corrects them afterwards from the
+epochs that follow and from the clock steps that the daemon recorded.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from thermocald.store.recording.head import Head
     from thermocald.store.recording.observation_file import ObservationRows
 
-NOT_CALIBRATED = "not_calibrated"  # the status of an epoch that has not been adjusted yet
+NOT_CALIBRATED = "not_calibrated"  # status of an epoch that is not adjusted yet
 _LISTED = 20
 _CLOCK_TOLERANCE_S = 10.0
 
@@ -37,9 +37,9 @@ _CLOCK_TOLERANCE_S = 10.0
 class EpochResult:
     """The numbers of one adjustment, in the order of `PARAMETER_NAMES`.
 
-    status: `ok` or one word for why there is no result, `reason` in a sentence; values (16,), NaN
-    where there is none; covariance (16, 16), zero where a parameter was held, None without a
-    result; rejected: rows of the test field.
+    status: `ok`, or one word for why there is no result; reason: the same in a sentence; values
+    (16,), NaN if not estimated; covariance (16, 16), zero for a parameter that was held, None
+    without a result; rejected: rows of the test field.
     """
 
     status: str
@@ -53,7 +53,7 @@ class EpochResult:
 
     @classmethod
     def from_adjustment(cls, adjustment: Adjustment) -> Self:
-        """The part of an adjustment that is kept."""
+        """Return the part of an adjustment that a store holds."""
         values = np.full(16, np.nan)
         if adjustment.interior is not None:
             values[:10] = adjustment.interior.as_array()
@@ -68,7 +68,7 @@ class EpochResult:
 
     @property
     def sd(self) -> Array:
-        """Standard deviations (16,), NaN where a parameter was held or nothing was estimated."""
+        """Standard deviations (16,), NaN for a parameter that was held or not estimated."""
         if self.covariance is None:
             return np.full(16, np.nan)
         variances = np.diag(self.covariance)
@@ -79,8 +79,9 @@ class EpochResult:
 class StoredSeries:
     """One series of one camera.
 
-    head: what its recording.yaml would say; start: the start condition, such as `cold`; identity:
-    what the device said it is; settings: how it was adjusted (both JSON-able); created_utc: s.
+    head: what its recording.yaml would hold; start: the start condition, such as `cold`; identity:
+    what the device reported about itself; settings: those of the adjustment (both can be written
+    as JSON); created_utc: s.
     """
 
     id: int
@@ -102,9 +103,9 @@ class StoredSeries:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened: a knock, a device gone or back, a deletion.
+    """An event: a knock, a device lost or found again, a deletion.
 
-    utc: s; kind: one word; series and epoch: where it belongs to one; data: JSON-able.
+    utc: s; kind: one word; series, epoch: None if it belongs to none; data can be written as JSON.
     """
 
     utc: float
@@ -117,7 +118,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class LoggedReading:
-    """What a thermometer said that belongs to no epoch: utc s, values {channel: °C}."""
+    """A reading of a thermometer that belongs to no epoch: utc s, values {channel: °C}."""
 
     thermometer: str
     utc: float
@@ -127,7 +128,7 @@ class LoggedReading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredEpoch:
-    """An epoch as kept: what was acquired, the latest calibration, and what else was recorded.
+    """An epoch as stored: what was acquired, its latest calibration, and further columns.
 
     revision: 0, and one more with each later calibration; extra: further columns by name.
     """
@@ -140,40 +141,40 @@ class StoredEpoch:
 
 
 class SeriesReader(ABC):
-    """An open store that is read, of a file or of a server; use it in a `with` block.
+    """An open store, in a file or on a server, to be read from; use it in a `with` block.
 
-    Each has its own way to list series and to read their columns and epochs as they were stamped;
-    finding a series and corrected times follow from these.
+    A subclass lists the series and reads their columns and epochs with the times as stamped. This
+    class finds a series and corrects the times.
     """
 
     path: Path
     corrected = False
-    """Whether times are given as they should have been, see `series_times`."""
+    """Whether times are corrected, see `series_times`."""
     _times: dict[int, SeriesTimes | None] | None = None
-    # how one of several series is selected
-    _remedy = "; select one: --series CAMERA/SERIES, or thermocald archive makes recordings of all"
+    # ends the message of a selection that fits no series or several
+    _remedy = "; select one with --series CAMERA/SERIES, or archive all with thermocald archive"
 
     @abstractmethod
     def all_series(self) -> list[StoredSeries]:
-        """All series, in the order in which they were started."""
+        """Return all series, in the order in which they were begun."""
 
     @abstractmethod
     def stamped_columns(
         self, series: StoredSeries, names: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
-        """Columns (E,) over all epochs by name, with times as they were stamped."""
+        """Return columns (E,) over all epochs by name, with times as stamped."""
 
     @abstractmethod
     def clock_steps(self, series: StoredSeries) -> list[Event]:
-        """The steps of the clock while this series ran, oldest first."""
+        """Return the steps of the clock while this series ran, oldest first."""
 
     @abstractmethod
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
-        """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
+        """Return covariances (E, 16, 16) of the epochs `numbers`, NaN without a result."""
 
     @abstractmethod
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        """The observations of the epochs numbered `first` to `last`, without their quality."""
+        """Return the observations of epochs `first` to `last` (numbers), without their quality."""
 
     @abstractmethod
     def _epochs(
@@ -182,7 +183,7 @@ class SeriesReader(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close it; may be called twice."""
+        """Close the store, and release its lock if it has one; may be called twice."""
 
     def __enter__(self) -> Self:
         return self
@@ -193,30 +194,30 @@ class SeriesReader(ABC):
     def epochs(
         self, series: StoredSeries, first: int = 0, last: int | None = None, *, details: bool = True
     ) -> Iterator[StoredEpoch]:
-        """The epochs numbered `first` to `last`, one after the other, in constant memory.
+        """Yield epochs `first` to `last` (numbers) in constant memory.
 
-        details: False leaves out observations and covariances, and is faster.
+        details: False leaves out observations and covariances, which is faster.
         """
-        found = self._epochs(series, first, last, details)
+        stamped = self._epochs(series, first, last, details)
         times = self._corrected_times(series) if self.corrected else None
-        return found if times is None else map(times.correct, found)
+        return stamped if times is None else map(times.correct, stamped)
 
     def series_columns(self, series: StoredSeries, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Columns over all epochs by name, (E,) each: a million epochs in a fraction of a second.
+        """Return columns (E,) over all epochs by name: a million epochs in a fraction of a second.
 
-        Names are `epoch`, `frame_time`, `c`, `sd_c`, `sigma0`, a temperature channel (°C as read),
-        an extra column such as `blur_px`; numbers are float64, NaN where an epoch has none;
+        Names are `epoch`, `frame_time`, `c`, `sd_c`, `sigma0`, a temperature channel (°C as read)
+        or an extra column such as `blur_px`. Numbers are float64, NaN for an epoch without one;
         `status` is text.
         """
         columns = self.stamped_columns(series, names)
         timed = {"frame_time", "temperature_time"} & set(names)
         if self.corrected and timed and (times := self._corrected_times(series)) is not None:
-            right = {"frame_time": times.frame, "temperature_time": times.reading}
-            columns |= {name: right[name] for name in timed}
+            corrected = {"frame_time": times.frame, "temperature_time": times.reading}
+            columns |= {name: corrected[name] for name in timed}
         return columns
 
     def _corrected_times(self, series: StoredSeries) -> SeriesTimes | None:
-        """The times of a series; None where they are as they were stamped."""
+        """Return the corrected times of a series; None if none of them was corrected."""
         if self._times is None:
             self._times = {}
         if series.id not in self._times:
@@ -226,21 +227,21 @@ class SeriesReader(ABC):
 
     @property
     def where(self) -> str:
-        """What messages call it: an address without its password."""
+        """The store's name in messages: a path, or an address without its password."""
         return str(self.path)
 
     def only_series(self, name: str | None) -> StoredSeries:
-        """The series `CAMERA/SERIES` or `SERIES` that --series names, None: the only one.
+        """Return the series `CAMERA/SERIES` or `SERIES` that --series names; None: the only one.
 
-        Raises StoreError, listing what there is and naming the option, if none or several fit.
+        Raises StoreError, listing the series and naming the option, if none or several fit.
         """
         camera, _, series = (name or "").rpartition("/")
         return self.find_series(camera or None, series or None)
 
     def find_series(self, camera: str | None = None, name: str | None = None) -> StoredSeries:
-        """The one series of a camera and a name, either of which may be left open.
+        """Return the one series of a camera and a name; None stands for any.
 
-        Raises StoreError, listing what there is, if none or several fit.
+        Raises StoreError, listing the series, if none or several fit.
         """
         every = self.all_series()
         found = [s for s in every if camera in (None, s.camera) and name in (None, s.name)]
@@ -259,10 +260,10 @@ class SeriesReader(ABC):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeriesTimes:
-    """Corrected times of a series.
+    """The corrected times of a series.
 
-    numbers (E,): of its epochs; frame, reading (E,) s: of the frames and of the readings;
-    corrections (E,) s: what was added to the times of the frames.
+    numbers (E,): the epochs' numbers; frame, reading (E,) s: times of the frames and of the
+    readings; corrections (E,) s: added to the times of the frames.
     """
 
     numbers: NDArray[np.int64]
@@ -271,7 +272,7 @@ class SeriesTimes:
     corrections: Array
 
     def correct(self, stored: StoredEpoch) -> StoredEpoch:
-        """The epoch with its corrected times."""
+        """Return an epoch with its corrected times."""
         row = int(np.searchsorted(self.numbers, stored.epoch.number))
         frame_time, temperature_time = float(self.frame[row]), float(self.reading[row])
         epoch = replace(stored.epoch, frame_time=frame_time, temperature_time=temperature_time)
@@ -279,7 +280,7 @@ class SeriesTimes:
 
 
 def series_times(source: SeriesReader, series: StoredSeries) -> SeriesTimes:
-    """The corrected times of all epochs of a series. Raises StoreError."""
+    """Return the corrected times of all epochs of a series. Raises StoreError."""
     names = ["epoch", "frame_time", "temperature_time", "clock_trusted"]
     columns = source.stamped_columns(series, names)
     steps = [
@@ -290,7 +291,7 @@ def series_times(source: SeriesReader, series: StoredSeries) -> SeriesTimes:
     stamped, reading = columns["frame_time"], columns["temperature_time"]
     corrections = clock_corrections(stamped, series.head.interval, columns["clock_trusted"], steps)
     frame = stamped + corrections
-    # a reading next to a step of the clock may be stamped by the other of the two
+    # at a clock step, a reading and its frame may be stamped by different settings
     nearest = reading.copy()
     for shift in np.unique(corrections):
         moved = reading + shift
@@ -301,13 +302,13 @@ def series_times(source: SeriesReader, series: StoredSeries) -> SeriesTimes:
 def clock_corrections(
     frame_time: Array, interval: float, trusted: Array | None = None, steps: Sequence[float] = ()
 ) -> Array:
-    """Seconds (E,) to add to times (E,) so that they are right where that is known, and in order.
+    """Return corrections (E,) s that make times (E,) ascend and, where known, right.
 
-    trusted: (E,) 0 where the clock was not synchronised; steps: s, those that time stamps followed.
-    In this order: what was taken before the machine learned the time moves by that step; what lies
-    between a step forwards and the same step back was a glitch of the clock, and moves back; before
-    any other step back all that came earlier is moved to end one interval before what follows, as
-    the later setting is the better known one. Zero elsewhere.
+    trusted (E,): 0 if the clock was not synchronised; steps, s: those that time stamps followed.
+    First, epochs from before the clock was set are moved by the step that set it. Then epochs
+    between a step forwards and the same step back, a glitch of the clock, are moved back. Last, at
+    any other step back, all earlier epochs are moved to end one interval before the next one, as
+    the later setting of the clock is the more reliable. Other corrections are zero.
     """
     corrections = np.zeros(len(frame_time))
     tolerance = max(_CLOCK_TOLERANCE_S, 3.0 * interval)

@@ -1,7 +1,7 @@
-"""Where analyses read series from: a store in a file, or one on a server; both answer alike.
+"""The sources that analyses read series from: a store in a file or on a server, read alike.
 
-A series in an open one is read as a recording is: columns, epochs, observations in blocks.
-Analyses read times that are corrected where the clock was wrong; the store has them as stamped.
+A series in an open store is read as a recording is: columns, epochs, observations in blocks.
+A store holds times as stamped; analyses get them corrected where the clock was wrong.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 
 def open_source(source: Path) -> SeriesReader:
-    """Open a store for reading: a file, or `postgresql://…?camera=…&series=…`; times are corrected.
+    """Open a store to read corrected times: a file, or `postgresql://…?camera=…&series=…`.
 
-    Raises StoreError, for a server also UsageError, ServerGone, ServerError.
+    Raises StoreError; for a server also UsageError, ServerGone, ServerError.
     """
     if is_server(source):
         from thermocald.store.server.reader import ServerStore
@@ -50,12 +50,12 @@ def open_source(source: Path) -> SeriesReader:
 
 
 def is_store(source: Path) -> bool:
-    """Whether a source is a store: a server's address, or a file that SQLite wrote."""
+    """Return whether a source is a store: a server's address, or a file that SQLite wrote."""
     return is_server(source) or is_database(source)
 
 
 def source_name(source: Path) -> str:
-    """A source as messages and results name it: an address without its password."""
+    """Return a source's name for messages and results: an address without its password."""
     if not is_server(source):
         return str(source)
     parsed = ServerAddress.parse(source)
@@ -64,9 +64,9 @@ def source_name(source: Path) -> str:
 
 
 def require_source(source: Path) -> Path:
-    """A recording, a store or a server's address as given; StoreError for a path that is not there.
+    """Return a recording, a store or a server's address as given; StoreError if a path is missing.
 
-    A server is asked when it is opened.
+    A server is not contacted until it is opened.
     """
     if not is_server(source) and not source.exists():
         raise StoreError(
@@ -78,7 +78,7 @@ def require_source(source: Path) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class StoredRecording:
-    """One series of an open store, as `Recording` is one of a folder; it has its observations."""
+    """One series of an open store, with the interface of a `Recording`."""
 
     store: SeriesReader
     series: StoredSeries
@@ -94,12 +94,12 @@ class StoredRecording:
 
     @property
     def title(self) -> str:
-        """What messages call it."""
+        """The series' name in messages."""
         return f"{self.store.path}: {self.series.name}"
 
     @cached_property
     def columns(self) -> EpochColumns:
-        """Times and temperatures; files of frames are asked for one by one, see `framed`."""
+        """Times and temperatures, without the paths of frames, for which see `framed`."""
         channels = list(self.head.channels)
         names = ["epoch", "frame_time", "temperature_time", *channels]
         found = self.store.series_columns(self.series, names)
@@ -109,7 +109,7 @@ class StoredRecording:
         )  # fmt: skip
 
     def extra_columns(self) -> dict[str, Array]:
-        """Return by name what else is stored of each epoch, (E,), NaN where it has none."""
+        """Return the further columns (E,) by name, NaN for an epoch without a value."""
         place = {int(number): row for row, number in enumerate(self.columns.numbers)}
         found: dict[str, Array] = {}
         for stored in self.store.epochs(self.series, details=False):
@@ -128,13 +128,14 @@ class StoredRecording:
         return [stored.epoch for stored in self.store.epochs(self.series)]
 
     def observations(self, row: int) -> Observations | None:
-        """What one epoch (from 0) shows."""
+        """Return the observations of one epoch (from 0)."""
         return self._epoch(row).observations
 
     def framed(self, ok: NDArray[np.bool_]) -> list[tuple[int, Path]]:
-        """The first and the last of some epochs (E,), from 0, and their frames, where kept."""
-        found = [(row, self._epoch(row).frame) for row in np.flatnonzero(ok)[[0, -1]].tolist()]
-        return [(row, self.store.path.parent / frame) for row, frame in found if frame is not None]
+        """Return the first and the last epoch (from 0) of `ok` (E,) and their frames, if stored."""
+        rows = np.flatnonzero(ok).tolist()
+        ends = [(row, self._epoch(row).frame) for row in rows[:1] + rows[1:][-1:]]
+        return [(row, self.store.path.parent / frame) for row, frame in ends if frame is not None]
 
     def _epoch(self, row: int) -> Epoch:
         number = int(self.columns.numbers[row])
@@ -143,12 +144,12 @@ class StoredRecording:
     def blocks(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
-        """Grids of consecutive epochs, each with its first epoch (from 0); only of windows."""
+        """Yield grids of consecutive epochs, each with its first epoch (from 0), within windows."""
         numbers = self.columns.numbers
         for run in grid_runs(len(self), len(self.testfield), windows):
             wanted = numbers[run]
             found = self.store.observation_rows(self.series, int(wanted[0]), int(wanted[-1]))
-            # an epoch that came while the series was read is not among them
+            # leaves out epochs that were stored since `columns` was read
             found = found.rows(np.isin(found.epochs, wanted))
             found = replace(found, epochs=np.searchsorted(numbers, found.epochs))
             yield run.start, found.grid(run.start, run.stop, len(self.testfield))

@@ -1,1 +1,1 @@
-"""The store of a daemon: one SQLite file."""
+"""The store of a daemon, one SQLite file: its rows, columns, epochs and archive."""

@@ -1,4 +1,4 @@
-"""A series of the store as a recording; a verified copy of a store while a daemon writes it."""
+"""Write the series of a store as recordings; back up a store while a daemon writes to it."""
 
 from __future__ import annotations
 
@@ -32,24 +32,25 @@ def archive_store(
     skip_existing: bool,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Write the series of a store as recordings `<camera>-<series>`, and what else was read.
+    """Write series of a store as recordings `<camera>-<series>`, and readings without epochs.
 
-    series: `CAMERA/SERIES` or `SERIES`, None: all; finished: only those after which the camera
-    began another; say: is told of each. Returns `recordings` and `readings`.
+    series: `CAMERA/SERIES` or `SERIES`, None: all, with the readings; finished: only series after
+    which their camera began another; say: prints a line for each. Returns the document with
+    `recordings` and `readings`.
     """
     written: list[dict[str, Any]] = []
     readings: dict[str, Path] = {}
     with Store.open(path) as opened:
-        chosen = opened.all_series() if series is None else [opened.only_series(series)]
+        every = opened.all_series()
+        chosen = every if series is None else [opened.only_series(series)]
         if finished:
-            newest = {one.camera: one.id for one in opened.all_series()}
+            newest = {one.camera: one.id for one in every}
             chosen = [one for one in chosen if newest[one.camera] != one.id]
         make_folder(folder)
-        every = opened.all_series()
         for one in chosen:
             name = f"{one.camera}-{one.name}"
             if sum(f"{other.camera}-{other.name}" == name for other in every) > 1:
-                name = f"{one.camera}--{one.name}"  # `a-b`/`c` and `a`/`b-c` are two
+                name = f"{one.camera}--{one.name}"  # `a-b`/`c` and `a`/`b-c` must differ
             target = folder / name
             last = opened.last_epoch(one)
             if last is None or (skip_existing and target.exists()):
@@ -71,15 +72,15 @@ def archive_series(
 ) -> None:
     """Write a series as a recording, in constant memory.
 
-    frames: the folder that relative paths of frames refer to; a frame that was not kept is left
-    out. The head also holds what the store knows of the series: `start`, `device`, `calibration`.
-    Times are corrected (`database.times`), the head then holds `clock_set_back`
+    frames: the folder to which paths of frames are relative; a frame that is not there is left out.
+    The head also holds `start`, `device` and `calibration` of the stored series. Times are
+    corrected (`series_times`); steps back of the clock are in the head as `clock_set_back`
     [{epoch, seconds}]. Raises RecordingError, StoreError.
     """
     times = series_times(store, series)
     known = {"start": series.start, "device": series.identity, "calibration": series.settings}
-    told = {key: value for key, value in known.items() if value}
-    head = replace(series.head, extra={**series.head.extra, **told})
+    known = {key: value for key, value in known.items() if value}
+    head = replace(series.head, extra={**series.head.extra, **known})
     if set_back := np.flatnonzero(np.diff(times.corrections)).tolist():
         steps = [
             {
@@ -89,19 +90,19 @@ def archive_series(
             for i in set_back
         ]
         head = replace(head, extra={**head.extra, "clock_set_back": steps})
-    kept = FileFolder(frames or Path())
+    folder = FileFolder(frames or Path())
     with RecordingWriter(path, head, series.testfield) as writer:
         for stored in store.epochs(series):
             frame = stored.epoch.frame
-            found = None if frame is None else kept.find(frame)
+            found = None if frame is None else folder.find(frame)
             writer.append(replace(times.correct(stored).epoch, frame=found))
 
 
 def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
-    """Write what thermometers said apart from epochs, {thermometer: `thermometer-<name>.csv`}.
+    """Write the readings without epochs; return {thermometer: `thermometer-<name>.csv`}.
 
-    Columns: time (s UTC), clock_trusted, one per channel (°C, empty where it was not read). Raises
-    StoreError, OutputError if the folder cannot be written.
+    Columns: time (s UTC), clock_trusted, one per channel (°C, empty if not read). Raises
+    StoreError; OutputError if the folder cannot be written.
     """
     channels: dict[str, dict[str, None]] = {}
     for reading in store.readings():
@@ -122,11 +123,11 @@ def archive_readings(store: Store, folder: Path) -> dict[str, Path]:
 
 
 def back_up(store: Path, target: Path, keep: int = 0) -> dict[str, Any]:
-    """Copy a store to a file, or into a folder as `<store>-<UTC>.db`, and read the copy again.
+    """Copy a store to a file, or into a folder as `<store>-<UTC>.db`, and verify the copy.
 
-    keep: delete all but the newest so many of a folder, 0: none. Returns the document of the
-    command. Raises DataError where the file exists, UsageError where its folder does not,
-    StoreError for a damaged store, which is not copied.
+    keep: number of newest backups in the folder to keep, older ones are deleted; 0: keep all.
+    Returns the document of the command. Raises DataError if the file exists, UsageError if its
+    folder does not, StoreError for a damaged store, which is not copied.
     """
     if target.is_dir():
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
@@ -134,7 +135,7 @@ def back_up(store: Path, target: Path, keep: int = 0) -> dict[str, Any]:
     elif keep:
         raise UsageError(f"--keep is for a folder of backups; {target} is not a folder")
     if target.exists():
-        raise DataError(f"{target}: exists already; a backup is never written over")
+        raise DataError(f"{target}: exists already; choose another name for the backup")
     if not target.absolute().parent.is_dir():
         raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
     with Store.open(store) as opened:
@@ -144,8 +145,8 @@ def back_up(store: Path, target: Path, keep: int = 0) -> dict[str, Any]:
             found = copy.examine()
         if found.damaged:
             raise StoreError(
-                f"{store}: is damaged, and was not backed up: {found.damaged[0]}; "
-                "`thermocald check` lists all"
+                f"{store}: is damaged and was not backed up: {found.damaged[0]}; "
+                "`thermocald check` lists all damage"
             )
     except StoreError:
         target.unlink(missing_ok=True)

@@ -1,17 +1,17 @@
-"""The rows of a store with their checksums, and an epoch's numbers over a series as columns.
+"""The rows of a store with their checksums, and the numbers of a series' epochs as columns.
 
 Names are those of the tables. A column over a series is a number of the table `epoch`, `status`, or
-one of what its texts hold: `temperatures.<channel>` as read, `extra.<name>`.
+a number in its texts: `temperatures.<channel>` as read, `extra.<name>`.
 
-SQLite hands out rows at some microseconds each; a million epochs would take seconds. So when
-CHUNK epochs of a series have accumulated, each of their columns is written once more as one blob
-of float64, in the transaction of the last of them; and when MERGED such chunks have accumulated,
-they become one, since long blobs are read twice as fast. Reading joins the chunks and takes the
-tail, and what was calibrated again after its chunk was written, from the rows.
+SQLite needs some microseconds per row, which would be seconds for a million epochs. So when CHUNK
+epochs of a series have accumulated, each of their columns is written again as one blob of float64,
+in the transaction of the last epoch; MERGED such chunks are merged into one, since long blobs are
+read twice as fast. Reading joins the chunks and takes from the rows the epochs after the last chunk
+and those that were calibrated after their chunk was written.
 
-Checksums are of rows, since SQLite's own integrity check does not see a bit that changed inside a
-value: a CRC-32 over a row's numbers, as little-endian float64 with one NaN for NULL, and then its
-texts, joined by a control character.
+Each row has a checksum, since SQLite's integrity check does not find a bit that changed inside a
+value: a CRC-32 of the row's numbers, as little-endian float64 with one NaN for NULL, and then of
+its texts, joined by a control character.
 """
 
 from __future__ import annotations
@@ -57,19 +57,19 @@ CHUNKED = (*(n for n in EPOCH_NUMBERS if n not in ("revision", "measured")), "st
 
 
 class DamageError(StoreError):
-    """A row of the store is not as it was written."""
+    """The error for a damaged row of the store."""
 
 
 class _ChunkError(StoreError):
-    """A chunk is damaged: what it holds is in the rows too."""
+    """The error for a damaged chunk, whose numbers can be read from the rows."""
 
 
 def row_checksum(numbers: Sequence[Any], texts: Iterable[str] = (), data: bytes = b"") -> int:
-    """CRC-32 of a row as SQLite gives it back: numbers or None, texts, bytes.
+    """Return the CRC-32 of a row as SQLite returns it: numbers or None, texts, bytes.
 
-    Raises TypeError or ValueError where a value is of another type, which is damage too.
+    Raises TypeError or ValueError for a value of another type, which is damage too.
     """
-    # 0.0 + -0.0 is 0.0: SQLite does not keep the sign of a zero
+    # 0.0 + -0.0 is 0.0: SQLite does not store the sign of a zero
     plain = [math.nan if v is None or v != v else 0.0 + v for v in numbers]
     found = zlib.crc32(struct.pack(f"<{len(plain)}d", *plain))
     found = zlib.crc32(_SEPARATOR.join(texts).encode(errors="surrogateescape"), found)
@@ -79,43 +79,43 @@ def row_checksum(numbers: Sequence[Any], texts: Iterable[str] = (), data: bytes 
 def require_checksum(
     kept: int, what: str, numbers: Sequence[Any], texts: Iterable[str] = (), data: bytes = b""
 ) -> None:
-    """Raise DamageError naming `what` if a row is not as it was written."""
+    """Raise DamageError naming `what` if a row differs from its checksum."""
     try:
         good = row_checksum(numbers, texts, data) == kept
     except (TypeError, ValueError, OverflowError, struct.error):
         good = False
     if not good:
         raise DamageError(
-            f"{what} is damaged: its checksum does not match; `thermocald check` lists all that "
-            "is damaged, a backup has it as it was"
+            f"{what} is damaged: its checksum does not match; `thermocald check` lists all "
+            "damage; restore a backup to repair it"
         )
 
 
 def next_id(connection: sqlite3.Connection, table: str) -> int:
-    """Return the id of the next row; not left to SQLite, since the checksum covers it."""
+    """Return the id of the next row; SQLite does not assign it, as the checksum covers it."""
     (found,) = connection.execute(f"SELECT ifnull(max(id), 0) + 1 FROM {table}").fetchone()
     return int(found)
 
 
 def insert_row(connection: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
-    """Insert a row, all columns but `checksum` given; within the caller's transaction."""
+    """Insert a row, given without its `checksum`, in the caller's transaction."""
     numbers, texts = ([row[name] for name in names] for names in KEPT[table])
     values = (*numbers, *texts, row_checksum(numbers, texts))
     if connection.execute(_INSERT[table], values).rowcount != 1:
-        raise sqlite3.IntegrityError(f"a trigger that is not ours keeps rows out of {table}")
+        raise sqlite3.IntegrityError(f"a foreign trigger keeps rows out of {table}; drop it")
 
 
 def examined_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[tuple[dict[str, Any], StoreError | None]]:
-    """Yield rows by column, each with what says that it is not as it was written, or None."""
+    """Yield rows as {column: value}, each with the error of its damage or None."""
     names, count = ROW[table], len(KEPT[table][0])
-    called = "number" if table == "epoch" else "id"
+    key = "number" if table == "epoch" else "id"
     select = f"SELECT {', '.join(f'{table}.{name}' for name in names)} FROM {table} {condition}"
     for found in connection.execute(select, values):
         row, damage = dict(zip(names, found, strict=True)), None
         try:
-            what = f"{table} {row[called]}"
+            what = f"{table} {row[key]}"
             require_checksum(row["checksum"], what, found[:count], found[count:-1])
         except DamageError as error:
             damage = error
@@ -125,7 +125,7 @@ def examined_rows(
 def read_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[dict[str, Any]]:
-    """Yield rows by column, one by one; raises DamageError for one that is damaged."""
+    """Yield rows as {column: value}. Raises DamageError for a damaged row."""
     for row, damage in examined_rows(connection, table, condition, values):
         if damage is not None:
             raise damage
@@ -135,7 +135,7 @@ def read_rows(
 def read_epochs(
     connection: sqlite3.Connection, series: int, first: int, last: int | None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the rows of the epochs numbered `first` to `last`, by number and revision."""
+    """Yield the rows of epochs `first` to `last` (numbers), by number and revision."""
     condition = (
         "WHERE series_id = ? AND number >= ? AND number <= ifnull(?, number) "
         "ORDER BY number, revision"
@@ -150,7 +150,7 @@ def latest_columns(
     until: int | None = None,
     names: Sequence[str] | None = None,
 ) -> dict[str, Array]:
-    """Return columns of the epochs numbered above `after`, up to `until`, as calibrated last."""
+    """Return columns of the epochs with numbers above `after` up to `until`, latest revisions."""
     latest = {row["number"]: row for row in read_epochs(connection, series, after + 1, until)}
     return _columns(connection, list(latest.values()), names)
 
@@ -158,7 +158,7 @@ def latest_columns(
 def _columns(
     connection: sqlite3.Connection, rows: list[dict[str, Any]], names: Sequence[str] | None
 ) -> dict[str, Array]:
-    """Turn rows into columns, NaN where a row has no such number; names: None for all."""
+    """Turn rows into columns, NaN for a row without the number; names: None for all."""
     columns: dict[str, Array] = {}
     for field in CHUNKED if names is None else dict.fromkeys(n.split(".")[0] for n in names):
         column = [row[field] for row in rows]
@@ -182,7 +182,7 @@ def _columns(
 def _name_statuses(
     connection: sqlite3.Connection, columns: dict[str, Array]
 ) -> dict[str, NDArray[Any]]:
-    """Put words in the place of the codes in the column `status`."""
+    """Replace the codes in the column `status` by their words."""
     named: dict[str, NDArray[Any]] = dict(columns)
     if "status" in columns:
         codes = dict(connection.execute("SELECT code, status FROM status_code"))
@@ -194,10 +194,10 @@ def _name_statuses(
 def read_columns(
     connection: sqlite3.Connection, series: int, names: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
-    """Return columns (E,) by name, NaN where there is none.
+    """Return columns (E,) by name, NaN for an epoch without the number.
 
-    They share one piece of memory, which lives as long as any of them. Where a chunk is damaged the
-    rows are read instead; raises StoreError where these are damaged too.
+    They share one block of memory, which is freed with the last of them. If a chunk is damaged, the
+    rows are read instead. Raises StoreError if these are damaged too.
     """
     try:
         columns = SeriesColumns(connection, series).read(names)
@@ -210,13 +210,13 @@ def read_columns(
 def read_page(
     connection: sqlite3.Connection, series: int, names: Sequence[str], after: int, rows: int
 ) -> dict[str, NDArray[Any]]:
-    """Return columns of at most `rows` epochs numbered above `after`, read from the rows."""
+    """Return columns of at most `rows` epochs with numbers above `after`, from their rows."""
     end = _number_after(connection, series, after, rows)
     return _name_statuses(connection, latest_columns(connection, series, after, end, names))
 
 
 def _number_after(connection: sqlite3.Connection, series: int, after: int, rows: int) -> int | None:
-    """Find the number of the epoch `rows` after a number, None if there are not so many."""
+    """Return the number of the epoch `rows` after a number; None if there are fewer."""
     found = connection.execute(
         "SELECT number FROM epoch WHERE series_id = ? AND number > ? AND revision = 0 "
         "ORDER BY number LIMIT 1 OFFSET ?",
@@ -226,12 +226,12 @@ def _number_after(connection: sqlite3.Connection, series: int, after: int, rows:
 
 
 def checked_chunks(connection: sqlite3.Connection) -> Iterator[str]:
-    """Yield a sentence for every chunk that is damaged."""
+    """Yield a phrase for each damaged chunk."""
     for row in connection.execute(
         "SELECT checksum, series_id, name, first_row, last_number, last_id, data FROM column_chunk"
     ):
         try:
-            _require(*row)
+            _require_chunk(*row)
         except (_ChunkError, TypeError, ValueError):
             yield f"a chunk of column {row[2]} (its epochs are read one by one instead)"
 
@@ -243,7 +243,7 @@ def insert_chunk(
     last: int,
     columns: dict[str, Array],
 ) -> None:
-    """Write columns (n,) of epochs `first_row` to number `last`, as they are now, as one chunk."""
+    """Write columns (n,) of the epochs from row `first_row` to number `last` as one chunk."""
     last_id = next_id(connection, "epoch") - 1
     rows = [
         (series, name, first_row, last, last_id, values.tobytes())
@@ -252,30 +252,32 @@ def insert_chunk(
     connection.executemany(
         "INSERT INTO column_chunk (series_id, name, first_row, last_number, last_id, data, "
         "checksum) VALUES (?, ?, ?, ?, ?, ?, ?)",
-        [(*row, _checksum(*row)) for row in rows],
+        [(*row, _chunk_checksum(*row)) for row in rows],
     )
 
 
-def _checksum(series: int, name: str, first_row: int, last: int, last_id: int, data: bytes) -> int:
+def _chunk_checksum(
+    series: int, name: str, first_row: int, last: int, last_id: int, data: bytes
+) -> int:
     return row_checksum((series, first_row, last, last_id), (name,), data)
 
 
-def _require(kept: int, series: int, name: str, *row: Any) -> None:
-    if kept != _checksum(series, name, *row):
+def _require_chunk(kept: int, series: int, name: str, *row: Any) -> None:
+    if kept != _chunk_checksum(series, name, *row):
         raise _ChunkError(f"a chunk of column {name} is damaged")
 
 
-def _renew(columns: dict[str, Array], numbers: Array, late: dict[str, Array]) -> None:
-    """Write later calibrations over what columns hold of the epochs with `numbers`."""
+def _overwrite(columns: dict[str, Array], numbers: Array, late: dict[str, Array]) -> None:
+    """Overwrite columns of the epochs `numbers` with their later calibrations."""
     rows = np.searchsorted(numbers, late["number"])
     for name, column in columns.items():
         column[rows] = late.get(name, np.nan)
 
 
 class SeriesColumns:
-    """The columns of a series. rows: of its epochs in chunks; last_number: of the last of these.
+    """The columns of a series; rows: number of epochs in chunks; last_number: that of their last.
 
-    Files may hold chunks of any length: CHUNK is this program's choice, not the file's.
+    A file may hold chunks of any length; CHUNK is only the length that this version writes.
     """
 
     def __init__(self, connection: sqlite3.Connection, series: int) -> None:
@@ -284,7 +286,7 @@ class SeriesColumns:
         self._find_chunks()
 
     def _find_chunks(self) -> None:
-        # (first row, bytes, last number, the last row of `epoch` when it was written)
+        # (first row, bytes, number of the last epoch, last id of `epoch` when it was written)
         self._chunks: list[tuple[int, int, int, int]] = self._connection.execute(
             "SELECT first_row, length(data), last_number, last_id FROM column_chunk "
             "WHERE series_id = ? AND name = 'number' ORDER BY first_row",
@@ -302,7 +304,7 @@ class SeriesColumns:
         tail = latest_columns(
             self._connection, self._series, self.last_number, names=["number", *names]
         )
-        # one allocation for all: the system hands it out in huge pages, which halves the time
+        # one allocation for all, which the system makes in huge pages: half the time
         block = np.empty((len(names), self.rows + tail["number"].size))
         columns = dict(zip(names, block, strict=True))
         for name, column in columns.items():
@@ -311,7 +313,7 @@ class SeriesColumns:
         if late := self._late_rows(0):
             numbers = np.empty(self.rows)
             self._fill("number", numbers)
-            _renew(columns, numbers, _columns(self._connection, late, ["number", *names]))
+            _overwrite(columns, numbers, _columns(self._connection, late, ["number", *names]))
         return columns
 
     def count_loose(self) -> int:
@@ -323,7 +325,7 @@ class SeriesColumns:
         return int(count)
 
     def build(self) -> None:
-        """Write the chunks that the rows allow; within the caller's transaction."""
+        """Write chunks while there are enough rows, in the caller's transaction."""
         while end := _number_after(self._connection, self._series, self.last_number, CHUNK):
             columns = latest_columns(self._connection, self._series, self.last_number, end)
             insert_chunk(self._connection, self._series, self.rows, end, columns)
@@ -331,7 +333,7 @@ class SeriesColumns:
             self._merge()
 
     def _merge(self) -> None:
-        """Make one chunk of the last MERGED small ones, with what was calibrated meanwhile."""
+        """Merge the last MERGED small chunks, with later calibrations of their epochs."""
         chunks = self._chunks[-MERGED:]
         if len(chunks) < MERGED or any(size != 8 * CHUNK for _, size, *_ in chunks):
             return
@@ -342,14 +344,14 @@ class SeriesColumns:
             "WHERE series_id = ? AND first_row >= ?",
             (self._series, start),
         ):
-            _require(kept, self._series, name, first, *row, data)
+            _require_chunk(kept, self._series, name, first, *row, data)
             column = columns.setdefault(name, np.full(MERGED * CHUNK, np.nan))
             column[first - start :][:CHUNK] = np.frombuffer(data)
         if late := self._late_rows(len(self._chunks) - MERGED):
             renewed = _columns(self._connection, late, None)
             for name in renewed:
                 columns.setdefault(name, np.full(MERGED * CHUNK, np.nan))
-            _renew(columns, columns["number"].copy(), renewed)
+            _overwrite(columns, columns["number"].copy(), renewed)
         self._connection.execute(
             "DELETE FROM column_chunk WHERE series_id = ? AND first_row >= ?", (self._series, start)
         )
@@ -357,7 +359,7 @@ class SeriesColumns:
         self._find_chunks()
 
     def _late_rows(self, start: int) -> list[dict[str, Any]]:
-        """Read the calibrations that came after their chunk was written, from a chunk on."""
+        """Read the calibrations that are later than their chunk, from chunk `start` on."""
         condition = (
             "INDEXED BY epoch_revised WHERE series_id = ? AND number > ? AND number <= ? "
             "AND revision > 0 AND epoch.id > ? ORDER BY epoch.id"
@@ -371,7 +373,7 @@ class SeriesColumns:
         return rows
 
     def _fill(self, name: str, column: Array) -> None:
-        """Copy a column's chunks into (rows,); NaN where it did not exist yet, or any more."""
+        """Copy a column's chunks into `column` (rows,), NaN for chunks without it."""
         target = column.data.cast("B")  # copies faster than NumPy assigns
         sizes = {first: size for first, size, *_ in self._chunks}
         done = 0
@@ -382,7 +384,7 @@ class SeriesColumns:
         ):
             if sizes.get(first) != len(data):
                 raise _ChunkError(f"a chunk of column {name} is broken")
-            _require(kept, self._series, name, first, *row, data)
+            _require_chunk(kept, self._series, name, first, *row, data)
             column[done:first] = np.nan
             target[8 * first : 8 * first + len(data)] = data
             done = first + len(data) // 8

@@ -1,14 +1,13 @@
 """Epochs as rows of a store: one row each, its covariance and observations as compact bytes.
 
-An observation is 18 bytes: target row uint16, x and y int32 in units of 1e-5 px, their standard
-deviations float32; 4 more for the covariance of x and y where it is known, 4 for each quality.
-The rounding of 3e-6 px (rms) is a thousandth of the best measurement and the digits of
-observations.csv. A covariance is the 136 float64 of its upper triangle. All little-endian.
+An observation has 18 bytes: target row uint16, x and y int32 in units of 1e-5 px, their standard
+deviations float32; 4 more for the covariance of x and y if it is given, 4 for each quality. The
+rounding error of 3e-6 px (rms) is a thousandth of the best sd and equals that of observations.csv.
+A covariance is the 136 float64 of its upper triangle. All numbers are little-endian.
 
-And series as rows of the store; all rows as they lie in the file: what is damaged or missing, and
-what came since. SQLite's integrity check finds a broken structure, the checksums a value that
-changed, the numbers of the epochs a row that is gone. Rows are never changed or deleted, so the
-last id that was sent elsewhere is all a sender has to remember.
+The module also has the rows of series, and reads damaged, missing and new rows. SQLite's integrity
+check finds a broken structure, the checksums a changed value, the epochs' numbers a missing row. As
+rows are never changed or deleted, a forwarder only needs to remember the last id it sent.
 """
 
 from __future__ import annotations
@@ -70,13 +69,13 @@ _SDS = tuple(f"sd_{name}" for name in _VALUES)
 
 
 def pack_covariance(covariance: Array) -> bytes:
-    """(16, 16) → 1088 bytes."""
+    """Pack a covariance (16, 16) into 1088 bytes."""
     upper: Array = covariance[_UPPER]
     return upper.astype("<f8").tobytes()
 
 
 def unpack_covariance(data: bytes) -> Array:
-    """The inverse of `pack_covariance`; raises StoreError for another length."""
+    """Invert `pack_covariance`. Raises StoreError for another length."""
     if len(data) != 8 * len(_UPPER[0]):
         raise StoreError(f"a covariance of {len(data)} bytes in the store is broken")
     covariance = np.zeros((16, 16))
@@ -86,7 +85,7 @@ def unpack_covariance(data: bytes) -> Array:
 
 
 def pack_observations(seen: Observations) -> bytes:
-    """Observations → bytes; points rounded to 1e-5 px, the rest to float32."""
+    """Pack observations; points are rounded to 1e-5 px, the rest to float32."""
     quanta = np.rint(seen.points / POINT_QUANTUM_PX)
     flags = 0
     if seen.covariances is not None:
@@ -94,7 +93,7 @@ def pack_observations(seen: Observations) -> bytes:
     if len(seen) and int(seen.targets.max()) > 0xFFFF:
         flags |= _LONG_ROWS
     if not bool(np.all(np.abs(quanta) < 2**31)):
-        flags |= _FLOAT_POINTS  # beyond ±21474 px, or no number: kept as it is
+        flags |= _FLOAT_POINTS  # beyond ±21474 px, or not finite: as float64
     names = "\n".join(seen.quality).encode()
     parts = [
         _HEADER.pack(_LAYOUT, flags, len(seen), len(names)) + names,
@@ -111,9 +110,9 @@ def pack_observations(seen: Observations) -> bytes:
 
 
 def unpack_observations(data: bytes) -> Observations:
-    """The inverse of `pack_observations`; raises StoreError for bytes that are none."""
-    flags, n, start = _layout_of(data)
-    rows = _rows_of(flags, [(0, n, start, data)])
+    """Invert `pack_observations`. Raises StoreError for other bytes."""
+    flags, n, start = _read_header(data)
+    rows = _unpack(flags, [(0, n, start, data)])
     try:
         names = data[_HEADER.size : start].decode()
         end = start + n * sum(_sizes(flags))
@@ -127,30 +126,29 @@ def unpack_observations(data: bytes) -> Observations:
 
 
 def unpack_rows(packed: Mapping[int, bytes]) -> ObservationRows:
-    """The observations of many epochs {number: bytes}, without their quality.
+    """Return the observations of many epochs {number: bytes}, without their quality.
 
-    What would be taken epoch by epoch is taken from the bytes of all epochs at once. Raises
-    StoreError for bytes that are none.
+    The bytes of all epochs of one layout are converted at once. Raises StoreError for other bytes.
     """
     kinds: dict[int, list[tuple[int, int, int, bytes]]] = {}
     for number, data in packed.items():
-        flags, n, start = _layout_of(data)
+        flags, n, start = _read_header(data)
         kinds.setdefault(flags, []).append((number, n, start, data))
     return ObservationRows.join(
-        [_rows_of(flags, epochs) for flags, epochs in kinds.items()] or [_rows_of(0, [])]
+        [_unpack(flags, epochs) for flags, epochs in kinds.items()] or [_unpack(0, [])]
     )
 
 
-def _layout_of(data: bytes) -> tuple[int, int, int]:
-    """Return the flags of packed observations, how many there are, and where they begin."""
+def _read_header(data: bytes) -> tuple[int, int, int]:
+    """Return the flags of packed observations, their number, and the offset of the first."""
     if len(data) < _HEADER.size or data[0] != _LAYOUT:
-        raise StoreError("observations in the store are broken: they are of another layout")
+        raise StoreError("observations in the store are broken: their layout is unknown")
     _, flags, n, names_size = _HEADER.unpack_from(data)
     return flags, n, _HEADER.size + names_size
 
 
 def _sizes(flags: int) -> list[int]:
-    """Return the bytes of a target, a point, its standard deviations, and a covariance, if any.
+    """Return the sizes in bytes of a target, a point, its standard deviations, any covariance.
 
     The quality follows, column by column.
     """
@@ -158,8 +156,8 @@ def _sizes(flags: int) -> list[int]:
     return [*sizes, 4] if flags & _COVARIANCES else sizes
 
 
-def _rows_of(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> ObservationRows:
-    """Unpack epochs of one layout: their number, how many rows, where they begin, the bytes."""
+def _unpack(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> ObservationRows:
+    """Unpack epochs of one layout, each given as its number, rows, offset and bytes."""
     sizes = _sizes(flags)
     columns: list[list[bytes]] = [[] for _ in sizes]
     for _, n, position, data in epochs:
@@ -171,7 +169,7 @@ def _rows_of(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> Observati
     whole = [b"".join(column) for column in columns]
     points = np.frombuffer(whole[1], "<f8" if flags & _FLOAT_POINTS else "<i4").astype(np.float64)
     if not flags & _FLOAT_POINTS:
-        # dividing by 1e5 gives the decimal number's nearest double, times 1e-5 would not
+        # division by 1e5 gives the double nearest to the decimal; a product with 1e-5 would not
         points /= round(1 / POINT_QUANTUM_PX)
     numbers, counts = (np.array([e[k] for e in epochs], dtype=np.int64) for k in (0, 1))
     return ObservationRows(
@@ -184,11 +182,11 @@ def _rows_of(flags: int, epochs: list[tuple[int, int, int, bytes]]) -> Observati
 
 
 def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoch) -> None:
-    """Insert one epoch with its details; within the caller's transaction."""
+    """Insert one epoch with its details, in the caller's transaction."""
     epoch, result, seen = stored.epoch, stored.result, stored.epoch.observations
     connection.execute("INSERT OR IGNORE INTO status_code (status) VALUES (?)", (result.status,))
     id_ = next_id(connection, "epoch")
-    parts = _parts(epoch.number, id_, result.covariance, seen)
+    parts = _detail_rows(epoch.number, id_, result.covariance, seen)
     row: dict[str, Any] = {
         "id": id_,
         "series_id": series,
@@ -217,20 +215,20 @@ def insert_epoch(connection: sqlite3.Connection, series: int, stored: StoredEpoc
     insert_row(connection, "epoch", row)
     kept = connection.executemany("INSERT INTO detail (id, data) VALUES (?, ?)", parts).rowcount
     if parts and kept != len(parts):
-        raise sqlite3.IntegrityError("a trigger that is not ours keeps rows out of detail")
+        raise sqlite3.IntegrityError("a foreign trigger keeps rows out of detail; drop it")
 
 
-def _parts(
+def _detail_rows(
     number: int, id_: int, covariance: Array | None, seen: Observations | None
 ) -> list[tuple[int, bytes]]:
-    """Covariance and observations as rows of the table `detail`."""
+    """Return covariance and observations as rows of the table `detail`."""
     first = id_ * _PARTS
     parts = [] if covariance is None else [(first, pack_covariance(covariance))]
     if seen is not None:
         data = pack_observations(seen)
         cuts = range(0, len(data), _PART_BYTES)
         if len(cuts) >= _PARTS:
-            raise StoreError(f"epoch {number}: {len(seen)} observations are too many to keep")
+            raise StoreError(f"epoch {number}: {len(seen)} observations are too many to store")
         parts += [(first + 1 + i, data[c : c + _PART_BYTES]) for i, c in enumerate(cuts)]
     return parts
 
@@ -243,7 +241,7 @@ def select_epochs(
     *,
     details: bool = True,
 ) -> Iterator[StoredEpoch]:
-    """The epochs numbered `first` to `last` in their latest revision, one after the other.
+    """Yield epochs `first` to `last` (numbers), each in its latest revision.
 
     details: False leaves out observations and covariances. Raises StoreError for damage.
     """
@@ -255,15 +253,15 @@ def latest_epochs(
     rows: Iterable[Mapping[str, Any]],
     details: Callable[[Mapping[str, Any]], tuple[bytes, bytes]] | None,
 ) -> Iterator[StoredEpoch]:
-    """Each epoch in its latest revision, of rows by number and revision, of a file or of a server.
+    """Yield each epoch in its latest revision from rows of a file or a server.
 
-    details: gives the covariance and the observations of a row, packed; None leaves them out.
+    rows: by number and revision; details: gives a row's packed covariance, observations; or None.
     """
     for _, revisions in groupby(rows, key=itemgetter("number")):
         covariance = seen = b""
         every = list(revisions)
         if details is not None:
-            # a later calibration of observations that stay the same does not keep them again
+            # a later calibration of the same observations does not store them again
             measured = next((r for r in every[::-1] if r["measured"] is not None), every[-1])
             covariance, seen = details(every[-1])
             if measured is not every[-1]:
@@ -273,7 +271,7 @@ def latest_epochs(
             number=row["number"],
             frame_time=row["frame_time"],
             temperature_time=_nan(row["temperature_time"]),
-            temperatures=_mapping(row["temperatures"]),
+            temperatures=_parse_numbers(row["temperatures"]),
             frame=relative_path(row["frame"], f"epoch {row['number']}: frame", StoreError)
             if row["frame"]
             else None,
@@ -291,17 +289,16 @@ def latest_epochs(
             rejected=tuple(json.loads(row["rejected"])),
         )
         yield StoredEpoch(
-            epoch, result, _mapping(row["extra"]), bool(row["clock_trusted"]), row["revision"]
+            epoch, result, _parse_numbers(row["extra"]), bool(row["clock_trusted"]), row["revision"]
         )
 
 
 def select_observations(
     connection: sqlite3.Connection, series: int, first: int, last: int
 ) -> ObservationRows:
-    """The observations of the epochs numbered `first` to `last`, without their quality.
+    """Return the observations of epochs `first` to `last` (numbers), without their quality.
 
-    Raises StoreError where they are not as they were written; their epochs' other columns are left
-    unread.
+    Raises StoreError if they are damaged; the epochs' other columns are not read.
     """
     parts = connection.execute(
         "SELECT epoch.id, epoch.number, measured, detail_checksum, "
@@ -313,7 +310,7 @@ def select_observations(
     )
     packed: dict[int, bytes] = {}
     for (_, number, measured, checksum), rows in groupby(parts, key=itemgetter(0, 1, 2, 3)):
-        _, seen = _joined(
+        _, seen = _join_parts(
             number, checksum, [(part, data) for *_, part, data in rows if data is not None]
         )
         if measured is not None or number not in packed:
@@ -322,19 +319,19 @@ def select_observations(
 
 
 def read_details(connection: sqlite3.Connection, row: Mapping[str, Any]) -> tuple[bytes, bytes]:
-    """Read the covariance and the observations of a row, packed; empty where it has none.
+    """Read the packed covariance and observations of a row, empty if it has none.
 
-    Raises StoreError where they are not as they were written.
+    Raises StoreError if they are damaged.
     """
     parts = connection.execute(
         "SELECT id - :low, data FROM detail WHERE id >= :low AND id < :high ORDER BY id",
         {"low": row["id"] * _PARTS, "high": (row["id"] + 1) * _PARTS},
     ).fetchall()
-    return _joined(row["number"], row["detail_checksum"], parts)
+    return _join_parts(row["number"], row["detail_checksum"], parts)
 
 
-def _joined(number: int, kept: int, parts: list[tuple[int, bytes]]) -> tuple[bytes, bytes]:
-    """Join covariance and observations from their parts, which must be as they were written."""
+def _join_parts(number: int, kept: int, parts: list[tuple[int, bytes]]) -> tuple[bytes, bytes]:
+    """Join covariance and observations from their parts. Raises DamageError."""
     covariance = b"".join(bytes(data) for part, data in parts if part == 0)
     seen = b"".join(bytes(data) for part, data in parts if part)
     what = f"epoch {number}: its covariance or its observations"
@@ -347,7 +344,7 @@ def _numbers_json(values: Mapping[str, float]) -> str:
     return json.dumps(finite)
 
 
-def _mapping(text: str) -> dict[str, float]:
+def _parse_numbers(text: str) -> dict[str, float]:
     return {name: _nan(value) for name, value in json.loads(text).items()}
 
 
@@ -356,7 +353,7 @@ def _nan(value: float | None) -> float:
 
 
 def series_row(series: StoredSeries) -> tuple[dict[str, Any], str]:
-    """Return a series as file and server keep it, with its test field's digest; and the field."""
+    """Return a series as the row of a file or a server, and its test field as text."""
     csv = testfield_csv(series.testfield)
     row = {
         "camera": series.camera, "name": series.name, "start": series.start,
@@ -368,7 +365,7 @@ def series_row(series: StoredSeries) -> tuple[dict[str, Any], str]:
 
 
 def insert_series(connection: sqlite3.Connection, series: StoredSeries) -> None:
-    """Insert a series, and its test field if it is a new one; within the caller's transaction."""
+    """Insert a series, and its test field if it is new, in the caller's transaction."""
     row, csv = series_row(series)
     *texts, created = row.values()
     connection.execute(
@@ -383,7 +380,7 @@ def insert_series(connection: sqlite3.Connection, series: StoredSeries) -> None:
 
 
 def select_series(connection: sqlite3.Connection, path: Path) -> list[StoredSeries]:
-    """All series in the order in which they were begun; `path` is for the messages."""
+    """Return all series in the order in which they were begun; `path` is for the messages."""
     rows = connection.execute(
         "SELECT s.id, created_utc, s.checksum, csv, camera, name, start, head, identity, settings, "
         "digest FROM series s JOIN testfield t ON t.id = testfield_id ORDER BY s.id"
@@ -391,23 +388,23 @@ def select_series(connection: sqlite3.Connection, path: Path) -> list[StoredSeri
     if not rows and connection.execute("SELECT 1 FROM epoch LIMIT 1").fetchone():
         known = connection.execute("SELECT 1 FROM series JOIN testfield LIMIT 1").fetchone()
         if known is None:
-            raise StoreError(f"{path}: is damaged: its series or test fields are gone")
-    return [_series(path, *row) for row in rows]
+            raise StoreError(f"{path}: is damaged: its series or test fields are missing")
+    return [_read_series(path, *row) for row in rows]
 
 
-def _series(
+def _read_series(
     path: Path, number: int, created: float, kept: int, csv: str, *texts: str
 ) -> StoredSeries:
     camera, name, start, head, identity, settings, digest = texts
     what = f"{path}: series {camera}/{name}"
     require_checksum(kept, what, (created,), texts)
     if hashlib.sha256(csv.encode(errors="surrogateescape")).hexdigest() != digest:
-        raise StoreError(f"{what}: its test field is damaged: it is not what its digest says")
+        raise StoreError(f"{what}: its test field does not match its digest; restore a backup")
     file_name(camera, f"{what}: camera", StoreError)
     file_name(name, f"{what}: series", StoreError)
     parsed = parse_head(json.loads(head), path)
     if (parsed.camera.name, parsed.series) != (camera, name):
-        raise StoreError(f"{what}: its head is of {parsed.camera.name!r}/{parsed.series!r}")
+        raise StoreError(f"{what}: its head names {parsed.camera.name!r}/{parsed.series!r}")
     return StoredSeries(
         number, parsed, parse_testfield(csv, path), start, json.loads(identity),
         json.loads(settings), created,
@@ -415,13 +412,13 @@ def _series(
 
 
 def to_json(mapping: Mapping[str, Any]) -> str:
-    """A mapping as the text that a row keeps."""
+    """Return a mapping as JSON; other values, such as paths, become text."""
     return json.dumps(dict(mapping), default=str)
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Epochs `first` to `last` of a series are not in the store."""
+    """Epochs `first` to `last` of a series that are missing in the store."""
 
     camera: str
     series: str
@@ -431,17 +428,19 @@ class Gap:
     @property
     def text(self) -> str:
         """The gap in a sentence."""
-        if self.first == self.last:
-            return f"{self.camera}/{self.series}: epoch {self.first} is missing"
-        count = self.last - self.first + 1
         where = f"{self.camera}/{self.series}"
+        if self.first == self.last:
+            return f"{where}: epoch {self.first} is missing"
+        count = self.last - self.first + 1
         return f"{where}: epochs {self.first} to {self.last} are missing ({count})"
 
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """damaged: a sentence each; epochs: how many rows were read;
-    unfinished: the last write to the -wal file was cut off, see `wal`.
+    """The result of reading a whole store.
+
+    damaged: phrases; epochs: number of their rows; unfinished: the last write to the -wal file was
+    cut off, see `WalTail`.
     """
 
     damaged: tuple[str, ...]
@@ -451,7 +450,7 @@ class Examination:
 
 
 def examine(connection: sqlite3.Connection) -> Examination:
-    """Read everything; raises sqlite3.Error where the file's structure is broken."""
+    """Read everything. Raises sqlite3.Error if the file's structure is broken."""
     damaged = [
         f"the file's structure: {verdict}"
         for (verdict,) in connection.execute("PRAGMA integrity_check(20)")
@@ -486,10 +485,10 @@ def examine(connection: sqlite3.Connection) -> Examination:
 def whole_rows(
     connection: sqlite3.Connection, table: str, condition: str, values: Sequence[Any] = ()
 ) -> Iterator[dict[str, Any]]:
-    """Rows of a table in KEPT as {column: value}, read as they lie in the file.
+    """Yield rows of a table in KEPT as {column: value}, damaged ones too.
 
-    An epoch also has `covariance` and `observations`, packed bytes or None. Every row has `damage`:
-    empty, or in a sentence how it is not as it was written.
+    An epoch also has `covariance` and `observations`, packed bytes or None. Every row has `damage`,
+    a sentence or empty.
     """
     for row, damage in examined_rows(connection, table, condition, values):
         if table == "epoch" and damage is None:
@@ -503,9 +502,10 @@ def whole_rows(
 
 @dataclass(frozen=True, slots=True)
 class KeptFrame:
-    """An epoch's row, and where its frame was kept: path relative to the frames' folder or None.
+    """An epoch and its frame.
 
-    eventful: without a result, or something happened to the camera.
+    id: of the epoch's row; path: relative to the frames' folder, None without a frame; eventful:
+    the epoch has no result, or an event of the camera.
     """
 
     id: int
@@ -517,16 +517,16 @@ class KeptFrame:
 
 
 def frames_after(connection: sqlite3.Connection, after: int, limit: int) -> Iterator[KeptFrame]:
-    """Up to `limit` epochs with an id above `after`, with or without a frame."""
+    """Yield up to `limit` epochs with an id above `after`, with or without a frame."""
     for id_, series, number, time, status, extra, frame in connection.execute(
         "SELECT id, series_id, number, frame_time, status, extra, frame FROM epoch "
         "WHERE id > ? ORDER BY id LIMIT ?",
         (after, limit),
     ):
-        path, happened = None, False
+        path, eventful = None, False
         try:
             path = relative_path(frame, f"epoch {number}: frame", StoreError) if frame else None
-            happened = status not in (*WITH_VALUES, NOT_CALIBRATED) or "event" in json.loads(extra)
+            eventful = status not in (*WITH_VALUES, NOT_CALIBRATED) or "event" in json.loads(extra)
         except (StoreError, ValueError) as error:
             log.warning("%s; its frame is left out", error)
-        yield KeptFrame(id_, series, number, time, path, happened)
+        yield KeptFrame(id_, series, number, time, path, eventful)

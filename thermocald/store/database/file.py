@@ -1,14 +1,14 @@
-"""The SQLite file of a store: locked for one writer, opened, copied, its errors in words.
+"""The SQLite file of a store: lock it for one writer, open it, copy it, explain its errors.
 
-The lock is on the file itself, whatever name it was opened by.
-SQLite keeps what was committed last in the file `<store>-wal` until it is moved into the store. To
-read it, the helper file `-shm` must be there, or be made; a file opened with `immutable=1`
-is read without it, and lacks those epochs.
+The lock is on the file itself, under whatever name it was opened.
+SQLite writes commits into the file `<store>-wal` and moves them into the store later. To read them,
+the helper file `-shm` must exist or be created; a file opened with `immutable=1` is read without
+it and lacks those epochs.
 
-SQLite reads the frames of the -wal up to the first whose checksum does not match, and takes what
-follows for what a crash cut off. That is right for the last transaction, which may not have been
-committed; one that another follows, or that the index in the -shm file counts, was committed, and
-what does not match is damage.
+SQLite reads the frames of the -wal up to the first whose checksum does not match, and treats the
+rest as cut off by a crash. That is right for the last transaction, which may not have been
+committed. A transaction that is followed by another, or counted by the index in the -shm file, was
+committed: a wrong checksum in it is damage.
 Formats: https://www.sqlite.org/fileformat2.html#the_write_ahead_log,
 https://www.sqlite.org/walformat.html#the_wal_index_file_format
 """
@@ -43,10 +43,10 @@ log = logging.getLogger(__name__)
 
 Mode = Literal["read", "append"]
 
-_APPLICATION_ID = 0x74686572  # "ther": distinguishes our files from other SQLite files
-# of version 1 as it was before it was published
+_APPLICATION_ID = 0x74686572  # "ther": distinguishes a store from other SQLite files
+# a table of version 1 before its release
 _EARLIER_TABLE = "SELECT 1 FROM sqlite_master WHERE name = 'late_epoch'"
-# 4 KiB pages would hold one row of 2.1 to 4 kB each and stand half empty.
+# A page of 4 KiB would hold one row of 2.1 to 4 kB and be half empty.
 _PAGE_SIZE = 8192
 _BUSY_S = 10.0
 # A quota or a limit on the size of files shows as an error of writing or growing a file.
@@ -54,30 +54,30 @@ _NO_ROOM = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_TRUNCATE", "SQLIT
 _READ_ONLY = "the file or its folder is read-only; make it writable or choose another store"
 _NO_STORE = "it is not a store, or it is damaged ({})"
 _ADVICE = {
-    "SQLITE_FULL": "the disk is full; free some space, nothing that was stored before is lost",
-    "SQLITE_IOERR": "the disk failed or is full ({}); what was stored before is not touched",
+    "SQLITE_FULL": "the disk is full; free some space; nothing stored before is lost",
+    "SQLITE_IOERR": "the disk failed or is full ({}); what was stored before is unchanged",
     "SQLITE_READONLY": _READ_ONLY,
     "SQLITE_PERM": _READ_ONLY,
-    "SQLITE_CANTOPEN": "it cannot be opened; does its folder exist, and may this user write there?",
+    "SQLITE_CANTOPEN": "it cannot be opened; check that its folder exists and may be written",
     "SQLITE_BUSY": f"another process kept it locked for more than {_BUSY_S:g} s",
     "SQLITE_NOTADB": _NO_STORE,
     "SQLITE_CORRUPT": _NO_STORE,
 }
-"""By the beginning of SQLite's name of an error; {}: its own words."""
-# A small card must not be full of what waits to be moved; a replay need not sync so often.
+"""Advice by the beginning of SQLite's name of an error; {}: SQLite's message."""
+# The -wal file must not fill a small card; a replay need not sync so often.
 _WAL_LIMIT_BYTES = {True: 1_000_000, False: 4_000_000}  # durable or not
 _MMAP_BYTES = 2**31 - 1
 _ATTEMPTS = 3
-# SQLite's own locks of a file end when any descriptor of it is closed by this process: so a file
-# that is claimed already is not opened a second time.
+# SQLite's own locks of a file end when this process closes any descriptor of it, so a claimed file
+# must not be opened a second time.
 _CLAIMED: set[tuple[int, int]] = set()
 
 
 class StoreFile:
-    """A claimed file; the kernel gives the lock back however the process ends.
+    """A store's file with a lock, which the kernel releases however the process ends.
 
-    Makes an empty file where there is none. Raises StoreError where it cannot be written, or where
-    another process has it.
+    Creates an empty file if there is none. Raises StoreError if it cannot be written, or if another
+    process holds the lock.
     """
 
     def __init__(self, path: Path) -> None:
@@ -88,7 +88,7 @@ class StoreFile:
             raise _taken(path)
         self._made = found is None
         if found is not None and not path.is_dir() and not is_ordinary(path):
-            raise StoreError(f"{path}: is a device or a pipe; a store is a file of its own")
+            raise StoreError(f"{path}: is a device or a pipe; a store must be a regular file")
         try:
             self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
@@ -104,19 +104,19 @@ class StoreFile:
         _CLAIMED.add(self.identity)
 
     def release(self) -> None:
-        """Give the lock back; after the database was closed."""
+        """Release the lock; close the database first."""
         _CLAIMED.discard(self.identity)
         os.close(self._handle)
 
     def discard_empty(self) -> None:
-        """Remove a file that was only made to be locked; one that was there before stays."""
+        """Remove the file if it was created for the lock and is still empty."""
         empty = os.fstat(self._handle).st_size == 0
         if self._made and empty and _identity(self.path) == self.identity:
             self.path.unlink(missing_ok=True)
 
     @property
     def deleted(self) -> bool:
-        """Whether no name leads to the file any more."""
+        """Whether the file has no name any more."""
         return os.fstat(self._handle).st_nlink == 0
 
     @property
@@ -125,13 +125,13 @@ class StoreFile:
         return _identity(self.path) == self.identity
 
     def remember_helpers(self) -> None:
-        """Note which -wal and -shm files the open database uses, as soon as they are there."""
+        """Remember which -wal and -shm files the open database uses, once they exist."""
         for kind in HELPERS:
             if kind not in self._helpers and (found := _identity(helper(self.path, kind))):
                 self._helpers[kind] = found
 
     def helper_there(self, kind: str) -> bool:
-        """Whether one of HELPERS is still the file that was noted."""
+        """Return whether a file of HELPERS is still the one remembered, or none was remembered."""
         return self._helpers.get(kind) in (None, _identity(helper(self.path, kind)))
 
 
@@ -139,17 +139,16 @@ HELPERS = ("wal", "shm")
 
 
 def helper(path: Path, kind: str) -> Path:
-    """Return the path of a store's -wal or -shm file: next to what a link leads to."""
+    """Return the path of a store's -wal or -shm file, beside the target of a link."""
     return Path(f"{os.path.realpath(path)}-{kind}")  # `resolve` raises RuntimeError for a loop
 
 
 def written_elsewhere(path: Path) -> bool:
-    """Whether a file with several names is being written under another of them, or was and its
-    writer was killed.
+    """Return whether a file is (or was, by a killed writer) written under another of its names.
 
-    Then what was committed last is in a -wal file that cannot be found from this name, but where
-    the other name is in the same folder. Nothing is opened here: SQLite's locks of this process
-    would end with it.
+    The latest commits are then in a -wal file that can be found from this name only if the other
+    one is in the same folder. The file is not opened here, as closing it would end SQLite's locks
+    of this process.
     """
     found = path.stat()
     wal = helper(path, "wal")
@@ -174,12 +173,12 @@ def written_elsewhere(path: Path) -> bool:
 
 def _taken(path: Path) -> StoreError:
     return StoreError(
-        f"{path}: another thermocald writes it; end that one first, or choose another store"
+        f"{path}: another thermocald process writes to it; stop that one, or choose another store"
     )
 
 
 def _identity(path: Path, *, data: bool = False) -> tuple[int, ...] | None:
-    """Return what is the same for one file under all its names; data: and while it is as it is."""
+    """Return what identifies a file under all its names; data: also its size and time."""
     try:
         status = path.stat()
     except OSError:
@@ -192,7 +191,7 @@ def _identity(path: Path, *, data: bool = False) -> tuple[int, ...] | None:
 def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]:
     """Turn SQLite's errors into a StoreError that says what to do.
 
-    reading: what was read may be no text or number of ours, which tells of damage as well.
+    reading: errors of parsing what was read are damage of the store as well.
     """
     try:
         yield
@@ -218,22 +217,22 @@ def in_words(path: Path, doing: str, *, reading: bool = False) -> Iterator[None]
 
 
 def _name(cause: sqlite3.Error) -> str:
-    """SQLite's name of the error, such as SQLITE_IOERR_WRITE; empty where Python raised it."""
+    """Return SQLite's name of an error, such as SQLITE_IOERR_WRITE; empty if Python raised it."""
     return getattr(cause, "sqlite_errorname", "") or ""
 
 
 def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
-    """Open or, for appending, make the file; older versions are brought up to date.
+    """Open the file, or create it to append; an older version is upgraded.
 
-    Raises StoreError, StoreVersionError for a file of a newer program, or of one that was never
-    published.
+    Raises StoreError; StoreVersionError for a file of a newer version, or of one before the first
+    release.
     """
     if mode == "read" and not path.is_file():
         raise StoreError(f"{path}: there is no such store")
     if mode == "read" and written_elsewhere(path):
         raise StoreError(
-            f"{path}: is or was written under another of its names (hard links), and lacks what "
-            "was written last; read it under that name"
+            f"{path}: is or was written under another of its names (hard links) and lacks the "
+            "latest data; read it under that name"
         )
     with in_words(path, "the store cannot be opened", reading=True):
         connection = _open(path, mode)
@@ -241,10 +240,10 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
         with in_words(path, "the store cannot be opened", reading=True):
             version = _version(connection, path)
             if version == 0 and mode == "read":
-                raise StoreError(f"{path}: is empty, nothing was stored yet")
+                raise StoreError(f"{path}: is empty; nothing was stored yet")
             if version < len(schema.FILE_STEPS) and mode == "read":
                 connection.close()
-                connection = open_copy(path, _upgrade)  # who reads changes nothing
+                connection = open_copy(path, _upgrade)  # reading must not change the file
             elif version < len(schema.FILE_STEPS):
                 if version:
                     _backup_version(connection, path, version)
@@ -253,7 +252,7 @@ def connect(path: Path, mode: Mode, *, durable: bool) -> sqlite3.Connection:
                 connection.execute("PRAGMA journal_mode = WAL")
                 _upgrade(connection)
             if mode == "append":
-                connection.execute("PRAGMA journal_mode = WAL")  # a restored backup has it not
+                connection.execute("PRAGMA journal_mode = WAL")  # a backup is not in WAL mode
                 # with FULL, what is committed survives a power cut; with NORMAL, a killed process
                 connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
                 limit = _WAL_LIMIT_BYTES[durable]
@@ -276,7 +275,7 @@ def _open(path: Path, mode: Mode) -> sqlite3.Connection:
         connection.execute("SELECT 1 FROM sqlite_master").fetchone()
     except sqlite3.OperationalError as cause:
         connection.close()
-        # where its folder cannot be written, WAL's helper files cannot be made
+        # WAL's helper files cannot be created if the folder is read-only
         if not _name(cause).startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY")):
             raise
         return open_copy(path)
@@ -294,7 +293,7 @@ def _connect(path: Path, mode: str) -> sqlite3.Connection:
         isolation_level=None,  # transactions are begun and ended by hand
         check_same_thread=False,
     )
-    # a damaged text must show as a wrong checksum of its row, not as an error of the whole query
+    # a damaged text must give a wrong checksum of its row, not an error of the whole query
     connection.text_factory = lambda data: data.decode(errors="surrogateescape")
     return connection
 
@@ -304,18 +303,18 @@ def _version(connection: sqlite3.Connection, path: Path) -> int:
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
     if application != _APPLICATION_ID and (tables or application or version):
-        raise StoreError(f"{path}: is an SQLite file, but no thermocald store")
+        raise StoreError(f"{path}: is an SQLite file, but not a thermocald store")
     known = len(schema.FILE_STEPS)
     if version > known:
         copy = _copy_of_version(path, known)
-        older = f", or go on with {copy}, the copy made before" if copy.exists() else ""
+        older = f", or use {copy}, the backup made before" if copy.exists() else ""
         raise StoreVersionError(
-            f"{path}: is a store of version {version}, this program knows up to {known}; "
+            f"{path}: is a store of version {version}, but this program reads up to {known}; "
             f"update thermocald{older}"
         )
     if connection.execute(_EARLIER_TABLE).fetchone():
         raise StoreVersionError(
-            f"{path}: was written by an earlier development state of this program; to keep its "
+            f"{path}: was written by a version of this program before its release; to keep its "
             f"data, run `thermocald archive {path} --to FOLDER` with the program that wrote it, "
             "then `thermocald replay` with --store for each recording in FOLDER"
         )
@@ -323,10 +322,10 @@ def _version(connection: sqlite3.Connection, path: Path) -> int:
 
 
 def _upgrade(connection: sqlite3.Connection) -> None:
-    """Bring a store of any version to this program's, all or nothing."""
+    """Upgrade a store of any version to this program's, in one transaction."""
     connection.execute("BEGIN IMMEDIATE")
     try:
-        # another process may have been faster
+        # another process may have upgraded it meanwhile
         (before,) = connection.execute("PRAGMA user_version").fetchone()
         version = schema.upgrade(connection.execute, before, schema.FILE_STEPS)
         if not before:
@@ -344,7 +343,7 @@ def _copy_of_version(path: Path, version: int) -> Path:
 
 
 def _backup_version(connection: sqlite3.Connection, path: Path, version: int) -> None:
-    """Copy an older file before it is changed: `<name>.version-<version>`, made once."""
+    """Back up an older file before its upgrade, once, as `<name>.version-<version>`."""
     copy = _copy_of_version(path, version)
     if copy.exists():
         return
@@ -352,17 +351,17 @@ def _backup_version(connection: sqlite3.Connection, path: Path, version: int) ->
         copy_database(connection, copy)
     except (OSError, sqlite3.Error) as error:
         raise StoreError(
-            f"{path}: is of version {version}; a backup of it must be made before it is brought "
-            f"up to date, and {copy} cannot be written ({error}); nothing was changed"
+            f"{path}: is of version {version} and must be backed up before its upgrade, but "
+            f"{copy} cannot be written ({error}); nothing was changed"
         ) from error
     known = len(schema.FILE_STEPS)
-    log.info("%s: brought from version %d to %d; backup: %s", path, version, known, copy)
+    log.info("%s: is upgraded from version %d to %d; backup: %s", path, version, known, copy)
 
 
 def copy_database(source: sqlite3.Connection, target: Path) -> None:
-    """Copy what a connection sees to a file that appears whole or not at all (online backup).
+    """Copy a database (online backup) to a file that appears as a whole or not at all.
 
-    A writer is not held up. Raises OSError or sqlite3.Error.
+    A writer is not blocked. Raises OSError or sqlite3.Error.
     """
     target, straight = output_place(target)
     if straight:
@@ -370,7 +369,7 @@ def copy_database(source: sqlite3.Connection, target: Path) -> None:
     partial = target.with_name(f".{target.name}.partial")
     try:
         partial.unlink(missing_ok=True)
-        partial.touch()  # SQLite would not say why it cannot
+        partial.touch()  # raises with the reason, which SQLite would not give
         with closing(sqlite3.connect(partial)) as copy:
             source.backup(copy)
             copy.execute("PRAGMA journal_mode = DELETE")
@@ -390,38 +389,34 @@ def copy_database(source: sqlite3.Connection, target: Path) -> None:
 def open_copy(
     path: Path, change: Callable[[sqlite3.Connection], None] | None = None
 ) -> sqlite3.Connection:
-    """Open a store whose folder cannot be written, with all that its -wal file holds.
+    """Open a store whose folder cannot be written, including its -wal file.
 
-    Without a -wal file it is read where it is. Else file and -wal are copied to the folder for
-    temporary files, joined there and opened; the copy is gone with the connection. change: made to
-    the copy first, which then is needed in any case. Raises StoreError, sqlite3.Error.
+    Without a -wal file it is read in place. Otherwise file and -wal are copied to the folder for
+    temporary files, merged there and opened; the copy is gone when the connection is closed.
+    change: applied to the copy, which is then always made. Raises StoreError, sqlite3.Error.
     """
     wal = helper(path, "wal")
     if change is None and not (wal.exists() and wal.stat().st_size):
         return _connect(path, "ro&immutable=1")
     try:
-        folder = Path(tempfile.mkdtemp(prefix="thermocald-"))
+        with tempfile.TemporaryDirectory("", "thermocald-", ignore_cleanup_errors=True) as folder:
+            copy = Path(folder) / "copy.db"
+            _copy_files(path, wal, copy)
+            with closing(_connect(copy, "rw")) as connection:
+                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+                if change is not None:
+                    change(connection)
+                connection.execute("PRAGMA journal_mode = DELETE")
+            opened = _connect(copy, "ro&immutable=1")
+            # SQLite opens the file only now, before the folder is removed
+            opened.execute("SELECT 1 FROM sqlite_master").fetchone()
+            return opened
     except OSError as error:
         raise StoreError(f"{path}: no private copy can be made: {error}") from error
-    try:
-        copy = folder / "copy.db"
-        _copy_files(path, wal, copy)
-        with closing(_connect(copy, "rw")) as connection:
-            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            if change is not None:
-                change(connection)
-            connection.execute("PRAGMA journal_mode = DELETE")
-        opened = _connect(copy, "ro&immutable=1")
-        opened.execute("SELECT 1 FROM sqlite_master").fetchone()  # opens the file before it goes
-        return opened
-    except OSError as error:
-        raise StoreError(f"{path}: no private copy can be made: {error}") from error
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _copy_files(path: Path, wal: Path, copy: Path) -> None:
-    """Copy file and -wal as they are at one time: a writer elsewhere may be at work."""
+    """Copy file and -wal in one state, although another process may be writing."""
     for _ in range(_ATTEMPTS):
         before = _identity(path, data=True), _identity(wal, data=True)
         shutil.copyfile(path, copy)
@@ -430,7 +425,7 @@ def _copy_files(path: Path, wal: Path, copy: Path) -> None:
         if (_identity(path, data=True), _identity(wal, data=True)) == before:
             return
     raise StoreError(
-        f"{path}: is being written by another process, and its -shm file may not be read by you; "
+        f"{path}: is being written by another process, and you may not read its -shm file; "
         "join that user's group, or use sudo"
     )
 
@@ -440,14 +435,16 @@ _FRAME = struct.Struct(">6I")  # page, size of the database after a commit, two 
 _MAGIC = 0x377F0682
 _INDEX_BYTES = 48
 _DAMAGED_SALT_BITS = 3  # salts of another run differ in about half of their 64 bits
-_LOOKS, _PAUSE_S = 3, 0.02
+_TRIES, _PAUSE_S = 3, 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class WalTail:
-    """lost: committed transactions that cannot be read, -1 for all of them; unfinished: the last
-    transaction cannot be read, and nothing says that it was committed: its writer was killed, or
-    the file was cut off when it was copied, and more may have followed.
+    """The transactions of a -wal file that cannot be read.
+
+    lost: number of committed ones, -1 for all of them; unfinished: the last one is incomplete and
+    may not have been committed. Its writer was killed, or the file was cut off in copying, and more
+    may have followed.
     """
 
     lost: int = 0
@@ -455,17 +452,17 @@ class WalTail:
 
 
 def read_wal_tail(path: Path) -> WalTail:
-    """Look at a -wal file, and at the -shm file beside it; it may be written meanwhile."""
-    for _ in range(_LOOKS):
-        tail = _look(path)
+    """Read a -wal file, with the -shm file beside it; they may be written meanwhile."""
+    for _ in range(_TRIES):
+        tail = _read_tail(path)
         if tail == WalTail():
             break
-        time.sleep(_PAUSE_S)  # half of what is just being written looks like damage
+        time.sleep(_PAUSE_S)  # a frame that is only half written looks like damage
     return tail
 
 
-def _look(path: Path) -> WalTail:
-    committed = _committed_frames(path)  # first: what is committed later may be read half-written
+def _read_tail(path: Path) -> WalTail:
+    committed = _committed_frames(path)  # first: later commits may be read half-written
     try:
         data = path.read_bytes()
     except OSError:
@@ -478,15 +475,15 @@ def _look(path: Path) -> WalTail:
     if magic & ~1 != _MAGIC or sums != (first, second) or page_size % 512:
         return WalTail(lost=-1)
     broken = earlier = False
-    whole = ended = 0  # frames that are there, and up to the last end of a transaction
-    commits: list[int] = []  # numbers of the frames that end a transaction, from the broken one on
+    whole = ended = 0  # number of frames, and of those up to the last end of a transaction
+    commits: list[int] = []  # numbers of frames that end a transaction, from the broken one on
     step = _FRAME.size + page_size
     for number, at in enumerate(range(_HEADER.size, len(data) - step + 1, step), 1):
         _, commit, *frame_salts, first, second = _FRAME.unpack_from(data, at)
         if frame_salts != salts:
             pairs = zip(frame_salts, salts, strict=True)
             if sum((one ^ two).bit_count() for one, two in pairs) > _DAMAGED_SALT_BITS:
-                earlier = True  # of an earlier run
+                earlier = True  # frames from before the -wal file was restarted
                 break
             broken = True
         if not broken:
@@ -505,7 +502,7 @@ def _look(path: Path) -> WalTail:
 
 
 def _committed_frames(wal: Path) -> dict[bytes, int]:
-    """{salts of a -wal file: how many frames of it the index counts as committed}."""
+    """Return {salts of a -wal file: number of its frames that the index counts as committed}."""
     try:
         with wal.with_name(f"{wal.name.removesuffix('-wal')}-shm").open("rb") as file:
             one, two = file.read(_INDEX_BYTES), file.read(_INDEX_BYTES)

@@ -1,8 +1,8 @@
-"""The store: everything of a daemon in one SQLite file.
+"""The store: all data of a daemon in one SQLite file.
 
-Several cameras, each with series of epochs. An epoch is one transaction: a killed writer loses at
-most the current epoch. Nothing is changed or deleted: a later calibration of an epoch is a further
-revision, and triggers in the file refuse everything else.
+It holds several cameras, each with series of epochs. An epoch is one transaction, so a writer that
+is killed loses at most the current epoch. Nothing is changed or deleted: a later calibration of an
+epoch is a further revision, and triggers in the file refuse any change.
 """
 
 from __future__ import annotations
@@ -69,21 +69,21 @@ class Store(SeriesReader):
         self.path = path
         self.closed = False
         self._db = connection
-        self._file = file  # whose lock is given back with the store
+        self._file = file  # None if the caller holds the lock, or there is none
         self._lock = threading.RLock()
         self._unchunked: set[int] = set()  # series whose chunks cannot be built
-        # series → last number, rows in no chunk
+        # series → last epoch number, number of rows that are in no chunk
         self._ends: dict[int, tuple[int | None, int]] = {}
 
     @classmethod
     def open(
         cls, path: Path, mode: Mode = "read", *, durable: bool = True, claimed: bool = False
     ) -> Self:
-        """Open a store; for appending it is made if it does not exist, and locked for one writer.
+        """Open a store; `append` creates it if it does not exist and locks it for one writer.
 
-        durable: what is committed survives a power cut; False: the end of the process only, for
-        what can be computed again; claimed: the caller holds the lock, a StoreFile. Raises
-        StoreError, StoreVersionError.
+        durable: a commit survives a power cut; False: only the end of the process, for results that
+        can be computed again; claimed: the caller holds the lock, a StoreFile. Raises StoreError,
+        StoreVersionError.
         """
         if mode == "read" or claimed:
             return cls(path, connect(path, mode, durable=durable), None)
@@ -91,8 +91,8 @@ class Store(SeriesReader):
         try:
             if file.names > 1:
                 raise StoreError(
-                    f"{path}: has {file.names} names (hard links), and SQLite keeps what was "
-                    "written last beside one of them; remove the others, or use a symbolic link"
+                    f"{path}: has {file.names} names (hard links), and SQLite puts the latest data "
+                    "beside only one of them; remove the others, or use a symbolic link"
                 )
             return cls(path, connect(path, mode, durable=durable), file)
         except BaseException:
@@ -101,7 +101,6 @@ class Store(SeriesReader):
             raise
 
     def close(self) -> None:
-        """Close the file and give its lock back; may be called twice."""
         with self._lock, in_words(self.path, "the store cannot be closed"):
             self.closed = True
             self._db.close()
@@ -111,31 +110,30 @@ class Store(SeriesReader):
 
     @property
     def identity(self) -> str:
-        """A UUID that the store was given when it was made: a copy has the same."""
+        """The UUID that the store got when it was created; a copy has the same."""
         return str(self._value("SELECT identity FROM store"))
 
     def all_series(self) -> list[StoredSeries]:
-        """All series, in the order in which they were begun."""
         with self._reads("the series") as connection:
             return epochs.select_series(connection, self.path)
 
     def last_epoch(self, series: StoredSeries) -> int | None:
-        """The number of the last epoch kept, None if there is none: where to resume."""
+        """Return the number of the last epoch, after which to resume; None without epochs."""
         found = self._value("SELECT max(number) FROM epoch WHERE series_id = ?", series.id)
         if found is not None and not isinstance(found, int):
             raise columns.DamageError(
-                f"{self.path}: an epoch of {series.head.series} has the number {found!r}: the "
-                "store is damaged; restore a backup"
+                f"{self.path}: the store is damaged: an epoch of {series.head.series} has the "
+                f"number {found!r}; restore a backup"
             )
         return found
 
     def _epochs(
         self, series: StoredSeries, first: int, last: int | None, details: bool
     ) -> Iterator[StoredEpoch]:
-        """As they are read; what is missing of a whole series is logged at its end.
+        """Yield epochs; after a whole series, log a warning if some of its epochs are missing.
 
-        Page by page: no statement is open while another thread may close the file. SQLite's library
-        ends the process where a connection is closed under a statement.
+        They are read in pages, so that no statement is open while another thread may close the
+        file: SQLite's library crashes if a connection is closed during a statement.
         """
         whole = not first and last is None
         missing, size, first = 0, _EPOCHS_AT_ONCE, first or 1
@@ -160,17 +158,15 @@ class Store(SeriesReader):
             size = len(page)
         if whole and (missing := missing + max(0, (self.last_epoch(series) or 0) + 1 - first)):
             log.warning(
-                "%s: %d epochs of series %s are missing; `thermocald check` says which",
+                "%s: %d epochs of series %s are missing; `thermocald check` lists them",
                 self.path, missing, series.name,
             )  # fmt: skip
 
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        """The observations of the epochs numbered `first` to `last`, without their quality."""
         with self._reads("observations") as connection:
             return epochs.select_observations(connection, series.id, first, last)
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
-        """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
         result = np.full((len(numbers), 16, 16), np.nan)
         with self._reads("covariances") as connection:
             for i, number in enumerate(map(int, numbers)):
@@ -182,8 +178,7 @@ class Store(SeriesReader):
     def stamped_columns(
         self, series: StoredSeries, names: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
-        """Columns (E,) over all epochs by name, with times as they were stamped."""
-        source = {name: _source(name, series) for name in names}
+        source = {name: _chunk_name(name, series) for name in names}
         with self._reads("columns") as connection:
             found = columns.read_columns(connection, series.id, [*dict.fromkeys(source.values())])
         return {name: found[source[name]] for name in names}
@@ -191,12 +186,12 @@ class Store(SeriesReader):
     def column_pages(
         self, series: StoredSeries, names: Sequence[str], rows: int = 1000
     ) -> Iterator[dict[str, NDArray[Any]]]:
-        """The same columns, `rows` epochs at a time, in constant memory.
+        """Yield the columns of `stamped_columns`, `rows` epochs at a time, in constant memory.
 
-        Every page is read by itself: who takes long over one holds no writer up, and epochs that
-        come meanwhile follow.
+        Each page is a query of its own: a slow reader blocks no writer, and epochs stored meanwhile
+        are included.
         """
-        source = {name: _source(name, series) for name in names}
+        source = {name: _chunk_name(name, series) for name in names}
         wanted = list(dict.fromkeys(["number", *source.values()]))
         after = -1
         while True:
@@ -208,7 +203,7 @@ class Store(SeriesReader):
             yield {name: found[source[name]] for name in names}
 
     def readings(self, thermometer: str | None = None) -> Iterator[LoggedReading]:
-        """Readings apart from epochs, in the order they were kept."""
+        """Yield the readings that belong to no epoch, in the order in which they were stored."""
         after = -1
         while True:
             with self._reads("readings") as connection:
@@ -217,7 +212,7 @@ class Store(SeriesReader):
                 )
                 wanted = (after, thermometer, _READINGS_AT_ONCE)
                 page = list(columns.examined_rows(connection, "reading", condition, wanted))
-                for row in _sound(page):
+                for row in _intact(page):
                     name = file_name(row["thermometer"], "thermometer", StoreError)
                     values, trusted = json.loads(row["temperatures"]), bool(row["clock_trusted"])
                     yield LoggedReading(name, row["utc"], values, trusted)
@@ -226,7 +221,7 @@ class Store(SeriesReader):
             after = page[-1][0]["id"]
 
     def events(self, series: StoredSeries | None = None, since_utc: float = 0.0) -> list[Event]:
-        """What happened, oldest first; of one series, or all."""
+        """Return the events of one series, or of all, oldest first."""
         with self._reads("events") as connection:
             condition = "WHERE utc >= ? AND series_id IS ifnull(?, series_id) ORDER BY id"
             wanted = (since_utc, None if series is None else series.id)
@@ -236,18 +231,18 @@ class Store(SeriesReader):
                     row["utc"], row["kind"], row["text"], row["series_id"], row["epoch"],
                     json.loads(row["data"]),
                 )
-                for row in _sound(rows)
+                for row in _intact(rows)
             ]  # fmt: skip
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
-        """The steps of the clock that the daemon noted, oldest first: of every series the same."""
+        """Return the clock steps that the daemon recorded, oldest first, equal for all series."""
         del series
         return [event for event in self.events() if event.kind == "clock_step"]
 
     def rows_after(self, table: str, after: int, limit: int) -> list[dict[str, Any]]:
-        """Up to `limit` rows of a growing table with ids above `after`: for a forwarder.
+        """Return up to `limit` rows of a growing table with ids above `after`, for a forwarder.
 
-        As `database.epochs.whole_rows` has them, without this file's checksums.
+        They are those of `database.epochs.whole_rows`, without the file's checksums.
         """
         with self._reads(f"{table}s") as connection:
             found = list(
@@ -261,30 +256,30 @@ class Store(SeriesReader):
         return found
 
     def frames_after(self, after: int, limit: int) -> list[epochs.KeptFrame]:
-        """Epochs' frames as they were kept, see `database.epochs`: for a forwarder."""
+        """Return up to `limit` epochs with ids above `after` and their frames, for a forwarder."""
         with self._reads("frames") as connection:
             return list(epochs.frames_after(connection, after, limit))
 
     def rows_waiting(self, after: Mapping[str, int]) -> int:
-        """How many rows of the growing tables have ids above those given, by table."""
+        """Count the rows of the growing tables with ids above `after`, given by table."""
         return sum(
             int(self._value(f"SELECT count(*) FROM {table} WHERE id > ?", after[table]))
             for table in columns.KEPT
         )
 
     def examine(self) -> epochs.Examination:
-        """Read the whole file: what is damaged, and which epochs are missing.
+        """Read the whole file and return what is damaged, and which epochs are missing.
 
-        Raises StoreError where it cannot be read as a store at all.
+        Raises StoreError if it cannot be read as a store at all.
         """
         with self._reads("the store") as connection:
             found = epochs.examine(connection)
         tail = read_wal_tail(helper(self.path, "wal"))
         damaged = list(found.damaged)
         if tail.lost:
-            many = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
-            many = "all transactions" if tail.lost < 0 else many
-            damaged.insert(0, f"the -wal file: {many} in it cannot be read")
+            lost = f"{tail.lost} transaction{'s'[: tail.lost != 1]}"
+            lost = "all transactions" if tail.lost < 0 else lost
+            damaged.insert(0, f"the -wal file: {lost} in it cannot be read")
         found = replace(found, damaged=tuple(damaged), unfinished=tail.unfinished)
         if not found.damaged:
             for series in self.all_series():
@@ -294,9 +289,9 @@ class Store(SeriesReader):
         return found
 
     def copy_to(self, target: Path) -> None:
-        """Copy the store to another file, whole or not at all, while it may be written.
+        """Copy the store to another file, as a whole or not at all, also during writing.
 
-        Raises StoreError; OutputError where that cannot be written.
+        Raises StoreError, or OutputError if the target cannot be written.
         """
         with in_words(self.path, f"the copy {target} cannot be made"):
             try:
@@ -306,12 +301,12 @@ class Store(SeriesReader):
 
     @contextmanager
     def _reads(self, what: str) -> Iterator[sqlite3.Connection]:
-        """Hold the connection for this thread alone; `what` begins the message of an error."""
+        """Lock the connection for this thread; `what` begins the message of an error."""
         with self._lock, in_words(self.path, f"{what} cannot be read", reading=True):
             yield self._db
 
     def _value(self, statement: str, *values: Any) -> Any:
-        """Return the one value that a statement asks for."""
+        """Return the single value that a statement selects."""
         with self._reads("the store") as connection:
             return connection.execute(statement, values).fetchone()[0]
 
@@ -325,9 +320,9 @@ class Store(SeriesReader):
         settings: Mapping[str, Any] | None = None,
         created_utc: float = 0.0,
     ) -> StoredSeries:
-        """Begin a series; StoreError if the camera has one of this name already."""
+        """Begin a series. Raises StoreError if the camera already has one of this name."""
         require_channels(head.channels, f"{self.path}: series {head.series!r}", StoreError)
-        parse_head(head_document(head), self.path)  # what could not be read again is not written
+        parse_head(head_document(head), self.path)  # refuses what could not be read again
         file_name(head.camera.name, "camera", StoreError)
         file_name(head.series, "series", StoreError)
         with self._transaction(f"series {head.series!r} was not begun"):
@@ -352,11 +347,11 @@ class Store(SeriesReader):
         extra: Mapping[str, float] | None = None,
         clock_trusted: bool = True,
     ) -> None:
-        """Keep one epoch and its result, in one transaction.
+        """Store one epoch and its result, in one transaction.
 
-        result: None if it is to be calibrated later, by `amend`. extra: further columns such as
-        blur. Keeps nothing of the epoch and raises StoreError if its number does not come after the
-        last one, StoreFullError if the disk is full: an epoch without observations is smaller.
+        result: None if it will be calibrated later, by `amend`; extra: further columns such as
+        blur. Raises StoreError if the number is not above the last one, StoreFullError if the disk
+        is full; nothing of the epoch is then stored. An epoch without observations is smaller.
         """
         if taken := {*COLUMN_NAMES, *_DERIVED, *series.head.channels} & set(extra or ()):
             raise StoreError(f"an extra column cannot be called {min(taken)!r}")
@@ -366,13 +361,13 @@ class Store(SeriesReader):
         try:
             self._append(series, stored)
         except StoreFullError:
-            # what waits in the -wal file may be the room that is missing
+            # the checkpoint empties the -wal file, which may free enough space
             self.checkpoint()
             self._append(series, stored)
 
     def _append(self, series: StoredSeries, stored: StoredEpoch) -> None:
         epoch = stored.epoch
-        with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not kept"):
+        with self._transaction(f"epoch {epoch.number} of series {series.name!r} was not stored"):
             last, loose = self._ends.get(series.id) or (
                 self.last_epoch(series), columns.SeriesColumns(self._db, series.id).count_loose()
             )  # fmt: skip
@@ -388,7 +383,7 @@ class Store(SeriesReader):
         self._ends[series.id] = (epoch.number, 0 if full else loose + 1)
 
     def _build_chunks(self, series: StoredSeries) -> None:
-        """Damage in an old row must not stop new ones: then columns are read from the rows."""
+        """Build chunks; if old rows are damaged, the series gets no more and is read from rows."""
         self._db.execute("SAVEPOINT chunks")
         try:
             columns.SeriesColumns(self._db, series.id).build()
@@ -407,8 +402,8 @@ class Store(SeriesReader):
         observations: Observations | None = None,
         extra: Mapping[str, float] | None = None,
     ) -> None:
-        """Keep a later calibration of an epoch; observations None: as before; extra: added."""
-        with self._transaction(f"the calibration of epoch {number} was not kept"):
+        """Store a later calibration of an epoch; observations: None if unchanged; extra: added."""
+        with self._transaction(f"the calibration of epoch {number} was not stored"):
             found = epochs.select_epochs(self._db, series.id, number, number, details=False)
             if (then := next(found, None)) is None:
                 raise StoreError(f"{self.path}: series {series.name!r} has no epoch {number}")
@@ -422,8 +417,8 @@ class Store(SeriesReader):
             epochs.insert_epoch(self._db, series.id, stored)
 
     def add_event(self, event: Event) -> None:
-        """Log something that happened apart from an epoch."""
-        with self._transaction("an event was not kept"):
+        """Store an event."""
+        with self._transaction("an event was not stored"):
             row = {
                 "id": columns.next_id(self._db, "event"), "utc": event.utc,
                 "series_id": event.series, "epoch": event.epoch, "kind": event.kind,
@@ -432,8 +427,8 @@ class Store(SeriesReader):
             columns.insert_row(self._db, "event", row)
 
     def add_readings(self, readings: Sequence[LoggedReading]) -> None:
-        """Keep what thermometers said apart from epochs, in one transaction."""
-        with self._transaction("readings were not kept"):
+        """Store readings that belong to no epoch, in one transaction."""
+        with self._transaction("readings were not stored"):
             for reading in readings:
                 row = {
                     "id": columns.next_id(self._db, "reading"), "utc": reading.utc,
@@ -444,7 +439,7 @@ class Store(SeriesReader):
                 columns.insert_row(self._db, "reading", row)
 
     def checkpoint(self) -> bool:
-        """Move what is in the -wal file into the store; False if a reader or the disk forbids."""
+        """Move the -wal file into the store; return False if a reader or the disk prevents it."""
         try:
             busy = self._value("PRAGMA wal_checkpoint(TRUNCATE)")
         except StoreFullError:
@@ -453,7 +448,7 @@ class Store(SeriesReader):
 
     @contextmanager
     def _transaction(self, failed: str) -> Iterator[None]:
-        """All or nothing; `failed` begins the message of the error."""
+        """Run the block as one transaction; `failed` begins the message of an error."""
         with self._lock, in_words(self.path, failed):
             self._db.execute("BEGIN IMMEDIATE")
             try:
@@ -466,17 +461,17 @@ class Store(SeriesReader):
                 raise
 
 
-def _sound(rows: Iterable[tuple[dict[str, Any], StoreError | None]]) -> Iterator[dict[str, Any]]:
-    """Yield rows; leave out what is damaged, with a warning: no result depends on it."""
+def _intact(rows: Iterable[tuple[dict[str, Any], StoreError | None]]) -> Iterator[dict[str, Any]]:
+    """Yield undamaged rows; skip others with a warning, since no result depends on them."""
     for row, damage in rows:
         if damage is None:
             yield row
         else:
-            log.warning("%s; it is left out", damage)
+            log.warning("%s; it is skipped", damage)
 
 
-def _source(name: str, series: StoredSeries) -> str:
-    """The name in the chunks of a column by its public name."""
+def _chunk_name(name: str, series: StoredSeries) -> str:
+    """Return the name in chunks of a column, given its public name."""
     if name == "epoch":
         return "number"
     if name in COLUMN_NAMES or name == "status":

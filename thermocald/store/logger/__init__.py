@@ -1,1 +1,1 @@
-"""What people's loggers and cameras write: tables of any dialect, clocks, photographs."""
+"""Files of loggers and cameras: tables of any dialect, times, photographs."""

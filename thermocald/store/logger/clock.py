@@ -1,7 +1,7 @@
-"""Dates and times as loggers and cameras write them, brought to UTC.
+"""Convert dates and times of loggers and cameras to UTC.
 
-A time without a zone is never taken as UTC, nor as this computer's: the zone must be given. An hour
-that daylight saving repeats or leaves out is refused unless the caller says how it is meant.
+A time without a zone is taken neither as UTC nor as local time: the zone must be given. A time that
+daylight saving skips is refused, and one that it repeats too, unless it is given which is meant.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 AMBIGUOUS = ("refuse", "order", "earlier", "later")
-"""What to do with the hour that comes twice: refuse it, go by the order of the rows, take one."""
+"""How to treat the repeated hour: refuse it, use the order of the rows, or take one."""
 
 _OFFSET = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?::?(\d{2}))?", re.IGNORECASE)
 _ERROR = re.compile(r"([+-]?)(?:(\d+):)?(\d+):(\d+(?:\.\d+)?)|([+-]?)(\d+(?:\.\d+)?)s?")
@@ -31,7 +31,7 @@ _LARGEST_OFFSET_H = 14
 
 
 def time_zone(text: str) -> tzinfo:
-    """`Europe/Berlin`, `UTC`, `+02:00` or `UTC+2` as a zone; UsageError for anything else."""
+    """Return the zone `Europe/Berlin`, `UTC`, `+02:00` or `UTC+2`. Raises UsageError."""
     name = text.strip()
     if name.upper() in ("UTC", "GMT", "Z"):
         return UTC
@@ -44,20 +44,20 @@ def time_zone(text: str) -> tzinfo:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError):
         raise UsageError(
-            f"time zone {text!r} is not known: write Europe/Berlin, UTC, or an offset like +02:00"
+            f"time zone {text!r} is unknown; give Europe/Berlin, UTC, or an offset like +02:00"
         ) from None
 
 
 def clock_error(text: str) -> float:
-    """`+00:03:12`, `-12:30`, `+4.5` (s): how far a clock was ahead of the true time, in s.
+    """Return by how many seconds a clock was ahead, from `+00:03:12`, `-12:30` or `+4.5` (s).
 
-    UsageError for anything else.
+    Raises UsageError for other text.
     """
     found = _ERROR.fullmatch(text.strip())
     if found is None:
         raise UsageError(
-            f"clock error {text!r}: write +HH:MM:SS where the clock was ahead, -HH:MM:SS where it "
-            "was behind, or seconds"
+            f"clock error {text!r}: give +HH:MM:SS if the clock was ahead, -HH:MM:SS if it was "
+            "behind, or seconds"
         )
     sign, hours, minutes, seconds, sign_s, only = found.groups()
     if only is not None:
@@ -68,11 +68,11 @@ def clock_error(text: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class DeviceClock:
-    """How a device's times are meant.
+    """The clock of a device: its zone and its error.
 
-    zone: of times without one, None where it was not said; ahead: s, how far the clock was ahead of
-    the true time; ambiguous: one of AMBIGUOUS; forced: the zone is that of times with a zone too;
-    option: what to write where the zone is missing, for messages.
+    zone: of times without one, None if not given; ahead: s, by which the clock was ahead of the
+    true time; ambiguous: one of AMBIGUOUS; forced: the zone also replaces that of times with one;
+    option: the option that gives a missing zone, for messages.
     """
 
     zone: tzinfo | None = None
@@ -82,10 +82,10 @@ class DeviceClock:
     option: str = "--timezone"
 
     def utc(self, moments: Sequence[datetime], where: Callable[[int], str]) -> Array:
-        """Seconds since 1970 UTC (n,) of moments as the device wrote them.
+        """Convert moments written by the device to seconds since 1970 UTC, (n,).
 
         where: names the place of moment i. Raises DataError for a time without a zone, for one that
-        does not exist, and for one that exists twice where the order does not tell which.
+        does not exist, and for one that exists twice if it is not known which one is meant.
         """
         seconds = np.empty(len(moments))
         twice: list[int] = []
@@ -95,7 +95,7 @@ class DeviceClock:
                 continue
             if self.zone is None:
                 raise DataError(
-                    f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} has no time zone: say which with "
+                    f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} has no time zone: give it with "
                     f"{self.option}, such as {self.option} Europe/Berlin or {self.option} UTC"
                 )
             local = moment.replace(tzinfo=self.zone, fold=0)
@@ -105,29 +105,29 @@ class DeviceClock:
                 if back.replace(tzinfo=None) != local.replace(tzinfo=None):
                     raise DataError(
                         f"{where(i)}: {moment:%Y-%m-%d %H:%M:%S} does not exist in {self.zone}: "
-                        "clocks were put forward. A device that does not change its clock has a "
+                        "clocks were put forward. For a device that does not change its clock, "
                         # fold 0 has the offset from before the change
-                        f"fixed zone: {self.option} {local.isoformat()[-6:]}"
+                        f"give a fixed zone: {self.option} {local.isoformat()[-6:]}"
                     )
                 twice.append(i)
         if twice:
-            self._settle(seconds, moments, twice, where)
+            self._resolve_repeated(seconds, moments, twice, where)
         return seconds - self.ahead
 
-    def _settle(
+    def _resolve_repeated(
         self,
         seconds: Array,
         moments: Sequence[datetime],
         twice: list[int],
         where: Callable[[int], str],
     ) -> None:
-        """Decide between the two times of each moment that exists twice, in place."""
+        """Choose one of the two times of each moment that exists twice, in place."""
         first = twice[0]
         moment = moments[first]
         again = f"{where(first)}: {moment:%Y-%m-%d %H:%M:%S} exists twice in {self.zone}"
         if self.ambiguous == "refuse":
             raise DataError(
-                f"{again} (clocks were put back): say --ambiguous order where the rows are in the "
+                f"{again} (clocks were put back): give --ambiguous order if the rows are in the "
                 "order of time, else --ambiguous earlier or later"
             )
         if self.ambiguous == "earlier":
@@ -139,8 +139,8 @@ class DeviceClock:
         back = [k for k in range(1, len(twice)) if seconds[twice[k]] < seconds[twice[k - 1]]]
         if len(back) != 1:
             raise DataError(
-                f"{again}, and the order of the rows does not tell which is meant (it runs back "
-                f"{len(back)} times, not once): say --ambiguous earlier or later"
+                f"{again}, and the order of the rows does not show which is meant (time runs back "
+                f"{len(back)} times, not once): give --ambiguous earlier or later"
             )
         seconds[twice[back[0] :]] = later[back[0] :]
 
@@ -152,10 +152,10 @@ def device_clock(
     ambiguous: str = "order",
     option: str = "--timezone",
 ) -> DeviceClock:
-    """Return the clock of one device from what is said of it as text.
+    """Return the clock of one device from the text of options.
 
-    timezone: of all devices; own: its own, which counts for times with a zone too; ahead: how far
-    it was ahead, as `clock_error` reads it; option: that says its own. Raises UsageError.
+    timezone: of all devices; own: the device's, which also replaces the zone of times with one;
+    ahead: the clock's error, see `clock_error`; option: that of `own`. Raises UsageError.
     """
     if ambiguous not in AMBIGUOUS:
         raise UsageError(f"--ambiguous {ambiguous}: must be one of {', '.join(AMBIGUOUS)}")
@@ -193,26 +193,26 @@ _MONTHS = {
          "oct okt", "nov", "dec dez"), 1)
     for name in names.split()
 }  # fmt: skip
-"""By the first letters, as English, German and Dutch loggers write them."""
+"""Months by their first letters in English, German and Dutch."""
 _WORD = re.compile(r"[A-Za-z]{3}")
 _CHINESE = str.maketrans({"年": "-", "月": "-", "日": " "})
 _ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
-_PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds since 1970 are fewer for 3000 years
+_PARTS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))  # seconds are less until the year 5138
 
 
 def iso(seconds: float) -> str:
-    """A time as ISO 8601 in UTC, to a millisecond."""
+    """Return a time as ISO 8601 in UTC, to a millisecond."""
     moment = datetime.fromtimestamp(float(seconds), UTC)
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
-    """A date with a time, with or without a zone; or a date, or a time, alone.
+    """Parse a date with a time, with or without a zone; or a date or a time alone.
 
-    order: of day and month, `dmy` or `mdy`, None for what the date's form says. Numbers are seconds
-    (or ms, µs, ns) since 1970 UTC. Raises ValueError for what is none of these.
+    order: of day and month, `dmy` or `mdy`; None: year-month-day or dmy, by the date's form.
+    Numbers are seconds (or ms, µs, ns) since 1970 UTC. Raises ValueError for other text.
     """
-    text = _numbered(text.strip())
+    text = _month_to_number(text.strip())
     if _NUMBER.fullmatch(text):
         try:
             return datetime.fromtimestamp(whole_seconds(float(text.replace(",", "."))), UTC)
@@ -228,26 +228,26 @@ def parse_moment(text: str, order: str | None = None) -> datetime | date | time:
 
 
 def whole_seconds(number: float) -> float:
-    """Seconds since 1970 of a number of s, ms, µs, or ns, told by its size."""
+    """Convert a number of s, ms, µs or ns since 1970 to s; its size shows the unit."""
     return number / next((parts for least, parts in _PARTS if number >= least), 1.0)
 
 
 def is_date_like(text: str) -> bool:
-    """Whether it is 06/14/2026, with or without a time, whichever number is the month."""
+    """Return whether text begins as 06/14/2026 or 14/06/2026 does, month or day first."""
     return re.match(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}(?!\d)", text) is not None
 
 
 def day_and_month(text: str) -> tuple[int, int] | None:
-    """First and second number of a date written with / or -, not beginning with the year."""
-    text = _numbered(text.strip())
+    """Return the first two numbers of a date with / or - that does not begin with the year."""
+    text = _month_to_number(text.strip())
     found = _FULL.fullmatch(text) or _ONLY_DATE.fullmatch(text)
     if found is None or found["compact"] or len(found["a"]) == 4 or found["mark"] == ".":
         return None
     return int(found["a"]), int(found["b"])
 
 
-def _numbered(text: str) -> str:
-    """A date whose month is a word, or which is Chinese, as 2026-06-14."""
+def _month_to_number(text: str) -> str:
+    """Rewrite a date with the month as a word, or in Chinese, as 2026-06-14."""
     if text.isascii() and not _WORD.search(text):
         return text
     text = text.translate(_CHINESE)

@@ -1,10 +1,10 @@
-"""A table as any program writes it: encoding, separator, decimal mark and header found out.
+"""Read a table of any program: detect its encoding, separator, decimal mark and head.
 
-Lines above the table (a logger's name, its serial number) are passed over; a second line of the
-header with units is joined to the names. The rows are read one by one: a year of them has to fit
-into memory. What was found is kept, to be shown.
+Lines above the table (a logger's name, its serial number) are skipped; a second line of the head
+with units is joined to the names. Rows are read one by one, so that a year of them fits into
+memory. What was detected is kept for the user to see.
 
-Units of temperatures are those that heads of columns and the readings of any device state.
+Units of temperatures are detected in heads of columns and in readings.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def stated_unit(text: str) -> str | None:
     """Return the unit, one of `UNITS`, that a column's head or a reading states, or None.
 
     `(F)`, `[F]`, `°F`, `ºF`, `℉`, `degF`, `deg. F`, `TempF`, `temp_f`, `Temperature, F` and
-    `Fahrenheit` state the same.
+    `Fahrenheit` are equivalent.
     """
     found = _STATED.search(text)
     if found is None:
@@ -75,11 +75,11 @@ def to_celsius(values: Array, unit: str) -> Array:
 
 
 OUR_TIMES = ("time", "temperature_time", "frame_time", "timestamp")
-"""Names of a column of seconds in files of ours, which may count from any day."""
+"""Names of columns of seconds in this program's files, which may count from any day."""
 TIME_NAME = re.compile(
     r"time|date|zeit|datum|uhr|stamp|tijd|heure|fecha|hora|utc|时间|日期|changed", re.IGNORECASE
 )
-"""In the head of a column of times."""
+"""Words in the head of a column of times."""
 SEPARATORS = {";": "semicolon", "\t": "tab", "|": "bar", ",": "comma"}
 _LARGEST_BYTES = 2_000_000_000
 _CHUNK = 1 << 20
@@ -100,10 +100,10 @@ _READING = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class LoggerFile:
-    """A table in a file: the names of its columns, and what was found out about it.
+    """A table in a file: the names of its columns, and its detected form.
 
-    first_line: that of the first row; sample: some rows, from its beginning and its end; above: the
-    lines above the head.
+    first_line: line of the first row; sample: some rows from the beginning and the end; above: the
+    lines above the first row.
     """
 
     path: Path
@@ -117,7 +117,7 @@ class LoggerFile:
 
     @property
     def description(self) -> str:
-        """What was found, for people."""
+        """The detected form, for the user."""
         mark = "a comma" if self.decimal == "," else "a point"
         return (
             f"{self.encoding}, columns separated by "
@@ -125,36 +125,38 @@ class LoggerFile:
         )
 
     def column(self, name: str) -> list[str]:
-        """Values of a column in the sample."""
+        """Return the values of a column in the sample."""
         place = self.names.index(name)
         return [row[place] for row in self.sample]
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Every row with its line: as many fields as there are names, missing ones empty."""
+        """Yield each row with its line, with one field per name; missing ones are empty."""
         width = len(self.names)
         with self.path.open(encoding=self.encoding, errors="replace", newline="") as file:
-            for line, row in _parsed(self.path, file, self.separator):
+            for line, row in _parse_rows(self.path, file, self.separator):
                 if line >= self.first_line:
-                    yield line, _fitted(row, width)
+                    yield line, _fit_width(row, width)
 
 
 def open_log(path: Path, separator: str | None = None, decimal: str | None = None) -> LoggerFile:
-    """Find out how a logger's table is written; separator and decimal mark where not given.
+    """Detect the form of a logger's table; separator and decimal mark only if not given.
 
-    Raises DataError where the file cannot be read or holds no table with times.
+    Raises DataError if the file cannot be read or holds no table with times.
     """
-    encoding = _encoding(path)
+    encoding = _detect_encoding(path)
     with path.open(encoding=encoding, errors="replace", newline="") as file:
         begin = list(islice(file, _SAMPLE))
-        end = list(deque(file, _SAMPLE))
+        end = list(deque(filter(str.strip, file), _SAMPLE))
+    if not any(map(str.strip, begin + end)):
+        raise DataError(f"{path}: is empty")
     ours = any(name.strip() in OUR_TIMES for name in begin[0].split(","))
     try:
-        mark = separator or _separator(path, end if len(end) == _SAMPLE else begin + end)
+        mark = separator or _detect_separator(path, end if len(end) == _SAMPLE else begin + end)
     except DataError:
         if not ours:
             raise
         mark = ","
-    start, last = _cut(begin, mark), _cut(end, mark)
+    start, last = _split_lines(begin, mark), _split_lines(end, mark)
     width = Counter(len(row) for _, row in (start + last)[-_SAMPLE:]).most_common(1)[0][0]
     if width > _MOST_COLUMNS:
         raise DataError(f"{path}: has {width} columns; at most {_MOST_COLUMNS} are read")
@@ -163,31 +165,31 @@ def open_log(path: Path, separator: str | None = None, decimal: str | None = Non
         first = 1
     if first < 0 or width < 2:
         raise DataError(
-            f"{path}: no row holds a time and a number; is it a log of temperatures? Separator and "
-            "decimal mark can be given (--separator ';' --decimal ',')"
+            f"{path}: no row holds a time and a number; is it a log of temperatures? Give its "
+            "separator and decimal mark (--separator ';' --decimal ',')"
         )
     head = [row for _, row in start[:first]]
     above = tuple(" ".join(row) for row in head)
-    # what stood there were statistics, where another head follows
+    # if another head follows, the rows so far were statistics
     for i in range(first + 1, min(first + _PREAMBLE, len(start) - 1)):
         row, next_row = start[i][1], start[i + 1][1]
         named = row not in head and not _is_data(row) and any(map(TIME_NAME.search, row))
         if named and _is_data(next_row):
             head, first = [row], i + 1
-    names = _names(head, width)
-    rows = tuple(tuple(_fitted(row, len(names))) for _, row in start[first:] + last)
-    found = decimal or _decimal(rows, mark)
+    names = _column_names(head, width)
+    rows = tuple(tuple(_fit_width(row, len(names))) for _, row in start[first:] + last)
+    found = decimal or _detect_decimal(rows, mark)
     ends = [";".join(row[-2:]) for row in rows if row[-1]]
     if mark == "," and head and len(head[-1]) < width and ends and all(map(_CUT.fullmatch, ends)):
         raise DataError(
-            f"{path}, line {start[first][0]}: the rows hold more fields than the head: do commas "
-            "stand in the numbers and between the columns? Write either another way"
+            f"{path}, line {start[first][0]}: the rows hold more fields than the head: are commas "
+            "used both in numbers and between columns? Change one of them"
         )
     return LoggerFile(path, names, start[first][0], encoding, mark, found, rows, above)
 
 
-def _parsed(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
-    """Rows that are not empty, with their lines."""
+def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield rows that are not empty, with their lines."""
     reader = csv.reader(lines, delimiter=mark)
     try:
         for row in reader:
@@ -198,23 +200,23 @@ def _parsed(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[int, 
         raise DataError(f"{path}, line {reader.line_num}: is not readable: {cause}") from cause
 
 
-def _cut(lines: list[str], mark: str) -> list[tuple[int, list[str]]]:
+def _split_lines(lines: list[str], mark: str) -> list[tuple[int, list[str]]]:
     try:
-        return list(_parsed(Path(), lines, mark))
+        return list(_parse_rows(Path(), lines, mark))
     except DataError:
-        return []  # said with its line where all rows are read
+        return []  # reported with its line when all rows are read
 
 
-def _fitted(row: list[str], width: int) -> list[str]:
+def _fit_width(row: list[str], width: int) -> list[str]:
     return row[:width] + [""] * (width - len(row))
 
 
-def _encoding(path: Path) -> str:
-    """The first encoding in which the whole file is text."""
+def _detect_encoding(path: Path) -> str:
+    """Return the first encoding in which the whole file is text."""
     if not path.is_file():
         raise DataError(f"{path}: is not a file")
     if path.stat().st_size > _LARGEST_BYTES:
-        raise DataError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB; cut it")
+        raise DataError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB; split it")
     try:
         with path.open("rb") as file:
             head = file.read(4096)
@@ -239,7 +241,7 @@ def _is_text(chunks: Iterator[bytes], encoding: str) -> bool:
     decoder = codecs.getincrementaldecoder(encoding)()
     try:
         for number, chunk in enumerate(chunks):
-            # GB 18030 writes 温度 in pairs of high bytes; °C and ä of Latin-1 stand alone
+            # GB 18030 writes 温度 in pairs of high bytes; ° and ä of Latin-1 are single bytes
             if encoding == "gb18030" and number == 0:
                 runs = re.findall(rb"[\x80-\xff]+(?=[\0-\x7f])", chunk)
                 if any(len(run) % 2 for run in runs):
@@ -251,11 +253,11 @@ def _is_text(chunks: Iterator[bytes], encoding: str) -> bool:
     return True
 
 
-def _separator(path: Path, lines: list[str]) -> str:
-    """The first separator that cuts the last lines into rows of one width with a time in each."""
+def _detect_separator(path: Path, lines: list[str]) -> str:
+    """Return the first separator that splits the last lines into equal rows with a time each."""
     sample = [line for line in lines[-_SAMPLE:] if line.strip()]
     for mark in SEPARATORS:
-        rows = [row for _, row in _cut(sample, mark)]
+        rows = [row for _, row in _split_lines(sample, mark)]
         if not rows:
             continue
         width = Counter(len(row) for row in rows).most_common(1)[0][0]
@@ -263,14 +265,14 @@ def _separator(path: Path, lines: list[str]) -> str:
         if width > 1 and data >= max(1, _CONSISTENT * (len(rows) - _PREAMBLE)):
             return mark
     raise DataError(
-        f"{path}: no separator ({', '.join(SEPARATORS.values())}) cuts it into rows with a time "
-        f"and a number each, as in {sample[-1].strip()[:60]!r}; say --separator, or write times "
-        "and numbers another way"
+        f"{path}: no separator ({', '.join(SEPARATORS.values())}) splits it into rows with a time "
+        f"and a number, as in {sample[-1].strip()[:60]!r}; give --separator, or change the form "
+        "of times and numbers"
     )
 
 
 def _is_data(row: list[str]) -> bool:
-    """Whether a row holds a time and something that can stand for a reading besides."""
+    """Return whether a row holds a time and a reading or a word for a missing one."""
     times = sum(_is_time(field) for field in row)
     return times > 0 and sum(bool(_READING.fullmatch(field)) for field in row) > 0
 
@@ -279,21 +281,21 @@ def _is_time(field: str) -> bool:
     try:
         parse_moment(field)
     except ValueError:
-        return is_date_like(field)  # month before day, which is not decided yet
+        return is_date_like(field)  # month before day, not decided yet
     return True
 
 
-def _names(above: list[list[str]], width: int) -> tuple[str, ...]:
-    """Names of the columns, those of a second line (units) joined to them; unique.
+def _column_names(above: list[list[str]], width: int) -> tuple[str, ...]:
+    """Return unique names of the columns, joined with those of a second line (units).
 
-    above: the rows above the data. The first row of the data's width has the names; where none has
-    it, one that is wider (a serial number stands in the first row alone) or one field narrower (the
-    rows end with a separator).
+    above: the rows above the data. The names are in the first row of the data's width; if there is
+    none, in a wider one (a serial number is in the first data row only) or in one that is narrower
+    by one field (the rows end with a separator).
     """
-    wide = [_with_units(row, width) for row in above if len(row) > width][-1:]
+    wide = [_join_units(row, width) for row in above if len(row) > width][-1:]
     narrow = [row for row in above if len(row) == width - 1 and width > 2][-1:]
     rows = [row for row in above if len(row) == width]
-    # a logger's serial number may stand above in as many fields
+    # a line with a logger's serial number may have as many fields as the data
     named = next((i for i, row in enumerate(rows) if any(map(TIME_NAME.search, row))), None)
     if named is None and any(TIME_NAME.search(name) for row in wide for name in row):
         rows = wide
@@ -308,8 +310,8 @@ def _names(above: list[list[str]], width: int) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _with_units(row: list[str], width: int) -> list[str]:
-    """A head of more fields than the data has: `Temperature, F` without quotes is one of them."""
+def _join_units(row: list[str], width: int) -> list[str]:
+    """Join fields of a head that is wider than the data, as `Temperature, F` without quotes."""
     joined: list[str] = []
     for i, name in enumerate(row):
         if joined and len(joined) + len(row) - i > width and _BARE_UNIT.fullmatch(name):
@@ -319,7 +321,7 @@ def _with_units(row: list[str], width: int) -> list[str]:
     return joined
 
 
-def _decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
+def _detect_decimal(rows: tuple[tuple[str, ...], ...], separator: str) -> str:
     values = [value for row in rows for value in row]
     comma = sum(bool(_COMMA_NUMBER.fullmatch(v)) for v in values)
     if separator == ",":

@@ -1,11 +1,11 @@
-"""Photographs with the times at which they were taken: from EXIF, the file's name, or its date.
+"""Photographs with the times at which they were taken, from EXIF, the file's name or its date.
 
-Only the head of a file is read; what EXIF says of the camera comes with it. Source: CIPA DC-008,
-Exif 2.32: DateTimeOriginal, SubSecTimeOriginal, OffsetTimeOriginal.
+Only the header of a file is read, with the EXIF data of the camera. Source: CIPA DC-008, Exif 2.32:
+DateTimeOriginal, SubSecTimeOriginal, OffsetTimeOriginal.
 
-Put together with a log of temperatures they are the epochs of a recording. Each photograph gets the
-reading next to it in time, with the reading's own time, and the recording keeps every reading: the
-temperature at a photograph's time is interpolated from all of them.
+Photographs and a log of temperatures make a recording. Each photograph is an epoch with the nearest
+reading in time and that reading's own time. The recording also has every reading of the log, from
+which the temperature at a photograph's time is interpolated.
 """
 
 from __future__ import annotations
@@ -50,14 +50,15 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 _IN_NAME = re.compile(r"(\d{8})[_T-]?(\d{6})(?:[_.-]?(\d{3}))?")
 _EXIF_IFD = 0x8769
 _TIME_TAGS = ((0x9003, 0x9291, 0x9011), (0x9004, 0x9292, 0x9012), (0x0132, 0x9290, 0x9010))
-"""Time, its fraction of a second, its zone: as taken, as digitised, as changed last."""
+"""Tags of time, fraction of a second and zone: when taken, digitised, last changed."""
 _DIAGONAL_35MM = 43.2666  # mm, of 36 × 24
 
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """A file, when it was taken as the camera wrote it, its size px, and what EXIF says of the
-    camera: name, principal distance mm, pixel pitch mm, serial number; None where it does not.
+    """A photograph: its file, its time as written by the camera, and its size in px.
+
+    camera, focal_length (mm), pixel_pitch (mm), serial: from EXIF; "" or None if not given.
     """
 
     path: Path
@@ -71,12 +72,14 @@ class Photograph:
 
     @property
     def body(self) -> tuple[str, str, float | None]:
-        """What is the same in all photographs of one camera with one lens."""
+        """Name, serial number and focal length, the same for one camera with one lens."""
         return self.camera, self.serial, self.focal_length
 
 
 def find_photographs(paths: list[Path]) -> list[Path]:
-    """The pictures among files and in folders, each once; DataError where there are none."""
+    """Return the pictures among files and in folders, each once. Raises DataError if none."""
+    if not paths:
+        raise DataError("no photographs are given")
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
@@ -91,9 +94,10 @@ def find_photographs(paths: list[Path]) -> list[Path]:
 
 
 def read_photographs(paths: list[Path], source: str = "exif") -> list[Photograph]:
-    """All photographs among files and in folders; errors as `find_photographs`, `read_photograph`.
+    """Read all photographs among files and in folders.
 
-    Raises UsageError for a source of their times that there is not.
+    Raises UsageError for an unknown source of their times, and the errors of `find_photographs` and
+    `read_photograph`.
     """
     if source not in SOURCES:
         raise UsageError(f"--times {source}: must be one of {', '.join(SOURCES)}")
@@ -101,9 +105,9 @@ def read_photographs(paths: list[Path], source: str = "exif") -> list[Photograph
 
 
 def read_photograph(path: Path, source: str = "exif") -> Photograph:
-    """One photograph; `source` of its time is one of SOURCES.
+    """Read one photograph; `source` of its time is one of SOURCES.
 
-    Raises ImageError for what is not a picture, DataError where it does not hold its time.
+    Raises ImageError for a file that is not a picture, DataError if it has no time.
     """
     if importlib.util.find_spec("PIL") is None:
         raise DriverMissing("reading photographs needs Pillow: pip install 'thermocald[report]'")
@@ -111,9 +115,9 @@ def read_photograph(path: Path, source: str = "exif") -> Photograph:
 
     try:
         with warnings.catch_warnings():
-            # a large sensor is not an attack: nothing is decoded here
+            # a large image is no attack, as it is not decoded here
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            # of damaged EXIF: what is needed of it is tested
+            # damaged EXIF: the values that are used are tested
             warnings.simplefilter("ignore", UserWarning)
             with Image.open(path) as image:
                 width, height = image.size
@@ -137,9 +141,9 @@ def read_photograph(path: Path, source: str = "exif") -> Photograph:
 
 
 def other_camera(photographs: Sequence[Photograph]) -> str | None:
-    """Return a sentence on the first photograph that is not of the camera of most, or None.
+    """Return a sentence on the first photograph of another camera than most, or None.
 
-    EXIF tells: name, serial number, focal length (a zoom, another lens) within 2 %.
+    Name, serial number and focal length within 2 % (zoom, other lens) of EXIF are compared.
     """
     usual = Counter(p.body for p in photographs).most_common(1)[0][0]
     for photograph in photographs:
@@ -147,22 +151,22 @@ def other_camera(photographs: Sequence[Photograph]) -> str | None:
         same_lens = focal == usual[2] or (focal and usual[2] and abs(focal / usual[2] - 1) < 0.02)
         if (name, serial) != usual[:2] or not same_lens:
             return (
-                f"{photograph.path.name} is of {_body(photograph.body)}, the others of "
-                f"{_body(usual)}"
+                f"{photograph.path.name} is of {_body_text(photograph.body)}, the others of "
+                f"{_body_text(usual)}"
             )
     return None
 
 
-def _body(body: tuple[str, str, float | None]) -> str:
+def _body_text(body: tuple[str, str, float | None]) -> str:
     name, serial, focal = body
     parts = [name or "a camera without a name", serial, f"{focal:g} mm" if focal else ""]
     return " ".join(part for part in parts if part)
 
 
 def find_copies(paths: Sequence[Path]) -> dict[int, int]:
-    """Return {position: of the first one with the same bytes} of files that are there twice.
+    """Return {position of a copy: position of the first file with the same bytes}.
 
-    A file that cannot be read is none.
+    Files that cannot be read are ignored.
     """
     of_size: dict[int, list[int]] = {}
     first: dict[bytes, int] = {}
@@ -179,14 +183,14 @@ def find_copies(paths: Sequence[Path]) -> dict[int, int]:
 
 
 def strange_photographs(paths: Sequence[Path]) -> list[str]:
-    """Return what is doubtful in the frames of a recording, a sentence each."""
+    """Return doubts about the frames of a recording, a sentence each."""
     there = list(dict.fromkeys(path for path in paths if path.is_file()))
     found = []
     if copies := find_copies(there):
-        one, of = next(iter(copies.items()))
+        copy, original = next(iter(copies.items()))
         found.append(
-            f"{len(copies)} frames are copies of another one, the first {there[one].name} of "
-            f"{there[of].name}"
+            f"{len(copies)} frames are copies of another one, the first {there[copy].name} of "
+            f"{there[original].name}"
         )
     known = []
     for path in there:
@@ -198,7 +202,7 @@ def strange_photographs(paths: Sequence[Path]) -> list[str]:
 
 
 def moment_taken(path: Path) -> datetime | None:
-    """Return when a photograph was taken as its EXIF says it, None where it does not."""
+    """Return the time of a photograph from its EXIF, or None."""
     try:
         return read_photograph(path).moment
     except (DataError, DriverMissing, ImageError):
@@ -206,7 +210,7 @@ def moment_taken(path: Path) -> datetime | None:
 
 
 def focal_length(path: Path) -> float | None:
-    """Return the focal length that a photograph's EXIF says, mm, None where it does not."""
+    """Return the focal length of a photograph from its EXIF, mm, or None."""
     try:
         return read_photograph(path, "file").focal_length
     except (DriverMissing, ImageError):
@@ -237,7 +241,7 @@ def _exif_moment(path: Path, details: dict[int, Any]) -> datetime:
 def _name_moment(path: Path) -> datetime:
     found = _IN_NAME.search(path.stem)
     if found is None:
-        raise DataError(f"{path}: no time in the name; IMG_20260614_120301.jpg would hold one")
+        raise DataError(f"{path}: no time in the name, as in IMG_20260614_120301.jpg")
     try:
         moment = parse_moment(f"{found[1]}T{found[2]}" + (f".{found[3]}" if found[3] else ""))
     except ValueError as cause:
@@ -254,7 +258,7 @@ def _camera(details: dict[int, Any]) -> str:
 def _pixel_pitch(
     details: dict[int, Any], focal: float | None, width: int, height: int
 ) -> float | None:
-    """From the focal plane's resolution, else from the focal length of a 35 mm camera, mm."""
+    """Return the pixel pitch, mm, from the focal plane's resolution or the 35 mm equivalent."""
     resolution, unit = _positive(details.get(0xA20E)), details.get(0xA210)
     per_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(unit if isinstance(unit, int) else 2)
     if resolution and per_mm and 5e-4 < per_mm / resolution < 0.02:
@@ -288,13 +292,12 @@ def read_series(
     pitch: float | None = None,
     distance: float | None = None,
 ) -> tuple[Recording, list[str]]:
-    """Put photographs and a logger's file on one clock: a recording that lies in no folder of its
-    own, and what was understood of both, for people.
+    """Combine photographs and a logger's file into a recording; return it with notes for the user.
 
-    Copies of one photograph are left out. testfield: None to see what is understood, which a pixel
-    pitch that nobody knows does not prevent; camera: a camera file, which then says it all; pitch,
-    distance mm: instead of EXIF's. Raises DataError for photographs of different sizes or cameras,
-    for times that do not say their zone, and where log and photographs do not overlap.
+    The recording has no folder yet. Copies of a photograph are left out. testfield: None for a dry
+    run, in which an unknown pixel pitch is only noted; camera: a camera file, used instead of EXIF;
+    pitch, distance mm: used instead of EXIF's. Raises DataError for photographs of different sizes
+    or cameras, for times without a zone, and if log and photographs do not overlap in time.
     """
     sizes = {(p.width, p.height) for p in photographs}
     if len(sizes) > 1:
@@ -302,20 +305,18 @@ def read_series(
         other = next(p for p in photographs if (p.width, p.height) != (one.width, one.height))
         raise DataError(
             f"{other.path}: has {other.width} × {other.height} px, {one.path.name} "
-            f"{one.width} × {one.height}: one recording is of one camera in one position; "
-            "import them apart"
+            f"{one.width} × {one.height}: a recording has one camera in one position; import "
+            "them separately"
         )
     if strange := other_camera(photographs):
-        raise DataError(
-            f"{strange}: one recording is of one camera with one lens; import them apart"
-        )
+        raise DataError(f"{strange}: a recording has one camera and lens; import them separately")
     copies = find_copies([p.path for p in photographs])
     notes = [
         f"photographs: {photographs[i].path.name} is a copy of {photographs[k].path.name}: left out"
         for i, k in copies.items()
     ]
     photographs = [p for i, p in enumerate(photographs) if i not in copies]
-    # by name first: within a second it is the order in which they were taken
+    # sorted by name first, which gives the order within one second
     named = sorted(photographs, key=lambda p: p.path.name)
     times = clock.utc([p.moment for p in named], lambda i: str(named[i].path))
     order = np.argsort(times, kind="stable")
@@ -325,11 +326,11 @@ def read_series(
         first, second = (p.path.name for p in placed[same[0] : same[0] + 2])
         notes.append(
             f"doubtful: {len(same)} photographs have the time of another one, the first {first} "
-            f"and {second}: taken in the order of their names"
+            f"and {second}: the order of their names is used"
         )
     logged = read_log(log, options, (float(times[0]), float(times[-1])))
-    _overlap(times, logged.times)
-    row = _next_to(times, logged.times)
+    _require_overlap(times, logged.times)
+    row = _nearest_rows(times, logged.times)
     near, row = row >= 0, np.maximum(row, 0)
     channels = {n: np.where(near, values[row], np.nan) for n, values in logged.channels.items()}
     columns = EpochColumns(
@@ -341,7 +342,7 @@ def read_series(
     known = np.isfinite(at_frame)
     if not known.any():
         raise DataError(
-            "no photograph has a temperature: the log has gaps wherever photographs were taken "
+            "no photograph has a temperature: the log has gaps at the times of all photographs "
             f"({iso(times[0])} to {iso(times[-1])})"
         )
     spec, about_camera = _camera_of(photographs[0], camera, pitch, distance, testfield is None)
@@ -367,20 +368,20 @@ def read_series(
     return recording, [*notes, *about_camera]
 
 
-def _overlap(frames: Array, log: Array) -> None:
+def _require_overlap(frames: Array, log: Array) -> None:
     if frames[0] <= log[-1] and frames[-1] >= log[0]:
         return
     gap = log[0] - frames[-1] if frames[-1] < log[0] else frames[0] - log[-1]
     raise DataError(
         f"photographs ({iso(frames[0])} to {iso(frames[-1])}) and log ({iso(log[0])} to "
-        f"{iso(log[-1])}) lie {gap / 3600:.1f} h apart: is a time zone wrong (--camera-timezone, "
+        f"{iso(log[-1])}) are {gap / 3600:.1f} h apart: is a time zone wrong (--camera-timezone, "
         "--log-timezone), or a clock (--camera-clock, --log-clock)"
-        + (", or are years written with two figures?" if gap > 3e7 else "?")
+        + (", or are years written with two digits?" if gap > 3e7 else "?")
     )
 
 
-def _next_to(frames: Array, log: Array) -> NDArray[np.int64]:
-    """The row of the log next in time to each frame, -1 beyond ten of its intervals."""
+def _nearest_rows(frames: Array, log: Array) -> NDArray[np.int64]:
+    """Return the row of the log nearest to each frame, -1 if it is over ten intervals away."""
     right = np.clip(np.searchsorted(log, frames), 1, len(log) - 1)
     left = right - 1
     row = np.where(frames - log[left] <= log[right] - frames, left, right)
@@ -395,10 +396,10 @@ def _camera_of(
     distance: float | None,
     dry_run: bool,
 ) -> tuple[CameraSpec, list[str]]:
-    """Return the camera of photographs, what of it was taken from EXIF, and what EXIF denies.
+    """Return the camera of photographs, with notes on values from EXIF and doubts.
 
-    file: a camera file, which then says it all; pitch, distance mm: instead of EXIF's; dry_run: a
-    pixel pitch that nobody knows is no error, but noted.
+    file: a camera file, used instead of EXIF; pitch, distance mm: used instead of EXIF's; dry_run:
+    an unknown pixel pitch is noted, not an error.
     """
     notes: list[str] = []
     if file is not None:
@@ -416,13 +417,13 @@ def _camera_of(
     if pitch is None:
         pitch = photograph.pixel_pitch
         unknown = (
-            "the size of a pixel is not known and EXIF does not say it: --pixel-pitch 0.00112 "
-            "(mm), or --camera FILE"
+            "the pixel pitch is unknown, as EXIF does not give it: set --pixel-pitch 0.00112 (mm), "
+            "or --camera FILE"
         )
         if pitch is None and not dry_run:
             raise UsageError(unknown)
-        said = f"pixel pitch {pitch:.5f} mm from EXIF (--pixel-pitch)" if pitch else unknown
-        notes.append(f"camera: {said}")
+        source = f"pixel pitch {pitch:.5f} mm from EXIF (--pixel-pitch)" if pitch else unknown
+        notes.append(f"camera: {source}")
         pitch = pitch or 0.001
     else:
         notes += doubt_lines(pitch_doubts(pitch, photograph.pixel_pitch))
@@ -431,7 +432,7 @@ def _camera_of(
 
 
 def write_photographs(folder: Path, recording: Recording) -> None:
-    """Write what `read_series` returned, in a new folder."""
+    """Write a recording of `read_series` into a new folder."""
     head = replace(recording.head, name=folder.name)
     with RecordingWriter(folder, head, recording.testfield) as writer:
         for epoch in recording.iter_epochs():

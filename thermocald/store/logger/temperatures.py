@@ -1,8 +1,8 @@
-"""Temperatures as a logger, a recording or a store has them, for every command that reads a log.
+"""Read temperatures from the file of a logger, for every command that reads a log.
 
-Columns are taken by name, or guessed and shown. What is not certain is refused with the option that
-says it (units, the order of day and month, the time zone) unless the file or the times of the
-photographs tell.
+Columns are taken by name, or guessed and reported. Units, the order of day and month, and the time
+zone are taken from the file or follow from the times of the photographs. Otherwise the file is
+refused, and the message names the option that gives them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _TEMPERATURE_NAME = re.compile(
 _OTHER_NAME = re.compile(
     r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|\bnr\b|index|count|record|lux|light|dew|taupunkt"
     r"|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
-    # what a thermometer is to show, not what it shows
+    # setpoints and statistics, not readings
     r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
     r"|temp\w*[ _]?set|soll|consigne|desired|target|wanted|nominal|reference value|forecast"
     r"|prognose|heat.?index|wind.?chill|feels|设定|目标"
@@ -68,26 +68,26 @@ _NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_BEHIND = re.compile(r"\s*(?:[°º]\s*[CFK]?|℃|℉|deg\s?[CF]|(?<=[\d\s])[CFK])$")
 _UNIT_NAME = re.compile(r"unit|einheit|^scale$|unidad|eenheid", re.IGNORECASE)
 _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|℉", re.IGNORECASE)
-"""Lines above a table that speak of its unit."""
+"""Lines above a table that state °F."""
 _LABEL = "entity_id"
-"""Home Assistant writes all sensors below one another, each row with its name."""
+"""Home Assistant's column with the sensor of each row: one table has all sensors."""
 _NO_READING = {-127.0, -999.0, -9999.0, -99.0, 9999.0}
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _GOOD_SHARE = 0.8
-_FAHRENHEIT = (45.0, 120.0)  # °F of rooms and cameras, which may be °C of a hot one
+_FAHRENHEIT = (45.0, 120.0)  # °F of rooms and cameras, or °C of a hot camera
 _LATEST_S = 1e11
 _WORDS = {"dmy": "day/month", "mdy": "month/day"}
-_LONGER = 10.0  # times: a log in the wrong order of day and month runs over months
+_LONGER = 10.0  # ratio of spans: with day and month exchanged, a log spans months
 
 
 @dataclass(frozen=True, slots=True)
 class LogOptions:
-    """What is said about a log: names of time and temperature columns (empty: guess), separator and
-    decimal mark, order of dates, unit, and the logger's clock.
+    """What the user has given about a log.
 
-    wanted: names that are temperatures wherever they occur, such as a model's thermometers; names:
-    what columns are called from now on, by their names in the file.
+    times, temperatures: names of columns, empty to guess; separator, decimal, date_order, unit:
+    None to detect; clock: the logger's; wanted: names of temperature columns to use if they occur,
+    such as a model's thermometers; names: new names of columns by those in the file.
     """
 
     times: tuple[str, ...] = ()
@@ -115,7 +115,7 @@ def log_options(
     unit: str | None = None,
     name: Sequence[str] | None = None,
 ) -> LogOptions:
-    """Return what is said about a log from text; UsageError for what cannot be meant."""
+    """Return the options of a log from the text of a command. Raises UsageError."""
     for option, value, allowed in (
         ("--unit", unit, UNITS),
         ("--date-order", date_order, ("dmy", "mdy")),
@@ -141,46 +141,47 @@ def log_options(
 def read_log(
     path: Path, options: LogOptions | None = None, near: tuple[float, float] | None = None
 ) -> TemperatureLog:
-    """Read a logger's file; near: s UTC, the span in which it must have been recorded.
+    """Read a logger's file; near: first and last time, s UTC, that the log should cover.
 
-    Raises DataError or UsageError for what is not certain, with how to say it.
+    Raises DataError or UsageError if something cannot be determined, naming the option to set.
     """
     options = options or LogOptions()
     file = open_log(path, options.separator, options.decimal)
-    time_names = _time_columns(file, options)
-    clock, notes = _clock(options.clock, " ".join(time_names))
-    names = _temperature_columns(file, time_names, options)
-    order, told = _date_order(file, time_names, options, clock, near)
+    time_names = _find_time_columns(file, options)
+    clock, notes = _apply_header_zone(options.clock, " ".join(time_names))
+    names = _find_temperature_columns(file, time_names, options)
+    order, order_notes = _find_date_order(file, time_names, options, clock, near)
     table = _Table(file, time_names, names, order)
     table.read()
     times = table.times(clock)
     if len(times) < 2:
-        raise DataError(f"{path}: holds {len(times)} readings; two at least are needed")
-    _given(table.file, tuple(options.names), "--name")
+        raise DataError(f"{path}: holds {len(times)} readings; at least two are needed")
+    _require_columns(table.file, tuple(options.names), "--name")
     channels = {}
     for name in names:
-        values, unit_note = _celsius(table, name, options)
-        channel = options.names.get(name) or (name if name in options.wanted else _channel(name))
+        values, unit_note = _to_celsius_column(table, name, options)
+        given = name if name in options.wanted else None
+        channel = options.names.get(name) or given or _channel_name(name)
         while channel in channels:  # `T (1)` and `T [1]` are two columns
             channel += "_"
         channels[channel] = values
         notes += unit_note
     if table.labels:
-        channels = _by_label(table, next(iter(channels.values())), options)
+        channels = _split_by_label(table, next(iter(channels.values())), options)
     notes = [
         f"log: {len(times)} rows, {file.description}",
         f"log: time from {_quoted(time_names)}; temperatures from {_quoted(channels)}"
-        + ("" if options.temperatures else " (guessed: --temperature-column says otherwise)"),
-        *told, *notes, *table.left_out(),
+        + ("" if options.temperatures else " (guessed; set --temperature-column to change)"),
+        *order_notes, *notes, *table.left_out(),
     ]  # fmt: skip
-    times, channels, repeated = _in_order(times, channels)
+    times, channels, repeated = _sort_by_time(times, channels)
     if repeated:
         notes.append(f"log: {repeated} rows with the time of the row before: left out")
     return TemperatureLog(times, channels, tuple(notes))
 
 
-def _in_order(times: Array, channels: dict[str, Array]) -> tuple[Array, dict[str, Array], int]:
-    """Rows in the order of time; those of one time become one, and how many were left out."""
+def _sort_by_time(times: Array, channels: dict[str, Array]) -> tuple[Array, dict[str, Array], int]:
+    """Sort rows by time and join those of one time; return also the number left out."""
     unique, place = np.unique(times, return_inverse=True)
     kept, taken = {}, np.zeros(len(times), dtype=bool)
     for name, values in channels.items():
@@ -194,7 +195,7 @@ def _in_order(times: Array, channels: dict[str, Array]) -> tuple[Array, dict[str
 
 
 class _Table:
-    """The rows of a log while they are read: a year of them, as numbers."""
+    """The rows of a log as arrays of numbers, compact enough for a year of them."""
 
     def __init__(
         self, file: LoggerFile, times: tuple[str, ...], names: tuple[str, ...], order: str | None
@@ -211,7 +212,7 @@ class _Table:
         self.labels: list[str] = []
 
     def read(self) -> None:
-        """Read all rows; those without a time (a footer) and readings that are none are counted."""
+        """Read all rows; count those without a time (a footer) and words that are no reading."""
         file = self.file
         columns = [(name, file.names.index(name)) for name in self.names]
         label = file.names.index(_LABEL) if _LABEL in file.names else None
@@ -233,34 +234,34 @@ class _Table:
                 self.labels.append(row[label])
 
     def where(self, row: int) -> str:
-        """A row's place in the file, as errors name it."""
+        """Return a row's place in the file for messages."""
         return f"{self.file.path}, line {self._lines[row]}"
 
     def times(self, clock: DeviceClock) -> Array:
-        """Seconds since 1970 UTC of each row."""
+        """Return the time of each row, s since 1970 UTC."""
         seconds = np.array(self._seconds)
         places = list(self._dated)
         seconds[places] = clock.utc(list(self._dated.values()), lambda k: self.where(places[k]))
         return seconds
 
     def left_out(self) -> list[str]:
-        """What was passed over, for people."""
-        said = []
+        """Return notes for the user on rows and readings that were left out."""
+        notes = []
         if self._untimed:
             line, text = self._untimed[0]
-            said.append(
+            notes.append(
                 f"log: {len(self._untimed)} rows hold no time: left out (line {line}: "
                 f"{text[:30]!r})"
             )
         for name, words in self._words.items():
             if words:
                 shown = ", ".join(repr(word) for word, _ in words.most_common(3))
-                count = words.total()
-                said.append(f"log: {count} readings of {name!r} are none ({shown}): left empty")
-        return said
+                what = f"{words.total()} values of {name!r} are not readings ({shown})"
+                notes.append(f"log: {what}: left empty")
+        return notes
 
     def _moment(self, line: int, text: str) -> datetime | None:
-        """The time of a row, None where it is no row of readings."""
+        """Return the time of a row, None for a row that has no readings."""
         try:
             moment = parse_moment(text, self._order)
         except ValueError as cause:
@@ -272,13 +273,13 @@ class _Table:
             ) from cause
         if not isinstance(moment, datetime):
             raise DataError(
-                f"{self.file.path}, line {line}: {text[:40]!r} is a date or a time alone; name "
+                f"{self.file.path}, line {line}: {text[:40]!r} is only a date or a time; name "
                 "both columns (--time-column twice)"
             )
         return moment
 
     def _value(self, line: int, name: str, text: str) -> float:
-        """A reading as it stands, NaN for none."""
+        """Return a reading in the unit of the file, NaN for none."""
         if not text:
             return np.nan
         plain = text.replace(",", ".") if self.file.decimal == "," else text
@@ -300,7 +301,7 @@ class _Table:
 
 
 def _as_seconds(text: str) -> float | None:
-    """Seconds since 1970, or ms, µs, ns, of any number; None for a date."""
+    """Return a number of s, ms, µs or ns since 1970 in s; None for other text."""
     try:
         seconds = whole_seconds(float(text))
     except ValueError:
@@ -308,52 +309,58 @@ def _as_seconds(text: str) -> float | None:
     return seconds if seconds < _LATEST_S else None
 
 
-def _clock(clock: DeviceClock, header: str) -> tuple[DeviceClock, list[str]]:
-    """The logger's clock with the zone that the head of its times states."""
-    said = _HEADER_ZONE.search(header)
-    if said is None:
+def _apply_header_zone(clock: DeviceClock, header: str) -> tuple[DeviceClock, list[str]]:
+    """Return the logger's clock with the zone in the head of its times, and notes."""
+    stated = _HEADER_ZONE.search(header)
+    if stated is None:
         return clock, []
     if clock.forced:
-        return clock, [f"log: the header says {said[0]}; the logger's own zone was given instead"]
-    # it is no time without a zone: what is said of such times is not meant for it
-    zoned = replace(clock, zone=time_zone(said[0]))
-    return zoned, [f"log: the header says the time zone: {said[0]}"]
+        note = "the one given for the logger is used instead"
+        return clock, [f"log: the header gives the time zone {stated[0]}; {note}"]
+    # takes precedence over --timezone, which is for times without a zone
+    zoned = replace(clock, zone=time_zone(stated[0]))
+    return zoned, [f"log: the header gives the time zone {stated[0]}"]
 
 
-def _by_label(table: _Table, values: Array, options: LogOptions) -> dict[str, Array]:
-    """One channel for each sensor of a file that has them below one another."""
+def _split_by_label(table: _Table, values: Array, options: LogOptions) -> dict[str, Array]:
+    """Return one channel per sensor from a file that has all of them in one column."""
     labels = np.array(table.labels)
     every = list(dict.fromkeys(table.labels))
     names = [n for n in every if n in options.wanted] or [
         n for n in every if not _OTHER_NAME.search(n) and np.isfinite(values[labels == n]).any()
     ]
-    return {_channel(name): np.where(labels == name, values, np.nan) for name in names}
+    if not names:
+        raise DataError(
+            f"{table.file.path}: no sensor in column {_LABEL!r} has temperatures: "
+            f"{_quoted(every[:6])}; export one that has"
+        )
+    return {_channel_name(name): np.where(labels == name, values, np.nan) for name in names}
 
 
 def _quoted(names: Sequence[str] | dict[str, Array]) -> str:
     return ", ".join(repr(n) for n in names)
 
 
-def _channel(name: str) -> str:
-    """A name that a recording can have for a column, without its unit: a recording's is °C."""
+def _channel_name(name: str) -> str:
+    """Return a recording's name for a column, without the unit, which is °C there."""
     quantity = without_unit(column_label(name))
     plain = re.sub(r"[^\w .°+-]", "", quantity).strip() or "temperature"
     plain = plain[:48]
     return f"{plain} of the log" if channel_fault(plain) else plain
 
 
-def _given(file: LoggerFile, names: tuple[str, ...], option: str) -> tuple[str, ...]:
+def _require_columns(file: LoggerFile, names: tuple[str, ...], option: str) -> tuple[str, ...]:
     for name in names:
         if name not in file.names:
             raise DataError(
-                f"{file.path}: there is no column {name!r} ({option}); there are "
+                f"{file.path}: there is no column {name!r} ({option}); the columns are "
                 f"{_quoted(file.names)}"
             )
     return names
 
 
 def _kind(values: list[str]) -> str:
-    """What most of a column's values are: moment, date, time, number, text."""
+    """Return the kind of most of a column's values: moment, seconds, date, time, number, text."""
     kinds: Counter[str] = Counter(_kind_of(value) for value in values if re.search(r"\d", value))
     if not kinds:
         return "empty"
@@ -376,9 +383,9 @@ def _kind_of(value: str) -> str:
     return "time" if isinstance(found, time) else "date"
 
 
-def _time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
+def _find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     if options.times:
-        return _given(file, options.times, "--time-column")
+        return _require_columns(file, options.times, "--time-column")
     kinds = {name: _kind(file.column(name)) for name in file.names}
     ours = [n for n in OUR_TIMES if kinds.get(n) in ("number", "seconds")]
     moments = [n for n, kind in kinds.items() if kind == "moment"]
@@ -393,22 +400,22 @@ def _time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]:
     if len(seconds) == 1:
         return (seconds[0],)
     raise DataError(
-        f"{file.path}: no column holds dates with times; say --time-column NAME (twice for a date "
+        f"{file.path}: no column holds dates with times; give --time-column NAME (twice for a date "
         f"and a time). Columns: {_quoted(file.names)}"
     )
 
 
-def _date_order(
+def _find_date_order(
     file: LoggerFile,
     names: tuple[str, ...],
     options: LogOptions,
     clock: DeviceClock,
     near: tuple[float, float] | None,
 ) -> tuple[str | None, list[str]]:
-    """The order of day and month, None where each date says it; and how it was found.
+    """Return the order of day and month, None if dates need none, and notes.
 
-    A number above 12 tells it; else the photographs, as only one order puts the log next to them;
-    else the rows, as a log that runs on for days would jump from month to month in the other order.
+    It follows from a number above 12; else from the photographs, if only one order puts the log
+    near them; else from the rows, as a log of some days would span months in the other order.
     """
     if options.date_order is not None:
         return options.date_order, []
@@ -444,23 +451,23 @@ def _date_order(
             if abs(far["dmy"] - far["mdy"]) > 86400.0:
                 order = min(far, key=lambda o: far[o])
                 return order, [
-                    f"log: {first!r} is {_WORDS[order]}: so it lies next to the photographs"
+                    f"log: {first!r} is {_WORDS[order]}: this puts the log near the photographs"
                 ]
         lengths = {o: abs((b - a).total_seconds()) + 1.0 for o, (a, b) in spans.items()}
         order = min(lengths, key=lambda o: lengths[o])
         if max(lengths.values()) > _LONGER * lengths[order]:
-            return order, [f"log: {first!r} is {_WORDS[order]}: so the rows follow one another"]
+            return order, [f"log: {first!r} is {_WORDS[order]}: this makes the rows consecutive"]
     raise DataError(
-        f"{file.path}, column {names[0]!r}: {first!r} may be day/month or month/day: say "
+        f"{file.path}, column {names[0]!r}: {first!r} may be day/month or month/day: give "
         "--date-order dmy or mdy"
     )
 
 
-def _temperature_columns(
+def _find_temperature_columns(
     file: LoggerFile, times: tuple[str, ...], options: LogOptions
 ) -> tuple[str, ...]:
     if options.temperatures:
-        return _given(file, options.temperatures, "--temperature-column")
+        return _require_columns(file, options.temperatures, "--temperature-column")
     wanted = tuple(name for name in options.wanted if name in file.names)
     numeric = [
         name
@@ -481,33 +488,33 @@ def _temperature_columns(
         return (means[0],)
     shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in numeric) or "none with numbers"
     raise DataError(
-        f"{file.path}: which column is the temperature? Say --temperature-column NAME. {shown}"
+        f"{file.path}: which column is the temperature? Give --temperature-column NAME. {shown}"
     )
 
 
-def _celsius(table: _Table, name: str, options: LogOptions) -> tuple[Array, list[str]]:
-    """A column (n,) in °C, and what its unit is taken from."""
+def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[Array, list[str]]:
+    """Return a column (n,) in °C, and notes on its unit and readings."""
     path = table.file.path
     values = np.array(table.values[name])
     known = values[np.isfinite(values)]
-    unit, source = (options.unit, "") if options.unit else _unit(table, name)
+    unit, source = (options.unit, "") if options.unit else _find_unit(table, name)
     notes = []
     if unit is None:
         if len(known) and known.min() > _KELVIN[0] and known.max() < _KELVIN[1]:
             raise DataError(
-                f"{path}, column {name!r}: {known[0]:g} looks like kelvin: say --unit K to convert"
+                f"{path}, column {name!r}: {known[0]:g} looks like kelvin: give --unit K to convert"
             )
         if len(known) and known.min() > _FAHRENHEIT[0] and known.max() < _FAHRENHEIT[1]:
             notes.append(
                 f"doubtful: {name!r} names no unit: {known[0]:g} is taken as °C; if it is °F, it "
-                f"is {(known[0] - 32) / 1.8:.1f} °C: say --unit degF, or degC"
+                f"is {(known[0] - 32) / 1.8:.1f} °C: give --unit degF, or degC"
             )
         unit = "degC"
     elif unit != "degC" and options.unit is None:
-        notes.append(f"log: {name!r} is converted from {unit}, as {source} says")
+        notes.append(f"log: {name!r} is converted from {unit}, the unit in {source}")
     celsius = to_celsius(values, unit)
-    celsius, said = _measured(table, name, celsius, options)
-    notes += said
+    celsius, doubts = _drop_unmeasured(table, name, celsius, options)
+    notes += doubts
     wrong = (celsius < _PLAUSIBLE_C[0]) | (celsius > _PLAUSIBLE_C[1])
     if wrong.any():
         i = int(np.argmax(wrong))
@@ -519,12 +526,12 @@ def _celsius(table: _Table, name: str, options: LogOptions) -> tuple[Array, list
     return celsius, notes
 
 
-def _measured(
+def _drop_unmeasured(
     table: _Table, name: str, celsius: Array, options: LogOptions
 ) -> tuple[Array, list[str]]:
-    """Return a column (n,) °C without what its thermometer gives unmeasured, and notes on it.
+    """Return a column (n,) °C, NaN for values given without a measurement, and notes.
 
-    Raises DataError where the unit changes midway and was not stated.
+    Raises DataError if the unit changes midway and was not given.
     """
     if changed := find_unit_change(celsius):
         row, words = changed
@@ -532,14 +539,14 @@ def _measured(
         where = f"{table.where(row)}, column {name!r}: the unit seems to change {words} here"
         if options.unit is None:
             raise DataError(
-                f"{where} ({celsius[row]:.4g} after {last:.4g} °C): import the parts by "
-                "themselves, or say --unit if it is one unit"
+                f"{where} ({celsius[row]:.4g} after {last:.4g} °C): import the parts "
+                "separately, or give --unit if the unit is the same"
             )
         return celsius, [f"doubtful: {where}"]
     spikes = find_spikes(celsius)
     measured = celsius.copy()
     notes = [f"doubtful: {text}" for text in stuck_doubts(celsius, repr(name))]
-    for said, sort in (("left empty", False), ("kept", True)):
+    for treated, sort in (("left empty", False), ("kept", True)):
         found = [s for s in spikes if s.measured is sort]
         if not found:
             continue
@@ -547,7 +554,7 @@ def _measured(
         why = "leap away and back" if sort else "are what a thermometer gives without a measurement"
         notes.append(
             f"doubtful: {sum(s.stop - s.first for s in found)} readings of {name!r} {why} (the "
-            f"first {celsius[first]:.4g} °C, {table.where(first)}): {said}"
+            f"first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
         )
     for spike in spikes:
         if not spike.measured:
@@ -555,8 +562,8 @@ def _measured(
     return measured, notes
 
 
-def _unit(table: _Table, name: str) -> tuple[str | None, str]:
-    """The unit that a column states, and where; DataError where the file contradicts itself."""
+def _find_unit(table: _Table, name: str) -> tuple[str | None, str]:
+    """Return the unit of a column and where the file states it. Raises DataError if it has two."""
     file = table.file
     found: dict[str, str] = {}
     if unit := stated_unit(name):
@@ -573,6 +580,6 @@ def _unit(table: _Table, name: str) -> tuple[str | None, str]:
         return "degF", "a line above the table"
     if len(found) > 1:
         raise DataError(
-            f"{file.path}, column {name!r}: is {' and '.join(found)} at once; say which with --unit"
+            f"{file.path}, column {name!r}: is in {' and '.join(found)} at once; give --unit"
         )
     return next(iter(found.items()), (None, ""))

@@ -1,6 +1,4 @@
-"""Boards as other programs describe them: Kalibr's target.yaml, OpenCV's board parameters, lists of
-ring-coded targets.
-"""
+"""Read boards of other programs: Kalibr, OpenCV, calib.io, lists of ring-coded targets."""
 
 from __future__ import annotations
 
@@ -33,27 +31,27 @@ _SYNONYMS = {
     "dictionary": ("dictionary", "dict", "arucodict", "arucodictionary", "dictname",
                    "dictionaryname"),
 }  # fmt: skip
-"""Keys without case, underscores and the unit that they may end with."""
+"""Keys for each quantity, in lower case, without underscores and unit."""
 _CALIB_IO = re.compile(
-    r"calib\.io_(checker|charuco)_[^_]+_(\d{1,3})x(\d{1,3})_([\d.]+?)"
-    r"(?:_([\d.]+))?(?:_(DICT_\w+?))?(?:\.\w+)?",
+    r"calib\.io_(checker|charuco)_[^_]+_(\d{1,3})x(\d{1,3})_(\d*\.?\d+)"
+    r"(?:_(\d*\.?\d+))?(?:_(DICT_\w+?))?(?:\.\w+)?",
     re.IGNORECASE,
 )
-"""A file of calib.io's generator: kind, page, rows x columns of squares, square, marker mm."""
+"""Names of calib.io's files: kind, page, rows x columns of squares, square, marker mm."""
 
 
 def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
-    """The board in a YAML or JSON file, and what it was taken for.
+    """Read the board in a YAML or JSON file; return it with a description for the user.
 
     Kalibr: target_type aprilgrid or checkerboard, lengths in metres. Others: type charuco or
-    chessboard with OpenCV's names for the parameters; lengths below 1 are metres, else mm.
-    A file of calib.io's generator states its board by its name (`calib.io_charuco_420x297_8x11_34_
-    25_DICT_5X5.pdf`: 8 rows of 11 squares of 34 mm). Raises TestFieldError naming file and key.
+    chessboard with OpenCV's names for the parameters; lengths below 1 are in metres, others in mm.
+    A file of calib.io's generator describes its board by its name (`calib.io_charuco_420x297_8x11_
+    34_25_DICT_5X5.pdf`: 8 rows of 11 squares of 34 mm). Raises TestFieldError naming file and key.
     """
     named = _CALIB_IO.fullmatch(path.name)
     if named is not None:
         return _of_calib_io(path, named, sigma)
-    # how a key is compared: `Square_Length_mm` → `squarelength`
+    # keys are compared in a plain form: `Square_Length_mm` → `squarelength`
     plain = {re.sub(r"[^a-z0-9]", "", k.lower().removesuffix("_mm")): v
              for k, v in read_yaml(path, TestFieldError).items()}  # fmt: skip
     board = _Reader(path, plain)
@@ -64,12 +62,13 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
         columns, rows = board.count("columns"), board.count("rows")
         size = 1e3 * board.number("tagsize", "m", above=0.0, high=1e6)
         spacing = board.number("tagspacing", "1", above=0.0, high=1e6)
-        first = int(plain.get("startid", plain.get("lowid", 0)) or 0)
+        start = next((key for key in ("startid", "lowid") if plain.get(key) is not None), None)
+        first = 0 if start is None else int(board.number(start, "1", low=0, high=_MOST_ROWS))
         field = boards.aprilgrid(columns, rows, size, spacing, first=first, sigma=sigma)
-        said = (
-            f"Kalibr's AprilGrid of {columns} × {rows} tags of {size:g} mm, {spacing * size:g} mm"
+        return field, (
+            f"Kalibr's AprilGrid of {columns} × {rows} tags of {size:g} mm, "
+            f"{spacing * size:g} mm apart"
         )
-        return field, said + " apart"
     if kind in ("checkerboard", "chessboard") and "rowspacingmeters" in plain:
         columns, rows = board.count("columns"), board.count("rows")
         wide = 1e3 * board.number("colspacingmeters", "m", above=0.0, high=1e6)
@@ -85,9 +84,9 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
             field = boards.chessboard(columns, rows, square, sigma=sigma)
             return field, f"a chessboard of {columns} × {rows} inner corners, {square:g} mm"
         marker = board.length("marker")
-        key = board.known("dictionary")
+        key = board.find_key("dictionary")
         if plain.get(key) is None:
-            raise board.fail(key, f"is missing; there are {', '.join(plain)[:200]}")
+            raise board.fail(key, f"is missing; the file has {', '.join(plain)[:200]}")
         name = _dictionary(path, plain[key])
         legacy = bool(plain.get("legacy", plain.get("legacypattern", False)))
         field = boards.charuco(columns, rows, square, marker, name, legacy=legacy, sigma=sigma)
@@ -95,34 +94,33 @@ def read_board(path: Path, sigma: float | None = None) -> tuple[TestField, str]:
             f"a ChArUco board of {columns} × {rows} squares of {square:g} mm, markers of "
             f"{marker:g} mm of {name}"
         )
+    wrong = f"{kind!r} is unknown" if kind else "is missing"
     raise TestFieldError(
-        f"{path}, key target_type: {kind or 'is missing'}; aprilgrid, checkerboard, charuco and "
-        "chessboard are read"
+        f"{path}, key target_type: {wrong}; give aprilgrid, checkerboard, charuco or chessboard"
     )
 
 
 class _Reader(QuantityReader):
-    """The keys of a board, by what they mean."""
+    """A reader of a board's keys by their meaning in `_SYNONYMS`."""
 
     error = TestFieldError
 
-    def known(self, meaning: str) -> str:
-        """The key of `_SYNONYMS` that the file has; the first where it has none."""
+    def find_key(self, meaning: str) -> str:
+        """Return the synonym for a meaning that the file has; the first if it has none."""
         names = _SYNONYMS[meaning]
         return next((name for name in names if self.mapping.get(name) is not None), names[0])
 
     def count(self, meaning: str) -> int:
-        """Read a count."""
-        return self.whole(self.known(meaning), "1", high=_MOST_ROWS)
+        return self.whole(self.find_key(meaning), "1", high=_MOST_ROWS)
 
     def length(self, meaning: str) -> float:
-        """Read a length in mm; below 1 it is in metres, as ROS and OpenCV's samples have it."""
-        length = self.number(self.known(meaning), "mm", above=0.0, high=1e6)
+        """Read a length in mm; below 1 it is in metres, as in ROS and OpenCV's samples."""
+        length = self.number(self.find_key(meaning), "mm", above=0.0, high=1e6)
         return 1e3 * length if length < 1 else length
 
 
 def _of_calib_io(path: Path, named: re.Match[str], sigma: float | None) -> tuple[TestField, str]:
-    """The board that a file's name states."""
+    """Return the board that a file's name describes."""
     kind, rows, columns = named[1].lower(), int(named[2]), int(named[3])
     square = float(named[4])
     if kind == "checker":
@@ -132,10 +130,10 @@ def _of_calib_io(path: Path, named: re.Match[str], sigma: float | None) -> tuple
         )
     if named[5] is None or named[6] is None:
         raise TestFieldError(
-            f"{path}: the name does not state the markers: give --charuco {columns}x{rows} "
+            f"{path}: the name does not describe the markers; give --charuco {columns}x{rows} "
             f"--square {square:g} with --marker and --dictionary"
         )
-    # the smaller dictionaries of a size are the beginning of the largest
+    # the smaller dictionaries of a marker size are the first markers of the largest
     name = named[6].upper()
     name = name if name.count("_") > 1 else f"{name}_1000"
     field = boards.charuco(
@@ -148,7 +146,7 @@ def _of_calib_io(path: Path, named: re.Match[str], sigma: float | None) -> tuple
 
 
 def _dictionary(path: Path, value: Any) -> str:
-    """OpenCV's name of a dictionary, from its name with or without DICT_, or its number."""
+    """Return OpenCV's name of a dictionary, given its name with or without DICT_, or number."""
     import cv2
 
     if isinstance(value, int):
@@ -159,15 +157,15 @@ def _dictionary(path: Path, value: Any) -> str:
     name = str(value).strip()
     name = name if name.startswith("DICT_") else f"DICT_{name}"
     if not isinstance(getattr(cv2.aruco, name, None), int):
-        raise TestFieldError(f"{path}: {str(value)[:40]!r} is not a dictionary of OpenCV's")
+        raise TestFieldError(f"{path}: {str(value)[:40]!r} is not one of OpenCV's dictionaries")
     return name
 
 
 def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = None) -> TestField:
-    """Ring-coded targets from a list as Metashape and AICON write it: label, X, Y, Z in mm.
+    """Read ring-coded targets from a list of Metashape or AICON: label, X, Y, Z in mm.
 
-    A label is the target's number, alone or after a word (`target 12`). Lines that hold none are
-    passed over. Raises TestFieldError naming file and line.
+    A label is the target's number, alone or after a word (`target 12`). Other lines are skipped.
+    Raises TestFieldError naming file and line.
     """
     try:
         if path.stat().st_size > _LARGEST_BYTES:
@@ -197,7 +195,7 @@ def read_rings(path: Path, bits: int, diameter: float, sigma: float | None = Non
 
 
 def read_distances(path: Path) -> list[Distance]:
-    """Read measured distances, a CSV with a, b, length, sigma mm; UsageError names the line."""
+    """Read measured distances from a CSV with a, b, length, sigma mm. Raises UsageError."""
     names = ("a", "b", "length", "sigma")
     found = Table(path, names, UsageError).read(numbers=names[2:], texts=names[:2])
     rows = zip(*(found.get(name, ()) for name in names), strict=True)

@@ -1,4 +1,4 @@
-"""`recording.yaml` (CONVENTIONS §3): what a recording says about itself."""
+"""`recording.yaml` (CONVENTIONS §3): the description of a recording."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Channel:
 
 @dataclass(frozen=True)
 class Head:
-    """What `recording.yaml` holds.
+    """The content of `recording.yaml`.
 
     name, series: as the user calls them; interval: s, nominal; channels: the temperature columns,
-    the first is the reference; extra: keys that the format does not know, kept as they are.
+    the first is the reference; extra: keys that the format does not define, unchanged.
     """
 
     name: str
@@ -49,22 +49,22 @@ class Head:
         return "thermal_model" in self.extra
 
     def require_calibrated(self, where: str) -> None:
-        """Raise DataError for a series whose cameras a thermal model predicted."""
+        """Raise DataError if a thermal model predicted the series' cameras."""
         if self.predicted:
             raise DataError(
                 f"{where}: series {self.series!r} was predicted by the thermal model "
-                f"{self.extra['thermal_model']!r}; nothing in it was calibrated. `thermocald "
-                "export` of its store has the cameras"
+                f"{self.extra['thermal_model']!r}; nothing in it was calibrated; run `thermocald "
+                "export` on its store to get the cameras"
             )
 
 
 class _Reader(QuantityReader):
-    """One mapping of the file."""
+    """A reader of one mapping of the file."""
 
     error = RecordingError
 
     def text(self, key: str, default: str | None = None) -> str:
-        """Read text as a message or a table can show it."""
+        """Read text that a message or a table can show."""
         text = super().text(key, default)
         if not text.isprintable() or len(text) > _LONGEST_NAME:
             raise self.fail(
@@ -74,10 +74,10 @@ class _Reader(QuantityReader):
 
 
 def read_head(folder: Path) -> Head:
-    """Read `recording.yaml` of a folder; raises RecordingError naming file and key."""
+    """Read `recording.yaml` of a folder. Raises RecordingError naming file and key."""
     path = folder / "recording.yaml"
     if not folder.is_dir():
-        raise RecordingError(f"{folder}: is not a folder; a recording is one with recording.yaml")
+        raise RecordingError(f"{folder}: is not a folder with recording.yaml, as a recording is")
     if not path.is_file():
         raise RecordingError(f"{folder}: is not a recording: recording.yaml is missing")
     head = parse_head(read_yaml(path, RecordingError), path)
@@ -86,7 +86,7 @@ def read_head(folder: Path) -> Head:
 
 
 def parse_head(document: Mapping[str, Any], path: Path) -> Head:
-    """The head in a mapping of `recording.yaml`; `path` is for the messages."""
+    """Return the head from the mapping of a `recording.yaml`; `path` is for the messages."""
     top = _Reader(path, document)
     top.require_format(FORMAT)
     known = {"format", "name", "series", "interval", "camera", "temperatures"}
@@ -101,7 +101,7 @@ def parse_head(document: Mapping[str, Any], path: Path) -> Head:
 
 
 def _plain(top: _Reader, extra: Mapping[str, Any]) -> dict[str, Any]:
-    """Unknown keys as JSON would keep them: a date of YAML becomes text, as it will in a store."""
+    """Return unknown keys as JSON holds them: a YAML date becomes text, as in a store."""
     try:
         plain: dict[str, Any] = json.loads(json.dumps(extra, default=str))
     except TypeError as cause:
@@ -131,7 +131,7 @@ def _channels(top: _Reader) -> dict[str, Channel]:
 
 
 def head_document(head: Head) -> dict[str, Any]:
-    """The mapping that `recording.yaml` holds; JSON-able where `extra` is."""
+    """Return the mapping that `recording.yaml` holds; it can be written as JSON if `extra` can."""
     sensor, interior = head.camera.sensor, head.camera.interior
     camera = {
         "name": head.camera.name, "width": sensor.width, "height": sensor.height,

@@ -1,7 +1,7 @@
-"""`observations.csv` (CONVENTIONS §3) or `.parquet`: image points by epoch, whole or as a stream.
+"""`observations.csv` (CONVENTIONS §3) or `.parquet`: image points by epoch, read whole or in parts.
 
-Besides the columns of the format, `sxy` (px², the covariance of x and y) is read where it stands,
-and further numeric columns become the observations' quality; other columns are ignored.
+An optional column `sxy` (px²) is the covariance of x and y. Further numeric columns become the
+observations' quality; other columns are ignored.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
     from thermocald.store.recording.table import Chunk
 
 
-_GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # of a grid: 12 MB
-# Of text or Parquet: above it (a day of 150 targets every 10 s) a recording is read in parts.
+_GRID_POINTS, _GRID_EPOCHS = 300_000, 4_000  # limits of a grid: 12 MB
+# A file of text or Parquet of this size (a day of 150 targets every 10 s) is read in parts.
 LONG_FROM_BYTES = 100_000_000
 _REQUIRED = ("epoch", "target", "x", "y", "sx", "sy")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservationRows:
-    """Observations of many epochs, a row each.
+    """Observations of many epochs, one per row.
 
-    epochs, targets (n,): their epochs, from 0 or by number, and rows of the test field; points,
-    sigmas (n, 2) px; covariances (n,) px² of x with y, 0 where it is not known, None where it
-    nowhere is; first: the row of a file that the first of them is.
+    epochs (n,): from 0, or epoch numbers; targets (n,): rows of the test field; points, sigmas
+    (n, 2) px; covariances (n,) px² of x and y, 0 if not given, None if given for none; first: row
+    of the first observation in its file.
     """
 
     epochs: NDArray[np.int64]
@@ -53,7 +53,7 @@ class ObservationRows:
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
-        """Rows one behind the other; all have the quality of the first."""
+        """Return parts one after another; all have the quality columns of the first."""
         covariances = None
         if any(part.covariances is not None for part in parts):
             covariances = np.concatenate(
@@ -67,7 +67,7 @@ class ObservationRows:
         return cls(epochs, targets, points, sigmas, covariances, quality, parts[0].first)
 
     def rows(self, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Self:
-        """Some of them; `first` is that of a slice."""
+        """Return some of the rows; `first` is only right for a slice."""
         first = self.first + (rows.start or 0 if isinstance(rows, slice) else 0)
         covariances = None if self.covariances is None else self.covariances[rows]
         quality = {name: values[rows] for name, values in self.quality.items()}
@@ -75,19 +75,19 @@ class ObservationRows:
         return type(self)(*kept, covariances, quality, first)
 
     def between(self, begin: int, end: int) -> Self:
-        """The rows of the epochs `begin` to before `end`, of rows in their order; no copies."""
+        """Return the rows of epochs `begin` to `end` (exclusive) of sorted rows, as views."""
         low, high = np.searchsorted(self.epochs, [begin, end])
         return self.rows(slice(int(low), int(high)))
 
     def of_epoch(self, epoch: int) -> Observations:
-        """What an epoch shows, of rows in the order of their epochs; no copies."""
+        """Return the observations of an epoch, as views; rows must be sorted by epoch."""
         found = self.between(epoch, epoch + 1)
         return Observations(
             found.targets, found.points, found.sigmas, found.covariances, dict(found.quality)
         )
 
     def grid(self, begin: int, end: int, targets: int) -> ObservationGrid:
-        """The grid of the epochs `begin` to before `end`, of which all rows must be."""
+        """Return the grid of epochs `begin` to `end` (exclusive), to which all rows belong."""
         return ObservationGrid.from_rows(
             (end - begin, targets), self.epochs - begin, self.targets, self.points, self.sigmas,
             self.covariances,
@@ -95,12 +95,12 @@ class ObservationRows:
 
 
 def grid_runs(epochs: int, targets: int, windows: Sequence[slice] | None) -> Iterator[slice]:
-    """Yield the epochs of the grids of a series, or of some windows of it."""
+    """Yield the slices of epochs that make the grids of a series, or of some windows of it."""
     return runs(epochs, max(min(_GRID_POINTS // targets, _GRID_EPOCHS), 1), windows)
 
 
 class ObservationFile:
-    """The file of a recording; numbers: the (E,) epoch numbers of epochs.csv, increasing."""
+    """The observations' file of a recording; numbers (E,): those of epochs.csv, increasing."""
 
     def __init__(
         self, path: Path, field: TestField, numbers: NDArray[np.int64], sensor: Sensor
@@ -114,13 +114,13 @@ class ObservationFile:
         self._field, self._numbers, self._sensor = field, numbers, sensor
         self._has_covariances = "sxy" in self._table.columns
         extras = [n for n in self._table.columns if n not in {*_REQUIRED, "sxy", ""}]
-        first = next(self._table.chunks(1), None) if extras else None
+        first = next(self._table.chunks(100), None) if extras else None
         self._quality = [n for n in extras if first is not None and first.is_number(n)]
 
     def load(self) -> ObservationRows:
-        """All observations, in the order of their epochs; in the file they may stand in any."""
+        """Return all observations sorted by epoch; the file may have them in any order."""
         parts = [self._read(chunk, self._quality) for chunk in self._table.chunks()]
-        whole = ObservationRows.join(parts) if parts else self._none()
+        whole = ObservationRows.join(parts) if parts else self._no_rows()
         del parts
         self._refuse_duplicates(whole)
         if np.any(np.diff(whole.epochs) < 0):
@@ -128,10 +128,10 @@ class ObservationFile:
         return whole
 
     def stream(self, window: slice | None = None) -> Iterator[Observations]:
-        """The observations of one epoch of epochs.csv after the other, in constant memory.
+        """Yield the observations of each epoch of epochs.csv, in constant memory.
 
-        window: only these epochs. Raises RecordingError where the rows are not in the order of
-        their epochs.
+        window: only these epochs. Raises RecordingError if the rows are not in the order of their
+        epochs.
         """
         for rows, first, stop in self._blocks(None if window is None else [window], self._quality):
             self._refuse_duplicates(rows)
@@ -141,9 +141,9 @@ class ObservationFile:
     def grids(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
-        """The same as grids of consecutive epochs, each with its first epoch (from 0).
+        """Yield observations as grids of consecutive epochs, each with its first epoch (from 0).
 
-        windows: only epochs of these slices, ascending; of a Parquet file only they are read.
+        windows: only the epochs of these slices, ascending; of a Parquet file only they are read.
         """
         for rows, first, stop in self._blocks(windows, []):
             for run in grid_runs(stop, len(self._field), [slice(first, stop)]):
@@ -156,9 +156,7 @@ class ObservationFile:
     def _blocks(
         self, windows: Sequence[slice] | None, quality: list[str]
     ) -> Iterator[tuple[ObservationRows, int, int]]:
-        """Rows of whole epochs, in order, with the first epoch of each that is asked for and the
-        one after the last.
-        """
+        """Yield rows of whole epochs, in order, with the first wanted one and the end."""
         columns = [*_REQUIRED, *(["sxy"] if self._has_covariances else []), *quality]
         every = [slice(0, len(self._numbers))]
         # text is read once for all windows
@@ -179,9 +177,9 @@ class ObservationFile:
     def _whole_epochs(
         self, chunks: Iterator[Chunk], quality: list[str]
     ) -> Iterator[tuple[ObservationRows, int, int]]:
-        """Rows of whole epochs, in order, with the first epoch of each and the one after it."""
+        """Yield rows of whole epochs, in order, with their first epoch and the end (exclusive)."""
         done = 0
-        pending = self._none()
+        pending = self._no_rows()
         for chunk in chunks:
             rows = self._read(chunk, quality)
             if len(pending.epochs):
@@ -190,7 +188,7 @@ class ObservationFile:
             if back.any() or rows.epochs[0] < done:
                 row = rows.first + (int(np.argmax(back)) + 1 if back.any() else 0)
                 self._table.fail(
-                    row, "epoch", "stands after a later epoch; sort the rows of so long a file"
+                    row, "epoch", "comes after a later one; sort the rows of so large a file"
                 )
             last = int(rows.epochs[-1])
             cut = int(np.searchsorted(rows.epochs, last))
@@ -199,7 +197,7 @@ class ObservationFile:
             done = last
         yield pending, done, len(self._numbers)
 
-    def _none(self) -> ObservationRows:
+    def _no_rows(self) -> ObservationRows:
         none, points = np.empty(0, dtype=np.int64), np.empty((0, 2))
         quality = {name: np.empty(0) for name in self._quality}
         covariances = np.empty(0) if self._has_covariances else None
@@ -207,7 +205,7 @@ class ObservationFile:
 
     def _read(self, chunk: Chunk, quality: list[str]) -> ObservationRows:
         numbers = chunk.integers("epoch")
-        # rows of one epoch follow one another: look each run of them up once
+        # rows of one epoch follow one another: each run is looked up once
         starts = np.flatnonzero(np.diff(numbers, prepend=-1))
         found = np.searchsorted(self._numbers, numbers[starts])
         epochs = np.repeat(found, np.diff(starts, append=len(numbers)))
@@ -215,7 +213,7 @@ class ObservationFile:
         chunk.check(
             "epoch",
             self._numbers[near] != numbers,
-            lambda row: f"epoch {numbers[row]} does not stand in epochs.csv",
+            lambda row: f"epoch {numbers[row]} is not in epochs.csv",
         )
         points = np.column_stack([chunk.numbers("x"), chunk.numbers("y")])
         sigmas = np.column_stack([chunk.numbers("sx"), chunk.numbers("sy")])
@@ -234,7 +232,7 @@ class ObservationFile:
         chunk.check(
             "target",
             targets < 0,
-            lambda row: f"target {chunk.text('target')[row]!r} does not stand in testfield.csv",
+            lambda row: f"target {chunk.text('target')[row]!r} is not in testfield.csv",
         )
         extras = {name: chunk.numbers(name, empty_is_nan=True) for name in quality}
         return ObservationRows(epochs, targets, points, sigmas, covariances, extras, chunk.first)

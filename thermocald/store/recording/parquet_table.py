@@ -1,11 +1,11 @@
 """`observations.parquet`: the columns of observations.csv as Apache Parquet, read in chunks.
 
-Ten times as fast to read as CSV and a third of its size; the numbers are the same to the bit. It
-needs pyarrow (`pip install 'thermocald[parquet]'`). A chunk answers as one of a CSV table does, so
-that what is checked of one is checked of the other.
+It is read ten times as fast as CSV and has a third of its size; the numbers are the same to the
+bit. It needs pyarrow (`pip install 'thermocald[parquet]'`). A chunk has the interface of a CSV
+table's chunk, so both pass the same checks.
 
-A CSV file that is too long for memory is read again and again by a series' passes: its text is
-parsed once, into such a file in the user's cache that is known by the text's place, size, time.
+A CSV file that is too long for memory is read several times by an analysis. Its text is parsed only
+once, into a Parquet copy in the user's cache, found by the text's path, inode, size and time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _ROWS = 1 << 18
 _MOST_COLUMNS = 200
-# as the writer of a recording writes them; a number that this would change is written in full
+# those of `RecordingWriter`; a number that such a form would change is written in full
 _FORMS = {"x": "%.5f", "y": "%.5f"}
 _USUAL_FORM = "%.6g"
 
@@ -48,9 +48,9 @@ _KEPT_DAYS = 14.0  # since a copy was last read
 
 
 class ParquetTable(Table):
-    """A Parquet file with the columns of a CSV table; RecordingError where one is missing.
+    """A Parquet file with the columns of a CSV table; RecordingError if a column is missing.
 
-    original: the table of which the file is a copy, which then says what is wrong with a row.
+    original: the table of which the file is a copy; errors then name the line of that table.
     """
 
     seeks = True
@@ -80,21 +80,23 @@ class ParquetTable(Table):
         columns: Sequence[str] | None = None,
         epochs: tuple[int, int] | None = None,
     ) -> Iterator[ColumnChunk]:
-        """The rows, at most `rows` at a time; only of `columns`, and of `epochs` where known."""
+        """Yield at most `rows` rows at a time of `columns` and, if groups allow, of `epochs`."""
         pyarrow = _pyarrow()
         first = 0
         try:
-            # not mapped: what was read of a long file would stay resident
+            # not memory-mapped: what was read of a long file would stay resident
             with pyarrow.parquet.ParquetFile(self.path, pre_buffer=False) as file:
                 groups = range(file.num_row_groups)
                 if epochs is not None:
-                    groups, first = _holding(file.metadata, self.columns.index("epoch"), epochs)
-                for group in groups:  # one call for all would keep what was read
+                    groups, first = _select_groups(
+                        file.metadata, self.columns.index("epoch"), epochs
+                    )
+                for group in groups:  # one call for all groups would hold them all in memory
                     for batch in file.iter_batches(rows, [group], columns):
                         if len(batch):
                             yield ColumnChunk(self, first, batch)
                             first += len(batch)
-        except (OSError, ValueError) as cause:  # pyarrow's errors are both
+        except (OSError, ValueError) as cause:  # pyarrow raises both
             if isinstance(cause, RecordingError):
                 raise
             raise RecordingError(f"{self.path}: is damaged: {cause}") from cause
@@ -124,13 +126,13 @@ class ColumnChunk(Chunk):
     def numbers(self, name: str, *, empty_is_nan: bool = False) -> Array:
         column = self._batch.column(name)
         if not self.is_number(name):
-            self.fail(0, name, f"holds {column.type}; numbers must stand here")
+            self.fail(0, name, f"holds {column.type}; numbers are required")
         empty = np.asarray(column.is_null())
         values: Array = column.cast(_pyarrow().float64(), safe=False).to_numpy(zero_copy_only=False)
         wrong = ~np.isfinite(values) & ~(empty & empty_is_nan)
         if wrong.any():
             row = int(np.argmax(wrong))
-            self.fail(row, name, "is empty; a number must stand here" if empty[row]
+            self.fail(row, name, "is empty; a number is required" if empty[row]
                       else f"{values[row]} is not a finite number")  # fmt: skip
         return values
 
@@ -153,10 +155,10 @@ class ColumnChunk(Chunk):
 
 
 def parse_once(table: Table, required: Sequence[str]) -> Table:
-    """Return a table of text as its binary copy in the user's cache, which is made where missing.
+    """Return the binary copy of a text table from the user's cache; write it if there is none.
 
-    The table itself is returned where pyarrow or room on the disk is missing, and where the text is
-    not the plain numbers that pyarrow's parser expects: the table then says what is wrong with it.
+    Without pyarrow or space on the disk, or if pyarrow's parser refuses the text, the table itself
+    is returned: reading it then reports what is wrong.
     """
     try:
         _pyarrow()
@@ -181,14 +183,14 @@ def parse_once(table: Table, required: Sequence[str]) -> Table:
                 partial.unlink(missing_ok=True)
         return ParquetTable(copy, required, table)
     except UsageError:
-        log.info("%s is read from text each time; pyarrow would parse it once", table.path)
-    except (OSError, ValueError, RecordingError) as cause:  # pyarrow's errors are the former two
+        log.info("%s is read from text each time; with pyarrow it would be parsed once", table.path)
+    except (OSError, ValueError, RecordingError) as cause:  # pyarrow raises the first two
         log.debug("%s has no binary copy: %s", table.path, cause)
     return table
 
 
 def _cache() -> Path:
-    """The folder of copies: the user's own and nobody else's."""
+    """Return the folder of copies, which must be this user's own; OSError if it is not."""
     with suppress(OSError, RuntimeError):
         base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
         folder = Path(base) / "thermocald"
@@ -204,10 +206,10 @@ def _cache() -> Path:
 
 
 def _parse(table: Table, target: Path) -> None:
-    """Write a CSV table as Parquet by pyarrow's parser, whose numbers are Python's to the bit."""
+    """Write a CSV table as Parquet with pyarrow's parser; its numbers are Python's to the bit."""
     from pyarrow import csv, float64, int64, string
 
-    first = next(table.chunks(1), None)
+    first = next(table.chunks(100), None)
     if first is None:
         raise ValueError("no rows")
     kinds = {
@@ -228,7 +230,7 @@ def _parse(table: Table, target: Path) -> None:
 
 
 def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
-    """Write columns, which come in parts, to a Parquet file."""
+    """Write columns, given in parts, to a Parquet file."""
     pyarrow = _pyarrow()
     with ExitStack() as opened:
         writer = None
@@ -247,9 +249,9 @@ def _write(path: Path, batches: Iterable[Mapping[str, Any]]) -> None:
 def write_parquet(
     path: Path, parts: Iterable[Mapping[str, Any]], *, nan_is_null: bool = False
 ) -> None:
-    """Write columns {name: (n,)}, which come in parts, as one Parquet file, whole or not at all.
+    """Write columns {name: (n,)}, given in parts, to a Parquet file, as a whole or not at all.
 
-    Numbers are kept bit for bit; nan_is_null: NaN becomes null. UsageError without pyarrow.
+    Numbers are written bit for bit; nan_is_null: NaN becomes null. UsageError without pyarrow.
     """
     pyarrow = _pyarrow()
     arrays = (
@@ -264,9 +266,9 @@ def write_parquet(
 
 
 def csv_to_parquet(source: Path, target: Path, advance: Any) -> None:
-    """Write observations.csv as Parquet, column by column; extra columns of text are kept as text.
+    """Write observations.csv as Parquet; extra columns of text stay text.
 
-    advance(n): told of rows done. Raises RecordingError, UsageError without pyarrow.
+    advance(n) is called after each n rows. Raises RecordingError; UsageError without pyarrow.
     """
     pyarrow = _pyarrow()
     table = Table(source, ("epoch", "target", "x", "y", "sx", "sy"))
@@ -290,7 +292,7 @@ def csv_to_parquet(source: Path, target: Path, advance: Any) -> None:
 
 
 def parquet_to_csv(source: Path, target: Path, advance: Any) -> None:
-    """Write observations.parquet as CSV, such that every number reads back the same."""
+    """Write observations.parquet as CSV, so that every number reads back the same."""
     import csv
 
     table = ParquetTable(source, ("epoch", "target", "x", "y", "sx", "sy"))
@@ -298,11 +300,11 @@ def parquet_to_csv(source: Path, target: Path, advance: Any) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(table.columns)
         for chunk in table.chunks():
-            writer.writerows(zip(*(_texts(chunk, n) for n in table.columns), strict=True))
+            writer.writerows(zip(*(_format_column(chunk, n) for n in table.columns), strict=True))
             advance(len(chunk))
 
 
-def _texts(chunk: ColumnChunk, name: str) -> Sequence[str]:
+def _format_column(chunk: ColumnChunk, name: str) -> Sequence[str]:
     if name == "epoch":
         return [str(n) for n in chunk.integers(name).tolist()]
     if not chunk.is_number(name):
@@ -315,10 +317,10 @@ def _texts(chunk: ColumnChunk, name: str) -> Sequence[str]:
     return texts
 
 
-def _holding(metadata: Any, column: int, epochs: tuple[int, int]) -> tuple[range, int]:
-    """The row groups that may hold epochs of a range, and how many rows come before them.
+def _select_groups(metadata: Any, column: int, epochs: tuple[int, int]) -> tuple[range, int]:
+    """Return the row groups that may hold a range of epochs, and the number of rows before them.
 
-    Files whose groups say nothing of their epochs, or are not in order, are read whole.
+    A file whose groups have no statistics of their epochs, or are not in order, is read whole.
     """
     whole = range(metadata.num_row_groups), 0
     low, high = [], []
@@ -341,7 +343,7 @@ def _pyarrow() -> Any:
         import pyarrow.parquet
     except ImportError as cause:
         raise UsageError(
-            "Parquet needs pyarrow: pip install 'thermocald[parquet]' (where it is installed, a "
-            "recording can be converted to CSV)"
+            "Parquet needs pyarrow: pip install 'thermocald[parquet]', or convert the recording to "
+            "CSV on a machine that has it"
         ) from cause
     return pa

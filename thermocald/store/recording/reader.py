@@ -47,18 +47,18 @@ __all__ = [
     "write_testfield",
 ]  # fmt: skip
 
-_KELVIN_FROM = 220.0  # hotter than any camera, and a cold day in kelvin
-_STRETCH = 8192  # readings: a part of a log in kelvin
+_KELVIN_FROM = 220.0  # as °C hotter than any camera, as K colder than any day
+_STRETCH = 8192  # readings in a row that are tested for kelvin: a part of a log may be in K
 _HOTTEST_C = 1000.0  # no camera works there: another unit, or a damaged line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochColumns:
-    """`epochs.csv` in columns.
+    """The columns of `epochs.csv`.
 
-    numbers (E,), frame_time (E,), temperature_time (E,) s, temperatures {channel: (E,) °C} with
-    NaN where there is none; frames: E relative paths, "" for none; extra: unknown columns as text;
-    readings: every reading of the log, of a recording that keeps them (`readings.csv`), else None.
+    numbers (E,); frame_time, temperature_time (E,) s; temperatures {channel: (E,) °C}; a missing
+    reading is NaN. frames: E relative paths, "" for none; extra: unknown columns as text; readings:
+    every reading of the log if the recording has a `readings.csv`, else None.
     """
 
     numbers: NDArray[np.int64]
@@ -73,11 +73,11 @@ class EpochColumns:
         return len(self.numbers)
 
     def at_frame(self, channel: str) -> Array:
-        """A channel's temperature at the frames' times, (E,) °C."""
+        """Return a channel's temperature at the frames' times, (E,) °C."""
         return interpolate_readings(self.frame_time, *self.readings_of(channel))
 
     def readings_of(self, channel: str) -> tuple[Array, Array]:
-        """Times (R,) s and readings (R,) °C of a channel: the log's, else those next to frames."""
+        """Return times (R,) s and readings (R,) °C of a channel: the log's, else the epochs'."""
         if self.readings is not None:
             return self.readings.times, self.readings.channels[channel]
         return self.temperature_time, self.temperatures[channel]
@@ -85,7 +85,7 @@ class EpochColumns:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A recording as read: head, test field, epochs. `epochs[i]` is built when it is asked for."""
+    """A recording: head, test field and epochs. Observations are read when they are first used."""
 
     path: Path
     head: Head
@@ -99,7 +99,7 @@ class Recording:
 
     @property
     def title(self) -> str:
-        """What messages call it."""
+        """The recording's name in messages."""
         return str(self.path)
 
     @property
@@ -116,16 +116,16 @@ class Recording:
 
     @cached_property
     def epochs(self) -> list[Epoch]:
-        """All epochs with their observations, which are read now if they were not."""
+        """All epochs with their observations, which are read at the first access."""
         if not self.has_observations:
             return [self._epoch(i, None) for i in range(len(self))]
         rows = self._observation_file.load()
         return [self._epoch(i, rows.of_epoch(i)) for i in range(len(self))]
 
     def iter_epochs(self) -> Iterator[Epoch]:
-        """One epoch after the other; a recording of months in constant memory.
+        """Yield the epochs; a long recording (`is_long`) is read in constant memory.
 
-        Then the rows of the observations must be in the order of the epochs.
+        The rows of its observations must be in the order of the epochs.
         """
         if "epochs" in self.__dict__ or (self.has_observations and not self.is_long):
             yield from self.epochs
@@ -153,15 +153,15 @@ class Recording:
     def blocks(
         self, windows: Sequence[slice] | None = None
     ) -> Iterator[tuple[int, ObservationGrid]]:
-        """The observations as grids of consecutive epochs, each with its first epoch (from 0).
+        """Yield observations as grids of consecutive epochs, each with its first epoch (from 0).
 
-        windows: only the epochs of these slices. Raises RecordingError, also where the rows are not
-        in the order of their epochs.
+        windows: only the epochs of these slices. Raises RecordingError, also if the rows are not in
+        the order of their epochs.
         """
         return self._observation_file.grids(windows)
 
     def observations(self, row: int) -> Observations | None:
-        """What one epoch (from 0) shows, of a recording that holds observations."""
+        """Return the observations of one epoch (from 0); None for a recording without any."""
         if not self.has_observations:
             return None
         if "epochs" in self.__dict__ or not self.is_long:
@@ -169,9 +169,9 @@ class Recording:
         return next(self._observation_file.stream(slice(row, row + 1)))
 
     def doubts(self) -> list[str]:
-        """Return what is doubtful in times, readings and repeated epochs, a sentence each.
+        """Return doubts about times, readings and repeated epochs, a sentence each.
 
-        Observations too many for memory are not read.
+        The observations of a long recording are not read for this.
         """
         columns = self.columns
         found = list(time_doubts(columns.numbers, columns.frame_time, self.head.interval))
@@ -182,7 +182,9 @@ class Recording:
             for name, values in columns.readings.channels.items():
                 found += reading_doubts(values, f"{name} of {READINGS}")
         if repeated := [f for f, n in Counter(columns.frames).items() if f and n > 1]:
-            found.append(f"{len(repeated)} frames stand in several epochs, the first {repeated[0]}")
+            found.append(
+                f"{len(repeated)} frames are listed in several epochs, the first {repeated[0]}"
+            )
         if self.has_observations and not self.is_long:
             first: dict[bytes, int] = {}
             twice = []
@@ -198,13 +200,13 @@ class Recording:
         return found
 
     def framed(self, ok: NDArray[np.bool_]) -> list[tuple[int, Path]]:
-        """The first and the last of some epochs (E,), from 0, whose frames were kept, and these."""
+        """Return the first and last epoch (from 0) of `ok` (E,) with a frame, and their frames."""
         rows = [i for i, frame in enumerate(self.columns.frames) if frame and ok[i]]
         return [(i, self.path / self.columns.frames[i]) for i in rows[:1] + rows[1:][-1:]]
 
     @property
     def is_long(self) -> bool:
-        """Whether its observations are read in parts, as they are too many for memory."""
+        """Whether the observations are read in parts, as they are too many for memory."""
         size = self._observation_path.stat().st_size if self.has_observations else 0
         return size >= LONG_FROM_BYTES
 
@@ -221,7 +223,7 @@ class Recording:
 
 
 def open_recording(path: Path) -> Recording:
-    """Read everything but the observations, which `epochs` or `iter_epochs` will.
+    """Read a recording except its observations, which are read when they are first used.
 
     Raises RecordingError or TestFieldError naming file, line and column.
     """
@@ -242,7 +244,7 @@ def open_recording(path: Path) -> Recording:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read and check a whole recording; nothing is half-read.
+    """Read and check a whole recording, with its observations.
 
     Raises RecordingError or TestFieldError naming file, line and column.
     """
@@ -270,8 +272,8 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
         behind = times - np.fmax.accumulate(np.concatenate([[-np.inf], times]))[:-1]
         if (back := np.flatnonzero(behind < 0)).size:
             row = int(back[0])
-            said = f"{times[row]:.3f} s after {times[row] - behind[row]:.3f} s"
-            table.fail(row, name, f"time runs backwards: {said}")
+            earlier = times[row] - behind[row]
+            table.fail(row, name, f"time runs backwards: {times[row]:.3f} s after {earlier:.3f} s")
         if fault := time_fault(times):
             table.fail(fault[0], name, fault[1])
     temperature_time = found.get("temperature_time", np.full(len(numbers), np.nan))
@@ -284,7 +286,7 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
         for rows in runs(len(values), _STRETCH):
             known = rows.start + np.flatnonzero(np.isfinite(values[rows]))
             if len(known) and values[known].min() > _KELVIN_FROM:
-                table.fail(int(known[0]), name, "reads as kelvin: subtract 273.15, K to °C")
+                table.fail(int(known[0]), name, "seems to be in kelvin: subtract 273.15 to give °C")
     frames = tuple(map(str.strip, found["frame"]))
     files = FileFolder(folder)
     for row, frame in enumerate(frames):
@@ -292,11 +294,11 @@ def _read_epochs(folder: Path, channels: list[str]) -> EpochColumns:
             table.fail(
                 row,
                 "frame",
-                f"{frame!r} is missing, or leads out of the recording; leave it empty if it "
-                "was not kept",
+                f"{frame!r} is missing or outside the recording; leave the field empty if the "
+                "frame was not stored",
             )
     if len(frame_time) > 2 and np.ptp(frame_time) == 0:
-        table.fail(1, "frame_time", "all epochs have one time; write when each frame was taken")
+        table.fail(1, "frame_time", "all epochs have the same time; give the time of each frame")
     return EpochColumns(
         numbers,
         frame_time,

@@ -1,4 +1,4 @@
-"""The temperature at the time of the frame, from readings taken at other times."""
+"""The readings of a log, and their interpolation at the times of frames."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 READINGS = "readings.csv"
-"""Every reading of a log, in a recording whose frames were taken beside one."""
+"""The file with every reading of a log, in a recording of frames and a separate log."""
 _LARGEST_GAP_IN_INTERVALS = 10.0
-_AT_ONCE = 100_000  # frames: a year of them has to fit into memory
+_AT_ONCE = 100_000  # frames: a year of them must fit into memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TemperatureLog:
     """Every reading of a log.
 
-    times (n,) s UTC, increasing; channels {name: (n,) °C}, NaN where there is none, the first is
-    the reference; notes: what was found and guessed where it was read, for people.
+    times (n,) s UTC, increasing; channels {name: (n,) °C}, NaN for a missing reading, the first is
+    the reference; notes: sentences for the user on what was found and assumed when it was read.
     """
 
     times: Array
@@ -39,7 +39,7 @@ class TemperatureLog:
     notes: tuple[str, ...] = ()
 
     def with_reference(self, name: str | None) -> TemperatureLog:
-        """The same with another channel as the first, if it has that one."""
+        """Return the log with the channel `name` first; unchanged if it has no such channel."""
         if name not in self.channels:
             return self
         first = {name: self.channels[name]}
@@ -47,7 +47,7 @@ class TemperatureLog:
 
 
 def write_readings(path: Path, readings: TemperatureLog) -> None:
-    """Write readings as `readings.csv`: time, one column per channel."""
+    """Write readings as `readings.csv`: time and one column per channel."""
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(["time", *readings.channels])
@@ -57,7 +57,7 @@ def write_readings(path: Path, readings: TemperatureLog) -> None:
 
 
 def read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
-    """Read a `readings.csv`; RecordingError names line and column of what is wrong."""
+    """Read a `readings.csv`. Raises RecordingError naming line and column."""
     table = Table(path, ["time", *channels])
     columns = table.read(numbers=["time"], optional=channels)
     times = columns.pop("time", np.empty(0))
@@ -72,12 +72,11 @@ def read_readings(path: Path, channels: Sequence[str]) -> TemperatureLog:
 def interpolate_readings(
     frame_times: ArrayLike, reading_times: ArrayLike, readings: ArrayLike
 ) -> Array:
-    """Readings (R,) °C at `reading_times` (R,) s → temperatures (E,) °C at `frame_times` (E,) s.
+    """Return temperatures (E,) °C at `frame_times` (E,) s from `readings` (R,) °C at (R,) s.
 
-    Linear between two readings; before the first and after the last, the line through the two
-    outermost, for at most one interval. NaN readings are passed over. NaN where the readings on
-    both sides are more than ten times their median interval apart, or where there are none: a gap
-    is not filled with invention.
+    Interpolation is linear; before the first and after the last reading, the line through the two
+    outermost is extrapolated for at most one interval. NaN readings are ignored. The result is NaN
+    further out, and in a gap of more than ten times the readings' median interval.
     """
     frames = np.asarray(frame_times, dtype=float)
     times, values = np.asarray(reading_times, dtype=float), np.asarray(readings, dtype=float)
@@ -88,7 +87,7 @@ def interpolate_readings(
         times, unique = np.unique(times, return_index=True)
         values = values[unique]
     if len(times) < 2:
-        # one reading tells the temperature of its own time
+        # one reading gives the temperature at its own time only
         only = float(values[0]) if len(values) else np.nan
         return np.where(np.isin(frames, times), only, np.nan)
     interval = float(np.median(np.diff(times)))

@@ -1,7 +1,7 @@
-"""The sense of what was recorded: values that can be read, and cannot have been meant.
+"""Plausibility of recorded values: well-formed values that cannot have been meant.
 
-What no camera and no thermometer can give is refused where it is read; what is only unlikely is a
-doubt, one sentence each, which `check`, `replay` and `import` tell.
+A value that no camera or thermometer can give is refused when it is read. One that is only unlikely
+is a doubt, a sentence that `check`, `replay` and `import` print.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ if TYPE_CHECKING:
 
 _LATEST_S = 7.26e9  # the year 2200
 _LONGEST_PAUSE_S = 3.2e8  # ten years
-_UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}  # of times, by how many are a second
+_UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}  # of times, by their number per second
 _NOT_MEASURED = (85.0, 127.9375, 127.94, 0.0, -40.0, -45.0, -46.85, 125.0, 130.0, 150.0, -0.0625)
-"""°C that thermometers give without having measured: at power-on, unplugged, all zeros or ones."""
-_LEAP_K = 5.0  # in one interval, by which no camera warms
+"""°C that thermometers give without measuring: at power-on, unplugged, all zeros or ones."""
+_LEAP_K = 5.0  # more than a camera warms in one interval
 _LONGEST_SPIKE = 3  # readings
 _AROUND = 3  # readings before and after a change of the unit
-_FEWEST = 20  # image points that tell something of all
+_FEWEST = 20  # image points for a judgement on all
 _MOST_OUTSIDE = 0.02  # of the image points: gross errors are rarer
-_SMALLEST_EXTENT = 0.02  # of the image: less are millimetres, not px
+_SMALLEST_EXTENT = 0.02  # of the image: smaller coordinates are in mm, not px
 _FARTHEST_PX = 1e6
 _SIGMAS_PX = (1e-6, 1e4)
-_RHYTHM = 5.0  # times the stated interval
-_APART, _APART_S = 5.0, 60.0  # of a frame and its reading, intervals and s
-_HOT_C = 65.0  # no lens is made for that
-_DISTANCES = (0.8, 1.25)  # fitted to stated principal distance
-_CENTRE = 0.1  # of the image's diagonal
-_MOST_SAID = 6  # targets by name
+_RHYTHM = 5.0  # largest ratio of the frames' interval to the stated one, or its inverse
+_APART, _APART_S = 5.0, 60.0  # largest offset of a reading from its frame: intervals, s
+_HOT_C = 65.0  # no lens is made for more
+_DISTANCES = (0.8, 1.25)  # ratio of principal distances, estimated to stated, or of pitches
+_CENTRE = 0.1  # of the image's diagonal: largest offset of the principal point
+_MOST_NAMED = 6  # targets in a message
 _PITCH_OPTION = "--pixel-pitch, or pixel_pitch in recording.yaml or the camera file"
 
 
 def time_fault(times: Array) -> tuple[int, str] | None:
-    """Return the first row of times (n,) s that are no seconds since 1970, and what they are.
+    """Return the first row of times (n,) that cannot be seconds since 1970, and a message.
 
-    A clock that was not set says 1970.
+    The row after a jump of years is found as well: a clock that was not set shows 1970.
     """
     late = times > _LATEST_S
     if late.any():
@@ -69,22 +69,22 @@ def time_fault(times: Array) -> tuple[int, str] | None:
 
 
 def point_fault(points: Array, sigmas: Array) -> tuple[int, str, str] | None:
-    """Return the first row of points, sigmas (n, 2) px that none measures, its column and why."""
+    """Return the first row of impossible points or sigmas (n, 2) px, its column, a message."""
     low, high = _SIGMAS_PX
     wrong = np.hstack([np.abs(points) > _FARTHEST_PX, (sigmas < low) | (sigmas > high)])
     if not wrong.any():
         return None
     row, column = (int(i) for i in np.argwhere(wrong)[0])
     if column < 2:
-        return row, "xy"[column], f"{points[row, column]:g} px lies on no image; leave the row out"
+        return row, "xy"[column], f"{points[row, column]:g} px is on no image; leave the row out"
     return row, ("sx", "sy")[column - 2], (
-        f"a standard deviation of {sigmas[row, column - 2]:g} px is none; image points are "
-        f"measured to between {low:g} and {high:g} px"
+        f"a standard deviation of {sigmas[row, column - 2]:g} px is impossible; it must be "
+        f"between {low:g} and {high:g} px"
     )  # fmt: skip
 
 
 def frame_fault(points: Array, sensor: Sensor) -> tuple[int, str] | None:
-    """Return the first of image points (n, 2) px off the image where so many are, and a hint."""
+    """Return the first image point (n, 2) px off the image and a message, if too many are off."""
     n, size = len(points), np.array([sensor.width, sensor.height], dtype=float)
     if n < _FEWEST:
         return None
@@ -110,14 +110,15 @@ def frame_fault(points: Array, sensor: Sensor) -> tuple[int, str] | None:
     else:
         hint = "is the size that of another camera, mode, or crop?"
     return int(np.argmax(outside)), (
-        f"{count} of {n} image points lie outside of the {sensor.width} × {sensor.height} px of "
+        f"{count} of {n} image points lie outside the {sensor.width} × {sensor.height} px of "
         f"recording.yaml: {hint}"
     )
 
 
 class Spike(NamedTuple):
-    """Readings `first` to `stop` (exclusive), in a leap up and back; measured: whether they may be
-    what a thermometer measured, not what it gives without.
+    """Readings `first` to `stop` (exclusive) that leap away and back.
+
+    measured: False for values that a thermometer gives without a measurement.
     """
 
     first: int
@@ -126,10 +127,10 @@ class Spike(NamedTuple):
 
 
 def find_spikes(values: Array) -> list[Spike]:
-    """Return the readings (n,) °C, NaN for none, that leap away for a moment and come back.
+    """Return the spikes in readings (n,) °C, NaN for none: those that leap away and come back.
 
-    A leap has `_LEAP_K` and ten of the series' usual steps; at the ends only a value that is known
-    to be no measurement is one.
+    A leap is more than `_LEAP_K` and ten times the median step. At either end of the series, only
+    values that a thermometer gives without a measurement are a spike.
     """
     known = np.flatnonzero(np.isfinite(values))
     v = values[known]
@@ -159,10 +160,10 @@ def find_spikes(values: Array) -> list[Spike]:
 
 
 def find_unit_change(values: Array) -> tuple[int, str] | None:
-    """Return the first reading (n,) from which on a thermometer writes another unit, and which.
+    """Return the first of readings (n,) that is in another unit, and a phrase for the change.
 
-    Told by a step onto the value that the readings before it have in the other unit; spikes are
-    passed over.
+    The unit has changed if the readings step to the value that those before have in another unit.
+    Spikes are ignored.
     """
     values = values.copy()
     for spike in find_spikes(values):
@@ -194,7 +195,7 @@ def find_unit_change(values: Array) -> tuple[int, str] | None:
 
 
 def reading_doubts(values: Array, label: str) -> Iterator[str]:
-    """Yield what is doubtful in a thermometer's readings (n,) °C at the epochs."""
+    """Yield doubts about a thermometer's readings (n,) °C."""
     if changed := find_unit_change(values):
         row, words = changed
         yield (
@@ -218,7 +219,7 @@ def reading_doubts(values: Array, label: str) -> Iterator[str]:
 
 
 def stuck_doubts(values: Array, label: str) -> Iterator[str]:
-    """Yield that all readings (n,) °C are one that thermometers give without a measurement."""
+    """Yield a doubt if all readings (n,) °C are one value given without a measurement."""
     known = values[np.isfinite(values)]
     if len(known) < _AROUND or np.ptp(known) > 0:
         return
@@ -230,27 +231,28 @@ def stuck_doubts(values: Array, label: str) -> Iterator[str]:
 
 
 def time_doubts(numbers: NDArray[np.int64], times: Array, interval: float) -> Iterator[str]:
-    """Yield what is doubtful in the times (E,) s of epochs with numbers (E,)."""
+    """Yield doubts about the times (E,) s of epochs with numbers (E,)."""
     if len(times) < 2:
         return
     steps = np.diff(times)
     if (steps == 0).any():
         row = int(np.argmax(steps == 0))
+        shared = np.append(steps == 0, False) | np.insert(steps == 0, 0, False)
         yield (
-            f"{int((steps == 0).sum()) + 1} epochs have the time of another one, the first "
+            f"{int(shared.sum())} epochs have the time of another one, the first "
             f"{numbers[row]} and {numbers[row + 1]}"
         )
-    # epochs that are missing lengthen a step, not the time from one number to the next
+    # a missing epoch lengthens a step, but not the time per epoch number
     rhythm = float(np.median(steps / np.diff(numbers)))
     if rhythm > 0 and not 1.0 / _RHYTHM < rhythm / interval < _RHYTHM:
         yield (
-            f"frames follow one another every {rhythm:.3g} s, recording.yaml says {interval:.4g} s:"
-            " is frame_time in seconds?"
+            f"frames come every {rhythm:.3g} s, but the interval in recording.yaml is "
+            f"{interval:.4g} s: is frame_time in seconds?"
         )
 
 
 def pairing_doubts(frames: Array, readings: Array, interval: float) -> Iterator[str]:
-    """Yield that readings (E,) s, NaN for none, were not taken with their frames (E,) s."""
+    """Yield a doubt if readings (E,) s, NaN for none, are far from their frames (E,) s."""
     apart = (readings - frames)[np.isfinite(readings)]
     if len(apart) == 0:
         return
@@ -263,13 +265,13 @@ def pairing_doubts(frames: Array, readings: Array, interval: float) -> Iterator[
 
 
 def interior_doubts(camera: CameraSpec, c: float, x0: float, y0: float) -> list[str]:
-    """Return what is doubtful in an interior orientation, mm, estimated for a camera."""
+    """Return doubts about the interior orientation, mm, estimated for a camera."""
     sensor, found = camera.sensor, []
     stated = camera.principal_distance
     if stated is not None and not _DISTANCES[0] < c / stated < _DISTANCES[1]:
         found.append(
-            f"the principal distance is {c:.3f} mm where {stated:g} mm is stated, "
-            f"{c / stated:.3g} times: is one of distance, pixel pitch, image size another camera's?"
+            f"the principal distance is {c:.3f} mm, {c / stated:.3g} times the stated {stated:g} "
+            "mm: is the principal distance, pixel pitch or image size that of another camera?"
             f" Pixels of {camera.sensor.pixel_pitch * stated / c:.3g} mm would fit "
             f"({_PITCH_OPTION})"
         )
@@ -290,32 +292,32 @@ def interior_doubts(camera: CameraSpec, c: float, x0: float, y0: float) -> list[
 def target_doubts(
     names: Sequence[str], offsets: Array, c_px: float, least: float = ELSEWHERE
 ) -> list[str]:
-    """Return what is doubtful in the places of targets, as `find_misplaced` takes them."""
+    """Return doubts about the places of targets; the arguments are those of `find_misplaced`."""
     rows = np.flatnonzero(find_misplaced(offsets, c_px, least)).tolist()
     if not rows:
         return []
     size = np.hypot(*np.asarray(offsets)[rows].T)
     each = [f"{names[r]} {s:.0f} px" for r, s in zip(rows, size, strict=True)]
-    said = ", ".join(each[:_MOST_SAID])
-    said += f" and {len(each) - _MOST_SAID} more" if len(each) > _MOST_SAID else ""
+    listed = ", ".join(each[:_MOST_NAMED])
+    listed += f" and {len(each) - _MOST_NAMED} more" if len(each) > _MOST_NAMED else ""
     opposite = len(rows) == 2 and bool(np.hypot(*offsets[rows].sum(axis=0)) < 0.1 * size.sum())
     why = "their names look exchanged" if opposite else "are names exchanged, or coordinates wrong?"
-    return [f"targets are seen elsewhere than the test field has them: {said} off; {why}"]
+    return [f"targets are not where the test field has them: {listed} off; {why}"]
 
 
 def pitch_doubts(pitch: float, known: float | None) -> list[str]:
-    """Return what is doubtful in a pixel pitch, mm, where photographs' EXIF gives another."""
+    """Return doubts about a pixel pitch, mm, if the photographs' EXIF gives another, `known`."""
     if known is None or _DISTANCES[0] < pitch / known < _DISTANCES[1]:
         return []
     doubt = (
         f"a pixel pitch of {pitch:.4g} mm is {pitch / known:.2f} of the {known:.4g} mm that follow "
-        "from the EXIF of the photographs: the pixels of an image that was binned or made smaller "
-        f"are larger than the sensor's ({_PITCH_OPTION})"
+        "from the EXIF of the photographs: the pixels of a binned or scaled-down image are larger "
+        f"than the sensor's ({_PITCH_OPTION})"
     )
     return [doubt]
 
 
 def doubt_lines(doubts: Sequence[str], series: str = "") -> list[str]:
-    """Return doubts as lines for a person; series: that they are of, where there are several."""
+    """Return doubts as lines to print; series: the name, if there are several series."""
     of = f", {series}" if series else ""
     return [f"doubtful{of}: {text}" for text in doubts]

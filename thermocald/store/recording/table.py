@@ -1,7 +1,7 @@
 """CSV tables read in chunks of columns, with errors that name file, line and column.
 
-A row passes Python's csv reader once and is never an object of ours: a day of 1.3 million
-observations is read in one to two seconds and costs the memory of a chunk.
+A row passes Python's csv reader once and is never made an object of its own: a day of 1.3 million
+observations is read in one to two seconds, in the memory of one chunk.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _LONGEST_HEADER = 200_000
 
 
 class Table:
-    """A CSV file with a header; raises `error` if it, or a required column, is missing.
+    """A CSV file with a header; raises `error` if the file or a required column is missing.
 
-    text: the table itself where it is not the content of `path`, which then is for the messages.
+    text: the table's text if it is not read from `path`, which then is only for the messages.
     columns: the names in the header, in their order.
     """
 
@@ -60,15 +60,15 @@ class Table:
         columns: Sequence[str] | None = None,
         epochs: tuple[int, int] | None = None,
     ) -> Iterator[Chunk]:
-        """The rows below the header, at most `rows` at a time; empty lines are skipped.
+        """Yield the rows below the header, at most `rows` at a time; empty lines are skipped.
 
-        columns, epochs: what is needed, first and last; a table that `seeks` leaves out the rest.
+        columns, epochs (first, last): what is needed; a table that `seeks` leaves out the rest.
         """
         del columns, epochs
         first = 0
         with self._open() as file:
             reader = csv.reader(file, strict=True)
-            # as tuples, which the garbage collector does not come back to
+            # the garbage collector stops tracking tuples of text, but not lists
             content = map(tuple, filter(None, reader))
             try:
                 next(content, None)
@@ -87,7 +87,7 @@ class Table:
         optional: Sequence[str] = (),
         texts: Sequence[str] = (),
     ) -> dict[str, Any]:
-        """Whole columns by name; optional: numbers that may be missing, which are NaN."""
+        """Return whole columns by name; optional: numbers that may be empty, which become NaN."""
         parts: dict[str, list[Any]] = {}
         for chunk in self.chunks():
             for name in integers:
@@ -95,7 +95,7 @@ class Table:
             for name in (*numbers, *optional):
                 found = chunk.numbers(name, empty_is_nan=name in optional)
                 parts.setdefault(name, []).append(found)
-            # chunk by chunk: the garbage collector would walk through a list of a year's
+            # chunk by chunk: the garbage collector would traverse a list of a year's texts
             for name in texts:
                 parts.setdefault(name, []).append(chunk.text(name))
         return {
@@ -110,7 +110,7 @@ class Table:
         message: Callable[[int], str] | str,
         first: int = 0,
     ) -> None:
-        """Raise for the first row, from row `first` on, that is wrong; `message`: may be of it."""
+        """Raise for the first row marked wrong, after `first` others; message may take the row."""
         if wrong.any():
             row = int(np.argmax(wrong))
             self.fail(first + row, name, message if isinstance(message, str) else message(row))
@@ -126,7 +126,7 @@ class Table:
         if self._text is not None:
             return io.StringIO(self._text, newline="")
         try:
-            # a link to a device never ends
+            # reading a link to a device might never end
             if self.path.exists() and not self.path.is_file():
                 raise self._error(f"{self.path}: is not a file")
             return self.path.open(newline="", encoding="utf-8-sig")
@@ -168,7 +168,7 @@ class Table:
         return f"{self.path}, line 1: column {name} is missing; found: {found[:200]}{hint}"
 
     def _line(self, row: int) -> int:
-        """The line of a row in the file: counted again, since quoted fields may span lines."""
+        """Count the lines of the file up to a row: quoted fields may span several."""
         with self._open() as file:
             reader = csv.reader(file)
             for _ in islice(filter(None, reader), row + 2):
@@ -177,7 +177,7 @@ class Table:
 
 
 class Chunk:
-    """Some consecutive rows of a table as columns. first: the first row's number in the table."""
+    """Consecutive rows of a table, as columns; first: the number of the first row in the table."""
 
     def __init__(self, table: Table, first: int, rows: list[tuple[str, ...]]) -> None:
         self.table = table
@@ -198,15 +198,15 @@ class Chunk:
         return self._size
 
     def text(self, name: str) -> tuple[str, ...]:
-        """A column as it stands."""
+        """Return a column as text."""
         column: tuple[str, ...] = self._columns[name]
         return column
 
     def numbers(self, name: str, *, empty_is_nan: bool = False) -> Array:
-        """A column as (n,) finite numbers; empty fields are NaN if that is allowed."""
+        """Return a column as (n,) finite numbers; with `empty_is_nan`, empty fields are NaN."""
         column = self._columns[name]
         joined = "".join(column)
-        if "_" in joined or not joined.isascii():  # Python reads 2_5.0 and digits of any script
+        if "_" in joined or not joined.isascii():  # float() accepts 2_5.0 and digits of any script
             row = next(i for i, t in enumerate(column) if "_" in t or not t.isascii())
             self.fail(row, name, f"{column[row][:40]!r} is not a number")
         try:
@@ -226,16 +226,16 @@ class Chunk:
         return values
 
     def integers(self, name: str) -> NDArray[np.int64]:
-        """A column as (n,) integers that are not negative."""
+        """Return a column as (n,) integers that are not negative."""
         values = self.numbers(name)
         wrong = (values != np.floor(values)) | (values < 0) | (values >= _MAX_EXACT_INTEGER)
         if wrong.any():
             row = int(np.argmax(wrong))
-            self.fail(row, name, f"{self._columns[name][row]!r} is not an integer from 0 on")
+            self.fail(row, name, f"{self.text(name)[row]!r} is not an integer of at least 0")
         return values.astype(np.int64)
 
     def places(self, name: str, index: Mapping[str, int]) -> NDArray[np.int64]:
-        """Where `index` has each word of a column, (n,), -1 where it has not."""
+        """Return the value (n,) in `index` of each word of a column, -1 for an unknown word."""
         words = self.text(name)
         try:
             return np.fromiter(map(index.__getitem__, words), dtype=np.int64, count=self._size)
@@ -243,7 +243,7 @@ class Chunk:
             return np.array([index.get(word.strip(), -1) for word in words], dtype=np.int64)
 
     def is_number(self, name: str) -> bool:
-        """Whether a column begins with numbers, or with nothing."""
+        """Return whether the first 100 fields of a column are numbers or empty."""
         try:
             for text in self.text(name)[:100]:
                 float(text or "nan")
@@ -254,7 +254,7 @@ class Chunk:
     def check(
         self, name: str, wrong: NDArray[np.bool_], message: Callable[[int], str] | str
     ) -> None:
-        """Raise for the first row of this chunk that is wrong, as `Table.check` does."""
+        """Raise for the first row of this chunk marked wrong, see `Table.check`."""
         self.table.check(name, wrong, message, self.first)
 
     def fail(self, row: int, column: str | None, message: str) -> NoReturn:
@@ -265,7 +265,7 @@ class Chunk:
         if not text.strip():
             if empty_is_nan:
                 return float("nan")
-            self.fail(row, name, "is empty; a number must stand here")
+            self.fail(row, name, "is empty; a number is required")
         try:
             return float(text)
         except ValueError:

@@ -1,4 +1,4 @@
-"""`testfield.csv` (CONVENTIONS §3): reading, validating, writing."""
+"""`testfield.csv` (CONVENTIONS §3): read, check and write it."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _SIGMAS_MM = (1e-9, 1e4)
 _NUMBERS = ("X", "Y", "Z", "diameter", "sX", "sY", "sZ")
 _REQUIRED = ("target", *_NUMBERS)
 
-# No camera of ours can look at a field smaller than this; one in metres is (a room: 6 "mm").
+# Too small for a camera to be calibrated with; a field given in metres is (a room: 6 "mm").
 _SMALLEST_FIELD_MM = 25.0
-# A lens images nothing sharp that is smaller than a few principal distances across.
+# A lens cannot focus so close that a field of a few principal distances fills the image.
 _SMALLEST_FIELD_IN_PRINCIPAL_DISTANCES = 5.0
 
 
 def read_testfield(path: Path) -> TestField:
     """Read `testfield.csv`.
 
-    Raises TestFieldError, naming file, line and column, where a column is missing, a number is
-    none, a target is duplicated or the coordinates look like metres.
+    Raises TestFieldError, naming file, line and column, if a column is missing, a number is
+    invalid, a target is duplicated or the coordinates look like metres.
     """
     field = _read(Table(path, _REQUIRED, TestFieldError))
     require_millimetres(field, str(path))
@@ -41,10 +41,10 @@ def read_testfield(path: Path) -> TestField:
 
 
 def parse_testfield(text: str, path: Path) -> TestField:
-    """A test field that was accepted before, from the text of a `testfield.csv`.
+    """Return the test field in the text of a `testfield.csv` that was accepted before.
 
-    It may be empty: the series of a camera that is only acquired. path: for the messages. Errors
-    as `read_testfield`.
+    It may be empty, as for a camera that is acquired but not calibrated. path: for the messages.
+    Raises the errors of `read_testfield`, except for metres.
     """
     return _read(Table(path, _REQUIRED, TestFieldError, text), may_be_empty=True)
 
@@ -71,7 +71,8 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
         if column.startswith("s"):
             table.check(column, numbers < 0, "a standard deviation must not be negative")
             odd = (numbers > 0) & ((numbers < _SIGMAS_MM[0]) | (numbers > _SIGMAS_MM[1]))
-            table.check(column, odd, "is no standard deviation; 0 holds a coordinate fixed")
+            limits = f"{_SIGMAS_MM[0]:g} and {_SIGMAS_MM[1]:g} mm"
+            table.check(column, odd, f"must be between {limits}; 0 holds the coordinate fixed")
     empty = ("",) * len(names)
     kinds = [text.strip() or KINDS[0] for text in found.get("kind", empty)]
     for row, kind in enumerate(kinds):
@@ -79,8 +80,8 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
             table.fail(row, "kind", f"{kind!r} is unknown; it is one of {', '.join(KINDS)}")
     if len(names) > _MOST_TARGETS:
         raise TestFieldError(
-            f"{table.path}: holds more than {_MOST_TARGETS} targets; leave out what no camera "
-            "of yours sees"
+            f"{table.path}: holds more than {_MOST_TARGETS} targets; leave out those that no "
+            "camera sees"
         )
     if not names and not may_be_empty:
         raise TestFieldError(f"{table.path}: holds no targets")
@@ -97,9 +98,9 @@ def _read(table: Table, *, may_be_empty: bool = False) -> TestField:
 def require_millimetres(
     field: TestField, where: str, principal_distance: float | None = None
 ) -> None:
-    """Raise TestFieldError if a field is so small that its coordinates must be metres.
+    """Raise TestFieldError if a field is so small that its coordinates must be in metres.
 
-    principal_distance: mm, of the camera that looks at it, None where unknown.
+    principal_distance: the camera's, mm; None if unknown.
     """
     if len(field) < 2:
         return
@@ -116,7 +117,7 @@ def require_millimetres(
 
 
 def testfield_csv(field: TestField) -> str:
-    """A test field as the text of `testfield.csv`; numbers keep every digit."""
+    """Return a test field as the text of `testfield.csv`, with all digits of its numbers."""
     with_codes = any(field.codes)
     with_kinds = with_codes or any(kind != KINDS[0] for kind in field.kinds)
     header = [*_REQUIRED, *(["kind"] if with_kinds else []), *(["code"] if with_codes else [])]

@@ -1,4 +1,4 @@
-"""Writing a recording epoch by epoch; it appears as a whole or not at all."""
+"""Write a recording epoch by epoch; it appears as a whole or not at all."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import math
 import os
 import shutil
 from typing import TYPE_CHECKING, Self
+
+import numpy as np
 
 from thermocald.errors import RecordingError
 from thermocald.files import cannot_write, dump_yaml
@@ -20,19 +22,20 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any, TextIO
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from thermocald.epoch import Epoch
     from thermocald.photogrammetry.field.testfield import Observations, TestField
 
+_ABSENT = {"sxy": "0"}  # in rows of an epoch without the column; others are empty
+
 
 class RecordingWriter:
-    """Writes a recording as epochs come; memory does not grow with its length.
+    """A writer of a recording, epoch by epoch, in constant memory.
 
-    Use as a context manager. Everything goes into `.<name>.partial` next to `path`, which becomes
-    `path` at the end, and is removed where an error ends the block. Image points are written to
-    1e-5 px, times to 1e-6 s, temperatures and coordinates with all their digits. Raises
+    Use it as a context manager. Everything is written into `.<name>.partial` next to `path`, which
+    is renamed to `path` at the end, or removed if an error ends the block. Image points are written
+    to 1e-5 px, times to 1e-6 s, temperatures and coordinates with all their digits. Raises
     RecordingError if `path` exists and is not an empty folder, or if the disk is full.
     """
 
@@ -69,9 +72,9 @@ class RecordingWriter:
     def append(
         self, epoch: Epoch, image: bytes | NDArray[np.uint8] | NDArray[np.uint16] | None = None
     ) -> None:
-        """Add one epoch; `image` is its frame as JPEG bytes or as grey values (kept as PNG).
+        """Write one epoch; `image` is its frame as JPEG bytes or as grey values (written as PNG).
 
-        Without `image`, a frame that the epoch names is copied.
+        Without `image`, the frame that the epoch names is copied.
         """
         if self._epochs is None:
             raise RecordingError(f"{self.path}: the writer is not open")
@@ -91,7 +94,7 @@ class RecordingWriter:
             self._last_reading = epoch.temperature_time
 
     def keep_readings(self, readings: TemperatureLog) -> None:
-        """Keep every reading of a log, not only those next to the frames."""
+        """Write every reading of a log, not only those of the epochs."""
         try:
             write_readings(self._partial / READINGS, readings)
         except OSError as cause:
@@ -113,7 +116,7 @@ class RecordingWriter:
             raise self._failed(cause) from cause
 
     def _refuse_backwards(self, epoch: Epoch) -> None:
-        """What could not be read again is not written."""
+        """Raise RecordingError for an epoch that `open_recording` would refuse."""
         where = f"{self.path}: epoch {epoch.number}"
         if self._last is not None and epoch.number <= self._last.number:
             raise RecordingError(f"{where} comes after {self._last.number}; numbers must increase")
@@ -132,13 +135,13 @@ class RecordingWriter:
             if file is not None:
                 try:
                     file.close()
-                except OSError:  # a full disk also fails the flush; the file goes away anyhow
+                except OSError:  # a full disk fails the flush too; the file is removed below
                     file.close()
         shutil.rmtree(self._partial, ignore_errors=True)
 
     def _failed(self, cause: OSError) -> RecordingError:
         failed = cannot_write(self.path, cause)
-        error = RecordingError(f"{failed}; nothing was kept of it")
+        error = RecordingError(f"{failed}; the part written so far was removed")
         error.exit_status = failed.exit_status
         return error
 
@@ -165,38 +168,59 @@ class RecordingWriter:
         return f"frames/{name}"
 
     def _write_observations(self, number: int, seen: Observations) -> None:
-        columns: list[tuple[str, str, list[float]]] = [
-            ("x", "%.5f", seen.points[:, 0].tolist()),
-            ("y", "%.5f", seen.points[:, 1].tolist()),
-            ("sx", "%.6g", seen.sigmas[:, 0].tolist()),
-            ("sy", "%.6g", seen.sigmas[:, 1].tolist()),
-        ]
-        if seen.covariances is not None:
-            columns.append(("sxy", "%.6g", seen.covariances.tolist()))
-        columns += [(name, "%.6g", values.tolist()) for name, values in seen.quality.items()]
-        header = ["epoch", "target", *(name for name, _, _ in columns)]
+        """Write the rows of an epoch; a column that it lacks is empty, or 0 for the covariance."""
+        columns = dict(zip(("x", "y", "sx", "sy"), (*seen.points.T, *seen.sigmas.T), strict=True))
+        if len(seen) and seen.covariances is not None:
+            columns["sxy"] = seen.covariances
+        if len(seen):
+            columns |= seen.quality
         if self._observations is None:
             self._observations = self._new("observations.csv")
-            self._header = header
-            csv.writer(self._observations, lineterminator="\n").writerow(header)
-        elif header != self._header:
-            raise RecordingError(
-                f"{self.path}: epoch {number} has the columns {', '.join(header)}, the epochs "
-                f"before {', '.join(self._header)}; all must have the same"
+            self._columns = list(columns)
+            csv.writer(self._observations, lineterminator="\n").writerow(
+                ["epoch", "target", *columns]
             )
-        names = [_quoted(self._field.names[row]) for row in seen.targets.tolist()]
+        if added := [name for name in columns if name not in self._columns]:
+            self._add_columns(added)
+        forms: list[str] = []
+        values: list[list[Any]] = [[_quoted(self._field.names[i]) for i in seen.targets.tolist()]]
+        for name in self._columns:
+            if name not in columns:
+                forms.append(_ABSENT.get(name, ""))
+                continue
+            column = columns[name]
+            if (known := np.isfinite(column)).all():
+                forms.append("%.5f" if name in ("x", "y") else "%.6g")
+                values.append(column.tolist())
+            else:
+                forms.append("%s")
+                values.append(np.where(known, np.char.mod("%.6g", column), "").tolist())
         # one format for the whole epoch: three times as fast as csv.writer row by row
-        line = ",".join([f"{number},%s", *(form for _, form, _ in columns)]) + "\n"
-        rows = zip(names, *(values for _, _, values in columns), strict=True)
-        self._observations.write(
-            (line * len(names)) % tuple(value for row in rows for value in row)
-        )
+        line = ",".join([f"{number},%s", *forms]) + "\n"
+        rows = zip(*values, strict=True)
+        self._observations.write((line * len(seen)) % tuple(value for row in rows for value in row))
+
+    def _add_columns(self, names: list[str]) -> None:
+        """Add columns to the rows of observations written so far."""
+        assert self._observations is not None
+        self._observations.close()
+        before = self._partial / "observations.before"
+        (self._partial / "observations.csv").rename(before)
+        self._observations = self._new("observations.csv")
+        rows = csv.writer(self._observations, lineterminator="\n")
+        absent = [_ABSENT.get(name, "") for name in names]
+        with before.open(encoding="utf-8", newline="") as file:
+            written = csv.reader(file)
+            rows.writerow([*next(written), *names])
+            rows.writerows([*row, *absent] for row in written)
+        before.unlink()
+        self._columns += names
 
 
 def write_recording(path: Path, head: Head, testfield: TestField, epochs: Iterable[Epoch]) -> None:
-    """Write a recording from an iterable of epochs, as a stream; frames are copied.
+    """Write a recording of some epochs in constant memory; their frames are copied.
 
-    Raises RecordingError if `path` exists, or the disk is full; then nothing is left behind.
+    Raises RecordingError, leaving nothing behind, if `path` exists or the disk is full.
     """
     with RecordingWriter(path, head, testfield) as writer:
         for epoch in epochs:

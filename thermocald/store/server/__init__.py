@@ -1,1 +1,1 @@
-"""The store of many stations: one PostgreSQL database, forwarded to and read by every analysis."""
+"""The store of many stations: a PostgreSQL database that daemons forward to and analyses read."""

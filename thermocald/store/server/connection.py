@@ -1,8 +1,8 @@
-"""A server's store: its address, connections to its database, its tables, its errors in words.
+"""A store on a server: its address, connections, tables, and explanations of its errors.
 
     postgresql://reader@db.example/thermocald?camera=gauge-7&series=M1&sslmode=verify-full
 
-`station`, `camera` and `series` are ours; everything else goes to libpq as it stands.
+`station`, `camera` and `series` select series; libpq gets the rest of the address unchanged.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _SCHEME = re.compile(r"^postgres(ql)?:/+")
 _OURS = ("station", "camera", "series")
 _CONNECT_S = 10
-# A network that died is noticed within a minute, in a query or between two.
+# A lost connection is noticed within a minute, during a query or between two.
 _SESSION = {
     "connect_timeout": _CONNECT_S,
     "keepalives": 1,
@@ -48,12 +48,12 @@ _SESSION = {
 }
 # SQLSTATE or its class → what to do. Source: PostgreSQL manual, appendix A.
 _ADVICE = {
-    "28": "the server refused the user; check the name, the password or certificate, pg_hba.conf",
+    "28": "the server refused the user; check name, password or certificate, and its pg_hba.conf",
     "3D": "the server has no such database; create it, then run `thermocald server init`",
-    "42501": "this role may not do that; grant it, or use another role",
-    "42P01": "the database has no tables of thermocald; run `thermocald server init`",
+    "42501": "this role lacks the permission; grant it, or use another role",
+    "42P01": "the database has no thermocald tables; run `thermocald server init`",
     "42703": "the server's tables are of another version; run `thermocald server init`",
-    "53100": "the server's disk is full; free some space there, nothing is lost here",
+    "53100": "the server's disk is full; free some space there; nothing is lost here",
     "53": "the server is short of resources",
     "57": "the server is shutting down or starting",
     "22": "the server refused a value",
@@ -64,10 +64,10 @@ _REFUSED = {
     "certificate": "the certificate is not accepted; is it expired, or of another authority?",
     "database.*does not exist": _ADVICE["3D"],
 }
-"""What libpq says where the server itself did not → what to do."""
-_PASSES = ("08", "40", "53", "55", "57", "58")
-"""Classes of errors that may pass by themselves: the same batch is tried again."""
-_LOCK = 7496051  # of `server init`: two at a time would each make the tables
+"""Pattern of libpq's message, for errors without SQLSTATE → what to do."""
+_TEMPORARY = ("08", "40", "53", "55", "57", "58")
+"""Classes of temporary errors, after which the same batch is sent again."""
+_LOCK = 7496051  # of `server init`: two at the same time would both create the tables
 _TABLES = ("testfield", "series", "epoch", "event", "reading", "frame")
 _FUNCTIONS = (
     "thermocald_month(float8)",
@@ -76,13 +76,13 @@ _FUNCTIONS = (
 
 
 def is_server(source: Path | str) -> bool:
-    """Whether a source on the command line is a server's address and not a file or folder."""
+    """Return whether a source is a server's address, not a file or folder."""
     return bool(_SCHEME.match(str(source)))
 
 
 @dataclass(frozen=True, slots=True)
 class ServerAddress:
-    """An address as parsed: `url` for libpq, and a selection, None for all."""
+    """A parsed address: `url` for libpq, and the selection of series, None for all."""
 
     url: str
     station: str | None = None
@@ -91,7 +91,7 @@ class ServerAddress:
 
     @classmethod
     def parse(cls, source: Path | str) -> Self:
-        """From text or from a path, in which `//` has become `/`. UsageError where it is wrong."""
+        """Parse an address, also as a path, in which `//` has become `/`. Raises UsageError."""
         if not is_server(source):
             raise UsageError(
                 f"{without_secrets(str(source))}: is not a server's address (postgresql://…)"
@@ -116,7 +116,7 @@ class ServerAddress:
 
     @staticmethod
     def narrowed(source: Path, station: str, camera: str, series: str) -> Path:
-        """The same address, selecting one series, as a path in the place of the given one."""
+        """Return the address as a path that selects one series instead."""
         from pathlib import Path
 
         parts = urlsplit(_SCHEME.sub("postgresql://", str(source)))
@@ -127,12 +127,12 @@ class ServerAddress:
 
     @property
     def place(self) -> str:
-        """The whole of the address but its password: which server, database and user."""
+        """The address with its options, without the password: server, database and user."""
         options = sorted((n, v) for n, v in parse_qsl(urlsplit(self.url).query) if n != "password")
         return f"{self}?{urlencode(options)}"
 
     def __str__(self) -> str:
-        """The address for messages: without a password."""
+        """Return the address for messages, without the password."""
         parts = urlsplit(self.url)
         place = parts.netloc.rsplit("@", 1)
         user = place[0].split(":", 1)[0] + "@" if len(place) == 2 else ""
@@ -141,7 +141,7 @@ class ServerAddress:
 
 @contextmanager
 def in_words(address: ServerAddress | str, doing: str) -> Iterator[None]:
-    """Turn psycopg's errors into ServerGone (may pass) or ServerError."""
+    """Turn psycopg's errors into ServerGone (temporary) or ServerError."""
     try:
         import psycopg
     except ImportError as error:
@@ -153,21 +153,21 @@ def in_words(address: ServerAddress | str, doing: str) -> Iterator[None]:
     except ThermocaldError:
         raise
     except psycopg.Error as error:
-        raise _told(address, doing, error) from error
+        raise _explain(address, doing, error) from error
 
 
-def _told(address: ServerAddress | str, doing: str, cause: Any) -> StoreError:
+def _explain(address: ServerAddress | str, doing: str, cause: Any) -> StoreError:
     state = getattr(cause, "sqlstate", None) or ""
     text = without_secrets(" ".join(str(cause).split()))
     advice = _ADVICE.get(state) or _ADVICE.get(state[:2], "")
     if not state:
-        # libpq failed before the server spoke: name resolution, refusal, TLS, a dead connection
-        for said, advice in _REFUSED.items():
-            if re.search(said, text, re.IGNORECASE):
+        # libpq failed without an answer: name resolution, refusal, TLS, a lost connection
+        for pattern, advice in _REFUSED.items():
+            if re.search(pattern, text, re.IGNORECASE):
                 return ServerError(f"{address}: {doing}: {advice} ({text})")
         return ServerGone(f"{address}: {doing}: the server cannot be reached ({text})")
     message = f"{address}: {doing}: {advice + ' ' if advice else ''}({text})"
-    if state[:2] in _PASSES:
+    if state[:2] in _TEMPORARY:
         return ServerGone(message)
     refused = ServerError(message)
     refused.about_values = state[:2] in ("22", "23")
@@ -175,10 +175,10 @@ def _told(address: ServerAddress | str, doing: str, cause: Any) -> StoreError:
 
 
 class Connected:
-    """A server whose tables are of this program's version; use it in a `with` block.
+    """A server whose tables have this program's version; use it in a `with` block.
 
-    any_version: its tables may be older, or not there. Raises ServerGone, ServerError,
-    StoreVersionError, DriverMissing without psycopg.
+    any_version: the tables may be older or missing. Raises ServerGone, ServerError,
+    StoreVersionError; DriverMissing without psycopg.
     """
 
     def __init__(self, address: ServerAddress, *, any_version: bool = False) -> None:
@@ -213,7 +213,7 @@ class Connected:
 
     @contextmanager
     def _transaction(self, doing: str) -> Iterator[Connection[Any]]:
-        """A connection of one's own, in a transaction that is committed at the end."""
+        """Provide a connection in a transaction that is committed at the end of the block."""
         with in_words(self.address, doing):
             connection = self._take()
             try:
@@ -226,7 +226,7 @@ class Connected:
                 self._idle.append(connection)
 
     def _take(self) -> Connection[Any]:
-        """A connection that lives: one that was used before may have died meanwhile."""
+        """Return a live connection; one that was used before may have been lost since."""
         import psycopg
 
         while True:
@@ -235,9 +235,9 @@ class Connected:
             if connection is None:
                 try:
                     return psycopg.connect(self.address.url, **_SESSION)  # type: ignore[arg-type]
-                except psycopg.ProgrammingError as error:  # a parameter that libpq does not know
-                    said = without_secrets(str(error))
-                    raise StoreError(f"{self.address}: cannot be used: {said}") from error
+                except psycopg.ProgrammingError as error:  # an option unknown to libpq
+                    why = without_secrets(str(error))
+                    raise StoreError(f"{self.address}: cannot be used: {why}") from error
             with suppress(psycopg.Error):
                 connection.execute("SELECT 1")
                 connection.rollback()
@@ -245,16 +245,16 @@ class Connected:
             connection.close()
 
     def _query(self, statement: Any, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """All rows of a statement with %s."""
+        """Return all rows of a statement with placeholders %s."""
         with self._transaction("it cannot be read") as connection:
             return connection.execute(statement, values).fetchall()
 
 
 def create_tables(address: ServerAddress) -> None:
-    """Bring an empty or older database to this program's tables, all or nothing."""
+    """Create the tables, or upgrade older ones, in one transaction."""
     with (
         Connected(address, any_version=True) as server,
-        server._transaction("its tables cannot be made") as connection,
+        server._transaction("its tables cannot be created") as connection,
     ):
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
         connection.execute("CREATE TABLE IF NOT EXISTS thermocald_version (version integer)")
@@ -266,12 +266,12 @@ def create_tables(address: ServerAddress) -> None:
 
 
 def grant(address: ServerAddress, role: str, *, writes: bool) -> None:
-    """Let a role that exists read, or (writes) insert and nothing else.
+    """Allow an existing role to read or, with `writes`, only to insert.
 
-    A role that forwards sees no row of any station: what leaks with a stolen Pi is its own.
+    A role that forwards cannot read any station's rows: a stolen Pi only discloses its own data.
     """
     if not role or "\0" in role:
-        raise UsageError("a role must have a name")
+        raise UsageError("give the name of a role, without NUL characters")
     name = '"' + role.replace('"', '""') + '"'
     statements = [f"GRANT SELECT ON thermocald_version TO {name}"]
     if writes:
@@ -281,7 +281,7 @@ def grant(address: ServerAddress, role: str, *, writes: bool) -> None:
         statements.append(f"GRANT SELECT ON {', '.join(_TABLES)}, station, summary TO {name}")
     with (
         Connected(address, any_version=True) as server,
-        server._transaction(f"role {role!r} was not granted") as connection,
+        server._transaction(f"role {role!r} was not granted permission") as connection,
     ):
         for statement in statements:
             connection.execute(statement)

@@ -1,8 +1,8 @@
-"""What an overview of a whole fleet needs of a server, and no more: it must not read every epoch.
+"""Read from a server what an overview of a whole fleet needs, without reading every epoch.
 
-Of each camera the last epochs, through the index on (series, frame_time), and the summary that the
-server keeps of every series in slots of six hours: the cost grows with cameras and days, not with
-epochs. Of a series too short for the summary, epochs spread evenly over it are read instead.
+Of each camera, the last epochs are read through the index on (series, frame_time), and the summary
+that the server has of every series in slots of six hours. The cost grows with cameras and days, not
+with epochs. Of a series too short for the summary, epochs spread evenly over it are read instead.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
 
 
 RECENT = 60
-_COMPARED = 12  # of them, with others of the same number
+_COMPARED = 12  # of these, compared with other epochs of the same number
 SPREAD = 120
 FEWEST = 6
-"""Epochs that are read of the end of a camera's last series, spread over all, and at least each."""
+"""Numbers of epochs read at a camera's end, spread over all its series, and per series at least."""
 
-_FIRST, _DAY_S = 946_684_800.0, 86400.0  # before 2000 a clock was not set
+_FIRST, _DAY_S = 946_684_800.0, 86400.0  # a time before 2000 is of a clock that was not set
 _SLOTS = "slot BETWEEN thermocald_slot(%s) AND thermocald_slot(%s)"
 
 
 class RecentEpoch(NamedTuple):
-    """One of the last epochs: times in s UTC (received: the server's clock, NaN if not known)."""
+    """One of the last epochs; times in s UTC; received: by the server's clock, NaN if unknown."""
 
     frame_time: float
     received: float
@@ -48,10 +48,10 @@ class RecentEpoch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StationState:
-    """What a station said of itself.
+    """A station's state as it reported it.
 
     contact: s UTC, by the server's clock; clock: s, the station's minus the server's; waiting,
-    refused: rows; stores: how many stores reported under its name within an hour.
+    refused: numbers of rows; stores: number of stores that reported under its name within an hour.
     """
 
     contact: float
@@ -73,20 +73,20 @@ class Rate:
 
 @dataclass(slots=True, eq=False)
 class FleetCamera:
-    """A camera at a station, as a server knows it, and from `state` on its overview.
+    """A camera of a station: its data on a server and, from `state` on, its overview.
 
-    head, identity: of its last series; epochs, results: of all; last_ok: s UTC, of the last epoch
-    with a result; range: °C of the reference in all epochs with a result; both NaN without; recent:
-    the last epochs, newest first; samples (n, 9): series, frame_time, °C of the reference, c, its
-    sd, x0, sd, y0, sd (mm) of epochs with a result spread over all; copied: whether one of the last
-    epochs was taken at two times, as two copies of one store take them.
+    head, identity: of its last series; epochs, results: numbers over all series; last_ok: s UTC, of
+    the last epoch with a result; range: °C of the reference in all epochs with a result; both NaN
+    without one; recent: the last epochs, newest first; samples (n, 9): series, frame_time, °C of
+    the reference, c, sd, x0, sd, y0, sd (mm) of epochs with a result, spread over all; copied:
+    whether one of the last epochs has two times, as two copies of one store give.
 
-    lag_s: since its last epoch, by the server's clock; on_the_way_s: the median time that its last
-    epochs took to the server, NaN if not known; ok: fraction of its last epochs with a result;
-    temperature: °C, the last of the reference, NaN without; shift_px: how far c, x0 or y0 has left
-    its own line lately, and in standard deviations; odd: the probability that a camera of this type
-    is as unlike the others, NaN where that is not known; findings: what a person should look at:
-    kind, one word, see `fleet.overview`, and text, a sentence.
+    lag_s: time since the last epoch, by the server's clock; on_the_way_s: median time of the last
+    epochs' transfer, NaN if unknown; ok: fraction of the last epochs with a result; temperature:
+    °C, the last of the reference, NaN without; shift_px: recent deviation of c, x0 or y0 from its
+    own line; shift_sds: the same in standard deviations; odd: the probability that a camera of this
+    type differs as much from the others, NaN if unknown; findings for the user: kind, one word, see
+    `fleet.overview`, and text, a sentence.
     """
 
     JSON: ClassVar = {
@@ -127,35 +127,35 @@ class FleetCamera:
 
     @property
     def calibrated_range(self) -> tuple[float, float] | None:
-        """`range`, None without a result."""
+        """`range`, or None without a result."""
         return self.range if math.isfinite(self.range[0]) else None
 
     @property
     def waiting(self) -> int | None:
-        """How many rows wait at its station."""
+        """Number of rows waiting at its station."""
         return None if self.state is None else self.state.waiting
 
     @property
     def clock_s(self) -> float | None:
-        """Its station's clock minus the server's."""
+        """Its station's clock minus the server's, s."""
         return None if self.state is None else self.state.clock
 
     @property
     def version(self) -> str | None:
-        """Its station's program."""
+        """The version of its station's program."""
         return None if self.state is None else self.state.version
 
 
 class FleetReader(Connected):
-    """A server that is asked about all cameras which its address selects."""
+    """A server, to read the state of all cameras that its address selects."""
 
     def now(self) -> float:
-        """The server's clock, s UTC."""
+        """Return the server's clock, s UTC."""
         ((now,),) = self._query("SELECT extract(epoch FROM clock_timestamp())::float8", ())
         return float(now)
 
     def stations(self) -> dict[str, StationState]:
-        """What the stations said of themselves, by name."""
+        """Return the states that stations reported, by name."""
         rows = self._query(
             "SELECT DISTINCT ON (name) name, contact, clock - contact, waiting, refused, version, "
             "(SELECT count(*) FROM station other WHERE other.name = station.name "
@@ -166,13 +166,13 @@ class FleetReader(Connected):
         return {name: StationState(*state) for name, *state in rows}
 
     def cameras(self, now: float, path: Path) -> list[FleetCamera]:
-        """All cameras by station and name; path: of the server, for messages."""
+        """Return all cameras, by station and name; path: the server's, for messages."""
         from psycopg.rows import namedtuple_row
 
         wanted = self.address
-        # an epoch from the future is of a wrong clock: it must not hide those of today
+        # an epoch of a wrong clock in the future must not hide today's
         sane = (_FIRST, now + _DAY_S)
-        # first, last: s UTC, of a series' epochs; sampled: how many of its slots have a sample
+        # first, last: s UTC, of a series' epochs; sampled: number of its slots with a sample
         statement = (
             "SELECT s.key, station, camera, name, head, identity, min(first) AS first, "
             "max(last) AS last, sum(epochs)::bigint AS epochs, sum(ok)::bigint AS results, "
@@ -206,9 +206,9 @@ class FleetReader(Connected):
         return [camera for camera, _ in owned]
 
     def _read_recent(self, current: Mapping[Any, FleetCamera]) -> None:
-        """The last epochs; the summary says in which slots they are, so in which month.
+        """Read the last epochs; the summary gives their slots, and so the months to search.
 
-        A series is copied where one of the newest was taken at two times: by two stores.
+        A series is copied if one of its newest epochs has two times: those of two stores.
         """
         rows = self._query(
             "SELECT s.key, e.frame_time, e.received, e.status, e.temperatures, e.number, "
@@ -246,11 +246,11 @@ class FleetReader(Connected):
         heads: Mapping[Any, Head],
         sane: tuple[float, float],
     ) -> None:
-        """Epochs with a result of every series, spread over it: its slots', where they suffice."""
+        """Read epochs with a result, spread over each series: from its slots if these suffice."""
         counted = [(o, max(FEWEST, SPREAD // len(every))) for _, every in owned for o in every]
         long = [(one, count) for one, count in counted if one.sampled >= count]
         short = [(one, count) for one, count in counted if one.sampled < count]
-        # odd: with four slots a day, every time of day has its turn
+        # an odd step visits all four slots of a day
         steps = [(one.sampled // count) | 1 for one, count in long]
         found = self._query(
             "SELECT series, sample FROM (SELECT series, sample, step, "
@@ -267,7 +267,7 @@ class FleetReader(Connected):
             "FROM unnest(%s::uuid[], %s::text[], %s::float8[], %s::float8[], %s::int[]) "
             "s(key, channel, first, last, count) "
             "CROSS JOIN LATERAL generate_series(0, s.count - 1) k "
-            # ordered by the index alone: with the revision too, whole intervals would be sorted
+            # ordered by the index only; to order by revision too, whole intervals would be sorted
             "CROSS JOIN LATERAL (SELECT frame_time AS t FROM epoch "
             "WHERE series = s.key AND frame_time >= s.first + (s.last - s.first) * k / s.count "
             "AND frame_time <= s.first + (s.last - s.first) * (k + 1) / s.count "
@@ -283,7 +283,7 @@ class FleetReader(Connected):
             ),
         )
         samples: dict[Any, dict[float, list[float]]] = defaultdict(dict)
-        for key, (frame_time, _, *numbers) in found:  # neighbouring intervals may share one
+        for key, (frame_time, _, *numbers) in found:  # adjacent intervals may share an epoch
             samples[key][frame_time] = [frame_time, *numbers]
         for camera, every in owned:
             rows = [

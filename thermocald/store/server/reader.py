@@ -1,11 +1,11 @@
-"""A station's series on a server: written in batches, read with the methods of `database.store`.
+"""The series of stations on a server: written in batches, read with the methods of `Store`.
 
-A batch arrives whole or not at all, nothing twice. Keys are made here and not there, from what
-never changes: the same row sent again is the same key and is passed over. So a role that may only
-insert is enough, and sending again is always safe.
+A batch is inserted as a whole or not at all, and no row twice. The client makes the keys from what
+never changes, so a row sent again has the same key and is skipped. A role that may only insert is
+enough, and sending again is always safe.
 
-When read, a column comes as one value, which the server puts together and NumPy reads as it stands,
-so that neither of them holds the series as rows.
+A column is read as one value, which the server concatenates and NumPy reads directly, so neither of
+them holds the series as rows.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _LATEST = (
 
 
 class ServerStore(Connected, SeriesReader):
-    """An open store on a server, narrowed to what its address selects; use it in a `with` block."""
+    """An open store on a server: the series that its address selects; use it in a `with` block."""
 
     _remedy = "; select with ?station=…&camera=…&series=… in the address"
 
@@ -63,16 +63,15 @@ class ServerStore(Connected, SeriesReader):
 
     @property
     def where(self) -> str:
-        """The address without its password."""
         return str(self.address)
 
     @classmethod
     def open(cls, source: Path | str) -> Self:
-        """Open by address. Raises UsageError, ServerGone, ServerError, StoreVersionError."""
+        """Open an address. Raises UsageError, ServerGone, ServerError, StoreVersionError."""
         return cls(ServerAddress.parse(source))
 
     def all_series(self) -> list[StoredSeries]:
-        """All series that the address selects, in the order in which they were begun."""
+        """Return all series that the address selects, in the order in which they were begun."""
         wanted = self.address
         rows = self._query(
             "SELECT s.key, station, head, csv, start, identity, settings, created_utc "
@@ -97,23 +96,21 @@ class ServerStore(Connected, SeriesReader):
     def stamped_columns(
         self, series: StoredSeries, names: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
-        """Columns (E,) over all epochs by name, with times as they were stamped."""
         from psycopg import sql
 
         wanted = {name: _expression(name, series) for name in ("epoch", "frame_time", *names)}
-        # without parameters: the name of a channel may hold a %
+        # no placeholders, as the name of a channel may hold a %
         latest = sql.SQL(_LATEST.replace("%s", "{}")).format(sql.Literal(_key(series)))
         statement = sql.SQL("SELECT {} {}").format(sql.SQL(", ").join(wanted.values()), latest)
         with self._transaction("columns cannot be read") as connection:
             (found,) = connection.execute(statement, binary=True).fetchall()
-        columns = {name: _column(value) for name, value in zip(wanted, found, strict=True)}
+        columns = {name: _decode_column(value) for name, value in zip(wanted, found, strict=True)}
         if np.any(np.diff(columns["epoch"]) <= 0):
             order = np.lexsort((columns["frame_time"], columns["epoch"]))
             columns = {name: column[order] for name, column in columns.items()}
         return {name: columns[name] for name in names}
 
     def covariances(self, series: StoredSeries, numbers: Sequence[int]) -> Array:
-        """(E, 16, 16) covariances of some epochs, NaN for those without a result."""
         rows = self._query(
             f"SELECT number, covariance {_LATEST} AND number = ANY(%s)",
             (_key(series), [int(n) for n in numbers]),
@@ -138,7 +135,6 @@ class ServerStore(Connected, SeriesReader):
         )
 
     def observation_rows(self, series: StoredSeries, first: int, last: int) -> ObservationRows:
-        """The observations of the epochs numbered `first` to `last`, without their quality."""
         statement = (
             "SELECT number, observations FROM epoch WHERE series = %s AND number >= %s "
             "AND number <= %s AND observations IS NOT NULL ORDER BY number, revision"
@@ -147,7 +143,7 @@ class ServerStore(Connected, SeriesReader):
         return unpack_rows({number: bytes(data) for number, data in rows if data})
 
     def clock_steps(self, series: StoredSeries) -> list[Event]:
-        """The steps of the clock of the station that a series is of, oldest first."""
+        """Return the clock steps of the series' station, oldest first."""
         rows = self._query(
             "SELECT utc, kind, text, data FROM event WHERE kind = 'clock_step' "
             "AND station = %s ORDER BY utc, id",
@@ -159,7 +155,7 @@ class ServerStore(Connected, SeriesReader):
         return f"{series.identity['station']}: {series.camera}/{series.name}"
 
     def _stream(self, statement: str, values: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
-        """Rows by a server-side cursor: a year of epochs in constant memory."""
+        """Yield rows through a server-side cursor, in constant memory."""
         with (
             self._transaction("it cannot be read") as connection,
             connection.cursor(name="thermocald") as cursor,
@@ -174,12 +170,12 @@ def _details(row: Mapping[str, Any]) -> tuple[bytes, bytes]:
 
 
 def _key(series: StoredSeries) -> UUID:
-    """Return a series' key at the server, which is its id in every process that reads it."""
+    """Return a series' key on the server, which is its id in every process that reads it."""
     return UUID(int=series.id)
 
 
 def _expression(name: str, series: StoredSeries) -> Composable:
-    """All numbers of a column as one value, NaN for NULL; the words of `status`, a line each."""
+    """Return the SQL of a column as one value: its numbers, NaN for NULL, or lines of `status`."""
     from psycopg import sql
 
     if name == "status":
@@ -196,22 +192,22 @@ def _expression(name: str, series: StoredSeries) -> Composable:
     return sql.SQL("string_agg(float8send(coalesce({}::float8, 'NaN')), '')").format(number)
 
 
-def _column(value: bytes | str | None) -> NDArray[Any]:
-    """The column (E,) in a value of `_expression`; NULL is that of a series without epochs."""
+def _decode_column(value: bytes | str | None) -> NDArray[Any]:
+    """Return the column (E,) in a value of `_expression`; a series without epochs gives NULL."""
     if isinstance(value, str):
         return np.array(value.split("\n"))
     return np.frombuffer(value or b"", ">f8").astype(np.float64)
 
 
 _DAY_S = 86400.0
-_SANE = (946_684_800.0, 4_102_444_800.0)  # s UTC: 2000 to 2100
+_PLAUSIBLE = (946_684_800.0, 4_102_444_800.0)  # s UTC: 2000 to 2100
 _NAMESPACE = UUID("c1b7b0de-6c1e-5f0e-9d0d-7468656d6f63")
-# Columns of a store's row that the server does not keep: they have a meaning in that file alone.
+# Columns of a store's row that the server does not store: their values are only valid in the file.
 _LOCAL = {"epoch": {"id", "series_id"}, "event": {"series_id"}, "reading": set[str]()}
 
 
 def series_key(station: str, store: UUID, series: StoredSeries) -> UUID:
-    """The key of a series at the server: station, store, camera, name, and when it was begun."""
+    """Return the key of a series on the server: station, store, camera, name, its beginning."""
     text = json.dumps([station, str(store), series.camera, series.name, series.created_utc])
     return uuid5(_NAMESPACE, text)
 
@@ -228,7 +224,7 @@ class ServerWriter(Connected):
         self.store = UUID(store)
         self._sent: set[UUID] = set()
         self._days: set[int] = set()
-        # {table: {column: type}} there: one query, as every round of a station needs it
+        # {table: {column: type}} on the server, read once as every batch needs it
         self._tables: dict[str, dict[str, str]] = {}
         try:
             for table, column, kind in self._query(
@@ -243,9 +239,9 @@ class ServerWriter(Connected):
     def write(
         self, table: str, rows: Sequence[Mapping[str, Any]], series: Mapping[int, StoredSeries]
     ) -> None:
-        """Insert rows of a store's table in one transaction; what is there already stays as it is.
+        """Insert rows of a store's table in one transaction; existing rows stay unchanged.
 
-        series: the store's series by their ids; those of the rows are inserted with them.
+        series: the store's series by their ids; those of the rows are inserted too.
         """
         if not rows:
             return
@@ -255,16 +251,18 @@ class ServerWriter(Connected):
         days: set[int] = set()
         if table == "epoch":
             times = (row["frame_time"] for row in rows)
-            # there is no month for what a clock says that was not set
-            days = {int(t // _DAY_S) for t in times if _SANE[0] <= t <= _SANE[1]} - self._days
+            # a clock that was not set gives a time without a month's table
+            days = {
+                int(t // _DAY_S) for t in times if _PLAUSIBLE[0] <= t <= _PLAUSIBLE[1]
+            } - self._days
         with self._transaction(f"{len(rows)} {table}s were not sent") as connection:
             for id_ in sorted(needed):
                 if keys[id_] not in self._sent:
                     row, csv = series_row(series[id_])
                     self._insert(connection, "testfield", [{"digest": row["digest"], "csv": csv}])
-                    whose = {"key": keys[id_], "station": self.station, "store": self.store}
-                    self._insert(connection, "series", [whose | row])
-            for day in sorted(days):  # partitions for their months, of at most 31 days
+                    owner = {"key": keys[id_], "station": self.station, "store": self.store}
+                    self._insert(connection, "series", [owner | row])
+            for day in sorted(days):  # creates the months' partitions
                 connection.execute("SELECT thermocald_month(%s)", (day * _DAY_S,))
             self._insert(connection, table, ready)
         # only what was committed counts as done
@@ -272,7 +270,7 @@ class ServerWriter(Connected):
         self._days |= days
 
     def write_frame(self, series: StoredSeries, frame: KeptFrame, data: bytes) -> None:
-        """Insert the file of one epoch's frame; the server checks it against its SHA-256."""
+        """Insert the file of one epoch's frame; the server checks its SHA-256."""
         row = {
             "series": series_key(self.station, self.store, series),
             "number": frame.number,
@@ -285,7 +283,7 @@ class ServerWriter(Connected):
             self._insert(connection, "frame", [row])
 
     def report(self, waiting: int, refused: int, clock: float) -> None:
-        """Say how this station is: rows that wait, rows refused, its own clock (s, UTC)."""
+        """Report the station's state: numbers of waiting and refused rows, its clock (s UTC)."""
         values = (self.station, self.store, clock, waiting, refused, __version__)
         with self._transaction("the station's state was not sent") as connection:
             connection.execute("SELECT thermocald_report(%s, %s, %s, %s, %s, %s)", values)
@@ -303,32 +301,32 @@ class ServerWriter(Connected):
             if name not in columns:
                 raise StoreVersionError(
                     f"{self.address}: the store's {table}s have a column {name!r} that the server "
-                    "does not know; run `thermocald server init` there with this program's version"
+                    "lacks; run `thermocald server init` with this program's version"
                 )
             if name == "clock_trusted":
                 value = bool(value)
-            # PostgreSQL's text knows no NUL; a note may hold what a broken device sent
+            # PostgreSQL's text cannot hold NUL, which a broken device may send in a note
             ready[name] = value.replace("\0", "\ufffd") if isinstance(value, str) else value
         return ready
 
     def _insert(
         self, connection: Connection[Any], table: str, rows: Sequence[Mapping[str, Any]]
     ) -> None:
-        """One statement for all rows, of which those that are there already are passed over."""
+        """Insert rows by one statement, which skips those that exist."""
         kinds = self._tables[table]
         names = list(rows[0])
         columns = ", ".join(f'"{name}"' for name in names)
         arrays = ", ".join(f"%b::{kinds[name]}[]" for name in names)
-        values = tuple([_as(kinds[name], row[name]) for row in rows] for name in names)
+        values = tuple([_convert(kinds[name], row[name]) for row in rows] for name in names)
         connection.execute(
             f'INSERT INTO "{table}" ({columns}) SELECT * FROM unnest({arrays}) '
-            # no conflict target: naming one would ask for the right to read
+            # naming a conflict target would need permission to read
             "ON CONFLICT DO NOTHING",
             values,
         )
 
 
-def _as(kind: str, value: Any) -> Any:
-    """A value as the column's type: an array must hold one type alone."""
+def _convert(kind: str, value: Any) -> Any:
+    """Convert a value to the column's type, since an array must hold one type only."""
     of = {"float8": float, "int4": int, "int8": int}.get(kind)
     return value if value is None or of is None else of(value)

@@ -116,12 +116,12 @@ BAD = [
     (camera(calibration={"fre": []}), "cameras[0].calibration.fre: unknown; is 'free' meant?"),
     (document(calibration={"free": ["c", "f"]}), "calibration.free[1]: is 'f'"),
     (document(calibration={"free": ["c", "c"]}), "names a parameter twice"),
-    (document(calibration={"fixed": {"c": 3.0}}), "c stands in `free` and in `fixed`"),
+    (document(calibration={"fixed": {"c": 3.0}}), "c is both in `free` and in `fixed`"),
     (document(calibration={"priors": {"c": {"value": 3, "sd": 0}}}), "calibration.priors.c.sd"),
     (document(calibration={"exterior": "free"}), "'per_epoch'"),
     (document(frames={"keep": "some"}), "frames.keep: is 'some'"),
     (document(frames={"max_size_gb": -1}), "frames.max_size_gb: is -1"),
-    (document(dashboard={"host": "0.0.0.0"}), "name a token_file too"),
+    (document(dashboard={"host": "0.0.0.0"}), "give a token_file too"),
     (document(dashboard={"port": 70000}), "dashboard.port: is 70000"),
     (document(logging={"level": "loud"}), "logging.level: is 'loud'"),
     (document(cameras="none"), "cameras: is 'none'"),
@@ -188,8 +188,8 @@ PLACES = {
     "a hard link to the store": ("./hard", "is the store"),
     "a way round to the store": ("./a/../t.db", "is the store"),
     "the configuration": ("./config.yaml", "is the configuration"),
-    "another output's": ("./one.jsonl", "is what one writes"),
-    "another output's through a link": ("./alias", "is what one writes"),
+    "another output's": ("./one.jsonl", "is the file of output one"),
+    "another output's through a link": ("./alias", "is the file of output one"),
 }
 
 

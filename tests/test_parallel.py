@@ -40,5 +40,5 @@ def test_items_are_taken_as_results_are_asked_for():
 
 
 def test_a_process_that_dies_is_an_error_in_words():
-    with pytest.raises(DataError, match="take fewer --jobs"):
+    with pytest.raises(DataError, match="give fewer --jobs"):
         list(in_order(scaled, 1, [1, "dies", 2, 3], 2))

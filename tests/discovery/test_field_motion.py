@@ -120,4 +120,4 @@ def test_a_knock_that_may_be_a_slip_is_listed_as_both():
     assert knock["not_excluded"] == ["slip"]
     said = "\n".join(discovery_lines(found))
     assert "a knock of the mount or a slip inside the camera" in said
-    assert "nothing is missing" not in said
+    assert "is missing" not in said

@@ -72,10 +72,10 @@ def test_nothing_is_separated_where_neither_is(evidence_of):
 @pytest.mark.parametrize(
     ("text", "error", "said"),
     [
-        ("creep", UsageError, "write two effects"),
-        ("creep,creep", UsageError, "write two effects"),
+        ("creep", UsageError, "give two different effects"),
+        ("creep,creep", UsageError, "give two different effects"),
         ("creep,kreep", ConfigurationError, "did you mean 'creep'"),
-        ("creep,defocus", UsageError, "defocus is seen in the image"),
+        ("creep,defocus", UsageError, "defocus shows in the image"),
     ],
 )
 def test_what_is_no_pair_is_refused(text, error, said):

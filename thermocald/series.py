@@ -336,7 +336,11 @@ def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
         return ()
     for name in names:
         if name not in IOP_NAMES:
-            raise UsageError(f"--free: {name!r} is no IOP; there are {', '.join(IOP_NAMES)}, none")
+            choices = ", ".join(IOP_NAMES)
+            raise UsageError(
+                f"--free: {name!r} is no parameter of the interior orientation; give some of "
+                f"{choices}, or none"
+            )
     return tuple(name for name in IOP_NAMES if name in names)
 
 

@@ -195,14 +195,14 @@ def measure(
     >>> tc.measure("points.csv", "camera.yaml", log="M1", control="gcp.csv", seen="0",
     ...            surface="water.yaml", unit="km")
     Traceback (most recent call last):
-    thermocald.errors.UsageError: --length-unit km: mm or m
+    thermocald.errors.UsageError: --length-unit km: must be mm or m
     """
     from thermocald.analysis.thermal.control_points import UNITS, ControlPoints
     from thermocald.analysis.thermal.correction import first_times, row_blocks, seconds_of
     from thermocald.analysis.thermal.places import measure_places, read_surface
 
     if unit not in UNITS:
-        raise UsageError(f"--length-unit {unit}: mm or m")
+        raise UsageError(f"--length-unit {unit}: must be mm or m")
     tell = say or (lambda _: None)
     thermal, path = _thermal(model), source_of(points)
     clock = device_clock(timezone, ambiguous=ambiguous)

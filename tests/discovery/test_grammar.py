@@ -14,7 +14,7 @@ from tests.blind.bridge import series_input
 from tests.blind.case import OUTSIDE, Case
 from tests.blind.generator import generate
 from tests.blind.outside import HUMID
-from thermocald.discovery.formulas import Library, condensed
+from thermocald.discovery.formulas import Library, condense
 from thermocald.discovery.proposal import propose
 from thermocald.discovery.result import discover_series
 from thermocald.discovery.search import Search
@@ -93,7 +93,7 @@ def test_one_recording_gets_no_formula(above):
 
 def test_condensed_evidence_is_the_likelihood(above):
     """What condensed rows promise of a trajectory is what the full normal equations give."""
-    few = condensed(above.fitter, above.base.fit, BASE)
+    few = condense(above.fitter, above.base.fit, BASE)
     library = Library(few.histories)
     node = library.offsets(library.reference)[0]
     whole = Node("integral", (Node("above", (library.reference,), (26.5,)),))
@@ -107,7 +107,7 @@ def test_condensed_evidence_is_the_likelihood(above):
 
 
 def test_surrogates_are_as_strong_as_the_misfit(above):
-    few = condensed(above.fitter, above.base.fit, BASE)
+    few = condense(above.fitter, above.base.fit, BASE)
     power = np.sum(few.surrogates(40, np.random.default_rng(0)) ** 2, axis=0)
     assert 0.1 < np.median(power) / few.power < 10
 

@@ -159,7 +159,7 @@ def _examine_standing(
 
     def search_in(series: list[ReducedSeries]) -> Examination:
         search = Search(HypothesisFitter(series), say)
-        return _search_standing(search, search.base(given), say, jobs)
+        return _search_standing(search, search.base(given), jobs)
 
     say("base model")
     search = Search(HypothesisFitter(ready), say)
@@ -167,7 +167,7 @@ def _examine_standing(
     # a single effect accounts for most of the image's movement
     guide = min([base, *search.expand(base, _GUIDES)], key=lambda s: s.score).fit
     bent = remove_curvature(search.fitter, guide)
-    found = search_in(bent) if bent else _search_standing(search, base, say, jobs)
+    found = search_in(bent) if bent else _search_standing(search, base, jobs)
     if not found.adequate:
         again = remove_curvature(found.fitter, found.best.fit)
         if again is not None and _is_explained(again, found):
@@ -191,9 +191,7 @@ def _is_explained(series: list[ReducedSeries], found: Examination) -> bool:
     return _is_adequate(examine_all(fitter, refined), found.base_adequacy)
 
 
-def _search_standing(
-    search: Search, base: Solution, say: Callable[[str], None], jobs: int
-) -> Examination:
+def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
     """Search with a mount that stands still, extending combinations while the score improves."""
     fitter = search.fitter
     kept = len(base.terms)
@@ -202,8 +200,8 @@ def _search_standing(
     frontier = [base]
     complete = False
     for level in range(1, _EFFECTS + 1):
-        say(f"effect {level}: alongside {' or '.join(', '.join(s.names) for s in frontier)}"
-            if level > 1 else "effect 1: alongside the base")  # fmt: skip
+        beside = " or ".join(", ".join(s.names) for s in frontier) if level > 1 else "the base"
+        search.progress(f"effect {level}: alongside {beside}")
         if level == 1:
             grown = ranking = search.expand(base)
         else:

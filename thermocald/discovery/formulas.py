@@ -106,7 +106,7 @@ class Condensed:
         return out
 
 
-def condensed(
+def condense(
     fitter: HypothesisFitter,
     fit: Fit,
     parameters: Sequence[str],
@@ -190,7 +190,7 @@ class Library:
         """List the formulas that are tried first."""
         out: list[Node] = []
         for leaf in self.leaves:
-            for inner in self.remembered(leaf):
+            for inner in self.with_memory(leaf):
                 out += [inner, *self.shapes(inner)]
             out += self.waves(leaf)
             for rated in self.rates(leaf):
@@ -199,12 +199,12 @@ class Library:
             out += [_apply(n, changed) for n in ("square", "cube", "magnitude", "signed_square")]
             out.append(_apply("product", changed, Node(TIME)))
             for shape in (*self.offsets(leaf), *self.shapes(leaf)):
-                out += self.remembered(shape, few=True)
+                out += self.with_memory(shape, few=True)
                 out.append(_apply("integral", shape))
         out += self.products()
         return _keep_distinct(out)
 
-    def remembered(self, node: Node, few: bool = False) -> list[Node]:
+    def with_memory(self, node: Node, few: bool = False) -> list[Node]:
         """Apply each operator with memory to a quantity."""
         low, high = self.span(node)
         out = [] if few else [node]
@@ -281,13 +281,13 @@ class Library:
 
     def further(self, node: Node) -> list[Node]:
         """Add one operator to a formula: outside, at one of its quantities, or as a factor."""
-        out = [*self.remembered(node)[1:], _apply("rate", node), _apply("integral", node)]
+        out = [*self.with_memory(node)[1:], _apply("rate", node), _apply("integral", node)]
         out += self.shapes(node)
         out += [_apply("product", o, node) for leaf in self.leaves
                 for o in self.offsets(leaf, few=True)]  # fmt: skip
         out.append(_apply("product", node, Node(TIME)))
         for leaf in {n for n in node.walk() if n.is_leaf and n.operator != TIME}:
-            out += [_replace_leaf(node, leaf, inner) for inner in self.remembered(leaf)[1:]]
+            out += [_replace_leaf(node, leaf, inner) for inner in self.with_memory(leaf)[1:]]
             out += [_replace_leaf(node, leaf, other) for other in self.leaves if other != leaf]
         deepest = max(node.depth, 4)
         return [n for n in _keep_distinct(out) if n.depth <= deepest]
@@ -343,7 +343,7 @@ class FormulaSearch:
             self.library = Library(evidence.histories)
             self.nodes = self.library.first()
             self.tried = len(self.nodes)
-            self.nodes, self.stack = self._finite(self.nodes)
+            self.nodes, self.stack = self._keep_finite(self.nodes)
         else:
             self.library, self.tried = before.library, before.tried
             kept = np.sort(np.argsort(-before.gains)[:_KEPT])
@@ -351,7 +351,7 @@ class FormulaSearch:
         self.regressors = evidence.regressors(self.stack)
         self.gains: Array = np.sum((self.regressors @ evidence.data) ** 2, axis=1)
 
-    def _finite(self, nodes: Sequence[Node]) -> tuple[list[Node], Array]:
+    def _keep_finite(self, nodes: Sequence[Node]) -> tuple[list[Node], Array]:
         """Return the formulas that are finite and vary, and their trajectories (rows, G)."""
         with np.errstate(all="ignore"):
             stack = np.stack([self.library.values(n) for n in nodes], axis=1)
@@ -360,28 +360,28 @@ class FormulaSearch:
 
     def best(self, further: bool = True) -> list[Found]:
         """Rank formulas, best first, each structure once; further: also extend them."""
-        found = self._exact(self.nodes, self.gains, _WIDTH)
+        ranking = self._fit_structures(self.nodes, self.gains, _WIDTH)
         for _ in range(_STEPS if further else 0):
-            if self._left(found[0].gain) < 0.5 * len(self.evidence.data):
+            if self._left(ranking[0].gain) < 0.5 * len(self.evidence.data):
                 break
             more: list[Node] = []
-            for one in found[:_FURTHER]:
+            for one in ranking[:_FURTHER]:
                 more += self.library.further(one.node)
-            before = found[0]
+            before = ranking[0]
             self.tried += len(more)
-            kept, stack = self._finite(more)
-            tried = self._exact(kept, self.evidence.gains(stack), _WIDTH // 2)
-            found = sorted([*found, *tried], key=lambda f: f.rank, reverse=True)
-            if found[0].rank <= before.rank:
+            kept, stack = self._keep_finite(more)
+            tried = self._fit_structures(kept, self.evidence.gains(stack), _WIDTH // 2)
+            ranking = sorted([*ranking, *tried], key=lambda f: f.rank, reverse=True)
+            if ranking[0].rank <= before.rank:
                 break
-        return found
+        return ranking
 
     def _rank(self, node: Node, gain: float) -> float:
         """Return the rank, from the misfit left; a further operator must leave a quarter less."""
         return -float(np.log(self._left(gain))) - _SIMPLER * node.size
 
-    def _exact(self, nodes: Sequence[Node], gains: Array, width: int) -> list[Found]:
-        """Fit the constants of the best structures."""
+    def _fit_structures(self, nodes: Sequence[Node], gains: Array, width: int) -> list[Found]:
+        """Fit the constants of the best `width` structures of some formulas."""
         ranks = [-self._rank(n, float(g)) for n, g in zip(nodes, gains, strict=True)]
         order = np.argsort(ranks)
         seen: dict[Node, Node] = {}

@@ -142,7 +142,7 @@ def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: fl
 def _measure_moved(
     evidence: ReducedSeries, displaced: Sequence[Displaced], known: bool
 ) -> tuple[float, float]:
-    """Return χ² of the displaced targets about the other targets' camera, and its redundancy.
+    """Return displaced targets' χ² about the others' camera, and its degrees of freedom.
 
     known: whether their displacement is in the model.
     """

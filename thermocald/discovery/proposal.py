@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.discovery.formulas import FormulaSearch, condensed
+from thermocald.discovery.formulas import FormulaSearch, condense
 from thermocald.discovery.gap import image_chi2
 from thermocald.discovery.validation import SurrogateTest
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
@@ -70,7 +70,7 @@ def propose(
     (progress or (lambda _: None))("beyond the catalogue")
     base = _straighten(x)
     fitter = base.fitter
-    search = FormulaSearch(condensed(fitter, base.fit, moving), criteria.MARGIN)
+    search = FormulaSearch(condense(fitter, base.fit, moving), criteria.MARGIN)
     test = SurrogateTest(
         *search.surrogates(criteria.FORMULA_SURROGATES, np.random.default_rng(_SEED))
     )
@@ -81,7 +81,7 @@ def propose(
     for turn in range(_TURNS):
         before = best
         if turn:
-            here = condensed(fitter, base.fit, moving, best.fit.weightings)
+            here = condense(fitter, base.fit, moving, best.fit.weightings)
             search = FormulaSearch(here, criteria.MARGIN, search)
         _fit_formulas(base, moving, search.best(further=turn > 0), tried)
         best = min([base, *tried.values()], key=lambda s: s.score)

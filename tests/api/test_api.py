@@ -1,4 +1,4 @@
-"""The front door as API.md has it, line by line, and every example of its docstrings."""
+"""The front door as described in API.md, line by line, and every example of its docstrings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def examples():
     return found
 
 
-# the commands on the same series are tests/golden's
+# tests/golden runs the commands on the same series
 SLOW = {
     f"thermocald.{n}"
     for n in ("api.calibrate", "api.discover", "api.study", "series.Series.calibrate")
@@ -183,7 +183,7 @@ def test_one_result_prints_documents_draws_and_reports(name, epochs, camera, M1,
 
 def test_a_result_is_what_the_command_says(epochs, world, tmp_path):
     said = finish("replay", "M1", "--json", tmp_path / "M1.json", folder=world)
-    # what it refused stands in its standard error: an empty output alone tells nothing
+    # its errors are on standard error, which an empty output would not show
     document = json.loads((tmp_path / "M1.json").read_text())
 
     assert said.stdout.strip() == str(epochs).strip()
@@ -276,7 +276,7 @@ def test_what_is_wrong_is_said(M1, camera):
 
 
 def test_the_import_costs_nothing():
-    """Without NumPy, within 30 ms of the processor (median of five)."""
+    """It needs no NumPy and less than 30 ms of processor time (median of five)."""
     program = (
         "import sys, time; a = time.process_time(); import thermocald; "
         "print(time.process_time() - a, 'numpy' in sys.modules)"

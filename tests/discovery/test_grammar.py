@@ -1,4 +1,4 @@
-"""Beyond the catalogue: what follows something recorded is described, what does not is not.
+"""Formulas beyond the catalogue: only what follows a recorded quantity is described.
 
 The influences are those of `tests.blind.outside`, which shares no code with the operators.
 """
@@ -37,7 +37,7 @@ def reduced(kind: str, seed: int):
 
 
 def examined(kind: str, seed: int):
-    """What an examination leaves of the base model, without the catalogue's search."""
+    """Return an examination of the base model's misfit without the catalogue's search."""
     ready = [weight_slow_noise(e) for e in calibrate_thermometers(reduced(kind, seed))]
     fitter = HypothesisFitter(ready)
     base = Search(fitter).base()
@@ -92,7 +92,7 @@ def test_one_recording_gets_no_formula(above):
 
 
 def test_condensed_evidence_is_the_likelihood(above):
-    """What condensed rows promise of a trajectory is what the full normal equations give."""
+    """A trajectory gains the same in condensed rows as in the full normal equations."""
     few = condense(above.fitter, above.base.fit, BASE)
     library = Library(few.histories)
     node = library.offsets(library.reference)[0]
@@ -103,7 +103,7 @@ def test_condensed_evidence_is_the_likelihood(above):
     candidate = Candidate(structure.text(), BASE, "k", np.array([values["k"]]))
     full = float(Scanner(above.fitter).scan(candidate, fit).gains[0])
     assert gain == pytest.approx(full, rel=0.002)
-    assert few.gains(library.values(node)[:, None])[0] < 1e-3 * gain  # T itself is the base's
+    assert few.gains(library.values(node)[:, None])[0] < 1e-3 * gain  # T is in the base
 
 
 def test_surrogates_are_as_strong_as_the_misfit(above):

@@ -1,4 +1,4 @@
-"""`thermocald fleet`: what is wrong with a fleet is named, and nothing else."""
+"""`thermocald fleet` reports the faults of a fleet and nothing else."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run(*arguments):
 
 @pytest.fixture
 def fleet(server):
-    """Ten sound cameras of one type, and cameras with a fault each, by its name."""
+    """Ten cameras of one type without faults, and cameras with one fault each, named after it."""
     now = time.time()
     base = replace(BASE, end=now - 20)
     cameras = [replace(base, station=f"gauge{i}", rates=rate) for i, rate in enumerate(RATES)]
@@ -84,7 +84,7 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
     html = page.read_text()
     drawn = [html.count(f">{name}<") for name in document["types"][0]["cameras"]]
     assert len(drawn) >= 14
-    assert min(drawn) >= 3  # a row in the drawing of each rate
+    assert min(drawn) >= 3  # a row in each rate's drawing
     assert "secret" not in html
     rates = {c["station"]: c["rates"] for c in document["cameras"]}
     for i, true in enumerate(RATES):

@@ -1,4 +1,4 @@
-"""Archives calibrated again: every engine gives the same bits, and a bad block costs itself."""
+"""Reprocessed archives: every engine gives the same bits, and a bad block affects only itself."""
 
 from __future__ import annotations
 

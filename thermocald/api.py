@@ -15,10 +15,18 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camer
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.series import Series, check_exterior, free_names, source_of
+from thermocald.series import (
+    COLDEST_C,
+    Series,
+    check_exterior,
+    free_names,
+    require_within,
+    source_of,
+)
 from thermocald.series import open as open_series
 
 if TYPE_CHECKING:
+    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.discovery.plan import Plan
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.model import ModelEffect, ThermalModel
@@ -170,8 +178,10 @@ def study(
 
     if not series:
         raise UsageError("give at least one series to study")
-    if window % 2 == 0:
-        raise UsageError(f"window is {window}; it must be odd, so that it has a centre")
+    if len(labels) > len(series):
+        raise UsageError(
+            f"{len(labels)} labels for {len(series)} series; give one for each at most"
+        )
     _refuse_twice(series)
     check_exterior(exterior)
     settings = StudySettings(
@@ -179,6 +189,7 @@ def study(
         focus_mm=focus_mm, f_number=f_number, confusion_mm=confusion_mm,
         thermometer_sd=thermometer_sd, jobs=jobs,
     )  # fmt: skip
+    _check_settings(settings)
     named = [*labels, *[None] * (len(series) - len(labels))]
     measured = [
         one.measured(label, thermometer_sd, exterior, free_names(free), jobs)
@@ -199,6 +210,7 @@ def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
     from thermocald.results import Study
 
     chosen = StudySettings(**settings)
+    _check_settings(chosen)
     cameras = tuple(reference_studies(chosen, progress or (lambda _: None)))
     return Study(chosen, cameras, tuple(c for camera in cameras for c in compare(camera)))
 
@@ -239,6 +251,8 @@ def fit(
 
     if not series:
         raise UsageError("give at least one series to fit a model to")
+    _refuse_twice(series)
+    require_within(T0=(T0, COLDEST_C))
     if isinstance(kind, Path) or (isinstance(kind, str) and Path(kind).suffix in (".yaml", ".yml")):
         kind = read_model(source_of(kind))
     if isinstance(kind, ThermalModel):
@@ -329,6 +343,7 @@ def plan(
     """
     from thermocald.discovery.plan import plan_power, set_ups
 
+    require_within(strength_px=(strength_px, 0.001), seeds=(seeds, 1))
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
     source = None if series is None else series.observed()
     inputs = set_ups(source, thermal, preset, testfield, course, seeds)
@@ -391,6 +406,9 @@ def simulate(
     from thermocald.physics.presets import given_simulation
     from thermocald.physics.testfields import load_field
 
+    require_within(seed=(seed, 0), epochs=(epochs, 1))
+    if lamp is not None and (not lamp or [t for t, _ in lamp] != sorted({t for t, _ in lamp})):
+        raise UsageError(f"lamp is {list(lamp)}; give (from s, W) in the order of time")
     thermal, device, course_file = (
         None if p is None else source_of(p) for p in (model, camera, programme)
     )
@@ -418,6 +436,17 @@ def simulate(
     made = open_series(out)
     made.simulation = simulation
     return made
+
+
+def _check_settings(s: StudySettings) -> None:
+    require_within(
+        window=(s.window, 3), alpha=(s.alpha, 1e-6, 0.5), sets=(s.sets, 2), seed=(s.seed, 0),
+        distance_mm=(s.distance_mm, 10), grid=(s.grid, 2, 9), focus_mm=(s.focus_mm, 10),
+        f_number=(s.f_number, 0.1), confusion_mm=(s.confusion_mm, 1e-6),
+        thermometer_sd=(s.thermometer_sd, 0),
+    )  # fmt: skip
+    if s.window % 2 == 0:
+        raise UsageError(f"window is {s.window}; it must be odd, so that it has a centre")
 
 
 def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[str]:

@@ -5,6 +5,7 @@ It is read from a recording's folder, a store or a server; callers need not know
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     Progress = Callable[[int], None] | None
     Say = Callable[[str], None] | None
 
+COLDEST_C = -273.15
 _LOOKED_AT = 25  # epochs in which the targets are compared with the field
 
 
@@ -324,6 +326,17 @@ def check_exterior(exterior: str) -> None:
     if exterior not in EXTERIOR_CHOICES:
         choices = ", ".join(EXTERIOR_CHOICES)
         raise UsageError(f"--exterior {exterior}: must be one of {choices}")
+
+
+def require_within(
+    **bounds: tuple[float | None, float] | tuple[float | None, float, float],
+) -> None:
+    """Raise UsageError for an argument, name=(value, least[, most]), out of bounds; None passes."""
+    for name, (value, least, *rest) in bounds.items():
+        most = rest[0] if rest else math.inf
+        if value is not None and not (math.isfinite(value) and least <= value <= most):
+            bound = f"from {least:g} to {most:g}" if rest else f"at least {least:g}"
+            raise UsageError(f"{name} is {value:g}; it must be {bound}")
 
 
 def free_names(given: str | Iterable[str]) -> tuple[str, ...]:

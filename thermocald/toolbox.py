@@ -13,7 +13,7 @@ from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
 from thermocald.photogrammetry import camera_files
-from thermocald.series import Series, source_of
+from thermocald.series import COLDEST_C, Series, require_within, source_of
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.temperatures import LogOptions, log_options
 
@@ -107,6 +107,10 @@ def predict(
 
     if sum((temperature is not None, log is not None, bool(test), programme is not None)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
+    require_within(
+        temperature=(temperature, COLDEST_C), distance_m=(distance_m, 0.01),
+        wanted_mm=(wanted_mm, 1e-3),
+    )  # fmt: skip
     thermal = _thermal(model)
     if temperature is not None:
         state = thermal.at(temperature, channels=channels, extrapolate=extrapolate)
@@ -153,6 +157,9 @@ def correct(
     from thermocald.analysis.thermal.correction import first_times
     from thermocald.output.corrected import Correction
 
+    require_within(to=(to, COLDEST_C), temperature_sd=(temperature_sd, 0))
+    width, height = size or (1, 1)
+    require_within(width=(width, 1), height=(height, 1))
     thermal, path = _thermal(model), source_of(points)
     clock = device_clock(timezone, ambiguous=ambiguous)
     header, near = first_times(path, clock)
@@ -282,6 +289,9 @@ def fit_calibrations(
     from thermocald.analysis.thermal import calibrations as calibrated
     from thermocald.store.logger.temperatures import read_log
 
+    if not calibrations:
+        raise UsageError("give at least two calibrations to fit a model to")
+    require_within(T0=(T0, COLDEST_C), temperature_sd=(temperature_sd, 0))
     for name in calibrations:
         if not calibrated.is_calibration(source_of(name)):
             raise UsageError(f"{name}: is not a calibration; fit series and calibrations apart")
@@ -400,6 +410,7 @@ def check_testfield(
     from thermocald.api import read_testfield
     from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
 
+    require_within(sigma_px=(sigma_px, 1e-4))
     if camera is None:
         model = RASPBERRY_PI_V2
     elif isinstance(camera, Camera):

@@ -347,7 +347,7 @@ def plan(
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
     source = None if series is None else series.observed()
     inputs = set_ups(source, thermal, preset, testfield, course, seeds)
-    return plan_power(inputs, strength_px, lambda: (progress or (lambda _: None))(1))
+    return plan_power(inputs, strength_px, progress or (lambda _: None))
 
 
 def catalogue() -> Catalogue:

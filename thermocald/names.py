@@ -79,10 +79,7 @@ _LONGEST_NAME = 120
 
 
 def relative_path(text: str, what: str, error: type[ThermocaldError]) -> Path:
-    """Return a relative path that stays within its folder.
-
-    Raises `error`, whose message begins with `what`.
-    """
+    """Return a relative path that stays in its folder; the error's message begins with `what`."""
     path = PurePosixPath(text)
     if path.is_absolute() or ".." in path.parts or "\0" in text or len(text) > _LONGEST_PATH:
         raise error(
@@ -92,10 +89,7 @@ def relative_path(text: str, what: str, error: type[ThermocaldError]) -> Path:
 
 
 def file_name(text: str, what: str, error: type[ThermocaldError]) -> str:
-    """Return the name of a camera, series or thermometer if it can be part of a file's name.
-
-    Raises `error`, whose message begins with `what`.
-    """
+    """Return a camera's, series' or thermometer's name if it can be part of a file's name."""
     if (
         not text.strip()
         or text.startswith(".")

@@ -42,9 +42,7 @@ if TYPE_CHECKING:
     from thermocald.thermal.likelihood import Weighting
 
 _ROWS = 90  # per series
-
 _KNOTS = 400
-
 _NULL = 1e-9  # share of the largest eigenvalue: below are levels and the base's own rates
 
 

@@ -128,7 +128,7 @@ def _record(simulation: Simulation) -> SeriesInput:
 def plan_power(
     inputs: Sequence[tuple[SeriesInput, Simulation | None]],
     strength_px: float,
-    advance: Callable[[], None],
+    advance: Callable[[int], None],
 ) -> Plan:
     """Add every effect to every recording of `set_ups` and search for it."""
     found: dict[str, dict[str, int]] = {}
@@ -149,7 +149,7 @@ def plan_power(
             verdict = _examine(changed, given)
             row = found.setdefault(candidate.effect, {})
             row[verdict] = row.get(verdict, 0) + 1
-            advance()
+            advance(1)
     return Plan(found, len(inputs), strength_px)
 
 

@@ -157,15 +157,15 @@ def study(
     jobs: int = 1,
     progress: Progress = None,
 ) -> Study:
-    """Study how a camera changes with temperature, whether significantly, and with what effect.
+    """Study a camera's changes with temperature, their significance, and their effect on objects.
 
     labels: one per series, by default the camera's name; series with the same label are one camera.
     window (epochs), alpha: width and level of the F-test. sets, seed: of the Monte-Carlo
     simulation, on a plane at distance_mm with grid × grid points. focus_mm, f_number, confusion_mm:
     of the depth of field. thermometer_sd: K, estimated if not given. exterior, free: as in
-    `Series.calibrate`. progress: called with the number of further sets drawn. Raises UsageError if
-    a series is given twice, DataError if none can be studied. Source: Elias et al. 2020, Sensors
-    20, 643, section 4.
+    `Series.calibrate`. jobs: number of processes. progress: called with the number of further sets
+    drawn. Raises UsageError if a series is given twice, DataError if none can be studied. Source:
+    Elias et al. 2020, Sensors 20, 643, section 4.
 
     >>> found = tc.study(tc.open("M1"), tc.open("M2"), sets=200)
     >>> found.cameras[0].label
@@ -230,9 +230,9 @@ def fit(
     effects and T0 are fitted again, for example discovery's. T0: reference temperature, °C, by
     default the mean. kind: a name, to fit the model of a camera type to the series of several
     cameras; or such a type's model, to support a camera that was measured at few temperatures.
-    progress: called with the number of further frames measured. Raises DataError for series of
-    different cameras or at a single temperature, UsageError for an effect that a series cannot
-    show.
+    jobs: number of processes. progress: called with the number of further frames measured. Raises
+    DataError for series of different cameras or at a single temperature, UsageError for a series
+    given twice or an effect that a series cannot show.
 
     >>> camera = tc.fit(tc.open("M1"), tc.open("M2"))
     >>> camera.model.camera
@@ -303,6 +303,7 @@ def discover(
     from thermocald.results import Discovery
     from thermocald.thermal.reduce import reduce_together
 
+    require_within(jobs=(jobs, 1))
     tell = say or (lambda _: None)
     every = (series, *verify)
     _refuse_twice(every)
@@ -333,9 +334,9 @@ def plan(
     """Predict which effects a set-up could reveal, before the camera is heated.
 
     The set-up is a series (its epochs and noise), a preset of `simulate`, or a model and a
-    programme. testfield: a testfield.csv, or markers, circles, plain. strength_px: of each effect.
-    seeds: number of repetitions. progress: called with the number of further effects done. Raises
-    UsageError if no set-up is given.
+    programme. testfield: a testfield.csv, or markers, circles, plain. strength_px: RMS of each
+    effect in the image. seeds: number of repetitions. progress: called with the number of further
+    effects done. Raises UsageError if no set-up is given.
 
     >>> tc.plan(model="camera.yaml")
     Traceback (most recent call last):

@@ -284,7 +284,7 @@ def _adjust(
 
 
 def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
-    """Open a series of a recording's folder, a store (a file or `postgresql://…`).
+    """Open a series from a recording's folder or a store (a file or `postgresql://…`).
 
     series: `CAMERA/SERIES` or `SERIES`, needed if a store holds several. Frames and observations
     are read when they are needed. Raises StoreError if nothing is there or several series match,
@@ -304,7 +304,7 @@ def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
 
 
 def open_all(source: Path | str) -> list[Series]:
-    """Open all series of a store or a server; of a recording's folder its one series.
+    """Open all series of a store or a server, or the one series of a recording's folder.
 
     Raises StoreError if nothing is there, DataError if the store holds no series.
 

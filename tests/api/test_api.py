@@ -282,6 +282,7 @@ OUT_OF_BOUNDS = {
     "2 labels for 1 series": lambda M1, field: tc.study(M1, labels=["a", "b"]),
     "is the same series as": lambda M1, field: tc.fit(M1, M1),
     "T0 is nan": lambda M1, field: tc.fit(M1, T0=np.nan),
+    "jobs is 0": lambda M1, field: tc.discover(M1, jobs=0),
     "seeds is 0": lambda M1, field: tc.plan(M1, seeds=0),
     "epochs is 0": lambda M1, field: tc.simulate("rpi-v2.1-heating", epochs=0),
     "in the order of time": lambda M1, field: tc.simulate("nexus5-cold", lamp=[(9, 1), (0, 3)]),

@@ -36,24 +36,24 @@ class Separation:
     """The comparison of two alternatives in the recorded series.
 
     difference: between their scores; needed: the difference from which the worse one is excluded;
-    there: whether the better one explains more than the base model.
+    detected: whether the better one explains more than the base model.
     """
 
     better: str
     worse: str
     difference: float
     needed: float
-    there: bool
+    detected: bool
 
     @property
     def separated(self) -> bool:
         """Whether one of the two is excluded."""
-        return self.there and self.difference > self.needed
+        return self.detected and self.difference > self.needed
 
     @property
     def sentence(self) -> str:
         """The comparison as a sentence."""
-        if not self.there:
+        if not self.detected:
             return f"neither {self.better} nor {self.worse} is detected yet"
         if self.separated:
             return (

@@ -208,21 +208,17 @@ def _late(camera: FleetCamera, now: float) -> Findings:
             why = ", though its station reports: check the camera and its daemon"
         yield "late", since + why
     if camera.state is not None and camera.state.stores > 1:
-        yield (
-            "twins",
-            (
-                f"{camera.state.stores} stores report under its station's name, perhaps from a copied "
-                "card; give each station its own name (forward.station)"
-            ),
+        text = (
+            f"{camera.state.stores} stores report under its station's name, perhaps from a copied "
+            "card; give each station its own name (forward.station)"
         )
+        yield "twins", text
     if camera.copied:
-        yield (
-            "twins",
-            (
-                "epochs with the same number have different times: its store is used at two stations, "
-                "or a backup was restored; move a copied card's store away, so that a new one is made"
-            ),
+        text = (
+            "epochs with the same number have different times: its store is used at two stations, "
+            "or a backup was restored; move a copied card's store away, so that a new one is made"
         )
+        yield "twins", text
     if camera.state is not None and (count := camera.state.refused):
         yield "refused", f"the server refused {count} rows of its station; its log names them"
 
@@ -276,21 +272,17 @@ def _calibration(camera: FleetCamera, now: float) -> Findings:
     low, high = camera.range
     outside = max(low - camera.temperature, camera.temperature - high)
     if outside > _OUTSIDE_K:
-        yield (
-            "calibrate",
-            (
-                f"{camera.temperature:.1f} °C is {outside:.0f} K outside its calibrated range of "
-                f"{low:.0f} to {high:.0f} °C"
-            ),
+        text = (
+            f"{camera.temperature:.1f} °C is {outside:.0f} K outside its calibrated range of "
+            f"{low:.0f} to {high:.0f} °C"
         )
+        yield "calibrate", text
     if not camera.rates and math.isfinite(low):
-        yield (
-            "calibrate",
-            (
-                f"calibrated only from {low:.0f} to {high:.0f} °C, so that its rates are unknown; warm "
-                "it up, or use its type's model (fit --type)"
-            ),
+        text = (
+            f"calibrated only from {low:.0f} to {high:.0f} °C, so that its rates are unknown; warm "
+            "it up, or use its type's model (fit --type)"
         )
+        yield "calibrate", text
     if camera.shift_px > _SHIFT_PX and camera.shift_sds > _SHIFT_SDS:
         yield "calibrate", f"has recently moved by {camera.shift_px:.1f} px from its straight line"
 
@@ -306,13 +298,11 @@ def _odd(camera: FleetCamera, kind: dict[str, Any] | None) -> Findings:
 
     name = max(RATED, key=distance)
     usual = kind["rates"][name]
-    yield (
-        "odd",
-        (
-            f"{name} drifts by {camera.rates[name].value * 1e3:+.3f} µm/K, the others "
-            f"by {usual['value'] * 1e3:+.3f} ± {usual['sd_between'] * 1e3:.3f} (p = {camera.odd:.1g})"
-        ),
+    text = (
+        f"{name} drifts by {camera.rates[name].value * 1e3:+.3f} µm/K, the others "
+        f"by {usual['value'] * 1e3:+.3f} ± {usual['sd_between'] * 1e3:.3f} (p = {camera.odd:.1g})"
     )
+    yield "odd", text
 
 
 def _clock(camera: FleetCamera) -> Findings:

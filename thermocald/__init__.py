@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# a module each, so that who uses only a camera does not import the analysis of series
+# module → names, so that a camera alone does not import the analysis of series
 _PLACES = {
     "analysis.camera.camera": "Camera",
     "analysis.series.epochs": "Epochs",

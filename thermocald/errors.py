@@ -39,7 +39,7 @@ class ThermocaldError(Exception):
 
 
 class UsageError(ThermocaldError, ValueError):
-    """The command or the call was used wrongly."""
+    """A command or a function was used wrongly."""
 
     exit_status = 2
 

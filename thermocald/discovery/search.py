@@ -252,7 +252,7 @@ class Search:
         return out
 
     def with_other_delay(self, solution: Solution) -> Solution | None:
-        """Replace a solution's delay of the temperature by the best other kind, None without."""
+        """Replace a solution's delay of the temperature by the best other kind; None if none."""
         delays = [c for c in self.candidates if c.kind.delay]
         for i, term in enumerate(solution.terms):
             if not term.kind.delay:

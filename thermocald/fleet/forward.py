@@ -309,8 +309,8 @@ def _read_frame(files: FileFolder, frame: KeptFrame) -> bytes | None:
 def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None:
     """Send waiting rows repeatedly until `wait(seconds)` returns True.
 
-    After an error that a person must mend, it is logged and the next attempt follows the longest
-    pause; nothing is lost, since the rows stay in the store.
+    An error that a person must mend is logged, and the next attempt follows the longest pause;
+    nothing is lost, since the rows stay in the store.
     """
     pause, trouble = _FIRST_PAUSE_S, ""
     while True:

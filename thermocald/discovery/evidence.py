@@ -71,21 +71,21 @@ _PASSES = 2
 def replace_moved_boards(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:
     """Find the boards that moved, and put them back to their places."""
     series = _field_series(evidence)
-    found = board_movements(series, wandering_targets(series))
-    if not found:
+    movements = board_movements(series, wandering_targets(series))
+    if not movements:
         return [], evidence
-    still = _put_boards_back(evidence, found)
+    still = _put_boards_back(evidence, movements)
     for _ in range(_PASSES):
-        found = [refined(_field_series(still), m) for m in found]
-        still = _put_boards_back(evidence, found)
-    return found, still
+        movements = [refined(_field_series(still), m) for m in movements]
+        still = _put_boards_back(evidence, movements)
+    return movements, still
 
 
-def _put_boards_back(evidence: ReducedSeries, found: list[FieldMovement]) -> ReducedSeries:
+def _put_boards_back(evidence: ReducedSeries, movements: list[FieldMovement]) -> ReducedSeries:
     """Reduce the series again with the boards in their places."""
     grid = evidence.source.grid
     points = np.array(grid.points)
-    for m in found:
+    for m in movements:
         points[:, m.rows] -= m.trajectory[:, None, None] * m.image
     return with_points(evidence, ObservationGrid(points, grid.weights))
 
@@ -95,17 +95,17 @@ def drop_wandering_targets(evidence: ReducedSeries) -> tuple[list[FieldMovement]
 
     Among few targets, wandering ones dominate the noise, and without them others may stand out.
     """
-    found: list[FieldMovement] = []
+    wandering: list[FieldMovement] = []
     still, every = evidence, int(evidence.weights[..., 0].any(axis=0).sum())
     while more := wandering_targets(_field_series(still)):
-        if len(found) + len(more) > MOST_TARGETS * every:
+        if len(wandering) + len(more) > MOST_TARGETS * every:
             break
-        found += more
-        rows = np.concatenate([m.rows for m in found])
+        wandering += more
+        rows = np.concatenate([m.rows for m in wandering])
         still = without_targets(evidence, np.union1d(evidence.excluded, rows))
         if every > FEW_TARGETS:
             break
-    return found, still
+    return wandering, still
 
 
 def _field_series(e: ReducedSeries) -> FieldSeries:
@@ -182,7 +182,7 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
     A marker jumps as a whole: if only some of its corners jump, it was badly measured and is left
     out without being reported.
     """
-    found: dict[int, tuple[int, float]] = {}
+    jumps: dict[int, tuple[int, float]] = {}
     limit = criteria.STEP_CHI2 * evidence.correlation
     cleaned = evidence
     for _ in range(8):
@@ -204,28 +204,28 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
         if not len(chosen):
             break
         for row in chosen:
-            found[int(row)] = (int(first[row]), float(gain[row]))
-        if len(found) > 0.2 * evidence.source.grid.observed.any(axis=0).sum():
+            jumps[int(row)] = (int(first[row]), float(gain[row]))
+        if len(jumps) > 0.2 * evidence.source.grid.observed.any(axis=0).sum():
             return [], evidence  # so many do not jump independently: the camera moved
         groups = evidence.source.field.groups  # a marker is left out as a whole
-        whole = np.flatnonzero(np.isin(groups, groups[sorted(found)]))
+        whole = np.flatnonzero(np.isin(groups, groups[sorted(jumps)]))
         cleaned = without_targets(evidence, whole)
-    if not found:
+    if not jumps:
         return [], evidence
-    jumped = _keep_whole_markers(evidence, found)
+    jumped = _keep_whole_markers(evidence, jumps)
     return _group_steps(cleaned, jumped) if jumped else [], cleaned
 
 
 def _keep_whole_markers(
-    evidence: ReducedSeries, found: dict[int, tuple[int, float]]
+    evidence: ReducedSeries, jumps: dict[int, tuple[int, float]]
 ) -> dict[int, tuple[int, float]]:
     """Drop the jumps that most corners of their marker did not make together."""
     groups = evidence.source.field.groups
     seen = evidence.source.grid.observed.any(axis=0)
     out = {}
-    for row, (first, gain) in found.items():
+    for row, (first, gain) in jumps.items():
         corners = np.flatnonzero((groups == groups[row]) & seen)
-        together = [r for r in corners.tolist() if r in found and abs(found[r][0] - first) <= 1]
+        together = [r for r in corners.tolist() if r in jumps and abs(jumps[r][0] - first) <= 1]
         if 4 * len(together) >= 3 * len(corners):
             out[row] = (first, gain)
     return out
@@ -238,9 +238,9 @@ def left_by_cameras(e: ReducedSeries, rows: NDArray[np.int64]) -> Array:
     return left
 
 
-def _group_steps(cleaned: ReducedSeries, found: dict[int, tuple[int, float]]) -> list[Displaced]:
+def _group_steps(cleaned: ReducedSeries, jumps: dict[int, tuple[int, float]]) -> list[Displaced]:
     """Measure the steps against the camera from the other targets; one group per time."""
-    rows = np.array(sorted(found))
+    rows = np.array(sorted(jumps))
     v = left_by_cameras(cleaned, rows)
     w = cleaned.weights[..., 0]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
@@ -275,7 +275,7 @@ def _group_steps(cleaned: ReducedSeries, found: dict[int, tuple[int, float]]) ->
                 np.array(vectors),
                 np.array(sds),
                 np.array(steps),
-                sum(found[int(rows[k])][1] for k in group),
+                sum(jumps[int(rows[k])][1] for k in group),
             )
         )
     return out

@@ -1,4 +1,4 @@
-"""Which host names are ours: what a foreign site can make a browser send is refused."""
+"""The page's host names: what a foreign site can make a browser send is refused."""
 
 from __future__ import annotations
 

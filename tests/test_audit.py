@@ -1,4 +1,4 @@
-"""The audit of the standard deviations: it repeats, it can fail, and its page shows its rows."""
+"""The audit of the standard deviations is repeatable, can fail, and its page shows its rows."""
 
 import re
 from collections import Counter
@@ -32,7 +32,7 @@ def test_a_false_statement_is_outside():
 
 
 def lines_of_the_page(section: str) -> list[tuple[str, list[str]]]:
-    """What is printed by which command, and the least and the largest figure of its cases."""
+    """Return what each command prints, with the least and the largest ratio of its cases."""
     page = PAGE.read_text(encoding="utf-8")
     found = []
     for line in re.findall(rf"^\| {section} \|(.*)\|$", page, re.M):
@@ -43,7 +43,7 @@ def lines_of_the_page(section: str) -> list[tuple[str, list[str]]]:
 
 @pytest.mark.parametrize("section", mostly_slow(SECTIONS, *(set(SECTIONS) - {"cameras"})))
 def test_page_and_audit_have_the_same_rows(section):
-    """The figures are those of 200 draws."""
+    """The page's ratios are those of 200 draws."""
     rows = SECTIONS[section](2, np.random.default_rng(1))
     found = lines_of_the_page(section)
     cases = Counter((row.printed_by, row.level is None) for row in rows)
@@ -53,7 +53,7 @@ def test_page_and_audit_have_the_same_rows(section):
 
 
 def test_every_ratio_on_the_page_is_met():
-    """0.9 to 1.1 within three of its own standard deviations; a level of 1 or 5 % holds."""
+    """Ratios are 0.9 to 1.1 within three standard deviations; levels of 1 and 5 % hold."""
     for section in SECTIONS:
         for printed_by, figures in lines_of_the_page(section):
             for value in figures:
@@ -68,7 +68,7 @@ def test_every_ratio_on_the_page_is_met():
 
 @pytest.mark.slow
 def test_the_page_shows_what_the_audit_prints():
-    """One section whole: the same seed, the same figures."""
+    """A whole section: the same seed gives the same ratios."""
     rows = SECTIONS["significance"](200, np.random.default_rng(1))
     page = PAGE.read_text(encoding="utf-8")
     assert HEADER in page

@@ -1,4 +1,4 @@
-"""config.yaml: bounded, unknown keys are errors that suggest the nearest, paths from the file."""
+"""config.yaml: bounds, unknown keys with the nearest known one, paths relative to the file."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_the_shipped_file_is_valid():
 
 
 def test_defaults():
-    config = parse(document(outputs=[{"name": "river", "driver": "mock"}]))  # as a camera is called
+    config = parse(document(outputs=[{"name": "river", "driver": "mock"}]))  # the name of a camera
     assert config.store.durable
     assert config.cameras[0].period_s == 10.0
     assert config.calibration_of(config.cameras[0]) is config.calibration
@@ -50,7 +50,7 @@ def test_defaults():
 
 
 def test_names_are_those_of_the_camera_model():
-    """config is a layer below photogrammetry and must repeat them."""
+    """config is a layer below photogrammetry, so that it repeats them."""
     assert get_args(InteriorName) == IOP_NAMES
     assert get_args(ParameterName) == PARAMETER_NAMES
     assert parse(document()).calibration.free == DEFAULT_FREE
@@ -116,12 +116,12 @@ BAD = [
     (camera(calibration={"fre": []}), "cameras[0].calibration.fre: unknown; is 'free' meant?"),
     (document(calibration={"free": ["c", "f"]}), "calibration.free[1]: is 'f'"),
     (document(calibration={"free": ["c", "c"]}), "names a parameter twice"),
-    (document(calibration={"fixed": {"c": 3.0}}), "c stands in `free` and in `fixed`"),
+    (document(calibration={"fixed": {"c": 3.0}}), "c is both in `free` and in `fixed`"),
     (document(calibration={"priors": {"c": {"value": 3, "sd": 0}}}), "calibration.priors.c.sd"),
     (document(calibration={"exterior": "free"}), "'per_epoch'"),
     (document(frames={"keep": "some"}), "frames.keep: is 'some'"),
     (document(frames={"max_size_gb": -1}), "frames.max_size_gb: is -1"),
-    (document(dashboard={"host": "0.0.0.0"}), "name a token_file too"),
+    (document(dashboard={"host": "0.0.0.0"}), "give a token_file too"),
     (document(dashboard={"port": 70000}), "dashboard.port: is 70000"),
     (document(logging={"level": "loud"}), "logging.level: is 'loud'"),
     (document(cameras="none"), "cameras: is 'none'"),
@@ -167,7 +167,7 @@ def test_any_damage_to_the_text(tmp_path, at, put):
 
 
 def test_the_comments_of_config_yaml_name_drivers_that_exist():
-    """In the file that every user starts from: after `driver: mock   #`, until a colon or dots."""
+    """They are in the file that every user starts from, after `driver: mock   #`."""
     text = (Path(__file__).parents[1] / "config.yaml").read_text()
     sections = re.split(r"^(cameras|thermometers|outputs):", text, flags=re.M)
     seen = 0
@@ -188,14 +188,14 @@ PLACES = {
     "a hard link to the store": ("./hard", "is the store"),
     "a way round to the store": ("./a/../t.db", "is the store"),
     "the configuration": ("./config.yaml", "is the configuration"),
-    "another output's": ("./one.jsonl", "is what one writes"),
-    "another output's through a link": ("./alias", "is what one writes"),
+    "another output's": ("./one.jsonl", "is the file of output one"),
+    "another output's through a link": ("./alias", "is the file of output one"),
 }
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_outputs_do_not_write_into_what_is_not_theirs(tmp_path, place):
-    """Lines of JSON in a store, or among those of another output."""
+    """Lines of JSON must not go into a store or among those of another output."""
     (tmp_path / "t.db").write_bytes(b"store")
     (tmp_path / "link").symlink_to("t.db")
     (tmp_path / "alias").symlink_to("one.jsonl")
@@ -216,7 +216,7 @@ def test_outputs_do_not_write_into_what_is_not_theirs(tmp_path, place):
     document["frames"] = {"folder": "./t.db"}
     with pytest.raises(ConfigurationError, match=r"frames\.folder: is the store"):
         parse_config(document, tmp_path / "config.yaml")
-    # to one device several may write
+    # several outputs may write to one device
     outputs = [{"name": n, "driver": "jsonl", "path": "/dev/null"} for n in ("one", "two")]
     document = {**document, "frames": {}, "outputs": outputs}
     assert len(parse_config(document, tmp_path / "config.yaml").outputs) == 2

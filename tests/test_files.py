@@ -1,4 +1,4 @@
-"""YAML files: what PyYAML would let through, or would need for ever, is one clear error."""
+"""YAML files: what PyYAML would accept or take for ever to read is one clear error."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_caller_chooses_the_error(tmp_path):
 
 @pytest.mark.slow
 def test_a_file_that_is_written_in_place_meanwhile_is_read_whole(tmp_path):
-    """As the status on a full disk; each document says at both ends which it is."""
+    """The status on a full disk is so; each document holds its number at both ends."""
     path, ended = tmp_path / "status.json", threading.Event()
     texts = [json.dumps({"a": n, "x": [10 + n] * (3 + 9000 * (n % 3)), "z": n}) for n in range(9)]
     path.write_bytes(texts[0].encode().ljust(131072))
@@ -85,7 +85,7 @@ def test_a_file_that_is_written_in_place_meanwhile_is_read_whole(tmp_path):
     writer = threading.Thread(target=write)
     writer.start()
     try:
-        # on a busy machine a look may always meet the writer, who is here a thousand times too busy
+        # on a busy machine a read may always meet the writer, which here writes far too often
         seen = [document for _ in range(1000) if (document := read_json(path))]
         assert all(document["a"] == document["z"] for document in seen)
         assert len(seen) > 900

@@ -1,4 +1,4 @@
-"""The hardware abstraction: its data, its clocks, its look-up by entry point."""
+"""The hardware abstraction layer: its data, clocks and entry points."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_clocks_keep_one_contract(clock):
     assert clock.sleep_until(begin + 0.02)
     assert clock.monotonic() >= begin + 0.02
     assert clock.utc() - utc == pytest.approx(clock.monotonic() - begin, abs=0.01)
-    assert clock.sleep_until(begin)  # what is past needs no waiting
+    assert clock.sleep_until(begin)  # a time in the past needs no waiting
     wake = threading.Event()
     wake.set()
     assert not clock.sleep_until(clock.monotonic() + 60.0, wake)
@@ -68,7 +68,7 @@ def test_system_clock_is_woken():
 @pytest.mark.parametrize("kind", ["camera", "thermometer", "output"])
 def test_look_up_names_what_there_is(kind, monkeypatch):
     assert "mock" in hal.driver_names(kind)
-    monkeypatch.setattr(hal.metadata, "entry_points", None)  # once: all packages are looked through
+    monkeypatch.setattr(hal.metadata, "entry_points", None)  # once, since all packages are searched
     assert load_driver(kind, "mock").__name__.startswith("Mock")
     with pytest.raises(ConfigurationError, match=f"no {kind} driver 'none'; installed are: .*mock"):
         load_driver(kind, "none")
@@ -99,7 +99,7 @@ def test_a_devices_name_cannot_leave_its_comment():
 
 
 def test_nothing_is_inferred_from_names_or_attributes():
-    """What the program needs to know of a driver or an error is a member of its class."""
+    """All that the program needs to know of a driver or an error is a member of its class."""
     root = Path(hal.__file__).parent
     folders = [root / "acquisition", root / "daemon", root / "cli"]
     sources = [root / "hal.py", *(path for folder in folders for path in folder.rglob("*.py"))]

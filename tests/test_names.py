@@ -1,4 +1,4 @@
-"""Names of channels that come from the world never become a column of ours, nor shift one."""
+"""Names of channels from outside never replace or shift one of the program's columns."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_natural_names_stay(name):
 
 
 def test_every_column_that_an_epoch_can_have_is_ours(tmp_path):
-    """From where the columns are made, so that a new one is refused as a channel too."""
+    """Read from where columns are made, so that a new one is refused as a channel too."""
     plan = SimpleNamespace(name="cam", series="M1")
     row = result_row(plan, Epoch(1, 0.0, 0.0, {}), None, {})
     recording = tmp_path / "M1"
@@ -119,7 +119,7 @@ def test_check_refuses_the_configuration(tmp_path, name, stanza):
         {"skew": ["s"], "air": ["temperature"]},
         {"a": ["b_d"], "a_b": ["d"]},
         {"sd": ["board"], "air": ["temperature"]},
-        {"board": ["inner", "temperature"]},  # `temperature` is reserved for the reference
+        {"board": ["inner", "temperature"]},  # `temperature` is the reference's name
         {"drift": ["px_per_min"], "x": ["y"]},
     ],
 )
@@ -163,7 +163,7 @@ def test_a_recording_with_a_column_of_ours_is_refused_when_it_is_opened(tmp_path
 
 
 def test_names_with_marks_are_quoted_in_the_csv_of_the_page(tmp_path):
-    """A store made before such names were refused."""
+    """A store may be older than the refusal of such names."""
     head = Head("a", "M1", 10.0, CameraSpec("cam", Sensor(640, 480, 0.001)), {"left": Channel()})
     with Store.open(tmp_path / "t.db", "append") as store:
         series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
@@ -204,7 +204,7 @@ def test_two_names_are_never_one():
 @settings(max_examples=30, deadline=None)
 @given(name=strategies.text(max_size=70))
 def test_any_text_as_a_channel_is_refused_or_right(tmp_path_factory, name):
-    """Refused with one line, or read back as it was: from the store, the page and a recording."""
+    """It is refused with one line, or read back unchanged from store, page and recording."""
     folder = tmp_path_factory.mktemp("any")
     head = Head("a", "M1", 10.0, CameraSpec("cam", Sensor(640, 480, 0.001)), {name: Channel()})
     field = TestField.build(["a"], np.zeros((1, 3)))

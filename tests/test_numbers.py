@@ -1,4 +1,4 @@
-"""Numbers as a book has them, whoever printed them."""
+"""Numbers in texts are typeset as in a book, whichever code printed them."""
 
 import pytest
 

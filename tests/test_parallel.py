@@ -1,4 +1,4 @@
-"""Work on several processes: the order, errors, and a process that dies."""
+"""Tasks in several processes: their order, errors, and a process that dies."""
 
 import os
 
@@ -25,7 +25,7 @@ def test_results_come_in_order_and_an_error_comes_through(jobs):
 
 
 def test_items_are_taken_as_results_are_asked_for():
-    """What is handed out is in memory: a year of blocks must not be."""
+    """Items handed out are in memory, which a year of blocks must not be."""
     taken = []
 
     def items():
@@ -40,5 +40,5 @@ def test_items_are_taken_as_results_are_asked_for():
 
 
 def test_a_process_that_dies_is_an_error_in_words():
-    with pytest.raises(DataError, match="take fewer --jobs"):
+    with pytest.raises(DataError, match="give fewer --jobs"):
         list(in_order(scaled, 1, [1, "dies", 2, 3], 2))

@@ -1,5 +1,5 @@
-"""Configurations, recordings and logger files that nobody wrote down: refused with one line, or
-right, or called doubtful. Few examples here, thousands in the slow suite.
+"""Random configurations, recordings and logger files: refused with one line, or
+right, or reported as doubtful. Few examples here, thousands in the slow suite.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _RECORDINGS_S = 200.0  # at most
 
 
 def one_line(error: ThermocaldError) -> None:
-    """A refusal that a person can read."""
+    """Check that a refusal can be read by a person."""
     assert len(str(error).splitlines()) == 1
     assert "Traceback" not in str(error)
     assert len(str(error)) < 1000
@@ -72,7 +72,7 @@ VALUES = st.recursive(
 
 
 def places(document, path=()):
-    """All places in a document at which a value stands."""
+    """Return all places of a document that hold a value."""
     items = document.items() if isinstance(document, dict) else enumerate(document)
     for key, value in items:
         yield (*path, key)
@@ -91,7 +91,7 @@ def test_any_value_anywhere_in_a_configuration(amount):
     def check(changes):
         document = copy.deepcopy(WHOLE)
         for path, value in changes:
-            with contextlib.suppress(LookupError, TypeError):  # gone by an earlier change
+            with contextlib.suppress(LookupError, TypeError):  # removed by an earlier change
                 reduce(getitem, path[:-1], document)[path[-1]] = value
         try:
             config = parse_config(document, SHIPPED, option_names=option_names)
@@ -112,7 +112,7 @@ def test_any_value_anywhere_in_a_configuration(amount):
 
 
 def numbers(config: Config):
-    """All numbers that the program itself reads; a driver's options are the driver's to judge."""
+    """Return all numbers that the program reads itself; a driver checks its own options."""
     stack = [config.model_dump(exclude={"cameras", "thermometers", "outputs"})]
     while stack:
         value = stack.pop()
@@ -124,7 +124,7 @@ def numbers(config: Config):
 
 @AMOUNTS
 def test_any_key_in_a_configuration(amount, tmp_path):
-    """An unknown key is an error that names it, wherever it stands."""
+    """An unknown key is an error that names it, wherever it is."""
     mappings = [(), ("store",), ("frames",), ("dashboard",), ("logging",), ("calibration",)]
 
     @settings(**amount)
@@ -151,7 +151,7 @@ def test_any_key_in_a_configuration(amount, tmp_path):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A recording of 12 epochs, the tables of it, and what it gives."""
+    """A recording of 12 epochs, its tables, and its calibration."""
     path = tmp_path_factory.mktemp("recorded") / "M"
     tc.simulate("rpi-v2.1-heating", seed=5, out=path)
     tables = {}
@@ -200,8 +200,8 @@ HEADS = st.one_of(
 @pytest.mark.slow
 @AMOUNTS
 def test_any_other_meaning_of_a_recording(amount, recorded, tmp_path):
-    """A column in another unit or with other values, in all rows or some: what is calibrated is
-    what was recorded, or the recording is refused, or something is said of it.
+    """A column in another unit or with other values, in all rows or some: the calibration agrees
+    with the original, or the recording is refused, or a doubt is reported.
     """
     source, tables, right = recorded
     folder = tmp_path / "M"
@@ -336,7 +336,7 @@ def written(log: dict, path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 @AMOUNTS
 def test_any_file_of_a_logger(amount, tmp_path):
-    """Each reading is the right one at the right time, or none; or the file is refused."""
+    """Each reading is right and at the right time, or missing, or the file is refused."""
     path = tmp_path / "log.csv"
     read = []
 
@@ -366,7 +366,7 @@ def test_any_file_of_a_logger(amount, tmp_path):
 
 
 def test_the_examples_are_what_they_seem(recorded):
-    """What is not damaged is right and has no doubts."""
+    """Undamaged examples are right and without doubts."""
     path, _, right = recorded
     assert right.ok.all()
     assert tc.open(path).doubts(right) == []

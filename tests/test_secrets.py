@@ -30,7 +30,7 @@ SECRET = "hunter2"
 ADDRESSES = [
     f"http://user:{SECRET}@example.org/hook",
     f"https://{SECRET}@example.org",
-    f"http://user:{SECRET}/x@example.org:80/hook",  # where a parser finds a port that is none
+    f"http://user:{SECRET}/x@example.org:80/hook",  # where a parser finds an invalid port
     f"postgresql:/owner:{SECRET}@db.example/thermocald",
     f"postgresql://db.example/thermocald?user=a&password={SECRET}",
     f"mqtt+ssl://a:{SECRET}@broker:8883",
@@ -128,14 +128,14 @@ def test_a_secret_that_nobody_knows_is_left_out_of_a_free_text(text):
 
 @pytest.fixture(autouse=True)
 def _nothing_is_known(monkeypatch):
-    """What another test made known would be left out by its value."""
+    """Forget secrets of other tests, which would be hidden by value."""
     monkeypatch.setattr(addresses, "_known", set())
 
 
 @given(st.text(min_size=4, max_size=30), st.data())
 @settings(max_examples=60, deadline=None)
 def test_a_known_secret_is_left_out_wherever_and_however_it_is_written(value, data):
-    """Its ends would be seen if a part of it stayed."""
+    """Its ends would show if a part of it remained."""
     value = f"bait{value}tiab"
     hide_secrets({"broker": [{"password": value}]})
     writings = [
@@ -332,7 +332,7 @@ def test_no_file_is_everybody_s_or_nobody_s(tmp_path, recording, umask, what):
     program = [sys.executable, "-m", "thermocald"]
     before = os.umask(umask)
     try:
-        if command[0] == "run":  # it has a process to itself, threads and signals
+        if command[0] == "run":  # in a process of its own, with threads and signals
             subprocess.run([*program, *command], cwd=tmp_path, check=True, capture_output=True)
         else:
             finish(*command, folder=tmp_path)

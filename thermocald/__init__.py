@@ -4,7 +4,8 @@
     epochs = tc.open("M1").calibrate()
     camera = tc.fit(tc.open("M1"), tc.open("M2")).at(35.0)
 
-Names are resolved when they are used (PEP 562): importing the package costs next to nothing.
+A name is imported when it is first used (PEP 562), so that `import thermocald` takes next to no
+time.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# a camera alone has not to wait for what analyses series
+# module → names, so that a camera alone does not import the analysis of series
 _PLACES = {
     "analysis.camera.camera": "Camera",
     "analysis.series.epochs": "Epochs",
@@ -73,14 +74,14 @@ __all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    """One of the public names, imported now."""
+    """Import a public name when it is first used."""
     if name not in _MODULES:
         raise AttributeError(f"module 'thermocald' has no attribute {name!r}")
     from importlib import import_module
 
-    found = getattr(import_module(f"thermocald.{_MODULES[name]}"), name)
-    globals()[name] = found
-    return found
+    value = getattr(import_module(f"thermocald.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

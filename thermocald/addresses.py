@@ -1,7 +1,7 @@
-"""Host names and addresses: what reaches this machine alone, how a page may be called, secrets.
+"""Host names and addresses: which are this machine's own, and which secrets they hold.
 
-A name that merely begins like an address (127.0.0.1.evil.example) is a name like any other: with it
-a foreign site makes a browser ask this machine (DNS rebinding).
+A name that merely begins like an address (127.0.0.1.evil.example) counts as a name: a foreign site
+uses such a name to make a browser ask this machine (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _KEYS = (
     r"|(?:api|access|private|shared|account)[_-]?key)"
 )
 _KEY = re.compile(_KEYS, re.IGNORECASE)
-_SHORT_KEYS = (  # words of other things too, without their `=`
+_SHORT_KEYS = (  # only with `=`: without it they are words of other things too
     r"(?:(?<![^\W_])(?:pass|passcode|psk|otp|jwt|bearer)|session[_-]?id|signature"
     r"|(?:secret|client)[_-]key)"
 )
@@ -48,7 +48,7 @@ _OF_QUERY = re.compile(r"[^\s&'\"]*")
 _PHRASE = re.compile(
     r"(?:(?!\s+[\w-]+\s*=|[,;:.)}\]]*(?:\s*[\r\n]|\s*\Z|\s[({])|[,;:]\s)(?s:\\.|[^&'\"]))*"
 )
-_WORD = re.compile(  # a sentence of ours about a key goes on in small letters
+_WORD = re.compile(  # this program's own messages about a key go on in small letters
     r"(?=\S*[^a-z\d\s.,;:()…-]|\d\S*[a-z]|[a-z]\S*\d)\S+?(?=[,;:.)]*(?:\s|\Z))"
     r"|(?!(?:unknown|missing|is|must|holds|needs)\b)[^\s,;:()…]+(?=[,;:.)]*(?:\Z|[\r\n,;:]))"
 )
@@ -58,21 +58,21 @@ _HEADER = re.compile(
     r"|(\bbearer\s+|\bbasic\s+(?=\S*[\d=+/]))[\w.~+/=-]{6,}"
     r"|(\bcookie\\*['\"]?\s*[:=]\s*\\*['\"]?)[^\r\n'\"\\]+"
 )
-_HOOK = re.compile(  # whoever knows the address may send
+_HOOK = re.compile(  # a webhook's address is its secret
     r"(?i)((?:hooks\.slack\.com/services|api\.telegram\.org/bot|discord(?:app)?\.com/api/webhooks"
     r"|webhook\.office\.com/\w+|maker\.ifttt\.com/\S+/key)/?)[^\s'\"<>?]+"
 )
 _PEM = re.compile(r"(?s)(-----BEGIN [\w ]*PRIVATE KEY-----).*?(?=-----END|\Z)")
-_SHORTEST = 4  # a shorter one is part of too many words
+_SHORTEST = 4  # a shorter secret is part of too many words
 _known: set[str] = set()
 
 
 def hide(value: str | None) -> None:
-    """Leave a secret out of all that is said from now on, as it is and as libraries write it."""
+    """Hide a secret in all later messages, as it is and as libraries write it."""
     if value is None or len(value) < _SHORTEST:
         return
     written = {value, value.strip(), " ".join(value.split())}
-    for _ in range(2):  # of a message that was quoted within another
+    for _ in range(2):  # twice: one message may quote another
         written |= {w for text in written for w in _quotations(text)}
     written |= {w for text in list(written) for w in (text.lower(), text.upper()) if "%" in text}
     _known.update(text for text in written if len(text) >= _SHORTEST)
@@ -89,7 +89,7 @@ def _quotations(text: str) -> set[str]:
 
 
 def hide_secrets(document: object, key: str = "") -> None:
-    """Leave out what stands in a configuration under a key such as `password`, and in addresses."""
+    """Hide a configuration's values of keys such as `password`, and the passwords in addresses."""
     if isinstance(document, dict):
         for name, value in document.items():
             hide_secrets(value, str(name))
@@ -105,12 +105,12 @@ def hide_secrets(document: object, key: str = "") -> None:
 
 
 def is_secret(key: str) -> bool:
-    """Whether the value of a key is a secret; a file that holds one is not."""
+    """Return whether the value of a key is a secret; the name of a file that holds one is not."""
     return _KEY.search(key) is not None and not re.search(r"(?i)file|path|name$", key)
 
 
 def without_secrets(text: str) -> str:
-    """A text without the known secrets, the user information of addresses, passwords and keys."""
+    """Return a text without hidden secrets, users in addresses, passwords and keys."""
     for value in sorted(_known, key=len, reverse=True):
         text = text.replace(value, "…")
     text = _PLAIN_USER.sub("", _without_users(text))
@@ -119,7 +119,10 @@ def without_secrets(text: str) -> str:
 
 
 def _without_users(text: str) -> str:
-    """Addresses without users, in queries of others too; a password may hold a `/`."""
+    """Remove users and passwords from addresses, also from one in another's query.
+
+    A password may hold a `/`.
+    """
     parts, at = [], 0
     while found := _ADDRESS.search(text, at):
         rest = found["rest"]
@@ -136,7 +139,7 @@ def _without_users(text: str) -> str:
 
 
 def _without_values(text: str) -> str:
-    """The text with … for the values of keys such as `password`."""
+    """Replace the values of keys such as `password` by …."""
     parts, at = [], 0
     for key in _BEFORE.finditer(text):
         if key.start() < at:
@@ -151,22 +154,22 @@ def _without_values(text: str) -> str:
 
 
 class CleanFormatter(logging.Formatter):
-    """Leaves out the passwords of addresses, in tracebacks too: libraries quote what they got."""
+    """A formatter that hides secrets, in tracebacks too: libraries quote what they were given."""
 
     def format(self, record: logging.LogRecord) -> str:
         return without_secrets(super().format(record))
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address that a server binds to is reached from this machine only."""
+    """Return whether a server that binds to a name or address is reached from this machine only."""
     address = _address(_plain(host))
     return _plain(host) == "localhost" if address is None else _is_loopback(address)
 
 
 class HostNames:
-    """The names by which a page may be asked for: this machine's own, where it listens, and more.
+    """The host names under which a page may be requested: this machine's own and configured ones.
 
-    host: the name or address the server is bound to; more: further names, as configured.
+    host: the name or address that the server binds to; more: further names.
     """
 
     def __init__(self, host: str, more: Iterable[str] = ()) -> None:
@@ -174,7 +177,7 @@ class HostNames:
         self._known = {_address(name) or name for name in names}
 
     def allow_host(self, header: str) -> bool:
-        """Whether a `Host` header, `name`, `name:port` or `[address]:port`, names us."""
+        """Return whether a `Host` header names this page: `name`, `name:port`, `[address]:port`."""
         text, port = header, ""
         if header.startswith("["):
             text, closed, rest = header[1:].partition("]")
@@ -193,7 +196,7 @@ class HostNames:
         return (address or _plain(text)) in self._known
 
     def allow_origin(self, header: str) -> bool:
-        """Whether the value of an `Origin` header names a page of ours."""
+        """Return whether an `Origin` header names this page."""
         try:
             parts = urlsplit(header)
         except ValueError:
@@ -202,7 +205,7 @@ class HostNames:
 
 
 def _plain(name: str) -> str:
-    """As names are compared: lower case, without the point at the end, without brackets."""
+    """Return a name in lower case, without a final full stop or brackets, for comparison."""
     return name.lower().removesuffix(".").removeprefix("[").removesuffix("]")
 
 

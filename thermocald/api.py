@@ -1,4 +1,4 @@
-"""The front door: what `import thermocald` offers; each function is what a command does.
+"""The functions that `import thermocald` offers; each does what the command of its name does.
 
 Times are seconds since 1970-01-01 UTC or datetime64, temperatures °C, lengths mm, image points px.
 Wrong input raises the errors of `thermocald.errors`.
@@ -15,10 +15,18 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camer
 from thermocald.errors import UsageError
 from thermocald.photogrammetry.camera.camera_model import DEFAULT_FREE
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
-from thermocald.series import Series, check_exterior, free_names, source_of
+from thermocald.series import (
+    COLDEST_C,
+    Series,
+    check_exterior,
+    free_names,
+    require_within,
+    source_of,
+)
 from thermocald.series import open as open_series
 
 if TYPE_CHECKING:
+    from thermocald.analysis.study.series_study import StudySettings
     from thermocald.discovery.plan import Plan
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.physics.model import ModelEffect, ThermalModel
@@ -42,13 +50,13 @@ def import_photographs(
     times: str = "exif",
     out: Path | str | None = None,
 ) -> Series:
-    """Make a series of photographs with EXIF times and a logger's file, in any dialect of CSV.
+    """Make a series from photographs and a logger's temperatures (CSV in any dialect).
 
-    timezone: of times without one (`Europe/Berlin`, `+02:00`), else they are refused; pixel_pitch
-    mm, or camera: a camera file, where EXIF does not say it; times: of the photographs, `exif`,
-    `name` (of the file) or `file` (date); out: a new folder to write the recording to; without it
-    the photographs are read where they are. Raises DataError where times or columns cannot be
-    understood, UsageError where a choice is needed.
+    timezone: for times without one (`Europe/Berlin`, `+02:00`); such times are refused if it is not
+    given. pixel_pitch (mm) or camera (a camera file): needed if EXIF does not give the pixel pitch.
+    times: where a photograph's time is read, `exif`, `name` (file name) or `file` (file date). out:
+    a new folder for the recording; if not given, the photographs are read in place. Raises
+    DataError if times or columns cannot be understood, UsageError if a choice is needed.
 
     >>> photos = tc.import_photographs("photos", log="logger.csv", timezone="Europe/Berlin",
     ...                                testfield="M1/testfield.csv", pixel_pitch=0.00112)
@@ -76,9 +84,9 @@ def import_photographs(
 
 
 def read_testfield(source: TestField | Path | str) -> TestField:
-    """Read a testfield.csv: names, coordinates and standard deviations, mm.
+    """Read a testfield.csv: the targets' names, coordinates and standard deviations, mm.
 
-    Raises TestFieldError naming line and column.
+    Raises TestFieldError, which names the line and the column.
 
     >>> field = tc.read_testfield("M1/testfield.csv")
     >>> len(field), field.points.shape
@@ -99,13 +107,14 @@ def calibrate(
     free: str | Iterable[str] = DEFAULT_FREE,
     progress: Progress = None,
 ) -> Calibration:
-    """Calibrate a camera from photographs of a test field, which share one interior orientation.
+    """Calibrate a camera from photographs of a test field that share one interior orientation.
 
-    images: files, or folders of them; camera: a camera file of any format, as initial values, held
-    where the photographs do not carry a calibration; pixel_pitch mm: without it and a camera a
-    pixel counts as 1 µm; free: the interior orientation to estimate; progress: receives how many
-    photographs are measured. Raises UsageError where there is no photograph; what became of each
-    says the result. Source: bundle adjustment with data snooping, Luhmann et al. 2019, chapter 4.4.
+    images: files or folders. camera: a camera file of any format with initial values, which are
+    held if the photographs do not support a calibration. pixel_pitch: mm; 1 µm is assumed if
+    neither it nor a camera is given. free: the parameters of the interior orientation to estimate.
+    progress: called with the number of further photographs measured. Raises UsageError if there is
+    no photograph; the result reports the status of each. Source: bundle adjustment with data
+    snooping, Luhmann et al. 2019, chapter 4.4.
 
     >>> one = tc.calibrate("board", "board.csv", pixel_pitch=0.003)
     >>> one.status, len(one.poses)
@@ -124,14 +133,10 @@ def calibrate(
         file = read_camera(source_of(camera), pixel_pitch)
     else:
         file = unknown_camera(paths, pixel_pitch)
-    found = calibrate_photographs(
-        paths,
-        read_testfield(testfield),
-        file,
-        AdjustmentSettings(free=free_names(free)),
-        progress,
-    )
-    return Calibration(found, file, camera is None and pixel_pitch is None)
+    settings = AdjustmentSettings(free=free_names(free))
+    field = read_testfield(testfield)
+    photographs = calibrate_photographs(paths, field, file, settings, progress)
+    return Calibration(photographs, file, camera is None and pixel_pitch is None)
 
 
 def study(
@@ -152,14 +157,15 @@ def study(
     jobs: int = 1,
     progress: Progress = None,
 ) -> Study:
-    """Study how a camera changes with its temperature, whether that is significant, what it does.
+    """Study a camera's changes with temperature, their significance, and their effect on objects.
 
-    labels: of the series, those with one label are one camera; by default the camera's name.
-    window, alpha: epochs and level of the F-test; sets, seed: of the Monte-Carlo, on a plane at
-    distance_mm with grid × grid points; focus_mm, f_number, confusion_mm: of the depth of field;
-    thermometer_sd K, by default estimated; exterior, free: as `Series.calibrate`; progress:
-    receives how many sets were drawn. Raises UsageError where one series is given twice, DataError
-    where none can be studied. Source: Elias et al. 2020, Sensors 20, 643, section 4.
+    labels: one per series, by default the camera's name; series with the same label are one camera.
+    window (epochs), alpha: width and level of the F-test. sets, seed: of the Monte-Carlo
+    simulation, on a plane at distance_mm with grid × grid points. focus_mm, f_number, confusion_mm:
+    of the depth of field. thermometer_sd: K, estimated if not given. exterior, free: as in
+    `Series.calibrate`. jobs: number of processes. progress: called with the number of further sets
+    drawn. Raises UsageError if a series is given twice, DataError if none can be studied. Source:
+    Elias et al. 2020, Sensors 20, 643, section 4.
 
     >>> found = tc.study(tc.open("M1"), tc.open("M2"), sets=200)
     >>> found.cameras[0].label
@@ -172,8 +178,10 @@ def study(
 
     if not series:
         raise UsageError("give at least one series to study")
-    if window % 2 == 0:
-        raise UsageError(f"window is {window}; it must be odd, so that it has a centre")
+    if len(labels) > len(series):
+        raise UsageError(
+            f"{len(labels)} labels for {len(series)} series; give one for each at most"
+        )
     _refuse_twice(series)
     check_exterior(exterior)
     settings = StudySettings(
@@ -181,6 +189,7 @@ def study(
         focus_mm=focus_mm, f_number=f_number, confusion_mm=confusion_mm,
         thermometer_sd=thermometer_sd, jobs=jobs,
     )  # fmt: skip
+    _check_settings(settings)
     named = [*labels, *[None] * (len(series) - len(labels))]
     measured = [
         one.measured(label, thermometer_sd, exterior, free_names(free), jobs)
@@ -191,16 +200,17 @@ def study(
 
 
 def reference_study(*, progress: Progress = None, **settings: Any) -> Study:
-    """Study the presets, each figure of the reference study beside ours.
+    """Study the presets and compare each number with the one that the reference study published.
 
-    settings: those of `study`, from window to jobs; progress: receives how many series are done.
-    Source: Elias et al. 2020, Sensors 20, 643, section 4.
+    settings: those of `study`, from window to jobs. progress: called with the number of further
+    series done. Source: Elias et al. 2020, Sensors 20, 643, section 4.
     """
     from thermocald.analysis.study.reference import compare, reference_studies
     from thermocald.analysis.study.series_study import StudySettings
     from thermocald.results import Study
 
     chosen = StudySettings(**settings)
+    _check_settings(chosen)
     cameras = tuple(reference_studies(chosen, progress or (lambda _: None)))
     return Study(chosen, cameras, tuple(c for camera in cameras for c in compare(camera)))
 
@@ -214,13 +224,15 @@ def fit(
     jobs: int = 1,
     progress: Progress = None,
 ) -> ThermalCamera:
-    """Fit a thermal model to all series of a camera, in one adjustment over all image points.
+    """Fit a thermal model to the series of a camera, in one adjustment of all image points.
 
-    effects: names, as in `--effect`, or {name: {parameter: start value}}; model: whose effects and
-    T0 are fitted again, such as discovery's; T0 °C, by default the mean; kind: of several cameras
-    the name of their type, of one its type's model, which helps where it was measured at few
-    temperatures; progress: receives how many frames were measured. Raises DataError for series of
-    different cameras or of one temperature, UsageError for an effect that a series cannot show.
+    effects: names, as for `--effect`, or {name: {parameter: start value}}. model: a model whose
+    effects and T0 are fitted again, for example discovery's. T0: reference temperature, °C, by
+    default the mean. kind: a name, to fit the model of a camera type to the series of several
+    cameras; or such a type's model, to support a camera that was measured at few temperatures.
+    jobs: number of processes. progress: called with the number of further frames measured. Raises
+    DataError for series of different cameras or at a single temperature, UsageError for a series
+    given twice or an effect that a series cannot show.
 
     >>> camera = tc.fit(tc.open("M1"), tc.open("M2"))
     >>> camera.model.camera
@@ -239,6 +251,8 @@ def fit(
 
     if not series:
         raise UsageError("give at least one series to fit a model to")
+    _refuse_twice(series)
+    require_within(T0=(T0, COLDEST_C))
     if isinstance(kind, Path) or (isinstance(kind, str) and Path(kind).suffix in (".yaml", ".yml")):
         kind = read_model(source_of(kind))
     if isinstance(kind, ThermalModel):
@@ -272,12 +286,12 @@ def discover(
     jobs: int = 1,
     say: Callable[[str], None] | None = None,
 ) -> Discovery:
-    """Find where simulation and measurement disagree, name the missing effect, prove it.
+    """Find where simulation and measurement disagree, and name and verify the missing effect.
 
-    verify: further series of this camera, made at another time, to prove it on; model: the model
-    so far, by default the base model, linear in temperature; jobs: processes; say: receives a line
-    at each step. Raises DataError for series of different cameras or thermometers and for copies,
-    UsageError where the series to explain is among those to prove it on.
+    verify: further series of the camera, measured at another time, on which an effect is verified.
+    model: the model to start from, by default the base model, linear in temperature. jobs: number
+    of processes. say: called with a line at each step. Raises DataError for series of different
+    cameras or thermometers and for copies, UsageError if the series is also given in verify.
 
     >>> found = tc.discover(tc.open("M1"), verify=[tc.open("M2")])
     >>> found.verdict
@@ -289,20 +303,21 @@ def discover(
     from thermocald.results import Discovery
     from thermocald.thermal.reduce import reduce_together
 
+    require_within(jobs=(jobs, 1))
     tell = say or (lambda _: None)
     every = (series, *verify)
     _refuse_twice(every)
-    old = _model_of(model)
+    start = _model_of(model)
     inputs = []
     for one in every:
         tell(f"reading {one.source}")
         inputs.append(one.observed(None, jobs, say=say))
     require_other_series(inputs)
     tell("reducing the epochs to normal equations")
-    evidence = reduce_together(inputs, None if old is None else old.T0)
-    found = discover_series(evidence, say, () if old is None else terms_of(old), jobs)
-    told = vars(found) | {"doubts": tuple(_doubts(every, evidence))}
-    return Discovery(**told, name=series.source.rsplit("/", 1)[-1], before=old)
+    evidence = reduce_together(inputs, None if start is None else start.T0)
+    found = discover_series(evidence, say, () if start is None else terms_of(start), jobs)
+    values = vars(found) | {"doubts": tuple(_doubts(every, evidence))}
+    return Discovery(**values, name=series.source.rsplit("/", 1)[-1], before=start)
 
 
 def plan(
@@ -316,12 +331,12 @@ def plan(
     seeds: int = 2,
     progress: Progress = None,
 ) -> Plan:
-    """Find which effects a set-up would show, before anything is heated.
+    """Predict which effects a set-up could reveal, before the camera is heated.
 
-    The set-up is a series (its own epochs and noise), a preset of `simulate`, or a model and a
-    programme; testfield: a testfield.csv, or markers, circles, plain; strength_px: of each effect;
-    seeds: repetitions; progress: receives how many effects are done. Raises UsageError where no
-    set-up is given.
+    The set-up is a series (its epochs and noise), a preset of `simulate`, or a model and a
+    programme. testfield: a testfield.csv, or markers, circles, plain. strength_px: RMS of each
+    effect in the image. seeds: number of repetitions. progress: called with the number of further
+    effects done. Raises UsageError if no set-up is given.
 
     >>> tc.plan(model="camera.yaml")
     Traceback (most recent call last):
@@ -329,14 +344,15 @@ def plan(
     """
     from thermocald.discovery.plan import plan_power, set_ups
 
+    require_within(strength_px=(strength_px, 0.001), seeds=(seeds, 1))
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
     source = None if series is None else series.observed()
     inputs = set_ups(source, thermal, preset, testfield, course, seeds)
-    return plan_power(inputs, strength_px, lambda: (progress or (lambda _: None))(1))
+    return plan_power(inputs, strength_px, progress or (lambda _: None))
 
 
 def catalogue() -> Catalogue:
-    """List the presets that `simulate` knows, and the effects that a camera may have.
+    """List the presets of `simulate` and the effects that a camera can have.
 
     >>> next(iter(tc.catalogue().as_dict()["presets"])).get("preset")
     'nexus5-cold'
@@ -364,17 +380,18 @@ def simulate(
     model_out: Path | str | None = None,
     progress: Progress = None,
 ) -> Series:
-    """Simulate a camera that warms up, as one series.
+    """Simulate a series of a camera that warms up.
 
-    preset: a camera of the reference study (`rpi-v2.1-heating`, `nexus5-cold`, …); model, camera,
-    programme: files (YAML) that replace its thermal model, its heat, thermometers and noise, and
-    what is done to it; effects: to add, {name: {parameter: value}}, or effect files; own_effects:
-    keep those of the preset; lamp: [(from s, W)], what heats the housing instead; testfield: a
-    file, or markers, circles, plain, by default a corner of 147 circles; epochs: by default the
-    preset's 150; frames: render frames instead of image points; out: the folder of the recording,
-    by default one that goes when the program ends; model_out: writes the model that was simulated.
-    The series knows its `truth` and its `simulation`. Raises ConfigurationError for an unknown
-    preset or effect, UsageError without a preset or model and programme.
+    preset: a camera of the reference study (`rpi-v2.1-heating`, `nexus5-cold`, …). model, camera,
+    programme: YAML files that replace the preset's thermal model; its heat flow, thermometers and
+    noise; and its heating programme. effects: to add, {name: {parameter: value}} or effect files.
+    own_effects: whether the preset's own effects stay. lamp: [(from s, W)], heats the housing in
+    place of the programme's sources. testfield: a file, or markers, circles, plain; by default a
+    corner of 147 circles. epochs: by default the preset's 150. frames: render frames, not points.
+    out: the recording's folder; by default a temporary one, removed when the program ends.
+    model_out: a file for the simulated model. The series has its `truth` and `simulation`. Raises
+    ConfigurationError for an unknown preset or effect, UsageError if neither a preset nor a model
+    with a programme is given.
 
     >>> simulated = tc.simulate("rpi-v2.1-heating", effects={"thermal_lag": {"tau": 75}}, seed=1)
     >>> len(simulated)
@@ -390,6 +407,9 @@ def simulate(
     from thermocald.physics.presets import given_simulation
     from thermocald.physics.testfields import load_field
 
+    require_within(seed=(seed, 0), epochs=(epochs, 1))
+    if lamp is not None and (not lamp or [t for t, _ in lamp] != sorted({t for t, _ in lamp})):
+        raise UsageError(f"lamp is {list(lamp)}; give (from s, W) in the order of time")
     thermal, device, course_file = (
         None if p is None else source_of(p) for p in (model, camera, programme)
     )
@@ -419,16 +439,25 @@ def simulate(
     return made
 
 
+def _check_settings(s: StudySettings) -> None:
+    require_within(
+        window=(s.window, 3), alpha=(s.alpha, 1e-6, 0.5), sets=(s.sets, 2), seed=(s.seed, 0),
+        distance_mm=(s.distance_mm, 10), grid=(s.grid, 2, 9), focus_mm=(s.focus_mm, 10),
+        f_number=(s.f_number, 0.1), confusion_mm=(s.confusion_mm, 1e-6),
+        thermometer_sd=(s.thermometer_sd, 0),
+    )  # fmt: skip
+    if s.window % 2 == 0:
+        raise UsageError(f"window is {s.window}; it must be odd, so that it has a centre")
+
+
 def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[str]:
-    """Return what is doubtful in some series, with the source of each where they are several."""
+    """Return what is doubtful in the series, each with its source if there are several."""
     from thermocald.thermal.reduce import mean_misclosure
 
     return [
         text if len(series) == 1 else f"{one.source}: {text}"
-        for one, found in zip(series, reduced, strict=True)
-        for text in one.doubts(
-            interior=found.at.iop, offsets=mean_misclosure(found.source, found.at)
-        )
+        for one, r in zip(series, reduced, strict=True)
+        for text in one.doubts(interior=r.at.iop, offsets=mean_misclosure(r.source, r.at))
     ]
 
 
@@ -437,7 +466,7 @@ def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
 
 
 def _refuse_twice(series: Sequence[Series]) -> None:
-    """UsageError where one series is given twice: it would count as two that agree."""
+    """Raise UsageError if a series is given twice: it would count as two that agree."""
     for i, one in enumerate(series):
         for other in series[:i]:
             if one is other or one.place == other.place:

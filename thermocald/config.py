@@ -1,9 +1,9 @@
-"""`config.yaml`: what the daemon runs, read and bounded once at start.
+"""The daemon's configuration, `config.yaml`, read and checked once at the start.
 
-Names carry units. A key that is not known is an error that suggests the nearest one that is. Keys
-of a device that are not its own here are options of its driver; `options:` holds those that are
-called like one of ours. Paths are relative to the file, and so are driver options that begin with
-`./` or `../`.
+A key's name includes its unit. An unknown key is an error that suggests the nearest known one. Keys
+of a device's stanza that are not defined here are options of its driver; `options:` takes driver
+options whose names are defined here. Paths are relative to the file, and so are driver options that
+begin with `./` or `../`.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ Positive = Annotated[float, Field(gt=0.0, le=1e9)]
 
 
 def _folder(info: ValidationInfo) -> Path:
-    """Return the folder of the file that is read."""
-    found: Path = (info.context or {}).get("folder", Path())
-    return found
+    """Return the configuration file's folder."""
+    folder: Path = (info.context or {}).get("folder", Path())
+    return folder
 
 
 FilePath = Annotated[Path, AfterValidator(lambda path, info: _folder(info) / path.expanduser())]
-"""A path that is relative to the folder of the file."""
+"""A path relative to the file's folder."""
 
 
 def _is_number(annotation: Any) -> bool:
-    """Return whether a field holds a number, which may have limits or be missing."""
+    """Return whether a field holds a number, with limits and None or without."""
     parts = (annotation, *get_args(annotation))
     return any(part in (int, float) or get_args(part)[:1] in ((int,), (float,)) for part in parts)
 
 
 class Section(BaseModel):
-    """A part of the file: immutable, finite numbers, no unknown keys."""
+    """A section of the file: immutable, with finite numbers and without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -73,28 +73,28 @@ class Section(BaseModel):
 
 
 def keys(section: type[Section]) -> list[str]:
-    """Return the keys of a section as the file spells them."""
+    """Return a section's keys as the file spells them."""
     return [field.alias or name for name, field in section.model_fields.items()]
 
 
 def wrong(message: str) -> PydanticCustomError:
-    """Return an error of ours, for a validator."""
+    """Return the error that a validator raises with this program's own message."""
     return PydanticCustomError("thermocald", "{message}", {"message": message})
 
 
 def _of_key(key: str, message: str) -> PydanticCustomError:
-    """Return an error of ours about one key of a section, for a validator of the whole."""
+    """Return the error that a section's validator raises about one of its keys."""
     return PydanticCustomError("of_key", "{message}", {"message": message, "key": key})
 
 
 def nearest(key: str, known: list[str]) -> str:
-    """Return the end of a message: which known key is meant, or which there are."""
+    """Return the end of a message: the known key that may be meant, or all known keys."""
     near = difflib.get_close_matches(key, known, 1, 0.5)
     return f"; is {near[0]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
 
 
 def in_words(path: Path | str, error: ValidationError) -> str:
-    """Return the first error, as file or place (or none), dotted key, value and what is allowed."""
+    """Return the first error as a message: file or place, if any, dotted key, value and bounds."""
     first = error.errors()[0]
     where = "".join(
         f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in first["loc"]
@@ -107,7 +107,7 @@ def in_words(path: Path | str, error: ValidationError) -> str:
     message = without_secrets(first["msg"])
     if first["type"] == "missing":
         message = "is missing"
-    elif first["type"] == "value_error":  # of a check that is shared with others
+    elif first["type"] == "value_error":  # a check shared with other readers
         message = str(context["error"])
     elif first["type"] not in ("thermocald", "of_key"):
         given = "a secret" if is_secret(where.rpartition(".")[2]) else _short(first["input"])
@@ -116,7 +116,7 @@ def in_words(path: Path | str, error: ValidationError) -> str:
 
 
 def _key(key: str) -> str:
-    """Return a key as it stands, or quoted where it is not of letters."""
+    """Return a key, quoted if it is long or holds characters that cannot be printed."""
     return key if key.isprintable() and len(key) <= 60 else _short(key)
 
 
@@ -130,78 +130,78 @@ ParameterName = Literal[InteriorName, "omega", "phi", "kappa", "X0", "Y0", "Z0"]
 
 
 class SensorConfig(Section):
-    """Size of the image and of a pixel."""
+    """The size of the image and of a pixel."""
 
     width_px: Annotated[int, Field(ge=16, le=100_000)]
-    """Width of the image."""
+    """Image width."""
     height_px: Annotated[int, Field(ge=16, le=100_000)]
-    """Height of the image."""
+    """Image height."""
     pixel_pitch_mm: Annotated[float, Field(ge=1e-4, le=0.1)]
-    """Size of a pixel."""
+    """Pixel pitch."""
 
 
 class Prior(Section):
-    """A value known beforehand, with its standard deviation, in the parameter's unit."""
+    """A parameter's prior value and its standard deviation, in the parameter's unit."""
 
     value: float
-    """What is known beforehand."""
+    """Prior value."""
     sd: Annotated[float, Field(gt=0.0)]
-    """Its standard deviation."""
+    """Standard deviation of the prior value."""
 
 
 class CalibrationConfig(Section):
-    """How epochs are adjusted.
+    """The settings of the adjustment of epochs.
 
-    exterior: how an epoch's result in its series is estimated, which is stored next to its own:
-    one orientation `per_epoch`, or one for the `series` of a camera that stands still, or that and
-    movements of the `mount` whose size the epochs show; `auto`: what the epochs so far show;
-    target_offsets: a constant offset per target, estimated from all epochs so far with the test
-    field's sigmas as prior, else these are noise of each epoch;
-    free: what is estimated; fixed: values of what is not; priors: values with their sd; the
-    bounds as in `photogrammetry.geometry`.
+    Each epoch is stored with its own result and with its result in the series. exterior: the
+    exterior orientation in the series: one `per_epoch`, one for the whole `series` of a camera that
+    stands still, or one and movements of the `mount`, whose size is estimated from the epochs;
+    `auto` chooses from the epochs so far. target_offsets: estimate a constant offset per target
+    from all epochs so far, with the test field's sigmas as prior; otherwise the sigmas count as
+    noise of each epoch. free: the parameters estimated; fixed: values of the others; priors: prior
+    values with their sds; the bounds are those of `photogrammetry.geometry`.
     """
 
     exterior: Literal["auto", "mount", "per_epoch", "series"] = "auto"
-    """One orientation per epoch or for the series, or one and movements of the mount."""
+    """Exterior orientation: one per epoch, one for the series, or one and the mount's movements."""
     free: tuple[InteriorName, ...] = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
-    """Interior parameters that are estimated."""
+    """Parameters of the interior orientation that are estimated."""
     fixed: dict[InteriorName, float] = Field(default_factory=dict)
-    """Values of those that are not; 0 where none is given."""
+    """Values of the parameters that are not estimated; 0 if not given."""
     priors: dict[ParameterName, Prior] = Field(default_factory=dict)
-    """By parameter, in its unit."""
+    """Prior values of parameters, each in its unit."""
     sigma_floor_px: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
-    """Image points are taken as no better than this."""
+    """Lower bound of an image point's standard deviation."""
     target_offsets: bool = True
-    """With series: a constant offset per target, for an imperfect field."""
+    """In the series, estimate a constant offset per target, for an imperfect field."""
     correlation_bound: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.9999
-    """Above it an epoch's geometry is called weak."""
+    """Correlation between parameters above which an epoch's geometry counts as weak."""
     snooping_alpha: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0005
-    """Probability that the test rejects a single good observation; 0: no test."""
+    """Probability that snooping rejects a good observation; 0: no snooping."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if both := set(self.free) & set(self.fixed):
-            raise wrong(f"{min(both)} stands in `free` and in `fixed`")
+            raise wrong(f"{min(both)} is both in `free` and in `fixed`")
         if len(set(self.free)) != len(self.free):
             raise wrong("`free` names a parameter twice")
         return self
 
 
 class DeviceConfig(Section):
-    """A device: a name for people, a driver (an entry point), and the driver's options."""
+    """A device: its name, its driver (an entry point) and the driver's options."""
 
     model_config = ConfigDict(extra="allow")
 
     name: Name
-    """For people; letters, digits, _ . -; unique in its list."""
+    """The device's name, unique in its list; letters, digits, _ . -."""
     driver: Annotated[str, Field(min_length=1)]
-    """An installed entry point; `thermocald devices` lists them."""
+    """An installed driver (entry point); `thermocald devices` lists them."""
     driver_options: dict[str, Any] = Field(default_factory=dict, alias="options")
-    """Options of the driver that are called like a key of ours."""
+    """Options of the driver that have the name of a key of this section."""
 
     @property
     def options(self) -> dict[str, Any]:
-        """What the driver's constructor gets."""
+        """The options for the driver's constructor."""
         return {**(self.model_extra or {}), **self.driver_options}
 
     @model_validator(mode="before")
@@ -221,16 +221,16 @@ class ThermometerConfig(DeviceConfig):
 
 
 class OutputConfig(DeviceConfig):
-    """Something that is told every epoch's result."""
+    """A device that receives every epoch's result."""
 
 
 class CameraConfig(DeviceConfig):
-    """A camera, what is known of it, and what it looks at.
+    """A camera, its known properties and its test field or thermal model.
 
-    series: what it takes when no session runs, None for nothing: the device is closed then.
-    thermometers: by name, the first is the reference; testfield: None if epochs are only
-    acquired; thermal_model: in place of a test field, the camera is predicted and, with control
-    points, posed; calibration: what differs from the common settings is given in full.
+    series: the series that it takes when no session runs; None: none, and the device is closed.
+    thermometers: by name, the reference first. testfield: None if epochs are only acquired.
+    thermal_model: in place of a test field; the camera is predicted and, with control points,
+    posed. calibration: replaces the common settings as a whole.
     """
 
     period_s: Period = 10.0
@@ -238,25 +238,26 @@ class CameraConfig(DeviceConfig):
     series: Name | None = "watch"
     """Name of the measurement series."""
     sensor: SensorConfig | None = None
-    """Size of the image and of a pixel."""
+    """The size of the image and of a pixel."""
     principal_distance_mm: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = None
-    """Nominal; helps to find a first orientation."""
+    """Nominal principal distance; helps to find a first orientation."""
     testfield: FilePath | None = None
-    """A testfield.csv; without it frames are only taken."""
+    """A testfield.csv; if not given, frames are taken but not calibrated."""
     thermal_model: FilePath | None = None
-    """In place of a test field: the camera is predicted from its thermometers."""
+    """In place of a test field: the model that predicts the camera from its thermometers."""
     control_points: FilePath | None = None
-    """With a thermal model: surveyed points that give its pose in each frame."""
+    """With a thermal model: control points, from which each frame's pose is estimated."""
     control_unit: Literal["mm", "m"] = "m"
-    """Of the control points' coordinates in a CSV."""
+    """Unit of the control points' coordinates in a CSV."""
     control_reference: FilePath | None = None
-    """A frame in which the control points' x, y are; without it they are coded targets."""
+    """A frame for which x, y of the control points are given; if not given, they are coded
+    targets."""
     mount_sd_deg: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
-    """How far the mount turns about an axis in an hour; None: not known."""
+    """Standard deviation of the mount's rotation about an axis in an hour; null: unknown."""
     thermometers: tuple[Name, ...] = ()
-    """By name; the first is the reference."""
+    """Names of its thermometers, the reference first."""
     calibration: CalibrationConfig | None = None
-    """Of this camera, in full, in place of the common one."""
+    """This camera's settings of the adjustment, which replace the common ones as a whole."""
 
     @model_validator(mode="after")
     def _one_task(self) -> Self:
@@ -274,7 +275,7 @@ class CameraConfig(DeviceConfig):
 
 
 def _resolved(value: Any, folder: Path) -> Any:
-    """Return a driver's option with paths made absolute, also within lists and mappings."""
+    """Return a driver's option with its paths made absolute, in lists and mappings too."""
     if isinstance(value, str) and re.match(r"\.\.?/", value):
         return str(folder / value)
     if isinstance(value, list):
@@ -285,67 +286,67 @@ def _resolved(value: Any, folder: Path) -> Any:
 
 
 class StoreConfig(Section):
-    """Where results go. durable: what is stored survives a power cut, at the price of a sync."""
+    """The store of the results."""
 
     path: FilePath = Field(default=Path("thermocald.db"), validate_default=True)
     """The SQLite file."""
     durable: bool = True
-    """What is stored survives a power cut; false: only the end of the process, but faster."""
+    """Sync each write, so that it survives a power cut; false: faster, survives only a crash."""
 
 
 class FramesConfig(Section):
-    """Which frames are kept, where, and for how long; None: no limit."""
+    """Which frames are kept, where, and for how long."""
 
     keep: Literal["all", "every_n", "events", "none"] = "every_n"
-    """Which frames are kept; events: knock, slip, failed epochs."""
+    """Which frames are kept; events: those of a knock, a slip or a failed epoch."""
     every_n: Annotated[int, Field(ge=1, le=1_000_000)] = 360
-    """With every_n: one of so many."""
+    """With keep: every_n, one frame in so many is kept."""
     corrected: bool = False
-    """Cameras with a thermal_model: each kept frame a second time, as it had been at T₀."""
+    """For cameras with a thermal_model, also store each kept frame corrected to T₀."""
     folder: FilePath = Field(default=Path("frames"), validate_default=True)
-    """Where they are kept."""
+    """Folder of the kept frames."""
     max_age_days: Positive | None = 90.0
     """Older frames are deleted, which is logged; null: no limit."""
     max_size_gb: Positive | None = 8.0
-    """Beyond it the oldest frames go first; null: no limit."""
+    """Total size above which the oldest frames are deleted; null: no limit."""
     min_free_gb: Annotated[float, Field(ge=0.0, le=1e6)] = 0.5
-    """With less room on the disk no frame is kept."""
+    """Free disk space below which no frame is kept."""
 
 
 class DashboardConfig(Section):
-    """The web page; elsewhere than on this machine it needs a token."""
+    """The web page, which needs a token if other machines can reach it."""
 
     enabled: bool = False
-    """Whether the daemon shows the page."""
+    """Whether the daemon serves the page."""
     host: str = "127.0.0.1"
-    """Elsewhere than on this machine a token_file is needed."""
+    """Address to listen on; one that other machines can reach needs a token_file."""
     port: Annotated[int, Field(ge=1, le=65535)] = 8437
-    """Of the page."""
+    """Port to listen on."""
     token_file: FilePath | None = None
-    """A file that holds the token; others must not be able to read it."""
+    """A file with the token; other users must not be able to read it."""
     names: tuple[Annotated[str, Field(min_length=1, max_length=253)], ...] = ()
-    """Further names by which the page may be asked for, such as that of a proxy."""
+    """Further host names of the page, for example a proxy's."""
 
     @model_validator(mode="after")
     def _guarded(self) -> Self:
         if not is_loopback(self.host) and self.token_file is None:
-            raise wrong(f"host {self.host} is open to others; name a token_file too")
+            raise wrong(f"host {self.host} is open to other machines; give a token_file too")
         return self
 
 
 class ForwardConfig(Section):
-    """Where the store's rows are sent, by a process of its own: `thermocald forward`."""
+    """The server to which `thermocald forward`, a separate process, sends the store's rows."""
 
     to: Annotated[str, Field(pattern=r"^postgres(ql)?://")] | None = None
     """The server, postgresql://USER@HOST/DATABASE; null: nothing is sent."""
     station: Name | None = None
-    """This station's name there; null: the host's."""
+    """The station's name on the server; null: the host's."""
     frames: Literal["none", "events", "every_n", "all"] = "none"
-    """Which of the kept frames are sent too; events: epochs without a result, and movements."""
+    """Which kept frames are sent too; events: those of movements and of epochs without a result."""
     every_n: Annotated[int, Field(ge=1, le=1_000_000)] = 360
-    """With frames: every_n, those whose number it divides."""
+    """With frames: every_n, frames are sent whose number is a multiple of it."""
     frames_mb_per_day: Positive = 200.0
-    """Frames beyond it wait for the next day."""
+    """Frames sent in a day at most; the others wait for the next day."""
 
     @field_validator("to")
     @classmethod
@@ -356,18 +357,18 @@ class ForwardConfig(Section):
         except ValueError:
             raise wrong("is not a valid address: postgresql://USER@HOST/DATABASE") from None
         if parts.password is not None or "password=" in parts.query:
-            raise wrong("holds a password; write it to the service's ~/.pgpass, or use passfile=")
+            raise wrong("holds a password; put it into the service's ~/.pgpass, or use passfile=")
         return value
 
 
 class LoggingConfig(Section):
-    """What goes to the journal."""
+    """The journal."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"
-    """From which on messages go to the journal."""
+    """Lowest level of the messages in the journal."""
 
 
-# kind of device, driver → names of the driver's options
+# (kind of device, driver) → names of the driver's options
 OptionNames = Callable[[Any, str], Sequence[str]]
 
 
@@ -375,7 +376,7 @@ class Config(Section):
     """The whole file."""
 
     store: StoreConfig = Field(default_factory=dict, validate_default=True)
-    """Where results go."""
+    """The store of the results."""
     frames: FramesConfig = Field(default_factory=dict, validate_default=True)
     """Which frames are kept."""
     cameras: tuple[CameraConfig, ...] = ()
@@ -383,49 +384,49 @@ class Config(Section):
     thermometers: tuple[ThermometerConfig, ...] = ()
     """The thermometers."""
     outputs: tuple[OutputConfig, ...] = ()
-    """What is told every epoch's result."""
+    """The outputs, which receive every epoch's result."""
     calibration: CalibrationConfig = CalibrationConfig()
-    """How epochs are adjusted."""
+    """The settings of the adjustment of epochs."""
     dashboard: DashboardConfig = DashboardConfig()
     """The web page."""
     forward: ForwardConfig = ForwardConfig()
-    """A server that gets every row."""
+    """The server to which the store's rows are sent."""
     logging: LoggingConfig = LoggingConfig()
-    """The log."""
+    """The journal."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if not self.cameras and not self.thermometers:
-            raise wrong("there is neither a camera nor a thermometer; nothing would be done")
+            raise wrong("there is neither a camera nor a thermometer; configure at least one")
         for kind in ("cameras", "thermometers", "outputs"):
             names = [device.name for device in getattr(self, kind)]
             for name in names:
                 if names.count(name) > 1:
                     raise wrong(f"{kind}: the name {name!r} is duplicated")
-        there = [thermometer.name for thermometer in self.thermometers]
+        known = [thermometer.name for thermometer in self.thermometers]
         for camera in self.cameras:
             if camera.name == "status":
-                raise wrong("camera 'status': choose another name; the live folder has a status")
+                raise wrong("camera 'status': choose another name; the live folder uses this one")
             for name in camera.thermometers:
-                if name not in there:
+                if name not in known:
                     raise wrong(
                         f"camera {camera.name!r}: there is no thermometer {name!r}"
-                        + nearest(name, there)
+                        + nearest(name, known)
                     )
         if self.frames.corrected and not any(c.thermal_model for c in self.cameras):
             raise wrong("frames.corrected needs a camera with a thermal_model")
         return self
 
     def calibration_of(self, camera: CameraConfig) -> CalibrationConfig:
-        """Return the settings that hold for a camera."""
+        """Return a camera's settings of the adjustment."""
         return camera.calibration or self.calibration
 
 
 def load_config(path: Path, option_names: OptionNames | None = None) -> Config:
     """Read and check `config.yaml`.
 
-    option_names: tells the options of a driver, so that wrong ones are found now and not when the
-    device is opened (`thermocald.hal.option_names`). Raises ConfigurationError naming the file, the
+    option_names: returns a driver's options, so that a wrong one is found before the device is
+    opened (`thermocald.hal.option_names`). Raises ConfigurationError, which names the file, the
     dotted key, the value and the bound.
     """
     return parse_config(read_yaml(path), path, option_names)
@@ -434,7 +435,7 @@ def load_config(path: Path, option_names: OptionNames | None = None) -> Config:
 def parse_config(
     document: dict[str, Any], path: Path, option_names: OptionNames | None = None
 ) -> Config:
-    """The configuration in a mapping; `path` is what relative paths and messages refer to."""
+    """Check a configuration given as a mapping; relative paths and messages refer to `path`."""
     hide_secrets(document)
     try:
         config = Config.model_validate(document, context={"folder": path.absolute().parent})
@@ -453,7 +454,7 @@ def parse_config(
 
 
 def _check_places(config: Config, path: Path) -> None:
-    """Refuse outputs that write into one another, into the store, or into the configuration."""
+    """Refuse outputs that write to each other's file, the store or the configuration."""
     store = config.store.path
     taken = {
         "the store": [store, *(store.with_name(f"{store.name}-{x}") for x in ("wal", "shm"))],
@@ -470,7 +471,7 @@ def _check_places(config: Config, path: Path) -> None:
                 raise ConfigurationError(
                     f"{path}: outputs[{i}].path: {place}: is {what}; choose another file"
                 )
-        taken[f"what {output.name} writes"] = [Path(place)]
+        taken[f"the file of output {output.name}"] = [Path(place)]
     for what, files in taken.items():
         if any(_same_file(config.frames.folder, file) for file in files):
             raise ConfigurationError(f"{path}: frames.folder: is {what}; choose another folder")
@@ -479,7 +480,7 @@ def _check_places(config: Config, path: Path) -> None:
 
 
 def _same_file(one: Path, other: Path) -> bool:
-    """Return whether two paths lead to one file, by links of either kind, there or not."""
+    """Return whether two paths lead to one file, which need not exist, through links or not."""
     try:
         return one.samefile(other)
     except OSError:

@@ -1,4 +1,4 @@
-"""The epoch: one tick with its image measurements and the temperatures around it."""
+"""The epoch: a frame's image measurements and the temperatures read with it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Epoch:
-    """One tick.
+    """One epoch.
 
-    number: as the recording counts; frame_time, temperature_time: s UTC, the temperature's is NaN
-    where none was read; temperatures: {channel: °C}, NaN where a channel could not be read, read at
-    `temperature_time`; frame: path of the image, None where there is none; observations: None
-    where the frame has still to be measured; note: why there are none.
+    number: as in the recording; frame_time, temperature_time: s UTC, the latter NaN if nothing was
+    read; temperatures: {channel: °C} at `temperature_time`, NaN if the channel could not be read;
+    frame: path of the image, None if there is none; observations: None if the frame is not measured
+    yet; note: why there are no observations.
     """
 
     number: int

@@ -1,19 +1,19 @@
-"""The tree of errors; every message says what is wrong, where, and what to do.
+"""The errors that thermocald raises; every message says what is wrong, where, and what to do.
 
     ThermocaldError
      ├── UsageError (ValueError)              exit 2: wrong usage
      │    ├── ConfigurationError              exit 2: config.yaml, camera, model or programme file
-     │    └── OutputError                     exit 2, or 3 where the disk is full or fails
-     ├── DataError (ValueError)               exit 1: the data do not allow it
+     │    └── OutputError                     exit 2, or 3 if the disk is full or fails
+     ├── DataError (ValueError)               exit 1: the data do not allow what was asked
      │    ├── RecordingError                  a recording is broken
      │    ├── TestFieldError                  a test field is broken
      │    ├── ImageError                      an image cannot be read or used
      │    ├── StoreError                      a store is broken, foreign, or cannot be written
      │    │    ├── StoreFullError             the disk has no room for it
      │    │    ├── StoreVersionError          a store of a newer program
-     │    │    └── ServerError                a server's store refused: a person must act
+     │    │    └── ServerError                a server refused a request: a person must act
      │    │         └── ServerGone (ConnectionError)  out of reach; may pass
-     │    └── GeometryError                   too little geometry for what was asked
+     │    └── GeometryError                   the geometry is too weak for what was asked
      └── DeviceError (OSError)                exit 3: a device failed
           ├── TransientDeviceError            may pass: the daemon retries with back-off
           │    ├── DeviceTimeout (TimeoutError)
@@ -21,25 +21,25 @@
           │    └── BadReading                       truncated frame, CRC error, garbage
           └── PermanentDeviceError            retrying cannot help: a person must act
                ├── DeviceNotFound                   no such device
-               ├── DeviceDenied (PermissionError)   permission, unauthorized, busy for good
+               ├── DeviceDenied (PermissionError)   no permission, unauthorized, permanently busy
                ├── WrongDevice                      identity, size or capability does not fit
                ├── DriverMissing                    an optional library is not installed
-               └── DeviceFinished                   nothing more will come, and that is not a fault
+               └── DeviceFinished                   no more data will come, which is no fault
 
-Leaves also are the built-in exception that they mean.
+An error is also the built-in exception in parentheses.
 """
 
 from __future__ import annotations
 
 
 class ThermocaldError(Exception):
-    """Base of everything that thermocald raises on purpose; `exit_status` is CONVENTIONS §4's."""
+    """The base class of thermocald's errors; `exit_status` is that of CONVENTIONS §4."""
 
     exit_status = 1
 
 
 class UsageError(ThermocaldError, ValueError):
-    """The command or the call was used wrongly."""
+    """A command or a function was used wrongly."""
 
     exit_status = 2
 
@@ -49,7 +49,7 @@ class ConfigurationError(UsageError):
 
 
 class OutputError(UsageError):
-    """A file cannot be written; status 2 where another place helps, 3 where the disk fails."""
+    """A file cannot be written; exit status 2 if another place helps, 3 if the disk fails."""
 
     def __init__(self, message: str, exit_status: int = 2) -> None:
         super().__init__(message)
@@ -75,11 +75,11 @@ class ImageError(DataError):
 
 
 class StoreError(DataError):
-    """A store is broken, is not ours, or cannot be written."""
+    """A store is broken, foreign, or cannot be written."""
 
 
 class StoreFullError(StoreError):
-    """There is no room on the disk; what was stored before is not lost."""
+    """The disk is full; what was stored before is not lost."""
 
     exit_status = 3
 
@@ -89,16 +89,16 @@ class StoreVersionError(StoreError):
 
 
 class ServerError(StoreError):
-    """A server's store refused what was asked; a person must act.
+    """A server refused a request; a person must act.
 
-    about_values: it is what a row holds that was refused, and not the connection or the role.
+    about_values: whether it refused a row's values, and not the connection or the role.
     """
 
     about_values = False
 
 
 class ServerGone(ServerError, ConnectionError):
-    """A server's store is out of reach, full or restarting: it may pass by itself."""
+    """A server is out of reach, full or restarting; this may pass by itself."""
 
 
 class GeometryError(DataError):
@@ -112,7 +112,7 @@ class DeviceError(ThermocaldError, OSError):
 
 
 class TransientDeviceError(DeviceError):
-    """A fault that may pass by itself: retried with back-off."""
+    """A fault that may pass by itself; the daemon retries with back-off."""
 
 
 class DeviceTimeout(TransientDeviceError, TimeoutError):
@@ -120,7 +120,7 @@ class DeviceTimeout(TransientDeviceError, TimeoutError):
 
 
 class DeviceGone(TransientDeviceError, ConnectionError):
-    """The device was there and is not any more."""
+    """The device was there and has disappeared."""
 
 
 class BadReading(TransientDeviceError):
@@ -148,4 +148,4 @@ class DriverMissing(PermanentDeviceError):
 
 
 class DeviceFinished(PermanentDeviceError):
-    """The device has delivered everything it had, such as a recording played to its end."""
+    """The device has delivered all its data, such as a recording played to its end."""

@@ -1,8 +1,8 @@
-"""The figures of all reports: described once, drawn with matplotlib as SVG, as PNG for papers.
+"""The figures of all reports, drawn with matplotlib as SVG, for papers also as PNG.
 
-A figure is a list of panels, each drawn by itself on a page and all together for a paper, or one
-drawing of its own. Long curves are thinned to the minimum and maximum of each stretch, so that no
-outlier disappears and no file grows with the length of a series. Text stays text: it can be
+A figure is either a list of panels, which a page shows one by one and a paper in one drawing, or a
+drawing made elsewhere. Long curves are thinned to the minimum and maximum of each stretch, so that
+no outlier disappears and no file grows with the length of a series. Text stays text: it can be
 searched, copied and edited.
 """
 
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
 
-# Colour-blind safe (Okabe & Ito 2008), dark enough for thin lines on white paper.
+# safe for the colour-blind (Okabe & Ito 2008), dark enough for thin lines on white paper
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 PALE, GREY = "#9fb4c1", "#555555"
 BAND = 1.96  # standard deviations: 95 % on every page
 _MOST_POINTS = 800
 _PANEL_INCHES = (3.4, 2.5)
-_LEGEND_LETTERS = 43  # in a line above a panel
-_MATRIX_LETTERS = 13  # of a row's name
-_TITLE_LETTERS = 11  # in an inch
+_LEGEND_LETTERS = 43  # per line above a panel
+_MATRIX_LETTERS = 13  # per name of a row
+_TITLE_LETTERS = 11  # per inch
 _FEW_ARROWS = 25
-_DECADES = 3.0  # that an axis must span to be logarithmic
+_DECADES = 3.0  # spanned by an axis that is logarithmic
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "thermocald",  # the same study gives the same file
     "font.family": "sans-serif",
     "font.size": 9,
-    "path.simplify": False,  # curves are thinned already; it would drop zero-length strokes
+    "path.simplify": False,  # curves are thinned already, and it drops zero-length strokes
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.titlesize": 10,
@@ -65,7 +65,7 @@ _STYLE: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """x, y (n,); half: half the width (n,) of a band about the line."""
+    """A curve or points x, y (n,); half: half the width (n,) of a band about the line."""
 
     name: str
     x: Array
@@ -78,10 +78,10 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Arrows:
-    """Vectors (n, 2) px at image points (n, 2) px, y down, of a frame of so many px.
+    """Vectors (n, 2) at image points (n, 2), px, y down, in a frame of (width, height), px.
 
-    longest: length of a vector, px, that is drawn a tenth of the frame's width long (a fifth where
-    there is room), by default that of the longest one.
+    longest: the length, px, that is drawn as a tenth of the frame's width (a fifth for few arrows),
+    by default that of the longest vector.
     """
 
     points: Array
@@ -93,9 +93,9 @@ class Arrows:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One diagram; horizontal: (y, label) of dashed lines; equal: same scale on both axes.
+    """A diagram; horizontal: (y, label) of dashed lines; equal: same scale on both axes.
 
-    y_down: y grows downwards, as in the image.
+    y_down: y increases downwards, as in the image.
     """
 
     title: str
@@ -110,7 +110,7 @@ class Panel:
 
 
 def image_panel(title: str, *curves: Curve, arrows: Arrows | None = None) -> Panel:
-    """A diagram of the image, px, y down as there; arrows bear a scale and a frame of their own."""
+    """Return a panel of the image, px, y down; `draw_arrows` sets an arrow panel's axes itself."""
     down = arrows is None
     return Panel(
         title, "x in px", "y in px, down", curves, equal=down, y_down=down, arrows=arrows
@@ -119,9 +119,9 @@ def image_panel(title: str, *curves: Curve, arrows: Arrows | None = None) -> Pan
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Panels under one name, which is a file name too, or a drawing of matplotlib.
+    """Panels or one matplotlib drawing, with a name that is also its file's.
 
-    images: (label, PNG bytes), in a page only; columns: most panels in a row.
+    images: (label, PNG bytes), shown on a page only; columns: greatest number of panels in a row.
     """
 
     name: str
@@ -134,16 +134,16 @@ class Figure:
 
     @property
     def in_a_row(self) -> int:
-        """How many panels or images stand side by side."""
+        """The number of panels or images side by side."""
         return max(1, min(self.columns, len(self.panels) + len(self.images)))
 
     @property
     def width_rem(self) -> float:
-        """The width of a column on a page that has the room."""
+        """The width of a column, rem, on a page that is wide enough."""
         return 27.0 if self.drawing is None else 7.4 * float(self.drawing.get_size_inches()[0])
 
     def svgs(self, prefix: str = "") -> list[str]:
-        """Return the drawings of a page as <svg> elements; prefix: of their ids."""
+        """Return the drawings for a page as <svg> elements; prefix: of their ids."""
         name = prefix + self.name
         if self.drawing is not None:
             return [inline_svg(self.drawing, name, self.title)]
@@ -153,30 +153,29 @@ class Figure:
         ]
 
     def sources(self) -> list[tuple[str, str]]:
-        """Return the label and the address of each image."""
+        """Return the label and the data URL of each image."""
         start = "data:image/png;base64,"
         return [(label, start + base64.b64encode(png).decode()) for label, png in self.images]
 
 
 def thin(x: Array, *ys: Array) -> tuple[Array, ...]:
-    """Columns (n,) at some hundred rows or fewer, which hold the extremes of the first of `ys`."""
+    """Thin columns (n,) to at most 800 rows, which include the extremes of the first of `ys`."""
     if len(x) <= _MOST_POINTS:
         return (x, *ys)
     low, high = (np.where(np.isfinite(ys[0]), ys[0], other) for other in (np.inf, -np.inf))
     stretches = np.array_split(np.arange(len(x)), _MOST_POINTS // 2)
-    kept = [(r[np.argmin(low[r])], r[np.argmax(high[r])]) for r in stretches]
-    rows = np.unique(kept)
+    rows = np.unique([(r[np.argmin(low[r])], r[np.argmax(high[r])]) for r in stretches])
     return tuple(column[rows] for column in (x, *ys))
 
 
 @contextmanager
 def drawing_style() -> Iterator[None]:
-    """The style that all drawings share, while they are made."""
+    """Set the common style of all drawings while one is made."""
     import matplotlib as mpl
 
     settings: Any = _STYLE
     with mpl.rc_context(settings), warnings.catch_warnings():
-        # the browser has the letters that this font lacks
+        # the browser has the glyphs that this font lacks
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         warnings.filterwarnings("ignore", message="Matplotlib currently does not support")
         yield
@@ -185,8 +184,11 @@ def drawing_style() -> Iterator[None]:
 def new_drawing(
     width: float, height: float, layout: Literal["constrained"] | None = "constrained"
 ) -> Any:
-    """Make an empty drawing of so many inches; DriverMissing without matplotlib."""
-    # Without pyplot: no global state, no window, nothing to close.
+    """Return an empty drawing, width × height inches.
+
+    Raises DriverMissing if matplotlib is not installed.
+    """
+    # not with pyplot: no global state, no window, nothing to close
     try:
         from matplotlib.figure import Figure as Canvas
     except ImportError:
@@ -204,7 +206,7 @@ def new_drawing(
 
 
 def inline_svg(drawing: Any, prefix: str, label: str) -> str:
-    """A drawing as an <svg> element; `prefix` keeps its ids apart from those of others."""
+    """Return a drawing as an <svg> element; prefix: makes its ids unique on a page."""
     buffer = io.StringIO()
     with drawing_style():
         drawing.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
@@ -220,14 +222,14 @@ def inline_svg(drawing: Any, prefix: str, label: str) -> str:
     text = re.sub(
         r"<[^>]*>", lambda tag: re.sub(r"(\.\d\d)\d+", r"\1", re.sub(r"\s+", " ", tag[0])), text
     )
-    # The page decides the width; the height follows from the viewBox.
+    # the page sets the width, and the height follows from the viewBox
     head, rest = text.split(">", 1)
     head = re.sub(r'\s(width|height)="[^"]*"', "", head)
     return f'{head} role="img" aria-label="{escape(label)}"{_scales(drawing)}>{rest}'
 
 
 def _scales(drawing: Any) -> str:
-    """What the page's script needs to read values off: corners of the one axis, in pt and data."""
+    """Return what the page's script needs to read values off: an axis's corners in pt and data."""
     if len(drawing.axes) != 1 or drawing.axes[0].get_yscale() != "linear":
         return ""
     axis = drawing.axes[0]
@@ -241,7 +243,7 @@ def _scales(drawing: Any) -> str:
 
 
 def save(drawing: Any, folder: Path, name: str) -> list[Path]:
-    """A drawing as <name>.svg and <name>.png (200 dpi)."""
+    """Write a drawing as <name>.svg and <name>.png (200 dpi); return the files."""
     paths = [folder / f"{name}.svg", folder / f"{name}.png"]
     with drawing_style():
         with new_file(paths[0]) as partial:
@@ -253,14 +255,14 @@ def save(drawing: Any, folder: Path, name: str) -> list[Path]:
 
 
 def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
-    """One panel as a drawing of its own."""
+    """Draw a panel alone."""
     with drawing_style():
-        # Fixed margins fit the short labels; fitting them exactly triples the time of a report.
+        # fixed margins fit the short labels; fitting them exactly triples the time of a report
         drawing = new_drawing(*_PANEL_INCHES, None)
         axis = drawing.subplots()
         rows = _fill(axis, panel, legend=legend)
         drawing.subplots_adjust(right=0.95, bottom=0.19, top=0.89 - 0.055 * rows)
-        # how many ticks there are, and with how many digits, depends on the height
+        # after the height is set, as the number of ticks and of their digits depends on it
         low, high = sorted(axis.get_ylim())
         ticks = [tick for tick in axis.get_yticks() if low <= tick <= high]
         labels = axis.yaxis.get_major_formatter().format_ticks(ticks)
@@ -270,7 +272,7 @@ def draw_panel(panel: Panel, *, legend: bool = True) -> Any:
 
 
 def draw_figure(figure: Figure) -> Drawing:
-    """All of a figure in one drawing, for a paper."""
+    """Draw all panels of a figure in one drawing, for a paper."""
     drawing: Drawing | None = figure.drawing
     if drawing is not None:
         return drawing
@@ -288,7 +290,7 @@ def draw_figure(figure: Figure) -> Drawing:
 
 
 def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
-    """Draw a panel; returns the rows of its legend, which is above it, clear of the data."""
+    """Draw a panel; return the number of rows of its legend, which is above the panel."""
     for curve in panel.curves:
         _draw_curve(axis, curve)
     if panel.arrows is not None:
@@ -304,19 +306,19 @@ def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
         use_logarithm(axis)
     if panel.equal:
         axis.set_aspect("equal", adjustable="datalim")
-        axis.locator_params(nbins=5)  # narrow: more labels would touch
+        axis.locator_params(nbins=5)  # the axis is narrow: more labels would touch
     if panel.y_down:
         axis.invert_yaxis()
     label_axes(axis, panel.x_label, panel.y_label)
     names = {c.name for c in panel.curves if c.name}
     rows = legend_above(axis) if legend and len(names) > 1 else 0
-    most = 40 if panel.arrows is None else 18  # beside the scale arrow
+    most = 40 if panel.arrows is None else 18  # letters, beside the scale arrow
     axis.set_title(shortened(panel.title, most), loc="left", pad=6 + 10 * rows)
     return rows
 
 
 def label_axes(axis: Any, x: str = "", y: str = "") -> None:
-    """Name both axes and write their ticks without an offset or a power that stands apart."""
+    """Label both axes and write their ticks without a common offset or power of ten."""
     if x:
         axis.set_xlabel(shortened(x, 48))
     if y:
@@ -327,7 +329,7 @@ def label_axes(axis: Any, x: str = "", y: str = "") -> None:
 
 
 def tick_text(value: float) -> str:
-    """`20`, `0.001`, `2·10⁵`: a tick in full, with a power of ten only where it needs one."""
+    """Write a tick's value: `20`, `0.001`, `2·10⁵`, with a power of ten only if it needs one."""
     if value == 0 or 1e-3 <= abs(value) < 1e5:
         return f"{value:.7g}".replace("-", "−")
     mantissa, _, exponent = f"{value:.4e}".partition("e")
@@ -337,7 +339,7 @@ def tick_text(value: float) -> str:
 
 
 def use_logarithm(axis: Any) -> None:
-    """A logarithmic y axis with the ticks in full; linear where nothing spans three decades."""
+    """Make the y axis logarithmic with full tick labels, unless the data span few decades."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     low, high = axis.get_ylim()
@@ -352,7 +354,7 @@ def use_logarithm(axis: Any) -> None:
 
 
 def legend_above(axis: Any) -> int:
-    """Put the legend above the axes, clear of the data; returns its rows."""
+    """Put the legend above the axes, clear of the data; return its number of rows."""
     handles, names = axis.get_legend_handles_labels()
     first = {shortened(name, 18): handle for name, handle in zip(names, handles, strict=True)}
     columns = max(1, min(len(first), _LEGEND_LETTERS // (max(map(len, first)) + 4)))
@@ -366,7 +368,7 @@ def legend_above(axis: Any) -> int:
 def _draw_curve(axis: Any, curve: Curve) -> None:
     label = curve.name or None
     if curve.kind == "points" or len(curve.x) == 1:
-        # Zero-length strokes with round caps: a tenth of the size of as many markers.
+        # zero-length strokes with round caps take a tenth of the bytes of markers
         x = np.column_stack([curve.x, curve.x, np.full(len(curve.x), np.nan)]).ravel()
         y = np.column_stack([curve.y, curve.y, np.full(len(curve.y), np.nan)]).ravel()
         axis.plot(x, y, color=curve.colour, linewidth=2.2, solid_capstyle="round", label=label)
@@ -379,7 +381,7 @@ def _draw_curve(axis: Any, curve: Curve) -> None:
 
 
 def draw_arrows(axis: Any, arrows: Arrows) -> None:
-    """Vectors on the frame, y down, with a scale arrow below it."""
+    """Draw vectors in their frame, y down, with a scale arrow above it."""
     width, height = arrows.frame
     lengths = np.linalg.norm(arrows.vectors, axis=1)
     shown = arrows.longest or max(float(np.nanmax(lengths, initial=0.0)), 1e-9)
@@ -397,7 +399,7 @@ def draw_arrows(axis: Any, arrows: Arrows) -> None:
         quiver, 0.9, 1.05, reference, f"{tick_text(reference)} px", labelpos="W",
         coordinates="axes", color="black", fontproperties={"size": 8},
     )  # fmt: skip
-    # the tips are in the picture too, except those of gross errors
+    # the limits include the tips, except those of gross errors
     tips = np.nan_to_num(arrows.points + arrows.vectors / scale)
     low = np.clip(tips.min(axis=0, initial=0.0), -0.3 * width, 0.0) - 0.03 * width
     high = np.clip(
@@ -411,7 +413,7 @@ def draw_arrows(axis: Any, arrows: Arrows) -> None:
 
 
 def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
-    """A matrix of correlation coefficients (n, n) in colours with its numbers; NaN stays grey."""
+    """Draw correlation coefficients (n, n) as coloured cells with numbers; NaN is grey."""
     with drawing_style():
         n = len(names)
         short = [shortened(name, _MATRIX_LETTERS) for name in names]
@@ -419,7 +421,7 @@ def draw_matrix(matrix: Array, names: Sequence[str], title: str) -> Any:
         drawing = new_drawing(size, size + 0.3)
         axis = drawing.subplots()
         axis.set_facecolor("#dddddd")
-        # Not an image: cells of an SVG stay sharp and can be edited.
+        # not an image, since cells of an SVG stay sharp and can be edited
         axis.pcolormesh(
             np.ma.masked_invalid(matrix), cmap="RdBu_r", vmin=-1, vmax=1, edgecolors="white"
         )

@@ -1,11 +1,12 @@
-"""Files that appear whole or not at all, YAML that people write, one sentence where either fails.
+"""Files that are written whole or not at all, and YAML files written by hand.
 
-What is written goes into `.<name>.partial` next to the file first, and is removed whatever ends the
-writing: an error, an interrupt, a full disk, a folder that became read-only meanwhile. YAML is read
-with one clear error, no key twice, and no code run.
+A file is written as `.<name>.partial` beside its place first. The partial file is removed if an
+error, an interrupt, a full disk or a folder that became read-only ends the writing. A YAML file
+that cannot be read raises one error that names the place; no key may occur twice, and no code is
+run.
 
-Numbers with units in files written by hand are `3.04` or `{value: 3.04, sd: 0.01, unit: mm}`. A
-bare number has the unit the documentation states; a unit that is written out must be that one.
+A number with a unit is written by hand as `3.04` or `{value: 3.04, sd: 0.01, unit: mm}`. A bare
+number has the unit that the documentation states, which a written unit must equal.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from thermocald.errors import ConfigurationError, OutputError, ThermocaldError
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping
 
-# the disk's fault, not the user's: exit status 3
+# faults of the disk and not of the user: exit status 3
 _DISK = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.ENXIO}
 _ADVICE = {
     errno.EACCES: "; choose another folder, or mend its permissions",
@@ -56,11 +57,12 @@ _RECORDED = {
 _LONGEST_NAME = 60
 
 Output = Literal["file", "folder", "recording", "either"]
-"""What a command writes: "recording" a folder that is new, "either" a folder where one is there."""
+"""What a command writes: "recording" is a new folder, "either" a folder if it exists, else a file.
+"""
 
 
 def cannot_write(path: Path | str, cause: OSError) -> OutputError:
-    """The error for what could not be written: what, why, and what to do."""
+    """Return the error for a file that could not be written: which, why, and what to do."""
     why = cause.strerror or str(cause)
     advice = _ADVICE.get(cause.errno or 0, "")
     status = 3 if cause.errno in _DISK else 2
@@ -68,10 +70,10 @@ def cannot_write(path: Path | str, cause: OSError) -> OutputError:
 
 
 def check_output(path: Path, kind: Output = "file") -> None:
-    """Refuse an output before it is computed: OutputError where it could not be written.
+    """Raise OutputError, before an output is computed, if it could not be written.
 
-    What may be replaced is what `output_place` says; a new recording replaces nothing. The nearest
-    folder that exists must take a file; folders below it are made when it is written.
+    `output_place` decides which files may be replaced; a new recording replaces nothing. The
+    nearest existing folder must accept files; missing folders are made when the output is written.
     """
     place = Path(os.path.realpath(path))
     if kind == "either":
@@ -82,7 +84,7 @@ def check_output(path: Path, kind: Output = "file") -> None:
         within = place.parent if kind == "file" else place
         folder = next(one for one in (within, *within.parents) if one.exists())
         if folder.parts[:2] in _KERNEL:
-            raise OSError(errno.EROFS, "the kernel keeps this folder")
+            raise OSError(errno.EROFS, "the folder belongs to the kernel")
         if not folder.is_dir():
             raise OSError(
                 errno.ENOTDIR, "it is a file" if folder == place else f"{folder} is a file"
@@ -97,30 +99,28 @@ def check_output(path: Path, kind: Output = "file") -> None:
 
 
 def output_place(path: Path) -> tuple[Path, bool]:
-    """Where an output goes: (the file that links lead to, whether it is written straight).
+    """Return where an output is written: (the file that links lead to, whether directly).
 
-    Straight is what must stay what it is: a device, a pipe, a descriptor of this process. Raises
-    OSError for a folder, a disk, a file that may not be written, and for what was measured: `-o`
-    where `--store` was meant must not cost a store.
+    A device, a pipe or a descriptor of this process is written directly and not replaced. Raises
+    OSError for a folder, a disk, a file without write permission, and a file with measurements:
+    `-o` in place of `--store` must not cost a store.
     """
-    try:
-        found = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        found = None
     place = Path(os.path.realpath(path))
-    if found is None:
-        return place, False  # nothing there yet, or a link that leads nowhere yet
-    if stat.S_ISDIR(found.st_mode):
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return place, False  # no file yet, or a link that leads to none yet
+    if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if not os.access(path, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-    if stat.S_ISBLK(found.st_mode):
+    if stat.S_ISBLK(mode):
         raise FileExistsError(errno.EEXIST, "it is a disk")
-    if stat.S_ISSOCK(found.st_mode):
+    if stat.S_ISSOCK(mode):
         raise OSError(errno.ENXIO, "it is a socket")
     if not is_ordinary(path):
         return path, True
-    what = is_measured(place)
+    what = _store_file(place)
     if place.name in _RECORDED and (place.parent / "recording.yaml").exists():
         what = "part of a recording"
     if what:
@@ -129,32 +129,32 @@ def output_place(path: Path) -> tuple[Path, bool]:
 
 
 def mount_point(path: Path) -> Path:
-    """Return where the disk that a path lies on, or would lie on, is mounted."""
+    """Return the mount point of the disk that holds a path, or would hold it."""
     folder = Path(os.path.realpath(path))
     return next(one for one in (folder, *folder.parents) if os.path.ismount(one))
 
 
 def is_unmounted(path: Path, mount: Path) -> bool:
-    """Whether what was mounted when `mount_point` gave that answer is gone."""
+    """Return whether the disk that was mounted at `mount`, as `mount_point` returned, is gone."""
     now = mount_point(path)
     return now != mount and mount.is_relative_to(now)
 
 
 def is_ordinary(path: Path) -> bool:
-    """Whether a path leads to a file on a disk: no device, no pipe, nothing of the kernel's."""
+    """Return whether a path leads to a file on a disk, not to a device, a pipe or the kernel."""
     return path.is_file() and Path(os.path.realpath(path)).parts[:2] not in _KERNEL
 
 
 def is_database(path: Path) -> bool:
-    """Whether a file is one that SQLite wrote."""
+    """Return whether a file is an SQLite database."""
     return _beginning(path) == _DATABASE
 
 
-def is_measured(path: Path) -> str:
-    """Say what of the measurements a file is that nothing else may be written to, "" if none."""
+def _store_file(path: Path) -> str:
+    """Return what a file of a store is, "" for any other file."""
     if is_database(path):
         return "a store (an SQLite database)"
-    return "what was written last to a store" if _beginning(path)[:4] in _WAL_MAGIC else ""
+    return "the write-ahead log of a store" if _beginning(path)[:4] in _WAL_MAGIC else ""
 
 
 def _beginning(path: Path) -> bytes:
@@ -167,28 +167,28 @@ def _beginning(path: Path) -> bytes:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Yield the path to write to; afterwards it stands at `path`, or nothing is left of it.
+    """Yield a partial file to write to; move it to `path` afterwards, or remove it after an error.
 
-    Links are followed; a device or a pipe is written straight, a folder refused. The folders above
-    are made; a file that was there hands on its permissions. Raises OutputError for every OSError.
+    Links are followed; a device or a pipe is written directly; a folder is refused. Missing folders
+    are made; a replaced file's permissions are kept. Raises OutputError for every OSError.
     """
     make_folder(path.absolute().parent)
     partial = None
     try:
-        place, straight = output_place(path)
-        if straight:
+        place, directly = output_place(path)
+        if directly:
             yield path
             return
-        # a long name leaves no room for more
+        # shortened: a long name leaves no room for the suffix
         partial = place.with_name(f".{place.name[:_LONGEST_NAME]}.partial")
-        _remove(partial)  # never through a link that somebody left under this name
+        _remove(partial)  # so that nothing is written through a link of this name
         yield partial
         if place.exists():
             with contextlib.suppress(OSError):
                 partial.chmod(stat.S_IMODE(place.stat().st_mode))
         os.replace(partial, place)
     except OSError as cause:
-        if isinstance(cause, ThermocaldError):  # a device's
+        if isinstance(cause, ThermocaldError):  # a device's error is an OSError too
             raise
         raise cannot_write(path, cause) from cause
     finally:
@@ -210,28 +210,28 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_parts(path: Path, parts: Iterable[str]) -> None:
-    """Write a text file that comes in parts, whole or not at all; raises OutputError."""
+    """Write a text file from its parts, whole or not at all; raises OutputError."""
     with new_file(path) as partial, partial.open("w", encoding="utf-8") as file:
         file.writelines(parts)
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it where there is none; raises OutputError."""
+    """Make a folder and its parents unless it exists; raises OutputError."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as cause:
         raise cannot_write(path, cause) from cause
 
 
-_LOOKS, _PAUSE_S = 10, 0.01
+_ATTEMPTS, _PAUSE_S = 10, 0.01
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file that another process writes; empty where there is none.
+    """Return the mapping in a JSON file that another process writes; empty if there is none.
 
-    It may be seen when `overwrite_json` has written half of it: what two looks agree on is whole.
+    `overwrite_json` may have written half of it: it is whole if read twice alike.
     """
-    for _ in range(_LOOKS):
+    for _ in range(_ATTEMPTS):
         try:
             data = path.read_bytes()
             document = json.loads(data)
@@ -246,9 +246,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def overwrite_json(path: Path, data: bytes) -> bool:
-    """Write a document over the one at a path, which takes no room on the disk; whether it fits.
+    """Write a document over a file in place, which takes no disk space; return whether it fits.
 
-    It is no JSON until all of it is there.
+    The file is no valid JSON until all of it is written.
     """
     try:
         with path.open("r+b", buffering=0) as file:
@@ -266,13 +266,14 @@ _MOST_VALUES = 100_000
 _MOST_BYTES = 20_000_000
 _DEEPEST = 60
 
-# What PyYAML's constructors let through on hostile scalars (`!!bool x`, `!!int ""`, 2020-99-99).
+# raised by PyYAML's constructors for hostile scalars (`!!bool x`, `!!int ""`, 2020-99-99)
 _CONSTRUCTION = (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError)
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """The safe loader, which also refuses a key that is duplicated, and numbers that begin with 0,
-    which YAML 1.1 takes as octal: `010` is 8.
+    """The safe loader, which also refuses duplicate keys and numbers that begin with 0.
+
+    YAML 1.1 reads such numbers as octal: `010` is 8.
     """
 
     def construct_whole(self, node: yaml.ScalarNode) -> int:
@@ -300,10 +301,10 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_whole)
 
 
 def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> dict[str, Any]:
-    """The mapping in a YAML file.
+    """Return the mapping in a YAML file.
 
-    Raises `error`, naming the file and where there is one the line, if the file is missing, is no
-    YAML, holds a key twice, or holds something else than a mapping with text keys.
+    Raises `error`, which names the file and if possible the line, if the file is missing, is no
+    YAML, holds a key twice, or holds something other than a mapping with text keys.
     """
     try:
         if path.exists() and not path.is_file():
@@ -331,7 +332,7 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
     if document is None:
         raise error(f"{path}: is empty")
     if not isinstance(document, dict):
-        raise error(f"{path}: must hold `key: value` lines, and holds something else")
+        raise error(f"{path}: must hold `key: value` lines, but holds something else")
     for key in document:
         if not isinstance(key, str):
             raise error(f"{path}: key {key!r} must be text")
@@ -341,7 +342,7 @@ def read_yaml(path: Path, error: type[ThermocaldError] = ConfigurationError) -> 
 
 
 def _is_too_deep(text: str) -> bool:
-    """Whether lists and mappings are nested so deep that building them would exhaust the stack."""
+    """Return whether lists and mappings are nested so deeply that the stack might not suffice."""
     depth = 0
     for event in yaml.parse(text, Loader=_Loader):
         if isinstance(event, yaml.CollectionStartEvent):
@@ -354,7 +355,7 @@ def _is_too_deep(text: str) -> bool:
 
 
 def _is_too_large(document: dict[str, Any]) -> bool:
-    """A few aliases (`*a`) can stand for billions of values, or for themselves."""
+    """Return whether there are too many values: a few aliases (`*a`) can stand for billions."""
     left, waiting = _MOST_VALUES, [document]
     while waiting and left > 0:
         value: Any = waiting.pop()
@@ -365,7 +366,7 @@ def _is_too_large(document: dict[str, Any]) -> bool:
 
 
 class _Dumper(yaml.SafeDumper):
-    """The safe dumper; what no file can hold (half of a pair, from a file's name) as its code."""
+    """The safe dumper, which escapes lone surrogates (from file names): no file can hold them."""
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
         return self.represent_str(text.encode(errors="backslashreplace").decode())
@@ -375,7 +376,7 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 
 
 def dump_yaml(document: dict[str, Any]) -> str:
-    """YAML text that keeps the order of the keys and writes short mappings on one line."""
+    """Return YAML text with the keys in their order and short mappings on one line."""
     text: str = yaml.dump(
         document,
         Dumper=_Dumper,
@@ -388,7 +389,7 @@ def dump_yaml(document: dict[str, Any]) -> str:
 
 
 def write_quantity(value: float, unit: str, sd: float | None = None) -> dict[str, Any]:
-    """Return the mapping that a file holds for a number."""
+    """Return the mapping that a file holds for a number with a unit."""
     document: dict[str, Any] = {"value": float(value)}
     if sd is not None and math.isfinite(sd):
         document["sd"] = float(sd)
@@ -396,7 +397,7 @@ def write_quantity(value: float, unit: str, sd: float | None = None) -> dict[str
 
 
 class QuantityReader:
-    """One mapping of a file; errors name the file and the dotted key."""
+    """A reader of one mapping of a file, whose errors name the file and the dotted key."""
 
     error: ClassVar[type[ThermocaldError]] = ConfigurationError
 
@@ -409,17 +410,17 @@ class QuantityReader:
         self.mapping: Mapping[str, Any] = mapping
 
     def fail(self, key: str, message: str) -> ThermocaldError:
-        """Make an error at a key; the caller raises it."""
+        """Return an error about a key, for the caller to raise."""
         return self.error(f"{self._path}, key {self._prefix}{key}: {message}")
 
     def require_format(self, wanted: str, said: str = "this program reads") -> None:
         """Refuse a file of another format."""
-        found = self.text("format")
-        if found != wanted:
-            raise self.fail("format", f"is {found[:60]!r}; {said} {wanted!r}")
+        given = self.text("format")
+        if given != wanted:
+            raise self.fail("format", f"is {given[:60]!r}; {said} {wanted!r}")
 
     def only(self, known: Iterable[str]) -> None:
-        """Refuse keys that nobody reads."""
+        """Refuse unknown keys."""
         names = list(known)
         for key in self.mapping:
             if key not in names:
@@ -460,9 +461,9 @@ class QuantityReader:
     def quantity(
         self, key: str, unit: str, default: float | None = None
     ) -> tuple[float, float | None]:
-        """Read a number in `unit` and its standard deviation, None where none is known.
+        """Read a number in `unit` and its standard deviation, None if none is given.
 
-        An error if it is missing, no number, or of another unit.
+        Raises `error` if it is missing, is no number, or has another unit.
         """
         raw = self.mapping.get(key, default)
         if raw is None:
@@ -471,9 +472,9 @@ class QuantityReader:
         if isinstance(raw, dict):
             inner = type(self)(self._path, raw, f"{self._prefix}{key}.")
             inner.only(("value", "sd", "unit"))
-            found = inner.text("unit", unit)
-            if found != unit:
-                raise inner.fail("unit", f"is {found!r}; it must be {unit!r}: convert the value")
+            written = inner.text("unit", unit)
+            if written != unit:
+                raise inner.fail("unit", f"is {written!r}; it must be {unit!r}: convert the value")
             if "value" not in raw:
                 raise inner.fail("value", "is missing")
             if raw.get("sd") is not None:
@@ -486,7 +487,7 @@ class QuantityReader:
     def finite(self, key: str, raw: Any) -> float:
         """Return a value at a key as a finite number."""
         try:
-            # PyYAML reads 1e-3 as text, since YAML 1.1 wants a point
+            # PyYAML reads 1e-3 as text, since YAML 1.1 demands a decimal point
             value = float(raw) if isinstance(raw, str | int | float) else math.nan
         except (ValueError, OverflowError):
             value = math.nan
@@ -495,20 +496,20 @@ class QuantityReader:
         return value
 
     def whole(self, key: str, unit: str, high: float = math.inf) -> int:
-        """Read a whole number from 1 on."""
+        """Read a whole number, at least 1."""
         value = self.number(key, unit, low=1, high=high)
         if value != int(value):
             raise self.fail(key, f"is {value:g} {unit}; it must be a whole number")
         return int(value)
 
     def inner(self, key: str) -> Self:
-        """Enter the mapping at a key."""
+        """Return the reader of the mapping at a key."""
         if self.mapping.get(key) is None:
             raise self.fail(key, "is missing")
         return type(self)(self._path, self.mapping[key], f"{self._prefix}{key}.")
 
     def items(self, key: str) -> Iterator[Self]:
-        """Yield the mappings of a list at a key; none where the key is absent."""
+        """Yield the readers of a list's mappings at a key; none if the key is absent."""
         values = self.mapping.get(key) or []
         if not isinstance(values, list):
             raise self.fail(key, "must be a list (lines that begin with `-`)")

@@ -1,17 +1,17 @@
-"""The hardware abstraction: the contracts of cameras, thermometers, outputs and clocks.
+"""The hardware abstraction layer: the interfaces of cameras, thermometers, outputs and clocks.
 
-The daemon, the demo, a replay and a test differ only in which of these they are given. Drivers are
-found by entry point and in no other way; the groups are `thermocald.cameras`,
+The daemon, the demo, a replay and a test differ only in the devices and the clock that they use.
+Drivers are found only by entry point; the groups are `thermocald.cameras`,
 `thermocald.thermometers` and `thermocald.outputs`. An entry point names a class whose `Options` has
 one field per configuration key. A driver module imports no device library at its top: the library
 is imported in `open()`.
 
-Nothing is inferred from a driver's name or attributes: what the program needs to know of a driver
-is a member of its class here, with a default.
+Nothing is inferred from a driver's name or attributes: all that the program needs to know of a
+driver is a member of the classes here, with a default.
 
-Errors are those of `thermocald.errors`: a `TransientDeviceError` is retried with back-off (the
-caller closes and re-opens the device), a `PermanentDeviceError` is reported and not retried, a
-`DeviceFinished` ends the device without being a fault.
+Errors are those of `thermocald.errors`: after a `TransientDeviceError` the caller closes and opens
+the device again, with back-off; a `PermanentDeviceError` is reported and not retried; after a
+`DeviceFinished`, which is no fault, the device is not used any more.
 """
 
 from __future__ import annotations
@@ -47,24 +47,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Kind = Literal["camera", "thermometer", "output"]
-_ATTEMPTS = 10  # at most, until clocks were read within this:
+_ATTEMPTS = 10  # at most, until the clocks were read within _CLOSE_S
 _CLOSE_S = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One image as a camera delivered it.
+    """A frame as a camera delivered it.
 
-    image: (H, W) uint8 or uint16 grey values, read-only; None where `encoded` holds a JPEG, or
-    where the frame was measured before and `observations` holds its image points, as
+    image: (H, W) uint8 or uint16 grey values, read-only; None if `encoded` holds a JPEG, or if the
+    frame was measured before and `observations` holds its image points, as
     `thermocald.photogrammetry.field.testfield.observations_from_lists` reads them.
-    monotonic, utc: s, the middle of the exposure as well as the device reports it, on the clock's
+    monotonic, utc: middle of the exposure, s, as exactly as the device reports it, on the clock's
     two scales.
     exposure: s, or None.
     sequence: the device's own frame number, or None.
-    settings: what moves the image, as read back with this frame, by name: focus, exposure, gain,
-    white balance in the device's own units; 1.0 and 0.0 for automatic modes. Stored with the epoch
-    as the columns `camera_<name>`.
+    settings: {name: value} of the settings that can move the image, read back with this frame:
+    focus, exposure, gain, white balance in the device's own units; 1.0 and 0.0 for automatic modes
+    on and off. They are stored with the epoch in the columns `camera_<name>`.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16] | None
@@ -85,13 +85,12 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a thermometer reported, and when.
+    """The values of a thermometer's channels at one time.
 
     values: {channel: °C}; a channel that could not be read is absent, never repeated or filled in,
-    and stands in `missing` with the reason;
-    one that is called like a column of the program, or holds a mark that separates columns
-    (`names`), is refused as WrongDevice.
-    monotonic, utc: s, the time of the conversion as well as the device reports it.
+    and is in `missing` with the reason. Raises WrongDevice if a channel has the name of one of the
+    program's columns or holds a character that separates columns (`names`).
+    monotonic, utc: time of the conversion, s, as exactly as the device reports it.
     """
 
     values: Mapping[str, float]
@@ -114,7 +113,7 @@ class Found:
 
     options: its stanza without name and driver.
     about: one line for the user.
-    certain: False if nobody can know what is there (a serial port, an I2C bus).
+    certain: False if the port cannot tell what is attached (a serial port, an I2C bus).
     """
 
     options: Mapping[str, Any]
@@ -122,30 +121,30 @@ class Found:
     certain: bool = True
 
     def __post_init__(self) -> None:
-        # names come from devices: no line break may leave the comment, no escape code be printed
+        # a device's name must neither end the comment by a line break nor print an escape code
         shown = "".join(c if c.isprintable() else "?" for c in self.about)
         object.__setattr__(self, "about", shown)
 
 
 @runtime_checkable
 class Clock(Protocol):
-    """Two scales and a way to wait; intervals use `monotonic`, files use `utc`."""
+    """A clock with two scales; intervals use `monotonic`, files use `utc`."""
 
     def monotonic(self) -> float:
-        """Seconds that never step."""
+        """Return seconds that never step."""
 
     def utc(self) -> float:
-        """Seconds since 1970-01-01 UTC; may step."""
+        """Return seconds since 1970-01-01 UTC; they may step."""
 
     def sleep_until(self, monotonic: float, wake: threading.Event | None = None) -> bool:
-        """Wait until a time of the monotonic scale; False if `wake` was set first."""
+        """Wait until a time of the monotonic scale; return False if `wake` was set before."""
 
 
 def read_together(first: Callable[[], float], *others: Callable[[], float]) -> tuple[float, ...]:
-    """Read some clocks (s) as of one instant.
+    """Read several clocks (s) at one instant.
 
-    The closest of ten attempts: a thread that is kept waiting between two clocks would be off by
-    that pause (76 ms on a busy machine).
+    The quickest of ten attempts counts: a pause of the thread between two clocks would be an error
+    of its length (76 ms on a busy machine).
     """
     best: tuple[float, tuple[float, ...]] = (float("inf"), ())
     for _ in range(_ATTEMPTS):
@@ -159,13 +158,13 @@ def read_together(first: Callable[[], float], *others: Callable[[], float]) -> t
 
 
 class DriverOptions(Section):
-    """The keys of a driver's stanza: types, bounds, defaults; nothing is converted."""
+    """The keys of a driver's stanza, with types, bounds and defaults; no type is converted."""
 
     model_config = ConfigDict(strict=True)
 
     @classmethod
     def read(cls, stanza: Mapping[str, Any], where: str = "") -> Self:
-        """Validate a stanza; ConfigurationError names the place, the key and what is wrong."""
+        """Validate a stanza; raises ConfigurationError, which names the place, key and fault."""
         try:
             return cls.model_validate(dict(stanza))
         except ValidationError as error:
@@ -173,19 +172,19 @@ class DriverOptions(Section):
 
 
 class HeatingStep(DriverOptions):
-    """A step of a heating programme: hold a temperature (°C; None: do not heat) for a time (s)."""
+    """A step of a heating programme: a time (s) and the temperature to hold (°C; None: no heat)."""
 
     seconds: Annotated[float, Field(ge=1.0, le=1e6)]
     hold_c: Annotated[float, Field(ge=-40.0, le=150.0)] | None
 
 
 class Device:
-    """What every driver has: its options, `open`, `close`, and use as a context manager.
+    """The base class of drivers: options, `open`, `close`, and use as a context manager.
 
     The constructor raises a ConfigurationError and does not touch hardware.
     `open` raises a DeviceError; `close` never raises and may be called twice.
-    where: the device in messages; handle: what `open` got hold of, None while it is closed; seen:
-    whether it was open before, for what is missing then has gone.
+    where: the device's name in messages; handle: the opened resource, None while the device is
+    closed; seen: whether it was open before, since a device that is missing then has disappeared.
     """
 
     Options: ClassVar[type[DriverOptions]] = DriverOptions
@@ -195,7 +194,7 @@ class Device:
     seen = False
 
     device_classes: ClassVar[tuple[str, ...]] = ()
-    """The nodes in /dev that it opens, as systemd's DeviceAllow= names them: `char-i2c`."""
+    """The device nodes that it opens, as systemd's DeviceAllow= names them: `char-i2c`."""
 
     def __init__(self, *, clock: Clock, **options: Any) -> None:
         self.clock = clock
@@ -203,11 +202,11 @@ class Device:
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> Sequence[Found]:  # noqa: ARG003
-        """List the attached devices of this driver; a DeviceError if it cannot look."""
+        """List the attached devices of this driver; raises a DeviceError if it cannot look."""
         return []
 
     def open(self) -> None:
-        """Claim the device; drivers that need a library import it here."""
+        """Claim the device; a driver that needs a library imports it here."""
 
     def close(self) -> None:
         """Release the device."""
@@ -216,13 +215,13 @@ class Device:
             handle.close()
 
     def opened(self) -> Any:
-        """Return the handle; DeviceGone while the device is closed."""
+        """Return the handle; raises DeviceGone while the device is closed."""
         if self.handle is None:
             raise DeviceGone(f"{self.where}: not open")
         return self.handle
 
     def identity(self) -> Mapping[str, str]:
-        """Name, serial number, versions: what distinguishes this device from others."""
+        """Return name, serial number and versions, which distinguish this device from others."""
         return {}
 
     def warnings(self) -> Sequence[str]:
@@ -238,44 +237,50 @@ class Device:
 
 
 class Camera(Device):
-    """`capture()` returns a fresh frame, exposed after the call."""
+    """The base class of cameras."""
 
     def capture(self) -> Frame:
-        """Take a frame; raises a DeviceError, never returns an old or a broken one."""
+        """Take and return a frame that is exposed after the call.
+
+        Raises a DeviceError rather than return an old or broken frame.
+        """
         raise NotImplementedError
 
     def frame_size(self) -> tuple[int, int] | None:
-        """Return (width, height) in px of the frames, where the configuration states it."""
+        """Return the frames' (width, height), px, if the configuration states it."""
         return None
 
     def known_scene(self) -> tuple[Any, Any] | None:
-        """Return the sensor and the test field it looks at, where a simulated camera knows both.
+        """Return a simulated camera's sensor and test field, None for any other camera.
 
-        It then needs no test field in the stanza.
+        The stanza of such a camera needs no test field.
         """
         return None
 
 
 class Thermometer(Device):
-    """`read()` returns what the device reports now."""
+    """The base class of thermometers."""
 
     def read(self) -> Reading:
-        """Read all channels; raises a DeviceError if none could be read."""
+        """Read all channels as they are now; raises a DeviceError if none could be read."""
         raise NotImplementedError
 
     def named_channels(self) -> Sequence[str]:
-        """The channels as the options name them, before it is opened; () if the device does."""
+        """Return the channels named by the options; () if the device names them when opened."""
         return ()
 
 
 class Output(Device):
-    """`emit()` passes a result on; it must not block longer than its option `timeout_s`."""
+    """The base class of outputs."""
 
     heats: ClassVar[bool] = False
     """Whether it heats the camera by a `programme`, which a session may replace."""
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        """Pass on one epoch's result: the columns of the CSV export, and `device`, `state`."""
+        """Pass on an epoch's result: the columns of the CSV export, and `device`, `state`.
+
+        It must not block longer than the option `timeout_s`.
+        """
         raise NotImplementedError
 
 
@@ -300,7 +305,7 @@ class SystemClock:
 class VirtualClock:
     """A clock that jumps to the end of each wait, so that 25 minutes take no time.
 
-    utc: UTC at monotonic 0; `step_utc` imitates an NTP step.
+    utc: UTC at the start, when the other scale is at `monotonic`; `step_utc` imitates an NTP step.
     """
 
     def __init__(self, utc: float = 1_600_000_000.0, monotonic: float = 0.0) -> None:
@@ -315,7 +320,7 @@ class VirtualClock:
         return self._now + self._offset
 
     def advance(self, seconds: float) -> None:
-        """Let time pass, as a slow device does."""
+        """Advance both scales, as while a slow device works."""
         with self._lock:
             self._now += seconds
 
@@ -333,7 +338,7 @@ class VirtualClock:
 
 @cache
 def entry_points(group: str) -> metadata.EntryPoints:
-    """Return the drivers of a group; once, since every installed package is looked through."""
+    """Return the entry points of a group, cached, since every installed package is searched."""
     return metadata.entry_points(group=group)
 
 
@@ -343,7 +348,11 @@ def driver_names(kind: Kind) -> list[str]:
 
 
 def load_driver(kind: Kind, name: str) -> type[Any]:
-    """Return the class behind one entry point; ConfigurationError names those that exist."""
+    """Return a driver's class.
+
+    Raises ConfigurationError, which lists the installed drivers, DriverMissing if it cannot be
+    imported.
+    """
     points = {point.name: point for point in entry_points(group=f"thermocald.{kind}s")}
     if name not in points:
         raise ConfigurationError(
@@ -358,7 +367,7 @@ def load_driver(kind: Kind, name: str) -> type[Any]:
 
 
 def option_names(kind: Kind, name: str) -> list[str]:
-    """Return the options of a driver; errors as `load_driver`."""
+    """Return the names of a driver's options; raises the errors of `load_driver`."""
     return keys(load_driver(kind, name).Options)
 
 
@@ -372,7 +381,7 @@ def open_device(kind: Kind, name: str, options: Mapping[str, Any], clock: Clock)
     hide_secrets(options)
     try:
         device = driver(clock=clock, **options)
-    except (ConfigurationError, TypeError) as error:  # TypeError: a key that is no name
+    except (ConfigurationError, TypeError) as error:  # TypeError: a key that is no text
         raise ConfigurationError(f"{where}: {error}") from error
     if kind == "thermometer":
         for channel in device.named_channels():

@@ -1,10 +1,10 @@
-"""Names and paths that come from the world: checked where they enter the program.
+"""Names and paths from outside the program, checked where they enter it.
 
-Channels come from devices, users and files, and become columns beside ours. One that is called like
-a column of ours would take its place in some table, and a mark that separates columns would shift
-them; so both are refused.
-A recording or a store may have been made by anybody. What it names must stay within its own folder:
-no absolute path, no `..`, no link that leads out; a name of a camera or series that becomes part of
+Channels are named by devices, users and files and become columns of tables. A channel with the name
+of one of this program's columns would replace it, and a character that separates columns would
+shift them; both are refused.
+A recording or a store may come from anybody. The paths in it must stay within its own folder: no
+absolute path, no `..`, no link that leads out. The name of a camera or series that becomes part of
 a file's name holds no separator and no control character.
 """
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from thermocald.errors import ThermocaldError
 
 WITH_VALUES = ("ok", "predicted", "resected", "last_pose")
-"""Statuses of epochs in which nothing is wrong: calibrated, or a thermal model's camera at work."""
+"""Statuses of epochs without a fault: calibrated, or predicted and posed with a thermal model."""
 
 _PARAMETERS = (
     "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2", "omega", "phi", "kappa", "X0", "Y0",
@@ -42,14 +42,14 @@ OUR_COLUMNS = frozenset(
         "saturation", "epochs", "per_point", "channels", "target",
     )
 )  # fmt: skip
-"""What tables, outputs and pages of ours call their columns."""
+"""The columns of this program's tables, outputs and pages."""
 _OUR_PREFIXES = ("sd_", "online_")
 _SEPARATORS = ",;=\"'\\"
 _LONGEST = 64
 
 
 def channel_fault(name: object) -> str:
-    """Say why a channel cannot have a name; empty where it can."""
+    """Return why a channel cannot have a name; empty if it can."""
     if not isinstance(name, str) or not name or name != name.strip() or len(name) > _LONGEST:
         return f"must be text of 1 to {_LONGEST} characters, without spaces around it"
     if not name.isprintable():
@@ -62,7 +62,7 @@ def channel_fault(name: object) -> str:
 
 
 def require_channels(names: Iterable[object], where: str, error: type[Exception]) -> None:
-    """Raise `error`, its message beginning with `where`, for names that channels cannot have."""
+    """Raise `error` for a name that a channel cannot have; its message begins with `where`."""
     known: set[object] = set()
     for name in names:
         fault = channel_fault(name)
@@ -79,7 +79,7 @@ _LONGEST_NAME = 120
 
 
 def relative_path(text: str, what: str, error: type[ThermocaldError]) -> Path:
-    """A path that stays within the folder it is relative to; `what` begins the error's message."""
+    """Return a relative path that stays in its folder; the error's message begins with `what`."""
     path = PurePosixPath(text)
     if path.is_absolute() or ".." in path.parts or "\0" in text or len(text) > _LONGEST_PATH:
         raise error(
@@ -89,7 +89,7 @@ def relative_path(text: str, what: str, error: type[ThermocaldError]) -> Path:
 
 
 def file_name(text: str, what: str, error: type[ThermocaldError]) -> str:
-    """A name of a camera, series or thermometer that may become part of a file's name."""
+    """Return a camera's, series' or thermometer's name if it can be part of a file's name."""
     if (
         not text.strip()
         or text.startswith(".")
@@ -99,21 +99,21 @@ def file_name(text: str, what: str, error: type[ThermocaldError]) -> str:
     ):
         raise error(
             f"{what}: {text[:80]!r} cannot be part of a file's name: it must be 1 to "
-            f"{_LONGEST_NAME} printable characters without `/`, and not begin with a point"
+            f"{_LONGEST_NAME} printable characters without `/`, and not begin with a full stop"
         )
     return text
 
 
 class FileFolder:
-    """A folder whose files are looked up by relative paths that must not lead out of it."""
+    """A folder whose files are found by relative paths that must not lead out of it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._root = os.path.realpath(folder)
-        self._inside: dict[str, bool] = {}  # sub-folders looked at: a year has few of them
+        self._inside: dict[str, bool] = {}  # by sub-folder, of which a year of frames has few
 
     def find(self, relative: str | Path) -> Path | None:
-        """The path of a regular file in the folder; None where it is absent or leads out."""
+        """Return the path of a regular file in the folder, None if it is absent or leads out."""
         text = os.fspath(relative)
         if os.path.isabs(text) or ".." in PurePosixPath(text).parts or "\0" in text:
             return None

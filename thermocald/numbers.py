@@ -1,4 +1,4 @@
-"""Numbers as people write them: with their standard deviation, its two digits, and a unit."""
+"""Numbers in texts: with a standard deviation of two digits, and a unit."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _MINUS = "−"
 
 
 def parameter_label(name: str) -> str:
-    """Return the name of a parameter or a thermometer in figures and tables."""
+    """Return a parameter's or a thermometer's name for figures and tables."""
     return _SYMBOLS.get(name) or column_label(name).replace("_", " ")
 
 
 def column_label(name: str) -> str:
-    """Return the label that its owner gave a logger's column (LBL), else its quantity.
+    """Return the label (LBL) that a logger's column was given, else its quantity.
 
-    Serial numbers are no name: `Temp, °C (LGR S/N: 204, SEN S/N: 204, LBL: housing)` is `housing`.
+    Serial numbers are left out: `Temp, °C (LGR S/N: 204, SEN S/N: 204, LBL: housing)` is `housing`.
     """
     if label := re.search(r"(?<![^\W_])LBL(?![^\W_])[\W_]*(.*\w)", name):
         return label[1]
@@ -44,7 +44,7 @@ def column_label(name: str) -> str:
 
 
 def shortened(text: str, most: int) -> str:
-    """Shorten a text to so many letters: its middle gives way, since units stand at the end."""
+    """Shorten a text to at most `most` letters, in its middle, since the unit is at the end."""
     if len(text) <= most:
         return text
     tail = (most - 1) // 2
@@ -52,20 +52,18 @@ def shortened(text: str, most: int) -> str:
 
 
 def superscript(exponent: int) -> str:
-    """Return an exponent as raised digits."""
+    """Return an exponent in superscript digits."""
     return str(exponent).translate(_SUPERSCRIPT)
 
 
 def typeset_powers(text: str) -> str:
-    """Return a text in which what a computer prints, (-1.2 ± 0.1)e-06 mm-1, reads as in a book:
-    (−1.2 ± 0.1)·10⁻⁶ mm⁻¹.
-    """
+    """Return a text with powers typeset: (-1.2 ± 0.1)e-06 mm-1 as (−1.2 ± 0.1)·10⁻⁶ mm⁻¹."""
     text = _COMPUTED.sub(lambda m: f"{m[1].replace('-', _MINUS)}·10{superscript(int(m[2]))}", text)
     return _UNIT_POWER.sub(lambda m: f"mm{m[1].translate(_SUPERSCRIPT)}", text)
 
 
 def with_sd(value: float, sd: float, unit: str = "") -> str:
-    """Write `6.959 ± 0.028 mm`, with a power of ten outside 0.001 to 10000; nothing as a dash."""
+    """Write `6.959 ± 0.028 mm`, with a power of ten outside 0.001 to 10000; NaN as a dash."""
     if not math.isfinite(value):
         return "–"
     if not math.isfinite(sd) or sd <= 0:
@@ -82,13 +80,13 @@ def with_sd(value: float, sd: float, unit: str = "") -> str:
 
 
 def signed(value: float, sd: float, unit: str = "") -> str:
-    """Write the same with its sign: `+0.350 ± 0.002 px/K`."""
+    """Write a number and its standard deviation with a sign: `+0.350 ± 0.002 px/K`."""
     text = with_sd(value, sd, unit)
     return f"+{text}" if value > 0 and not text.startswith("(") else text
 
 
 def rounded(value: float, sd: float, unit: str = "") -> str:
-    """Write a number to the second digit of its standard deviation, which is not shown."""
+    """Write a number, without its standard deviation, to the latter's second digit."""
     if not math.isfinite(value) or not math.isfinite(sd) or sd <= 0:
         return plain(value, unit, 6)
     if max(abs(value), sd) < 1e-3:
@@ -101,7 +99,7 @@ def rounded(value: float, sd: float, unit: str = "") -> str:
 
 
 def plain(value: float, unit: str = "", digits: int = 4) -> str:
-    """Write a number to some significant digits, with a power of ten where it needs one."""
+    """Write a number to `digits` significant digits, with a power of ten if it needs one."""
     if not math.isfinite(value):
         return "∞" if math.isinf(value) else "–"
     if value == 0:
@@ -115,7 +113,7 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write a duration as people say it: `25 minutes`, `1 minute`, `3.5 hours`, `12 days`."""
+    """Write a duration in words: `25 minutes`, `1 minute`, `3.5 hours`, `12 days`."""
     for unit, length in (("day", 86_400.0), ("hour", 3600.0), ("minute", 60.0)):
         if seconds >= 2 * length or (unit == "minute" and seconds >= 59.5):
             count = seconds / length
@@ -126,7 +124,7 @@ def duration(seconds: float) -> str:
 
 
 def percent(share: float, decimals: int = 0) -> str:
-    """Write a share as per cent; never 100 or 0 for what is not all or none."""
+    """Write a share as a percentage; 100 and 0 only for exactly all and none."""
     if not math.isfinite(share):
         return "–"
     shown = f"{100 * share:.{decimals}f}"
@@ -139,20 +137,20 @@ def percent(share: float, decimals: int = 0) -> str:
 
 
 def p_text(p: float) -> str:
-    """Write a p-value: `≤ 0.001`, or two digits."""
+    """Write a p-value with two digits, or as `≤ 0.001`."""
     if not math.isfinite(p):
         return "–"
     return "≤ 0.001" if p <= 0.001 else f"{p:.2g}"
 
 
 def coefficient(r: float) -> str:
-    """Write a correlation: two digits, three close to ±1, and 1 only for what is 1."""
+    """Write a correlation with two digits, near ±1 with three; ±1 only for exactly ±1."""
     if not math.isfinite(r):
         return "–"
     if abs(r) == 1:
         shown = f"{r:.0f}"
     elif abs(r) >= 0.995:
-        # Cut off, not rounded.
+        # truncated, since rounding could give 1
         shown = f"{math.copysign(math.floor(abs(r) * 1000) / 1000, r):.3f}"
     else:
         shown = f"{r:.2f}".replace("-0.00", "0.00")
@@ -160,9 +158,9 @@ def coefficient(r: float) -> str:
 
 
 def short_duration(seconds: float | None) -> str:
-    """Write a duration in the largest unit of which there are two: `90 s`, `2 min`, `3 h`, `12 d`.
+    """Write a duration in the largest unit that fits twice: `90 s`, `2 min`, `3 h`, `12 d`.
 
-    seconds: may be negative; `–` where it is not known or not finite.
+    seconds: may be negative; None or not finite is written `–`.
     """
     if seconds is None or not math.isfinite(seconds):
         return "–"

@@ -1,7 +1,7 @@
-"""Independent pieces of work on several processes, with the same results as on one.
+"""Independent tasks in several processes, with the same results as in one.
 
-The results come in the order of the items and are put together by who asked for them, so that sums
-are added in one order whatever the number of processes: every bit is the same.
+The results come in the order of the items and are combined by the caller. Sums are therefore formed
+in the same order for any number of processes, and every bit is the same.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     Result = TypeVar("Result")
 
 
-_WAITING = 2  # items a process that are handed out ahead: what they hold is in memory
+_WAITING = 2  # items per process handed out ahead; they are held in memory
 
-_current: tuple[Any, Any] | None = None  # of a process of the pool: its function and its state
+_current: tuple[Any, Any] | None = None  # in a process of the pool: its function and state
 
 
 def in_order(
@@ -33,12 +33,12 @@ def in_order(
 ) -> Iterator[Result]:
     """Yield the results of `work(state, item)` for all items, in their order.
 
-    work: a function of a module; state: what it needs besides the item, handed to each process
-    once; items: taken as results are asked for, a few ahead; jobs: how many processes, 1: this one.
-    An exception of `work` is raised here. Raises DataError where a process ends by itself.
+    work: a module's function; state: further input, passed to each process once; items: taken a few
+    ahead of the results; jobs: number of processes, 1: this one. An exception of `work` is raised
+    here. Raises DataError if a process ends unexpectedly.
     """
     if jobs <= 1:
-        # as a process gets it: in which order an array lies in memory decides how sums are rounded
+        # pickled as for a process: an array's order in memory decides how sums are rounded
         state = pickle.loads(pickle.dumps(state))
         for item in items:
             yield work(state, item)
@@ -47,15 +47,15 @@ def in_order(
         waiting: deque[Future[Any]] = deque()
         try:
             for item in items:
-                waiting.append(pool.submit(_done, item))
+                waiting.append(pool.submit(_work_on, item))
                 if len(waiting) >= _WAITING * jobs:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
         except BrokenProcessPool as cause:
             raise DataError(
-                f"one of {jobs} processes ended by itself, for want of memory perhaps: "
-                "take fewer --jobs"
+                f"one of {jobs} processes ended unexpectedly, perhaps for lack of memory; give "
+                "fewer --jobs"
             ) from cause
         finally:
             for future in waiting:
@@ -65,9 +65,9 @@ def in_order(
 def processes(
     jobs: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
 ) -> ProcessPoolExecutor:
-    """Make a pool of fresh processes, each of which begins with `begin(*given)`.
+    """Return a pool of new processes, each of which begins with `begin(*given)`.
 
-    Not forked: the threads of OpenCV and of linear algebra do not survive that.
+    They are not forked: the threads of OpenCV and of linear algebra do not survive a fork.
     """
     return ProcessPoolExecutor(jobs, get_context("spawn"), begin, given)
 
@@ -77,7 +77,7 @@ def _begin(work: Any, state: Any) -> None:
     _current = work, state
 
 
-def _done(item: Any) -> Any:
-    assert _current is not None  # set as the process began
+def _work_on(item: Any) -> Any:
+    assert _current is not None  # set when the process began
     work, state = _current
     return work(state, item)

@@ -1,8 +1,8 @@
-"""The page of every report: the answer first, then sections that fold; one file, without network.
+"""The page of every report: the answer first, then folding sections; one file that works offline.
 
-A report is one or more chapters. Each opens with its answer: a sentence with the number, its
-standard deviation and the condition, the one plot that proves it, what to do next, and what it
-does not cover. The page can be read without its script, which copies tables and reads plots off.
+A report has one or more chapters. Each opens with its answer: a sentence with the number, its
+standard deviation and the condition; the plot that proves it; what to do next; and what it does not
+cover. The page can be read without its script, which copies tables and reads values off plots.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _Record = TypeVar("_Record")
 _TEMPLATES = Path(__file__).parent / "templates"
 _A_YEAR = 31_557_600.0
 _RIGHT_TO_LEFT = "\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc"
-# no line ends between a number, its standard deviation and their unit, or within an option
+# no line break between a number, its standard deviation and their unit, or within an option
 _PROSE = re.compile(r"<(p|li|figcaption)\b[^>]*>.*?</\1>", re.DOTALL)
 _BEFORE_UNIT = re.compile(r"(?<=[\d)]) (?=±|%|°|(?:px|mm|µm|cm|m|K|s|min|h|σ)\b)|(?<=±) ")
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
@@ -37,7 +37,7 @@ _WORDS_TO_LEFT = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Headings and rows of text; note: what the columns mean."""
+    """A table of text; note: what the columns mean."""
 
     title: str
     headings: tuple[str, ...]
@@ -52,14 +52,14 @@ class Table:
         columns: Mapping[str, Callable[[_Record], str]],
         note: str = "",
     ) -> Table:
-        """Return a table with a row for each record; columns: how a cell is written, by heading."""
+        """Return a table with a row per record; columns: {heading: function that writes a cell}."""
         rows = tuple(tuple(cell(record) for cell in columns.values()) for record in records)
         return cls(title, tuple(columns), rows, note)
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The card that a chapter opens with; more: sentences beside the first."""
+    """A chapter's opening card; more: sentences after the first."""
 
     sentence: str
     proof: Figure | None = None
@@ -70,9 +70,9 @@ class Answer:
 
 @dataclass(frozen=True)
 class Section:
-    """Text, figures, items (head, text), tables, in that order; folded: shut at first.
+    """Text, figures, items (head, text) and tables, in that order; folded: shut at first.
 
-    printed: lines of a terminal, kept as they are.
+    printed: a command's output, shown unchanged.
     """
 
     title: str
@@ -86,7 +86,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Chapter:
-    """One camera, recording or field; about: where its data come from."""
+    """A chapter about one camera, recording or field; about: where its data come from."""
 
     title: str
     answer: Answer
@@ -100,7 +100,7 @@ class Chapter:
 
 
 def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> str:
-    """Return the page as HTML text."""
+    """Return the page of a report as HTML text."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
     environment = Environment(
@@ -108,7 +108,7 @@ def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> st
         autoescape=select_autoescape(["html", "j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,
-        # else a camera's name in Hebrew or Arabic exchanges the width and height that follow it
+        # else a camera's name in Hebrew or Arabic would swap the width and height after it
         finalize=lambda value: (
             _WORDS_TO_LEFT.sub(lambda m: f"\u2068{m[0]}\u2069", value)
             if type(value) is str
@@ -123,7 +123,7 @@ def render_report(title: str, chapters: Sequence[Chapter], lead: str = "") -> st
         lead=lead,
         chapters=chapters,
         made=f"Made on {at:%Y-%m-%d at %H:%M} UTC with thermocald {__version__} ({versions}). "
-        "Numbers bear one standard deviation (±); bands in figures hold 95 %.",
+        "Numbers have one standard deviation (±); bands in figures hold 95 %.",
         style=(_TEMPLATES / "report.css").read_text(encoding="utf-8"),
         script=(_TEMPLATES / "report.js").read_text(encoding="utf-8"),
     )
@@ -138,7 +138,7 @@ def as_sentence(text: str) -> str:
 
 
 def day(start_utc: float) -> str:
-    """The start of a series, or that it has no date: simulated recordings count from 1970."""
+    """Return a series' start, or that it has no date: simulated recordings begin in 1970."""
     if not start_utc > _A_YEAR:
         return "(no date)"
     return f"{datetime.fromtimestamp(start_utc, tz=UTC):%Y-%m-%d %H:%M} UTC"

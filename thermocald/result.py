@@ -1,4 +1,4 @@
-"""The result of an analysis: one object that is printed, written as JSON, drawn and reported."""
+"""The base class of results, which can be printed, written as JSON, drawn and reported."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class Result(ABC):
     """The result of an analysis; `print` shows what the command prints."""
 
-    heading = "What was found"
-    caption = "What was found over time, and its standard deviations."
+    heading = "Results"
+    caption = "The results over time, with their standard deviations."
 
     @abstractmethod
     def as_dict(self) -> dict[str, Any]:
@@ -32,7 +32,7 @@ class Result(ABC):
         """Return the lines that the command prints."""
 
     def answer(self) -> str:
-        """Return the sentence, without its stop, that a report opens with."""
+        """Return a report's first sentence, without its full stop."""
         return self.lines()[0]
 
     @abstractmethod
@@ -40,10 +40,9 @@ class Result(ABC):
         """Draw the result with matplotlib (extra `report`)."""
 
     def report(self, path: Path | str, title: str = "") -> Path:
-        """Write the result as one HTML file that works offline.
+        """Write the result as one HTML file that works offline; return its path.
 
-        title: of the page, by default `heading`. Returns the file's path; raises OutputError where
-        it cannot be written.
+        title: the page's, by default `heading`. Raises OutputError if the file cannot be written.
         """
         write_text(Path(path), self.page(title))
         return Path(path)
@@ -55,9 +54,9 @@ class Result(ABC):
 
         answer = self.answer()
         others = [line for line in self.lines() if line != answer]
-        proof = Figure("proof", "The result drawn", self.caption, drawing=self.plot())
-        said = Section("What the command prints", printed="\n".join(others))
-        return Chapter(title or self.heading, Answer(f"{answer}.", proof), (said,)).page()
+        proof = Figure("proof", "Results", self.caption, drawing=self.plot())
+        text = Section("What the command prints", printed="\n".join(others))
+        return Chapter(title or self.heading, Answer(f"{answer}.", proof), (text,)).page()
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
@@ -73,9 +72,9 @@ class Result(ABC):
 def new_figure(
     rows: int, columns: int = 1, panel: tuple[float, float] = (5.0, 2.0)
 ) -> tuple[Figure, Any]:
-    """Make a figure of matplotlib and its axes (rows, columns), which no window and no state knows.
+    """Make a matplotlib figure and its axes (rows, columns) without a window or pyplot's state.
 
-    panel: width and height of one, inches. Raises DriverMissing without matplotlib.
+    panel: width and height of an axis, inches. Raises DriverMissing if matplotlib is not installed.
     """
     from thermocald.figures import drawing_style, new_drawing
 
@@ -85,10 +84,10 @@ def new_figure(
 
 
 def jsonable(value: Any) -> Any:
-    """Return a value as JSON has it: NaN and infinity as null, paths as text.
+    """Return a value as JSON holds it: NaN and infinity as null, paths as text.
 
-    Arrays and tuples become lists, what has `as_dict` that document, other dataclasses what
-    `document_of` makes of them.
+    Arrays and tuples become lists; an object with `as_dict` becomes that document, another
+    dataclass its `document_of`.
     """
     if isinstance(value, dict):
         return {str(key): jsonable(inner) for key, inner in value.items()}
@@ -106,22 +105,23 @@ def jsonable(value: Any) -> Any:
 
 
 def document_of(record: Any) -> dict[str, Any]:
-    """Return a dataclass as JSON has it: its fields by name.
+    """Return a dataclass as JSON holds it: its fields by name.
 
-    Its class may say otherwise in JSON, {attribute: key}: another key, "" for what stays out, "*"
-    for what has keys of its own that stand in its place; what is no field is added.
+    The class attribute JSON, {attribute: key}, changes this: it gives another key, "" to leave an
+    attribute out, or "*" to merge the attribute's own document; an attribute that is no field is
+    added.
     """
     named = {field.name: field.name for field in fields(record)} | getattr(record, "JSON", {})
     document: dict[str, Any] = {}
     for name, key in named.items():
         if key:
-            told = jsonable(getattr(record, name))
-            document |= told if key == "*" else {key: told}
+            value = jsonable(getattr(record, name))
+            document |= value if key == "*" else {key: value}
     return document
 
 
 def with_sds(names: Iterable[str], values: Iterable[Any], sds: Iterable[Any]) -> dict[str, float]:
-    """Return numbers by name, and their standard deviations as `sd_` of the name."""
+    """Return {name: value} and {sd_name: standard deviation} in one mapping."""
     named = list(names)
-    told = {name: float(value) for name, value in zip(named, values, strict=True)}
-    return told | {f"sd_{name}": float(sd) for name, sd in zip(named, sds, strict=True)}
+    numbers = {name: float(value) for name, value in zip(named, values, strict=True)}
+    return numbers | {f"sd_{name}": float(sd) for name, sd in zip(named, sds, strict=True)}

@@ -1,4 +1,4 @@
-"""Results with all that output makes of them: text, document, report, figure."""
+"""The front door's results, each with its text, document, report and figure."""
 
 from __future__ import annotations
 
@@ -37,10 +37,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Study(Result, studies.Study):
-    """A study of one or several cameras: section 4 of Elias et al. 2020 for one's own.
+    """A thermal study of one or more cameras, as in section 4 of Elias et al. 2020.
 
-    cameras: for each label its series, statistics, correlations and Monte-Carlo; settings: what it
-    was made with; reference: each figure of the reference study beside ours, where that was asked.
+    cameras: for each label, its series, statistics, correlations and Monte-Carlo simulation;
+    settings: the study's settings; reference: for a reference study, each published number with
+    the one computed here.
     """
 
     heading = "Thermal study of a camera"
@@ -64,13 +65,13 @@ class Study(Result, studies.Study):
         return render_study(self, title or self.heading)
 
     def save_figures(self, folder: Path | str) -> list[Path]:
-        """Write every figure as SVG and PNG; returns the files."""
+        """Write every figure as SVG and PNG; return the files."""
         from thermocald.output.study.report import save_figures
 
         return save_figures(self, Path(folder))
 
     def plot(self) -> Figure:
-        """Draw how the interior orientation of the first camera changed."""
+        """Draw the changes of the first camera's interior orientation."""
         from thermocald.figures import draw_figure
         from thermocald.output.study.figures import deviation_figure
 
@@ -79,11 +80,11 @@ class Study(Result, studies.Study):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Discovery(Result, discoveries.Discovery):
-    """Where simulation and measurement disagree, and which effect is missing.
+    """The effects that explain where simulation and measurement disagree.
 
-    verdict: `adequate`, `effects_found` or `unexplained`; effects: names, sentences, estimates,
-    evidence and alternatives; stages: how the gap closed; name: of what was explained; before: the
-    model that it was explained from, None for the base model.
+    verdict: `adequate`, `effects_found` or `unexplained`; effects: the effects found, each with
+    name, sentence, estimates, evidence and alternatives; stages: the gap before and after each
+    effect; name: the explained series; before: the model at the start, None for the base model.
     """
 
     name: str = ""
@@ -96,13 +97,13 @@ class Discovery(Result, discoveries.Discovery):
         return discovery_lines(self)
 
     def page(self, title: str = "") -> str:
-        """Return the report as HTML text; title: by default the name of what was explained."""
+        """Return the report as HTML text; title: by default the series' name."""
         from thermocald.output.discovery import report_html
 
         return report_html(self, title or self.name)
 
     def plot(self) -> Figure:
-        """Draw the gap before and after each effect, px, against the noise."""
+        """Draw the gap before and after each effect and the noise, px."""
         from thermocald.figures import draw_figure
         from thermocald.output.discovery import gap_figure
 
@@ -110,31 +111,31 @@ class Discovery(Result, discoveries.Discovery):
 
     @cached_property
     def model(self) -> ThermalModel:
-        """The model with what was found."""
+        """The thermal model with the effects found."""
         return build_model(self, self.before)
 
     def save(self, path: Path | str) -> Path:
-        """Write the model with what was found (YAML), which `fit` and `simulate` take."""
+        """Write the thermal model with the effects found (YAML), for `fit` and `simulate`."""
         write_model(Path(path), self.model)
         return Path(path)
 
     def save_effects(self, path: Path | str) -> Path | None:
-        """Write what was found as an effect file; None where another recording would show none."""
+        """Write the effects found as an effect file; return None if none would recur elsewhere."""
         effects = [one for entry in self.effects for one in effects_of(entry)]
         if not effects:
             return None
         evidence = {"verdict": self.verdict, "gap": self.as_dict()["gap"]}
-        said = "; ".join(e.statement for e in self.effects)
-        write_effects(Path(path), effects, said, evidence)
+        statement = "; ".join(e.statement for e in self.effects)
+        write_effects(Path(path), effects, statement, evidence)
         return Path(path)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Result):
-    """A camera calibrated from photographs of a test field, and where each was taken.
+    """A camera calibrated from photographs of a test field, and the photographs' poses.
 
     photographs: status and reason, the adjustment's sigma0 and covariance, and each photograph;
-    file: what was known of the camera; pitch_assumed: nobody said how large a pixel is.
+    file: the camera's data as given; pitch_assumed: whether the pixel pitch was assumed.
     """
 
     JSON: ClassVar = {
@@ -147,40 +148,40 @@ class Calibration(Result):
 
     @property
     def head(self) -> dict[str, Any]:
-        """The camera as a document has it."""
+        """The camera's part of the document."""
         assumed = {"pixel_pitch_assumed": self.pitch_assumed}
         return {"name": self.file.name, **document_of(self.file.sensor), **assumed}
 
     @property
     def doubts(self) -> list[str]:
-        """Return what is doubtful in the estimated camera, a sentence each."""
-        found = self.photographs
-        if found.interior is None or not found.estimated or self.pitch_assumed:
+        """Probable mistakes in the estimated camera, one sentence each."""
+        result = self.photographs
+        if result.interior is None or not result.estimated or self.pitch_assumed:
             return []
-        nominal = self.file.principal_distance or focal_length(Path(found.photographs[0].path))
-        c, x0, y0 = found.interior.as_array()[:3].tolist()
+        nominal = self.file.principal_distance or focal_length(Path(result.photographs[0].path))
+        c, x0, y0 = result.interior.as_array()[:3].tolist()
         return interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
 
     @property
     def status(self) -> str:
-        """`ok` where the interior orientation was estimated."""
+        """`ok` if the interior orientation was estimated."""
         return self.photographs.status
 
     @property
     def posed(self) -> bool:
-        """Return whether the camera was calibrated, or a photograph has a pose."""
+        """Whether the camera was calibrated or a photograph has a pose."""
         return self.status == "ok" or any(p.status == "ok" for p in self.photographs.photographs)
 
     @property
     def sigma0(self) -> float:
-        """Standard deviation of unit weight, NaN where nothing was estimated."""
+        """Standard deviation of unit weight, NaN if nothing was estimated."""
         return self.photographs.sigma0
 
     @cached_property
     def camera(self) -> Camera:
-        """The camera, with covariance where it was estimated.
+        """The camera, with its covariance if it was estimated.
 
-        Raises DataError where there is none.
+        Raises DataError if the camera was not calibrated.
         """
         if self.photographs.interior is None:
             raise DataError(f"the camera was not calibrated: {self.photographs.reason}")
@@ -194,7 +195,7 @@ class Calibration(Result):
 
     @property
     def poses(self) -> dict[str, ExteriorOrientation]:
-        """{photograph: orientation} of those that have one."""
+        """{photograph: exterior orientation} of the photographs that have one."""
         return {
             str(p.path): p.exterior for p in self.photographs.photographs if p.exterior is not None
         }
@@ -265,9 +266,9 @@ class Calibration(Result):
         return draw_figure(residual_figure(self.photographs, self.file.sensor))
 
     def save(self, path: Path | str) -> Path:
-        """Write the camera as our own file: `.json` with covariance, `.yaml` without.
+        """Write the camera in this program's format: `.json` with covariance, `.yaml` without.
 
-        Raises DataError where nothing was estimated.
+        Raises DataError if nothing was estimated.
         """
         from thermocald.photogrammetry.camera_files import write_camera
 

@@ -1,11 +1,11 @@
-"""A measured series: camera, test field, thermometers, times, observations, wherever they lie.
+"""A measured series: its camera, test field, thermometers, times and observations.
 
-A recording's folder, a store and a server each have a reader here; what is above asks none of them
-which one it is.
+It is read from a recording's folder, a store or a server; callers need not know from which.
 """
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -51,14 +51,15 @@ if TYPE_CHECKING:
     Progress = Callable[[int], None] | None
     Say = Callable[[str], None] | None
 
-_LOOKED_AT = 25  # epochs that tell where the targets are
+COLDEST_C = -273.15
+_LOOKED_AT = 25  # epochs in which the targets are compared with the field
 
 
 class Series:
-    """What was measured: one series of one camera.
+    """A measured series of one camera.
 
-    head: name, interval s, camera and thermometers; testfield: the known points, mm; source: where
-    it is from, for messages. Observations are read when they are needed.
+    head: name, interval (s), camera and thermometers; testfield: the control points, mm; source:
+    where the series was read from, for messages. Observations are read when they are needed.
 
     >>> series = tc.open("M1")
     >>> series.camera, series.name, len(series)
@@ -66,12 +67,12 @@ class Series:
     """
 
     simulation: Simulation | None = None
-    """The simulation that a simulated series comes from, else None."""
+    """The simulation of a simulated series, else None."""
 
     def __init__(self, measured: Recording | StoredSeries, store: Path | None = None) -> None:
-        """Take a recording, or a series of a store, which is opened for each reading.
+        """Take a recording, or a series of a store; the store is opened whenever it is read.
 
-        `place` is the same for two series that are the same.
+        `place` identifies the series: two objects for the same series have the same place.
         """
         self._measured, self._store = measured, store
         self.head: Head = measured.head
@@ -89,7 +90,7 @@ class Series:
 
     @property
     def name(self) -> str:
-        """Its name, such as M1."""
+        """The series' name, for example M1."""
         return self.head.series
 
     @property
@@ -99,51 +100,49 @@ class Series:
 
     @cached_property
     def frame_time(self) -> Array:
-        """(E,) s UTC: when each frame was taken, corrected where a daemon's clock was wrong."""
+        """(E,) times of the frames, s UTC, corrected where a daemon's clock was wrong."""
         with self._opened() as source:
             return source.columns.frame_time
 
     @property
     def truth(self) -> Array | None:
-        """The true interior orientation (E, 10) of a simulated series, else None."""
+        """(E, 10) true interior orientation of a simulated series, else None."""
         return None if self.simulation is None else np.array(self.simulation.truth.iop)
 
     @property
     def time(self) -> NDArray[np.datetime64]:
-        """(E,): the frames' times, UTC, to the microsecond."""
+        """(E,) times of the frames, UTC, to the microsecond."""
         return np.round(self.frame_time * 1e6).astype(np.int64).astype("datetime64[us]")
 
     @cached_property
     def temperatures(self) -> dict[str, Array]:
-        """{thermometer: (E,) °C} at the frames' times, NaN where unknown; the first is the
-        reference.
-        """
+        """{thermometer: (E,) °C} at the frames' times, NaN if unknown; the reference is first."""
         with self._opened() as source:
             return {name: source.columns.at_frame(name) for name in self.head.channels}
 
     def besides(self, numbers: NDArray[np.int64], *, extra: bool = False) -> Columns:
-        """Return what else is known of epochs `numbers` (E,): every thermometer's °C at the frames.
+        """Return further columns for the epochs `numbers` (E,): the thermometers' °C at the frames.
 
-        extra: and what the camera reported, light, blur, the filter's state, a file's unknown
+        extra: also the camera's settings, light, blur, the filter's state and a file's unknown
         columns.
         """
-        found: Columns = {f"temperature {n}": column for n, column in self.temperatures.items()}
+        columns: Columns = {f"temperature {n}": column for n, column in self.temperatures.items()}
         with self._opened() as source:
             known = source.columns.numbers
             if extra:
-                found |= source.extra_columns()
+                columns |= source.extra_columns()
         rows = np.searchsorted(known, numbers)
         rows = np.where(np.append(known, -1)[rows] == numbers, rows, -1)
-        for name, column in found.items():
+        for name, column in columns.items():
             if isinstance(column, np.ndarray):
-                found[name] = np.append(column, np.nan)[rows]
+                columns[name] = np.append(column, np.nan)[rows]
             else:
-                found[name] = tuple("" if row < 0 else column[row] for row in rows)
-        return found
+                columns[name] = tuple("" if row < 0 else column[row] for row in rows)
+        return columns
 
     @property
     def temperature(self) -> Array:
-        """(E,) °C of the reference at the frames' times, NaN where unknown."""
+        """(E,) the reference thermometer's °C at the frames' times, NaN if unknown."""
         return next(iter(self.temperatures.values()), np.full(len(self), np.nan))
 
     def __len__(self) -> int:
@@ -167,15 +166,16 @@ class Series:
         jobs: int = 1,
         progress: Progress = None,
     ) -> Epochs:
-        """Calibrate every epoch, in one adjustment of the series.
+        """Calibrate all epochs in one adjustment of the series.
 
-        exterior: `per_epoch`, `series` (one orientation for all), `mount` (one, and movements of
-        the mount), `auto` (what the data show); of a store also `stored`: as they were stored.
-        free: the interior orientation to estimate, the rest is held; store: of a recording, a file
-        that keeps all epochs; what was interrupted goes on there; jobs: processes; progress:
-        receives how many epochs are done. Raises DataError where no epoch has a result, StoreError
-        for a store that cannot be written. Source: Gauss-Markov model with data snooping, Luhmann
-        et al. 2019, chapter 4.
+        exterior: `per_epoch`, `series` (one exterior orientation for all epochs), `mount` (one, and
+        the mount's movements) or `auto` (chosen from the data); for a series of a store also
+        `stored` (the results as they are stored). free: the parameters of the interior orientation
+        to estimate; the others are held. store: for a recording, a file in which all epochs are
+        stored; an interrupted run continues there. jobs: number of processes. progress: called with
+        the number of further epochs done. Raises DataError if no epoch has a result, StoreError if
+        the store cannot be written. Source: Gauss-Markov model with data snooping, Luhmann et al.
+        2019, chapter 4.
 
         >>> epochs = tc.open("M1").calibrate()
         >>> bool(abs(epochs.c[-1] - epochs.c[0]) > 3 * epochs.sd_c[0])
@@ -192,8 +192,8 @@ class Series:
         path = source_of(store)
         if not isinstance(self._measured, Recording):
             raise UsageError(f"{path}: {self.source} is in a store already")
-        tell = progress or (lambda _: None)
-        return replay_into(path, self._measured, settings, exterior, tell, jobs)
+        advance = progress or (lambda _: None)
+        return replay_into(path, self._measured, settings, exterior, advance, jobs)
 
     def doubts(
         self,
@@ -201,29 +201,29 @@ class Series:
         interior: Array | None = None,
         offsets: Array | None = None,
     ) -> list[str]:
-        """Return what cannot have been meant in what was recorded, a sentence each.
+        """Return probable mistakes in the recorded data, one sentence each.
 
-        epochs: as calibrated, for what they tell of the camera and its field; interior: c, x0, y0
-        in mm and what follows; offsets (T, 2) px: by how much targets are seen elsewhere than one
-        mean camera expects.
+        epochs: the calibrated epochs, to check the camera and the field as well. interior: an
+        interior orientation to check instead, c, x0, y0 (mm) first. offsets: (T, 2) px, by how much
+        the targets' images differ from those that a mean camera predicts.
 
         >>> tc.open("M1").doubts()
         []
         """
-        found = self._measured.doubts() if isinstance(self._measured, Recording) else []
+        doubts = self._measured.doubts() if isinstance(self._measured, Recording) else []
         good = np.zeros(0, dtype=np.int64) if epochs is None else np.flatnonzero(epochs.ok)
         if epochs is not None and len(good):
             interior = np.median(epochs.values[good, :3], axis=0)
         if interior is not None:
             c, x0, y0 = interior[:3].tolist()
-            found = [*found, *interior_doubts(self.head.camera, c, x0, y0)]
+            doubts = [*doubts, *interior_doubts(self.head.camera, c, x0, y0)]
             if offsets is not None:
                 c_px = c / self.head.camera.sensor.pixel_pitch
-                found += target_doubts(self.testfield.names, offsets, c_px, FAR_ELSEWHERE)
+                doubts += target_doubts(self.testfield.names, offsets, c_px, FAR_ELSEWHERE)
         if epochs is not None and len(good) and isinstance(self._measured, Recording):
             some = good[spread_rows(len(good), _LOOKED_AT)]
-            found = [*found, *misplaced_doubts(self._measured, some, epochs.values[some])]
-        return found
+            doubts = [*doubts, *misplaced_doubts(self._measured, some, epochs.values[some])]
+        return doubts
 
     def measured(
         self,
@@ -233,11 +233,11 @@ class Series:
         free: Iterable[str] = DEFAULT_FREE,
         jobs: int = 1,
     ) -> MeasuredSeries:
-        """Return the series as a study reads it.
+        """Return the series in the form that a study reads.
 
-        label: what it treats as one camera, by default the camera's name, and of a store the start
-        condition. Of a store `free` is what was stored, and `exterior="per_epoch"` gives the epochs
-        as they were stored.
+        label: series with the same label are one camera; by default the camera's name, for a
+        store's series with its start condition. A store's series uses the stored `free`, and
+        `exterior="per_epoch"` returns its epochs as they are stored.
         """
         usual = self.camera
         if not isinstance(self._measured, Recording):
@@ -252,16 +252,16 @@ class Series:
         return replace(found, doubts=tuple(self.doubts(table, found.mean)))
 
     def observed(self, progress: Progress = None, jobs: int = 1, say: Say = None) -> SeriesInput:
-        """Return the series as a thermal model and discovery read it; frames are measured.
+        """Return the series in the form that thermal models and discovery read; measure its frames.
 
-        say: is told so beforehand.
+        say: called with a sentence before frames are measured.
         """
         with self._opened() as source:
             return series_input(source, say, progress, jobs)
 
     @contextmanager
     def _opened(self) -> Iterator[Recording | StoredRecording]:
-        """Open its source for reading."""
+        """Open the recording or the store for reading."""
         if isinstance(self._measured, Recording):
             yield self._measured
         else:
@@ -277,18 +277,18 @@ def _adjust(
     progress: Progress,
     jobs: int,
 ) -> tuple[Epochs, Callable[[int], Observations | None]]:
-    """Return the epochs of an open source adjusted, and what shows an epoch's observations."""
+    """Return a source's adjusted epochs, and a function that returns an epoch's observations."""
     if isinstance(source, Recording):
         return recorded_table(source, settings, exterior, progress, jobs)
     return table_of_stored(source, settings, exterior, jobs), source.observations
 
 
 def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
-    """Open a series: a recording's folder, a store, or `postgresql://…`.
+    """Open a series from a recording's folder or a store (a file or `postgresql://…`).
 
-    series: which of a store, `CAMERA/SERIES` or `SERIES`; not needed where there is one. Frames
-    and observations are read when they are needed. Raises StoreError where nothing is there, or
-    several series fit; RecordingError names file, line and column.
+    series: `CAMERA/SERIES` or `SERIES`, needed if a store holds several. Frames and observations
+    are read when they are needed. Raises StoreError if nothing is there or several series match,
+    RecordingError, which names file, line and column, if the recording is broken.
 
     >>> tc.open("M1")
     <Series rpi-v2.1/M1: 150 epochs, 147 targets, 25.0 to 50.0 °C (reference: temperature)>
@@ -304,9 +304,9 @@ def open(source: Path | str, series: str | None = None) -> Series:  # noqa: A001
 
 
 def open_all(source: Path | str) -> list[Series]:
-    """Open every series of a store, a server or a recording's folder (then one).
+    """Open all series of a store or a server, or the one series of a recording's folder.
 
-    Raises StoreError where nothing is there, DataError for a store without series.
+    Raises StoreError if nothing is there, DataError if the store holds no series.
 
     >>> len(tc.open_all("thermocald.db"))
     1
@@ -322,27 +322,42 @@ def open_all(source: Path | str) -> list[Series]:
 
 
 def check_exterior(exterior: str) -> None:
-    """Raise UsageError for a choice of exterior orientation that there is not."""
+    """Raise UsageError for an unknown choice of the exterior orientation."""
     if exterior not in EXTERIOR_CHOICES:
         choices = ", ".join(EXTERIOR_CHOICES)
         raise UsageError(f"--exterior {exterior}: must be one of {choices}")
 
 
-def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
-    """Return which interior orientation is estimated, in its order, from names or `c,x0,y0`.
+def require_within(
+    **bounds: tuple[float | None, float] | tuple[float | None, float, float],
+) -> None:
+    """Raise UsageError for an argument, name=(value, least[, most]), out of bounds; None passes."""
+    for name, (value, least, *rest) in bounds.items():
+        most = rest[0] if rest else math.inf
+        if value is not None and not (math.isfinite(value) and least <= value <= most):
+            bound = f"from {least:g} to {most:g}" if rest else f"at least {least:g}"
+            raise UsageError(f"{name} is {value:g}; it must be {bound}")
 
-    `none` frees nothing. Raises UsageError for a name that there is not.
+
+def free_names(given: str | Iterable[str]) -> tuple[str, ...]:
+    """Return the parameters to estimate in the order of IOP_NAMES, from names or `c,x0,y0`.
+
+    `none` frees no parameter. Raises UsageError for an unknown name.
     """
     names = [n.strip() for n in given.split(",")] if isinstance(given, str) else list(given)
     if names in (["none"], [""]):
         return ()
     for name in names:
         if name not in IOP_NAMES:
-            raise UsageError(f"--free: {name!r} is no IOP; there are {', '.join(IOP_NAMES)}, none")
+            choices = ", ".join(IOP_NAMES)
+            raise UsageError(
+                f"--free: {name!r} is no parameter of the interior orientation; give some of "
+                f"{choices}, or none"
+            )
     return tuple(name for name in IOP_NAMES if name in names)
 
 
 def source_of(text: Path | str) -> Path:
-    """Return a path, or a server's address, as the readers take it; ~ is one's home."""
+    """Return a path with `~` expanded, or a server's address, as the readers take it."""
     path = Path(text)
     return path if is_server(path) else path.expanduser()

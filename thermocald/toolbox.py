@@ -1,6 +1,6 @@
-"""The front door's toolbox: files of cameras, predictions, corrections, test fields.
+"""Further functions of `import thermocald`: camera files, predictions, corrections, test fields.
 
-Each function is what a command does, as in `thermocald.api`; units and errors are as there.
+Each does what a command does; units and errors are those of `thermocald.api`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
 from thermocald.photogrammetry import camera_files
-from thermocald.series import Series, source_of
+from thermocald.series import COLDEST_C, Series, require_within, source_of
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.temperatures import LogOptions, log_options
 
@@ -43,11 +43,12 @@ def convert_camera(
     format: str | None = None,  # noqa: A002
     pixel_pitch: float | None = None,
 ) -> Conversion:
-    """Convert a camera file, exactly where the conventions allow, else by a fit that says how well.
+    """Convert a camera file, exactly if the formats' conventions allow it, else by a fit.
 
-    to, format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json; the source's is told by
-    its content; pixel_pitch mm, where it does not say it. Raises ConfigurationError naming the
-    file, UsageError for an unknown format.
+    The result states how well a fit agrees. to, format: the formats of out and of source, opencv,
+    ros, colmap, mrcal, kalibr, metashape, aicon or json; the source's is by default recognised from
+    its content. pixel_pitch: mm, needed if the file does not give it. Raises ConfigurationError,
+    which names the file, UsageError for an unknown format.
 
     >>> print(tc.convert_camera("cold.json", "cold.xml", "metashape").statement)
     exact: both models give the same pixels
@@ -58,10 +59,11 @@ def convert_camera(
 def compare_cameras(
     first: Path | str, second: Path | str, *, pixel_pitch: float | None = None
 ) -> CameraDifference:
-    """Compare two camera files of any format: parameters, and by how much the image differs.
+    """Compare two camera files of any format: their parameters, and how far image points differ.
 
-    pixel_pitch mm, where they do not say it. The result is second minus first, with standard
-    deviations where both have a covariance. Raises ConfigurationError for cameras of other sizes.
+    pixel_pitch: mm, needed if the files do not give it. The result is second minus first, with
+    standard deviations if both files have a covariance. Raises ConfigurationError if the cameras'
+    image sizes differ.
 
     >>> found = tc.compare_cameras("cold.json", "warm.json")
     >>> found.rms_px > 0, found.has_sd
@@ -89,13 +91,14 @@ def predict(
     extrapolate: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Prediction:
-    """Predict a camera: at one temperature °C, along a log, of series, or through a programme.
+    """Predict a camera at a temperature (°C), along a log, for series, or during a programme.
 
-    channels: {name: °C} of other thermometers; log: a logger's file, a recording or a store,
-    log_options: how it is to be read; test: measured series, to hold against the prediction;
-    programme: what is done to the camera, which camera's file (YAML) says how it warms: when it is
-    steady to wanted_mm at distance_m. Raises UsageError unless one of the four is given, and far
-    outside the model's validity unless `extrapolate`.
+    channels: {name: °C} of the other thermometers. log: a logger's file, a recording or a store;
+    log_options: how to read it. test: measured series with which the prediction is compared.
+    programme: a heating programme, and camera: the YAML file that describes how the camera warms;
+    the result tells when the camera is steady to wanted_mm at distance_m. Raises UsageError unless
+    exactly one of temperature, log, test and programme is given, and far outside the model's range
+    unless `extrapolate` is set.
 
     >>> tc.predict("camera.yaml", 35.0).document["temperature"]
     35.0
@@ -104,6 +107,10 @@ def predict(
 
     if sum((temperature is not None, log is not None, bool(test), programme is not None)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
+    require_within(
+        temperature=(temperature, COLDEST_C), distance_m=(distance_m, 0.01),
+        wanted_mm=(wanted_mm, 1e-3),
+    )  # fmt: skip
     thermal = _thermal(model)
     if temperature is not None:
         state = thermal.at(temperature, channels=channels, extrapolate=extrapolate)
@@ -133,13 +140,14 @@ def correct(
     extrapolate: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> Correction:
-    """Correct image points, or images, that were taken at known temperatures.
+    """Correct image points or images for the camera's temperature when they were taken.
 
-    points: a CSV with time, x, y (px) or with time, image; `-` is standard input; log: a logger's
-    file, a recording or a store; to °C: by default the model's T0; temperature_sd K, of a reading,
-    by default as the fit found it; size: width and height px where images are binned; timezone,
-    ambiguous: of times without a zone; say: is told of each row that cannot be corrected. Nothing
-    is done before the result is written. Raises DataError for a table that cannot be read.
+    points: a CSV with time, x, y (px) or with time, image; `-` reads standard input. log: a
+    logger's file, a recording or a store. to: the temperature to correct to, °C, by default the
+    model's T0. temperature_sd: of a reading, K, by default as the fit estimated it. size: width and
+    height of binned images, px. timezone, ambiguous: for times without a zone. say: called with a
+    line for each row that cannot be corrected. The correction is computed when the result is
+    written. Raises DataError for a table that cannot be read.
 
     >>> done = tc.correct("points.csv", "camera.yaml", log="M1")
     >>> done.write("corrected.csv")
@@ -149,6 +157,9 @@ def correct(
     from thermocald.analysis.thermal.correction import first_times
     from thermocald.output.corrected import Correction
 
+    require_within(to=(to, COLDEST_C), temperature_sd=(temperature_sd, 0))
+    width, height = size or (1, 1)
+    require_within(width=(width, 1), height=(height, 1))
     thermal, path = _thermal(model), source_of(points)
     clock = device_clock(timezone, ambiguous=ambiguous)
     header, near = first_times(path, clock)
@@ -178,40 +189,41 @@ def measure(
     extrapolate: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> Places:
-    """Measure where image points lie on a water surface, a plane, a staff or a cross-section.
+    """Measure image points on a water surface, a plane, a staff or a cross-section.
 
-    points: a CSV with time, x, y, sx, sy (px) and name; log: a logger's file, a recording or a
-    store; control: control points (CSV, GeoJSON, pyorc's JSON) with where they were seen in the
-    image at the time `seen`; surface: a YAML with level, plane, line or profile, in the unit (mm or
-    m) and coordinates of the control points; timezone, ambiguous: of times without a zone; say:
-    receives a line for each row that is left out. Raises DataError where there is no pose or no
-    temperature, ConfigurationError naming the file, GeometryError for rays that miss the surface.
+    points: a CSV with time, x, y, sx, sy (px) and name. log: a logger's file, a recording or a
+    store. control: control points (CSV, GeoJSON, pyorc's JSON) with their image coordinates at the
+    time `seen`. surface: a YAML file with level, plane, line or profile, in the unit (mm or m) and
+    coordinate system of the control points. timezone, ambiguous: for times without a zone. say:
+    called with a line for each row that is left out. Raises DataError if there is no pose or no
+    temperature, ConfigurationError, which names the file, GeometryError for rays that miss the
+    surface.
 
     >>> tc.measure("points.csv", "camera.yaml", log="M1", control="gcp.csv", seen="0",
     ...            surface="water.yaml", unit="km")
     Traceback (most recent call last):
-    thermocald.errors.UsageError: --length-unit km: mm or m
+    thermocald.errors.UsageError: --length-unit km: must be mm or m
     """
     from thermocald.analysis.thermal.control_points import UNITS, ControlPoints
     from thermocald.analysis.thermal.correction import first_times, row_blocks, seconds_of
     from thermocald.analysis.thermal.places import measure_places, read_surface
 
     if unit not in UNITS:
-        raise UsageError(f"--length-unit {unit}: mm or m")
+        raise UsageError(f"--length-unit {unit}: must be mm or m")
     tell = say or (lambda _: None)
     thermal, path = _thermal(model), source_of(points)
     clock = device_clock(timezone, ambiguous=ambiguous)
-    given = ControlPoints.read(source_of(control), unit)
-    if given.assumed:
-        tell(given.assumed)
-    plane = read_surface(source_of(surface), given)
+    controls = ControlPoints.read(source_of(control), unit)
+    if controls.assumed:
+        tell(controls.assumed)
+    plane = read_surface(source_of(surface), controls)
     _, near = first_times(path, clock)
     table = read_model_log(thermal, source_of(log), _log_options(log_options), near)
     rows = list(row_blocks(path, ("x", "y", "sx", "sy"), clock))
     for line, why in (refused for block in rows for refused in block.refused):
         tell(f"{path}, line {line}: {why}; left out")
     when = seconds_of(seen, clock)
-    return measure_places(thermal, table, given, when, plane, rows, extrapolate)
+    return measure_places(thermal, table, controls, when, plane, rows, extrapolate)
 
 
 def follow_scene(
@@ -225,12 +237,12 @@ def follow_scene(
     progress: Callable[[int], None] | None = None,
     recording: Path | str | None = None,
 ) -> SceneCourse:
-    """Compare what does not move in photographs of a scene with what the thermal model predicts.
+    """Compare the image motion of static points in a scene with the thermal model's prediction.
 
-    photographs: a folder of them, the first is the reference; log: a logger's file, a recording or
-    a store; times: of the photographs, `exif`, `name` (of the file) or `file` (date); timezone: of
-    times without one; recording: a folder to keep what does not move, which `open` and `discover`
-    read. Raises DataError where there is no temperature or nothing to follow.
+    photographs: a folder; the first is the reference. log: a logger's file, a recording or a store.
+    times: where a photograph's time is read, `exif`, `name` (file name) or `file` (file date).
+    timezone: for times without one. recording: a folder in which the static points are recorded,
+    for `open` and `discover`. Raises DataError if there is no temperature or no point to follow.
 
     >>> tc.follow_scene("photos", "camera.yaml", log="logger.csv", times="sun")
     Traceback (most recent call last):
@@ -240,15 +252,15 @@ def follow_scene(
     from thermocald.store.logger.photographs import read_photographs
 
     thermal = _thermal(model)
-    found = read_photographs([source_of(photographs)], times)
-    moments = [photograph.moment for photograph in found]
-    taken = device_clock(timezone).utc(moments, lambda i: str(found[i].path)).tolist()
+    pictures = read_photographs([source_of(photographs)], times)
+    moments = [picture.moment for picture in pictures]
+    taken = device_clock(timezone).utc(moments, lambda i: str(pictures[i].path)).tolist()
     options = _log_options(log_options or {"timezone": timezone})
     table = read_model_log(thermal, source_of(log), options, (min(taken), max(taken)))
-    frames = list(zip([photograph.path for photograph in found], taken, strict=True))
-    kept = None if recording is None else Path(recording)
+    frames = list(zip([picture.path for picture in pictures], taken, strict=True))
+    folder = None if recording is None else Path(recording)
     return scene.follow_scene(
-        thermal, table, frames, advance=progress or (lambda _: None), recording=kept
+        thermal, table, frames, advance=progress or (lambda _: None), recording=folder
     )
 
 
@@ -263,12 +275,13 @@ def fit_calibrations(
     temperature_sd: float = 0.1,
     say: Callable[[str], None] | None = None,
 ) -> ThermalCamera:
-    """Fit a thermal model to photographs that were calibrated at two temperatures or more.
+    """Fit a thermal model to calibrations from photographs at two or more temperatures.
 
-    calibrations: {file: °C}, what `calibrate` wrote as JSON; log: of a thermometer, says the
-    temperatures at the photographs' times; timezone, ambiguous: of these; T0 °C, by default the
-    mean; temperature_sd K, of each temperature; say: receives notes about the log. Raises
-    UsageError where a temperature is missing or cameras differ, DataError for too narrow a range.
+    calibrations: {file: °C}, JSON files written by `calibrate`. log: a thermometer's log, which
+    gives the temperatures at the photographs' times in place of the °C; timezone, ambiguous: for
+    these times. T0: reference temperature, °C, by default the mean. temperature_sd: of each
+    temperature, K. say: called with notes about the log. Raises UsageError if a temperature is
+    missing or the cameras differ, DataError if the temperature range is too narrow.
 
     >>> tc.fit_calibrations({"cold.json": 26.0, "warm.json": 45.0}).model.T0
     35.5
@@ -276,6 +289,9 @@ def fit_calibrations(
     from thermocald.analysis.thermal import calibrations as calibrated
     from thermocald.store.logger.temperatures import read_log
 
+    if not calibrations:
+        raise UsageError("give at least two calibrations to fit a model to")
+    require_within(T0=(T0, COLDEST_C), temperature_sd=(temperature_sd, 0))
     for name in calibrations:
         if not calibrated.is_calibration(source_of(name)):
             raise UsageError(f"{name}: is not a calibration; fit series and calibrations apart")
@@ -307,15 +323,15 @@ def survey_testfield(
     camera_out: Path | str | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Survey:
-    """Measure a test field from photographs of it: coordinates and their standard deviations.
+    """Measure a test field's coordinates and their standard deviations from photographs of it.
 
-    photographs: files, or folders of them, of one camera; scale: two targets and their distance mm,
-    scale_sd mm; distances: more of them, a CSV (a, b, length, sigma in mm); field: as it was
-    printed, for plain circles; camera: a file of any format, hold_camera: trust it; pixel_pitch mm,
-    by default the camera file's, else 0.001; out, camera_out: the testfield.csv and the camera
-    (JSON) to write; say: is told what is done. Raises UsageError where the scale is missing,
-    GeometryError where photographs do not carry it. Source: bundle adjustment, Luhmann et al. 2019,
-    chapter 4.4.
+    photographs: files or folders, from one camera. scale: two targets and their distance, mm, with
+    scale_sd, mm. distances: further distances, a CSV (a, b, length, sigma in mm). field: the field
+    as printed, needed for plain circles. camera: a camera file of any format; hold_camera: do not
+    estimate its parameters. pixel_pitch: mm, by default the camera file's, else 0.001. out,
+    camera_out: files to write, the testfield.csv and the camera (JSON). say: called with a line at
+    each step. Raises UsageError if the scale is missing, GeometryError if the photographs do not
+    support the adjustment. Source: bundle adjustment, Luhmann et al. 2019, chapter 4.4.
 
     >>> tc.survey_testfield(["photos"], field="M1/testfield.csv")
     Traceback (most recent call last):
@@ -348,7 +364,7 @@ def survey_testfield(
         pixel_pitch = known.sensor.pixel_pitch
     if pixel_pitch is None:
         pixel_pitch = 0.001
-        tell("pixel pitch not given: 0.001 mm assumed, the camera's mm are only as good")
+        tell("pixel pitch not given: 0.001 mm assumed; the camera's mm depend on it")
     found = survey(
         {str(path): partial(decode_grey, path) for path in paths},
         measured,
@@ -378,12 +394,13 @@ def check_testfield(
     roll: float = 0.0,
     sigma_px: float = 0.03,
 ) -> FieldCheck:
-    """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
+    """Assess a test field: how well a camera sees it, what it would calibrate, what is missing.
 
-    camera: a file of any format, by default a Raspberry Pi camera v2.1; pixel_pitch mm, where that
-    does not say it; place X, Y, Z mm where it stands, by default where the field just fills its
-    image; look_at X, Y, Z mm, by default the field's middle; roll degrees; sigma_px of an image
-    coordinate. Raises ConfigurationError for a camera file that cannot be read.
+    camera: a camera file of any format, by default a Raspberry Pi camera v2.1. pixel_pitch: mm,
+    needed if the file does not give it. place: the camera's X, Y, Z, mm, by default where the field
+    just fills its image. look_at: X, Y, Z, mm, by default the field's centre. roll: degrees.
+    sigma_px: standard deviation of an image coordinate. Raises ConfigurationError for a camera file
+    that cannot be read.
 
     >>> tc.check_testfield("M1/testfield.csv").as_dict()["calibrates"]
     True
@@ -393,6 +410,7 @@ def check_testfield(
     from thermocald.api import read_testfield
     from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
 
+    require_within(sigma_px=(sigma_px, 1e-4))
     if camera is None:
         model = RASPBERRY_PI_V2
     elif isinstance(camera, Camera):

@@ -1,4 +1,4 @@
-"""A folder as a user has it: two recordings, a store, a model, photographs and a logger's file."""
+"""A user's folder: two recordings, a store, a model, photographs and a logger's file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.golden.workshop import photographs
 
 @pytest.fixture(scope="session")
 def world(tmp_path_factory):
-    """The folder; tests write beside it."""
+    """Make the folder; tests write beside it."""
     folder = tmp_path_factory.mktemp("world")
     for k in (1, 2):
         tc.simulate("rpi-v2.1-heating", seed=k, series=f"M{k}", out=folder / f"M{k}")
@@ -41,7 +41,7 @@ def world(tmp_path_factory):
 
 @pytest.fixture
 def inside(world, monkeypatch):
-    """The folder as the working directory."""
+    """Use the folder as working directory."""
     monkeypatch.chdir(world)
     return world
 

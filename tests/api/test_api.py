@@ -1,4 +1,4 @@
-"""The front door as API.md has it, line by line, and every example of its docstrings."""
+"""The front door as described in API.md, line by line, and every example of its docstrings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def examples():
     return found
 
 
-# the commands on the same series are tests/golden's
+# tests/golden runs the commands on the same series
 SLOW = {
     f"thermocald.{n}"
     for n in ("api.calibrate", "api.discover", "api.study", "series.Series.calibrate")
@@ -183,7 +183,7 @@ def test_one_result_prints_documents_draws_and_reports(name, epochs, camera, M1,
 
 def test_a_result_is_what_the_command_says(epochs, world, tmp_path):
     said = finish("replay", "M1", "--json", tmp_path / "M1.json", folder=world)
-    # what it refused stands in its standard error: an empty output alone tells nothing
+    # its errors are on standard error, which an empty output would not show
     document = json.loads((tmp_path / "M1.json").read_text())
 
     assert said.stdout.strip() == str(epochs).strip()
@@ -275,8 +275,32 @@ def test_what_is_wrong_is_said(M1, camera):
         tc.import_photographs("nothing", log="x.csv", testfield="M1/testfield.csv")
 
 
+OUT_OF_BOUNDS = {
+    "window is -1": lambda M1, field: tc.study(M1, window=-1),
+    "grid is 0; it must be from 2 to 9": lambda M1, field: tc.study(M1, grid=0),
+    "distance_mm is 0": lambda M1, field: tc.reference_study(distance_mm=0.0),
+    "2 labels for 1 series": lambda M1, field: tc.study(M1, labels=["a", "b"]),
+    "is the same series as": lambda M1, field: tc.fit(M1, M1),
+    "T0 is nan": lambda M1, field: tc.fit(M1, T0=np.nan),
+    "jobs is 0": lambda M1, field: tc.discover(M1, jobs=0),
+    "seeds is 0": lambda M1, field: tc.plan(M1, seeds=0),
+    "epochs is 0": lambda M1, field: tc.simulate("rpi-v2.1-heating", epochs=0),
+    "in the order of time": lambda M1, field: tc.simulate("nexus5-cold", lamp=[(9, 1), (0, 3)]),
+    "temperature is nan": lambda M1, field: tc.predict("camera.yaml", np.nan),
+    "height is 0": lambda M1, field: tc.correct("x.csv", "camera.yaml", log="M1", size=(9, 0)),
+    "at least two calibrations": lambda M1, field: tc.fit_calibrations({}),
+    "sigma_px is 0": lambda M1, field: tc.check_testfield(field, sigma_px=0.0),
+}
+
+
+@pytest.mark.parametrize("message", OUT_OF_BOUNDS)
+def test_an_argument_out_of_bounds_is_refused(M1, message):
+    with pytest.raises(UsageError, match=message):
+        OUT_OF_BOUNDS[message](M1, M1.testfield)
+
+
 def test_the_import_costs_nothing():
-    """Without NumPy, within 30 ms of the processor (median of five)."""
+    """It needs no NumPy and less than 30 ms of processor time (median of five)."""
     program = (
         "import sys, time; a = time.process_time(); import thermocald; "
         "print(time.process_time() - a, 'numpy' in sys.modules)"

@@ -1,4 +1,4 @@
-"""Documentation and notebooks use the public names; what they show of Python runs."""
+"""Documentation and notebooks use only public names, and the Python code they show runs."""
 
 from __future__ import annotations
 

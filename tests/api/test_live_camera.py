@@ -1,4 +1,4 @@
-"""The live camera: what `along` says of the same history, reading by reading; frames corrected."""
+"""The live camera: equal to `along` for the same history, reading by reading; frames corrected."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHAIN = (
 
 
 def course(epochs: int, interval: float, seed: int = 0):
-    """Uneven times, a warm-up and cooling with noise, °C."""
+    """Return uneven times, and temperatures of a warm-up and cooling with noise, °C."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(interval * rng.uniform(0.6, 1.4, epochs))
     phase = np.linspace(0.0, 2.5 * np.pi, epochs)
@@ -29,7 +29,7 @@ def course(epochs: int, interval: float, seed: int = 0):
 
 
 def effect_of(name: str) -> ModelEffect:
-    """An effect of the catalogue with all its numbers, and a standard deviation of each."""
+    """Return an effect of the catalogue with all its values and their standard deviations."""
     kind = catalogue.get(name)
     values: dict = {k: p.default for k, p in kind.nonlinear.items() if not p.text}
     values |= {k: "board" for k, p in kind.nonlinear.items() if p.unit == "name"}
@@ -79,7 +79,7 @@ def test_lag_delay_and_play_together(order):
 
 
 def test_a_delay_ahead_of_its_time_is_asked_for_again():
-    """T stamped late, then a lag: what was said of the past changes with each reading."""
+    """T with late times, then a lag: each reading changes earlier predictions."""
     ahead = ModelEffect("time_offset", {"d": -20.0}, {"d": 0.5})
     camera = tc.ThermalCamera(thermal_model(ahead, CHAIN[0]))
     times, T = course(40, 10.0)
@@ -107,7 +107,7 @@ def replace_rows(along: tc.Along, rows: list[int]) -> tc.Along:
 
 
 def test_frames_as_the_steady_camera_had_seen_them():
-    """A point of the scene is where the camera at T0 would show it, to 0.05 px."""
+    """A point of the scene is where the camera at T0 would image it, to 0.05 px."""
     cv2 = pytest.importorskip("cv2")
     base = thermal_model(CHAIN[0])
     camera = tc.ThermalCamera(replace(base, rates={"c": 2e-3, "x0": 1e-3, "y0": -8e-4}))

@@ -92,7 +92,7 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
         (["--reference", "x"], UsageError, "give no recordings with it"),
         (["RECORDING", "--report", "RECORDING/epochs.csv/r.html"], OutputError, "written"),
         (["RECORDING", "--exterior", "both"], UsageError, "one of per_epoch, series"),
-        (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no IOP"),
+        (["RECORDING", "--free", "c,z0"], UsageError, "'z0' is no parameter"),
     ],
 )
 def test_wrong_usage_is_one_error(run, recording, arguments, error, words):

@@ -157,5 +157,7 @@ def test_outputs_that_can_be(tmp_path):
         check_output(tmp_path / "empty", kind)
         check_output(tmp_path / "new" / "deep", kind)
     assert not (tmp_path / "new").exists()
-    with pytest.raises(OutputError, match="the kernel keeps this folder; choose another folder"):
+    with pytest.raises(
+        OutputError, match="the folder belongs to the kernel; choose another folder"
+    ):
         check_output(tmp_path / "/proc/a.csv")

@@ -1,4 +1,4 @@
-"""Blind recordings in memory, and what discovery makes of them."""
+"""Blind recordings in memory, reduced for discovery."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from thermocald.thermal.reduce import reduce_together
 
 @pytest.fixture
 def evidence_of():
-    """ReducedSeries of M1 (and M2) of a blind case, and the truth."""
+    """Return a blind case's reduced series, M1 and perhaps M2, and its truth."""
 
     def build(*effects: str, px: float = 0.3, seed: int = 1, **more):
         series, truth = generate(Case(effects, px, seed, **more))

@@ -1,4 +1,4 @@
-"""Long series are examined on blocks of epochs; everything that is said of them fits together."""
+"""Long series are examined in blocks of epochs, and all results are consistent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from thermocald.thermal.series import in_blocks
 
 @pytest.fixture
 def short_blocks(monkeypatch):
-    """Every series counts as long: 180 epochs on 60 rows."""
+    """Make every series count as long: 180 epochs in 60 rows."""
     monkeypatch.setattr(examination, "in_blocks", lambda series: in_blocks(series, rows=60))
 
 
@@ -36,7 +36,7 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
 
 
 def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
-    """The rate of the temperature is of all epochs, the misfit of blocks: np.gradient of both."""
+    """The temperature's rate is of all epochs and the misfit of blocks: np.gradient of both."""
     evidence, _ = evidence_of("outside", px=0.3, seed=24, with_m2=False)
     found = discover_series(evidence)
     rows = found.as_dict()["effects"][0]["evidence"]["base_misfit"]["against"]

@@ -1,4 +1,4 @@
-"""Condensing a long series: exact means, gross errors out, short means where it is fast."""
+"""A condensed long series: exact means without gross errors, short ones at fast changes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIGMA = 0.05
 
 @pytest.fixture(scope="module")
 def recorded():
-    """The image moves as a sine of 80 s for one of 30 hours; one point in epoch 4001 is gross."""
+    """A sine of 80 s for one of 30 hours; one point in epoch 4001 has a gross error."""
     rng = np.random.default_rng(1)
     places = rng.uniform(200, 2800, (T, 2))
     t = 15.0 * np.arange(E)
@@ -60,7 +60,7 @@ def test_rows_are_weighted_means(recorded):
 def test_the_blocks_that_are_read_do_not_matter(recorded):
     whole, grid = recorded
     one, other = (condensed(whole, InBlocks(grid, size), most=500) for size in (E, 480))
-    # but for points at the limit of what is gross
+    # except for points at the limit of gross errors
     assert np.mean(np.abs(one.grid.points - other.grid.points) > 1e-9) < 0.002
     np.testing.assert_array_equal(one.counts, other.counts)
 

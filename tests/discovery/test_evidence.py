@@ -34,7 +34,7 @@ def test_noise_is_found(e):
 
 def test_gross_errors_are_taken_out(e):
     share = e.gross / e.source.grid.observed.sum()
-    assert 0.001 < share < 0.004  # 0.2 % were put in, some below what can be seen
+    assert 0.001 < share < 0.004  # 0.2 % were added, some too small to be seen
     normal = e.residuals * np.sqrt(e.weights[..., :2])
     assert np.nanmax(np.abs(normal)) < 6.0
 
@@ -48,9 +48,9 @@ def test_wrong_field_coordinates_do_not_matter(source, e):
     fits = [HypothesisFitter([x]).fit((Term("creep"),)) for x in (e, reduce_series(other))]
 
     creep = [f.coefficients[3:] for f in fits]
-    # 0.1 mm of 1 m turn the partial derivatives by 1e-4 and the linearisation by a little more
+    # 0.1 mm in 1 m changes the partial derivatives by 1e-4, the linearisation slightly more
     assert np.linalg.norm(creep[0] - creep[1]) < 0.005 * np.linalg.norm(creep[0])
-    # 18 combinations of parameters in each epoch, their levels, 6 coefficients; three sigma of χ²
+    # 18 combinations of parameters per epoch, their levels, 6 coefficients; three sigma of χ²
     free = 18 * (len(source.frame_times) - 1) - 6
     for fit in fits:
         assert abs(fit.chi2 - free) < 3 * np.sqrt(2 * free)
@@ -91,7 +91,7 @@ def test_blocks_keep_the_slow_courses(e):
 
 
 def test_the_place_of_linearisation_has_all_parameters():
-    """Where C1 of 4e-3 is held at 0, y0 and B2 make up for it, and the drifts come out biased."""
+    """If C1 = 4e-3 were held at 0, y0 and B2 would absorb it, and the drifts would be biased."""
     series, _ = generate(Case(("affinity_drift",), 0.3, 210, with_m2=False))
 
     at = reduce_series(series_input(series[0])).at

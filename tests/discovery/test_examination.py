@@ -1,4 +1,4 @@
-"""Names, no forced names, and alternatives, on a few blind recordings; many are in tests/blind."""
+"""Names, no false names, and alternatives in a few blind recordings; tests/blind has many."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_no_effect_no_name(evidence_of):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [24, 26])
 def test_an_outside_influence_gets_no_name(evidence_of, seed):
-    """Its size is what it moves the image by, its parameters are those that moved."""
+    """Its size is the image's movement, its parameters are those that moved."""
     evidence, truth = evidence_of("outside", px=0.3, seed=seed, with_m2=False)
     found = discover_series(evidence)
     size = found.effects[0].estimates["size"]["value"]
@@ -88,7 +88,7 @@ def test_a_lag_and_a_delay_that_do_the_same_stay_alternatives(evidence_of, effec
 
 @pytest.mark.slow
 def test_a_delay_is_no_lag_because_the_temperature_was_smooth(evidence_of):
-    """A lag smooths the thermometer's noise, and a smooth image would speak for it: d is 10 s."""
+    """A lag smooths the thermometer's noise, so that a smooth image would favour it: d is 10 s."""
     evidence, _ = evidence_of("time_offset", px=0.3, seed=330)
     found = discover_series(evidence)
     assert [e.effect for e in found.effects] == ["time_offset"]
@@ -96,7 +96,7 @@ def test_a_delay_is_no_lag_because_the_temperature_was_smooth(evidence_of):
 
 @pytest.mark.slow
 def test_a_play_shorter_than_an_interval_is_named(evidence_of):
-    """Where it turns nobody saw the extreme; taken for sure, that spoke against every play."""
+    """The extreme is not read; taking the largest reading for it would exclude every play."""
     evidence, truth = evidence_of("hysteresis", px=0.1, seed=360)
     found = discover_series(evidence)
     assert [e.effect for e in found.effects] == ["hysteresis"]
@@ -109,7 +109,7 @@ def test_document(evidence_of):
     said: list[str] = []
     found = discover_series(evidence, said.append)
     document = found.as_dict()
-    # how far it is: each stage once, in the order of the work
+    # the progress: each stage once, in order
     stages = ("targets that moved", "measuring noise", "base model", "effect 1")
     first = [next(i for i, line in enumerate(said) if line.startswith(s)) for s in stages]
     assert first == sorted(first)
@@ -124,12 +124,12 @@ def test_document(evidence_of):
     assert tau["unit"] == "s"
     for gap in (document["gap"]["fit"]["before"], document["gap"]["verify"]["after"]):
         assert set(gap) == {"rms_px", "chi2_reduced", "object_mm_at_10m"}
-    page = report_html(found, "M1")  # the name beside what noise alone reaches
+    page = report_html(found, "M1")  # the name, compared with noise
     assert "Could noise do this?" in page
     assert page.count("<figure") == 6
     assert "≤ 1/120" in page
     assert f"UTC, {len(evidence[0].source.frame_times)} epochs." in page
-    assert "&lt;" not in page  # no object in place of its text
+    assert "&lt;" not in page  # no object's repr in place of its text
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Boards that are knocked or creep, a target that wanders: reported, and none of the camera's."""
+"""Boards that are knocked or creep and targets that wander are reported, not as the camera's."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_board_that_moves_is_reported_and_the_cameras_effect_is_named(evidence
     document = found.as_dict()["field"]["movements"]
     assert [(m["recording"], m["kind"]) for m in document] == [("M1", kind)]
     assert document[0]["targets"] == [str(i + 1) for i in BOARD]
-    # what one camera sees of it is across the rays
+    # a single camera sees it only across the rays
     assert 0.5 * MOVED_MM < document[0]["size_mm"] < 1.2 * MOVED_MM
     assert document[0]["sd_size_mm"] < 0.01
     assert (document[0]["time_s"] is not None) is (kind == "knock")
@@ -69,7 +69,7 @@ WANDERING = ((1, 9, 11), (3, 12, 16))
 
 
 def few_tags(source, wandering, course):
-    """Six tags of a blind recording, of whose corners some wander by 0.3 px."""
+    """Keep six tags of a blind recording, some of whose corners wander by 0.3 px."""
     corners = [49 * (t // 9) + 14 * (t % 9 // 3) + 2 * (t % 3) for t in TAGS]
     rows = np.array([at + k for at in corners for k in (0, 1, 7, 8)])
     points = np.array(source.grid.points)[:, rows]
@@ -89,7 +89,7 @@ def few_tags(source, wandering, course):
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", ["slip", "thermal_gradient"])
 def test_an_effect_is_named_where_corners_of_a_few_tags_wander(effect):
-    """So few that three of them bend the cameras until none stands out."""
+    """They are so few that three of them bend the cameras until none stands out."""
     series, _ = generate(Case((effect,), 0.25, 901, epochs=60))
     inputs = [
         few_tags(series_input(s), rows, lambda u, k: np.cos(np.pi * (k + 1) * u + k))
@@ -106,7 +106,7 @@ def test_an_effect_is_named_where_corners_of_a_few_tags_wander(effect):
 
 @pytest.mark.slow
 def test_a_knock_that_may_be_a_slip_is_listed_as_both():
-    """So many corners jump that none is left out, and the mount is taken for what moves."""
+    """So many corners jump that none is left out, and the mount is assumed to move."""
     series, _ = generate(Case(("slip",), 0.25, 901, epochs=60))
     inputs = [
         few_tags(series_input(s), range(at, 24, 3), lambda u, k: 0.4 * (u > 0.2 + 0.07 * k))
@@ -120,4 +120,4 @@ def test_a_knock_that_may_be_a_slip_is_listed_as_both():
     assert knock["not_excluded"] == ["slip"]
     said = "\n".join(discovery_lines(found))
     assert "a knock of the mount or a slip inside the camera" in said
-    assert "nothing is missing" not in said
+    assert "is missing" not in said

@@ -1,4 +1,4 @@
-"""Beyond the catalogue: what follows something recorded is described, what does not is not.
+"""Formulas beyond the catalogue: only what follows a recorded quantity is described.
 
 The influences are those of `tests.blind.outside`, which shares no code with the operators.
 """
@@ -14,7 +14,7 @@ from tests.blind.bridge import series_input
 from tests.blind.case import OUTSIDE, Case
 from tests.blind.generator import generate
 from tests.blind.outside import HUMID
-from thermocald.discovery.formulas import Library, condensed
+from thermocald.discovery.formulas import Library, condense
 from thermocald.discovery.proposal import propose
 from thermocald.discovery.result import discover_series
 from thermocald.discovery.search import Search
@@ -37,7 +37,7 @@ def reduced(kind: str, seed: int):
 
 
 def examined(kind: str, seed: int):
-    """What an examination leaves of the base model, without the catalogue's search."""
+    """Return an examination of the base model's misfit without the catalogue's search."""
     ready = [weight_slow_noise(e) for e in calibrate_thermometers(reduced(kind, seed))]
     fitter = HypothesisFitter(ready)
     base = Search(fitter).base()
@@ -92,8 +92,8 @@ def test_one_recording_gets_no_formula(above):
 
 
 def test_condensed_evidence_is_the_likelihood(above):
-    """What condensed rows promise of a trajectory is what the full normal equations give."""
-    few = condensed(above.fitter, above.base.fit, BASE)
+    """A trajectory gains the same in condensed rows as in the full normal equations."""
+    few = condense(above.fitter, above.base.fit, BASE)
     library = Library(few.histories)
     node = library.offsets(library.reference)[0]
     whole = Node("integral", (Node("above", (library.reference,), (26.5,)),))
@@ -103,11 +103,11 @@ def test_condensed_evidence_is_the_likelihood(above):
     candidate = Candidate(structure.text(), BASE, "k", np.array([values["k"]]))
     full = float(Scanner(above.fitter).scan(candidate, fit).gains[0])
     assert gain == pytest.approx(full, rel=0.002)
-    assert few.gains(library.values(node)[:, None])[0] < 1e-3 * gain  # T itself is the base's
+    assert few.gains(library.values(node)[:, None])[0] < 1e-3 * gain  # T is in the base
 
 
 def test_surrogates_are_as_strong_as_the_misfit(above):
-    few = condensed(above.fitter, above.base.fit, BASE)
+    few = condense(above.fitter, above.base.fit, BASE)
     power = np.sum(few.surrogates(40, np.random.default_rng(0)) ** 2, axis=0)
     assert 0.1 < np.median(power) / few.power < 10
 

@@ -1,4 +1,4 @@
-"""A thermometer that lags makes gradients of one time constant times the rates."""
+"""A lagging thermometer causes gradients of one time constant times the rates."""
 
 from __future__ import annotations
 

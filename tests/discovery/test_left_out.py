@@ -1,4 +1,4 @@
-"""Blocks left out: a cause predicts them, a look-alike does not, and an unseen step is forgiven."""
+"""A cause predicts blocks left out, unless they hold a step; a look-alike does not."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def test_the_cause_predicts_every_block(evidence_of):
     ("gain", "expected"),
     [
         ([30.0, 5.0, -3.0, 0.0, 20.0, 1.0], True),
-        ([30.0, 5.0, -30.0, 0.0, 20.0, 1.0], False),  # one block speaks against it
+        ([30.0, 5.0, -30.0, 0.0, 20.0, 1.0], False),  # one block contradicts it
         ([-1.0, -2.0, 1.0, 0.0, 0.0, 0.0], False),  # nothing is predicted
-        ([1e5, 2e4, -300.0, 10.0, 20.0, 1.0], True),  # small against what it explains
+        ([1e5, 2e4, -300.0, 10.0, 20.0, 1.0], True),  # small relative to what it explains
     ],
 )
 def test_what_confirms(gain, expected):
@@ -35,7 +35,7 @@ def test_what_confirms(gain, expected):
 
 
 def test_a_course_that_follows_the_noise_predicts_nothing(evidence_of):
-    """A cycle fitted to a recording without effects, at the period that suits it best."""
+    """A cycle is fitted to a recording without effects, at the best period."""
     lab = HypothesisFitter(evidence_of(px=0.2, seed=92, epochs=90, with_m2=False)[0])
     trials = [
         lab.fit([Term("cyclic_interference", nonlinear=(("P", p),))])
@@ -48,7 +48,7 @@ def test_a_course_that_follows_the_noise_predicts_nothing(evidence_of):
 
 
 def test_a_step_within_the_block_left_out_is_no_fault(evidence_of):
-    """Where a slip comes early in M2, the block with it leaves its height undetermined."""
+    """Without the block that holds an early slip in M2, its size is undetermined."""
     evidence, truth = evidence_of("slip", px=0.2, seed=91, epochs=90)
     lab = HypothesisFitter(evidence)
     times = [s["time"] for (s,) in truth["effects"] if s["happens"]]

@@ -1,4 +1,4 @@
-"""The level of a discovered model: its sds hold both noises and the test field's errors."""
+"""The level of a discovered model: its sds include both noises and the test field's errors."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from thermocald.thermal.source import epochs_input
 
 
 def pulls(draws: int, noise: float, field: float) -> np.ndarray:
-    """Errors of c, x0, y0 at T0 over their sds (draws, 3)."""
+    """Return the errors of c, x0, y0 at T0 over their sds (draws, 3)."""
     out = []
     for seed in range(draws):
         s = simulated(seed, epochs=40)
@@ -36,7 +36,7 @@ def pulls(draws: int, noise: float, field: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("noise", "field"), [(0.1, 0.02), (1.0, 1e-4)])
 def test_the_level_is_as_sure_as_stated(noise, field):
-    """Without the part of field and thermometer errors are 12 and 3 times the sds.
+    """Without the field's and the thermometer's part, errors are 12 and 3 times the sds.
 
     Over 200 draws: the sections `thermal` and `discovery` of benchmarks.audit.
     """

@@ -20,7 +20,7 @@ def of_images(e):
 
 
 def products(S, C, V):
-    """Inner products of trajectories C (E, R) along V (k, R), their levels eliminated, under S."""
+    """Inner products under S of trajectories C (E, R) along V (k, R), with levels eliminated."""
     X = np.einsum("er,kr->ekr", C, V).reshape(-1, C.shape[1])
     level = np.tile(np.eye(len(V)), (len(C), 1))
     inverse = np.linalg.inv(S)
@@ -58,7 +58,7 @@ def test_inner_products_equal_the_dense_ones(dense):
 
     expected = products(S, C, keep.T @ V)
     assert pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected).max()) == A
-    # the thermometer's part of S is seen: image noise alone gives something else
+    # the thermometer's part of S matters: image noise alone gives other values
     alone = products(images, C, keep.T @ V)
     assert np.abs(alone - expected).max() > 0.02 * np.abs(expected).max()
 
@@ -68,7 +68,7 @@ def test_determinant(dense):
     expected = np.linalg.slogdet(S)[1] - np.linalg.slogdet(images)[1]
     assert (
         expected > keep.shape[1]
-    )  # readings are noisier than images: the determinants differ by much
+    )  # readings are noisier than images: the determinants differ greatly
     assert fit.weightings[0].logdet == pytest.approx(expected, rel=1e-3)
 
 
@@ -89,7 +89,7 @@ def test_scan_agrees_with_reduce(dense):
 
 
 def test_effect_free_recordings_are_at_the_floor(evidence_of):
-    """Reduced χ² of the parameters is 1 with the thermometer's error in it, and far off without."""
+    """Reduced χ² of the parameters is 1 with the thermometer's error included, not without it."""
     evidence, _ = evidence_of(seed=8)
     fitter = HypothesisFitter(evidence)
     fit = fitter.fit(())

@@ -1,4 +1,4 @@
-"""The rates of a camera whose temperature goes far: the linearisation takes nothing of them."""
+"""The linearisation does not bias the rates of a camera with a large temperature range."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def test_the_scatter_of_long_series(tmp_path):
         path = tmp_path / f"{seed}"
         write_long_recording(path, 30_000, 21, seed=seed)
         series = tc.open(path).observed()
-        assert series.counts is not None  # on means
+        assert series.counts is not None  # of means
         fitted = fit_thermal_model([reduce_series(series, strict=False)], [])
         sds = fitted.model.sds
         ratios.append([(fitted.model.rates[n] - RATES[k]) / sds[f"rates.{n}"]
                        for k, n in enumerate(NAMES)])  # fmt: skip
         noise.append(fitted.fitted["series"][0].thermometer_sd)
-    # thirty numbers know a standard deviation to 13 %
+    # thirty values estimate a standard deviation to 13 %
     assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.25
     assert np.median(noise) == pytest.approx(0.02, rel=0.15)

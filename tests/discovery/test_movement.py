@@ -14,7 +14,7 @@ from thermocald.thermal.movement import (
 
 
 def test_slow_drifts_in_weak_directions_are_movement(evidence_of):
-    """Moments of rough half-waves do not show them; left at zero they were told as effects."""
+    """Moments of rough half-waves do not show them; set to zero, they would be named as effects."""
     (e,), _ = evidence_of(seed=7, epochs=60, with_m2=False)
     W = find_combinations([e])
     half_wave = np.cos(np.pi * np.linspace(0, 1, len(e.times)))

@@ -1,4 +1,4 @@
-"""The recordings that a discovery is made and proved on."""
+"""The recordings for discovery and for verification."""
 
 from __future__ import annotations
 

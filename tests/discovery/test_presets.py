@@ -1,4 +1,4 @@
-"""The cameras of the reference study as they are simulated: what was put in is what is named."""
+"""The effects of the reference study's simulated cameras are named."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DISTORTION = [{"decentering_drift"}, {"radial_distortion_drift"}]
 @pytest.mark.parametrize(
     ("preset", "expected"),
     [
-        # a mount that bends, with six coefficients, explains nearly as much as the two drifts
+        # a bending mount, with six coefficients, explains nearly as much as the two drifts
         ("nexus5-cold", DISTORTION),
         ("galaxy-s8-cold", [{"defocus"}, *DISTORTION[1:]]),
         ("rpi-v2.1-heating", [{"defocus"}, {"self_heating", "permanent_set"}, *DISTORTION]),

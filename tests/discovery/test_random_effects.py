@@ -1,4 +1,4 @@
-"""What is integrated out: offsets of hidden targets, the mount's movement."""
+"""Random effects: offsets of hidden targets, the mount's movement."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thermocald.thermal.reduce import reduce_together
 
 
 def hidden_but(epochs: slice, targets: list[int]):
-    """A camera with nothing but its rates, some targets of which are seen for a while only."""
+    """A camera with rates only, which sees some targets only in some epochs."""
     series, _ = generate(Case((), 0.3, 7, epochs=40, with_m2=False))
     source = series_input(series[0])
     never = np.zeros(source.grid.observed.shape, dtype=bool)
@@ -30,7 +30,7 @@ def hidden_but(epochs: slice, targets: list[int]):
 
 
 def test_targets_seen_in_one_epoch_say_nothing():
-    """Whatever their offsets are: one epoch has nothing to hold them against."""
+    """Whatever their offsets are, a single epoch cannot be compared with others."""
     without, once = hidden_but(slice(11, 12), list(range(60)))
 
     a, b = (HypothesisFitter(series).fit(()) for series in (without, once))

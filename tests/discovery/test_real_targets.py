@@ -17,9 +17,9 @@ CAMERAS = ("aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6")
 
 
 def with_temperature(shared, camera, kind, stretched=1.0):
-    """A recording in which nothing thermal happens, with a temperature that nobody measured.
+    """A recording without thermal effects, with an invented temperature.
 
-    stretched: factor on all times, so that fifty seconds may pass for a quarter of an hour.
+    stretched: factor of all times, so that fifty seconds become a quarter of an hour.
     """
     source = series_input(read_recording(shared / "data" / camera))
     t = source.frame_times - source.frame_times[0]
@@ -57,7 +57,7 @@ def test_fifty_seconds_are_too_short(shared, camera):
 @pytest.mark.parametrize("kind", ["ramp", "lamp", "steps"])
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_an_invented_temperature_names_no_effect(shared, camera, kind):
-    """Tag 22 of cam2 and camera 6 as a whole really move a little: that may be `unnamed`."""
+    """Tag 22 of cam2 and camera 6 as a whole do move slightly, which may be `unnamed`."""
     found = discover_series([reduce_series(with_temperature(shared, camera, kind, 20.0))])
 
     assert {e.effect for e in found.effects} <= {"unnamed"}

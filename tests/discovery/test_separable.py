@@ -1,4 +1,4 @@
-"""A shift of the principal point or a tilt of the camera: the recording says which it can tell."""
+"""Whether a recording separates a shift of the principal point from a tilt of the camera."""
 
 from __future__ import annotations
 

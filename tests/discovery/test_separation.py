@@ -1,4 +1,4 @@
-"""The experiment that separates two effects, and the recording that has done so."""
+"""The experiment that separates two effects, and the test whether a recording separates them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_programmes_stay_within_the_limits(pair, limits):
 
 
 def test_what_separates_is_preferred():
-    """A set that stays is told from a warm-up by heating again, not by one long hold."""
+    """Heating twice separates a permanent set from a warm-up; one long hold does not."""
     order = [e.name for e in rank_experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)]
     assert order.index("two equal cycles") < order.index("one long hold")
     sigmas = [e.sigmas for e in rank_experiments(*PAIRS[0], Limits(55.0), Body(), 180, 10.0)]
@@ -72,10 +72,10 @@ def test_nothing_is_separated_where_neither_is(evidence_of):
 @pytest.mark.parametrize(
     ("text", "error", "said"),
     [
-        ("creep", UsageError, "write two effects"),
-        ("creep,creep", UsageError, "write two effects"),
+        ("creep", UsageError, "give two different effects"),
+        ("creep,creep", UsageError, "give two different effects"),
         ("creep,kreep", ConfigurationError, "did you mean 'creep'"),
-        ("creep,defocus", UsageError, "defocus is seen in the image"),
+        ("creep,defocus", UsageError, "defocus shows in the image"),
     ],
 )
 def test_what_is_no_pair_is_refused(text, error, said):

@@ -1,4 +1,4 @@
-"""Discovery's folder: data flows one way, and a reader goes through few floors."""
+"""The layers of discovery: imports go one way and through few floors."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from thermocald.thermal.thermometer import (
 
 
 def trajectory(t):
-    """Two lamps, as a body with a time constant of 250 s follows them."""
+    """The temperature (t,) of a body with a time constant of 250 s that two lamps heat."""
     up = 20 * (1 - np.exp(-np.maximum(t - 200, 0) / 250))
     down = 20 * (1 - np.exp(-np.maximum(t - 805, 0) / 250))
     return 21 + up - down
@@ -40,7 +40,7 @@ def test_noise_with_quantisation(readings):
         t = 10.0 * np.arange(180) + rng.uniform(-1, 1, 180)
         y = np.round((trajectory(t) + rng.normal(0, 0.04, 180)) / 0.0625) * 0.0625
         noises.append(estimate_reading_noise(t, y, 0.0625))
-    # 177 third differences, correlated: 12 % each, so 2 % for the mean; kinks raise it a little
+    # 177 correlated third differences: 12 % each, so 2 % for the mean; kinks raise it slightly
     assert np.mean(noises) == pytest.approx(true, rel=0.08)
 
 
@@ -58,7 +58,7 @@ def test_kinks_get_a_latent_instant(readings):
 
 
 def smoothed(t, y):
-    """As an instrument, of which nothing is known between two readings."""
+    """Smooth readings as of an instrument that is unknown between two of them."""
     none = np.zeros(len(t), bool)
     return smooth_channel(t, y, ~none, none, none, 0.0625)
 
@@ -80,7 +80,7 @@ def test_a_missing_reading_is_uncertain(readings):
 
 
 def test_thermometers_are_not_read_at_even_intervals():
-    """On a steep trajectory jittered readings differ without any noise."""
+    """On a steep trajectory, readings at uneven times differ even without noise."""
     rng = np.random.default_rng(3)
     t = 10.0 * np.arange(200) + rng.uniform(-1, 1, 200)
 
@@ -88,7 +88,7 @@ def test_thermometers_are_not_read_at_even_intervals():
 
 
 def test_noise_is_seen_through_a_warm_up():
-    """One estimate for the study, the fit and the discovery: right to its own 3 %."""
+    """The one estimate for study, fit and discovery is right to its accuracy of 3 %."""
     rng = np.random.default_rng(4)
     t = 10.0 * np.arange(150)
     warm = 25 + 12 * (1 - np.exp(-t / 400.0))
@@ -105,7 +105,7 @@ def test_a_reading_without_a_time_is_no_reading():
 
 
 def test_kinks_between_sparse_readings_are_found():
-    """At 30 s every interval after a lamp bends more than its noise; the switches stand out."""
+    """At 30 s every interval after a lamp's switch bends by more than noise; switches stand out."""
     rng = np.random.default_rng(2)
     t = 30.0 * np.arange(60)
     latent, _ = find_times_between(t, trajectory(t) + rng.normal(0, 0.04, 60), None)
@@ -115,7 +115,7 @@ def test_kinks_between_sparse_readings_are_found():
 
 
 def test_the_noise_of_twenty_readings_with_two_kinks():
-    """Up to eight in seventeen third differences hold a kink: as a rule they are no noise."""
+    """Up to eight of seventeen third differences include a kink and not only noise."""
     found = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
@@ -127,8 +127,8 @@ def test_the_noise_of_twenty_readings_with_two_kinks():
 
 
 def test_between_sparse_readings_the_temperature_follows_its_curve():
-    """Of a warm-up straight lines between readings of 30 s are too low by h²/12 T'' everywhere."""
-    # the sharpest intervals, at the begin, have unknown values of their own
+    """Straight lines between readings every 30 s of a warm-up are too low by h²/12 T''."""
+    # the sharpest intervals, at the beginning, have unknowns of their own
     t, fine = 30.0 * np.arange(15), np.arange(120.0, 420.0, 2.0)
     y = trajectory(t + 300.0) + np.random.default_rng(5).normal(0, 0.001, 15)
     c = thermometers(t, {"T": y}, {"T": None})[1]["T"]
@@ -144,10 +144,10 @@ def test_on_a_curve_nothing_is_unknown_but_the_readings():
     c = thermometers(t, {"T": y}, {"T": None})[1]["T"]
     on_curve = c.mixing.diagonal() == 0
     weights = c.mixing.toarray()[on_curve]
-    assert on_curve.sum() >= 3 * 9  # the sharpest intervals have values of their own
+    assert on_curve.sum() >= 3 * 9  # the sharpest intervals have unknowns of their own
     assert weights[:, c.real].sum(axis=1) == pytest.approx(1.0)
     assert not weights[:, ~c.real].any()
-    # as sharp as a reading, but for the ends, where there are two neighbours on one side
+    # as accurate as a reading, except at the ends, with two neighbours on one side
     assert np.linalg.norm(weights, axis=1).max() < 1.1
 
 

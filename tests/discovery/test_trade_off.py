@@ -1,4 +1,4 @@
-"""Two time constants of which the data determine the sum alone."""
+"""Two time constants of which the data determine only the sum."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def twice_lagging(fitter, first, second):
 
 
 def saturating(fitter, middle, width):
-    """A saturation of the temperature, centred somewhere."""
+    """A saturation of the temperature."""
     return fitted(fitter, Node("saturation", (T,), (middle, width)))
 
 
@@ -69,7 +69,7 @@ def test_a_saturation_far_outside_the_recorded_range_is_known_by_its_course_alon
 
 @pytest.mark.parametrize(("middle", "width"), [(50.0, 20.0), (60.0, 30.0), (3783.7, 288.2)])
 def test_what_is_known_of_it_is_slope_and_curvature(lagging, middle, width):
-    """The curve is the same whichever of the formulas that explain the same is written."""
+    """The curve is the same for all formulas that explain the same."""
     found = find_tied_constants(lagging, saturating(lagging, middle, width), 0)
     square = Node("square", (Node("offset", (T,), (found["temperature"],)),))
     parabola = lagging.refine(lagging.fit((Term(square.text(), BASE),)), max_iterations=0)

@@ -18,7 +18,7 @@ from thermocald.thermal.reduce import reduce_together
 
 
 def trembling(effects, px, seed):
-    """Both series of a blind case; each image shifted by px, every epoch by itself."""
+    """Both series of a blind case, with each epoch's image shifted independently by px."""
     rng = np.random.default_rng([seed, 5])
     out = []
     for series in generate(Case(effects, 0.3, seed))[0]:
@@ -38,7 +38,7 @@ def test_a_tremble_is_found_along_its_own_directions(px, directions):
 
     clear = factors > 1.7
     assert clear.sum() == directions
-    # a shift of 147 points in units of the noise found, 0.04 px; 178 epochs tell it to 15 %
+    # a shift of 147 points in units of the estimated noise, 0.04 px; known to 15 % from 178 epochs
     expected = 1.0 + 147 * px**2 / 0.04**2 if directions else np.nan
     assert factors[clear] == pytest.approx([expected] * directions, rel=0.4)
     again = weight_jumps_down(series[0], factors, W)

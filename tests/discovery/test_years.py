@@ -1,4 +1,4 @@
-"""Discovery on a year: an effect hidden in one afternoon of it, and one that takes a year."""
+"""Discovery in a year's series: an effect within one afternoon, and one that takes a year."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LAG_S = 1200.0
 
 
 def cellar(t):
-    """One kelvin over the year, and one afternoon on which somebody opens the shutters."""
+    """The temperature of a cellar: 1 K over the year, and one afternoon with open shutters."""
     slow = 15.0 + np.sin(2 * np.pi * t / (365 * DAY))
     return slow + 12.0 * np.exp(-0.5 * ((t - 200.6 * DAY) / (0.06 * DAY)) ** 2)
 
@@ -26,12 +26,12 @@ def outdoors(t):
 
 
 def behind(at, _):
-    """The cellar's temperature behind a lag, by steps of 10 s about the afternoon."""
+    """The cellar's temperature with a lag, in steps of 10 s about the afternoon."""
     fine = np.arange(199.0 * DAY, 203.0 * DAY, 10.0)
     a = np.exp(-10.0 / LAG_S)
     warm = cellar(fine)
     lagged, _ = lfilter([1 - a], [1, -a], warm, zi=[a * warm[0]])
-    # of a slow course a lag is a delay
+    # for a slow change, a lag is a delay
     out = cellar(at - LAG_S)
     near = (at > 199.5 * DAY) & (at < 202.5 * DAY)
     out[near] = np.interp(at[near], fine + 5.0, lagged)

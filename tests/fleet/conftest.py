@@ -1,4 +1,4 @@
-"""A real PostgreSQL of its own on loopback, and the small store of tests/store to forward to it."""
+"""A real PostgreSQL on loopback, and the small store of tests/store to forward to it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def address(server: Server, query: str = "", **given: str) -> ServerAddress:
 
 
 def execute(server: Server, statement: str, *values: object) -> list[tuple]:
-    """What a statement gives in the database `thermocald`."""
+    """Return a statement's rows in the database `thermocald`."""
     import psycopg
 
     with psycopg.connect(server.address(name="thermocald")) as connection:
@@ -35,7 +35,7 @@ def execute(server: Server, statement: str, *values: object) -> list[tuple]:
 
 
 def count(server: Server, table: str) -> int:
-    """The rows of a table of the database `thermocald`."""
+    """Return the number of rows of a table in the database `thermocald`."""
     return execute(server, f"SELECT count(*) FROM {table}")[0][0]
 
 
@@ -46,7 +46,7 @@ def _programs() -> Path | None:
 
 
 class Server:
-    """A cluster in a folder; `stop` and `start` as often as a test likes."""
+    """A cluster in a folder, which can be stopped and started repeatedly."""
 
     def __init__(self, programs: Path, folder: Path) -> None:
         self.programs, self.folder = programs, folder
@@ -92,7 +92,7 @@ def cluster():
 
 @contextmanager
 def new_cluster(prepare=lambda server: None):
-    """A cluster of its own; prepare(server) is called before it is started."""
+    """Make a new cluster; prepare(server) is called before it is started."""
     programs = _programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed (apt install postgresql)")
@@ -112,7 +112,7 @@ def new_cluster(prepare=lambda server: None):
 
 @pytest.fixture(scope="session")
 def template(cluster):
-    """A database with the tables, to be copied: that is faster than to make them."""
+    """A database with the tables, since copying is faster than making them."""
     import psycopg
 
     from thermocald.store.server.connection import create_tables
@@ -136,7 +136,7 @@ def server(cluster, template):
 
 @pytest.fixture
 def role(server):
-    """The name of a role that may log in, with the password `berry`, and nothing else."""
+    """The name of a role that may only log in, with the password `berry`."""
     import psycopg
 
     with psycopg.connect(server.address(), autocommit=True) as connection:

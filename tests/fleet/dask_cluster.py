@@ -16,7 +16,7 @@ from typing import Self
 
 from thermocald.physics.presets import preset_simulation
 
-# docs/how-to/fleet.md: what idle processes do costs less
+# docs/how-to/fleet.md: idle processes cost less
 SETTINGS = """\
 distributed:
   worker: {profile: {enabled: false}, memory: {monitor-interval: 1s}}
@@ -25,7 +25,7 @@ distributed:
 
 
 class DaskCluster:
-    """A scheduler in a folder, and workers that a test starts and kills; ended with the block."""
+    """A scheduler in a folder, and workers that a test starts and kills; a context manager."""
 
     def __init__(self, folder: Path, workers: int) -> None:
         self._known = folder / "scheduler.json"
@@ -75,7 +75,7 @@ class DaskCluster:
 
 
 def write_frame_archive(folder: Path, recordings: int, frames: int) -> None:
-    """Recordings M00, M01 … of the same rendered 8 MP frames, which lie on the disk once."""
+    """Write recordings M00, M01 … of the same rendered 8 MP frames, which are stored once."""
     simulation = preset_simulation("rpi-v2.1-heating", 1, "M00")
     programme = replace(simulation.programme, epochs=frames)
     first = folder / "M00"

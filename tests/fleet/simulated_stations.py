@@ -1,4 +1,4 @@
-"""Stations for tests: stores written at 100 × speed and forwarded meanwhile, several a process.
+"""Simulated stations: stores written at 100 × speed while being forwarded, several per process.
 
 python -m tests.fleet.simulated_stations FOLDER FIRST COUNT EPOCHS ADDRESS
 """
@@ -33,7 +33,7 @@ def station_name(number: int) -> str:
 
 
 class Writer:
-    """Writes one station's store: an epoch, now and then an event and a reading."""
+    """The writer of a station's store: epochs, and now and then an event and a reading."""
 
     def __init__(self, folder: Path, number: int) -> None:
         self.rng = np.random.default_rng([21, number])
@@ -67,7 +67,7 @@ class Writer:
 
 
 def run(folder: Path, first: int, count: int, epochs: int, address: str) -> dict[str, float]:
-    """Write and forward until all is sent; the longest time a store waited after its last row."""
+    """Write and forward until all is sent; return the longest wait after a store's last row."""
     writers = [Writer(folder, first + i) for i in range(count)]
     written = threading.Event()
     lag: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""A real Dask cluster gives the bits of one process, whatever happens to its workers."""
+"""A real Dask cluster gives the same bits as one process, whatever happens to its workers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def start_client(archive, out, dask):
 
 
 def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archive, tmp_path, dask):
-    """One of two; the other after every few blocks, and another takes its place, as on machines
+    """One of two is killed, then the other after every few blocks and replaced, as on machines
     that are lent.
     """
     run_tasks(calibrate_block, blocks_of(archive, tmp_path / "one", 10))
@@ -64,7 +64,7 @@ def test_workers_that_are_killed_again_and_again_finish_with_equal_results(archi
 
 
 def test_workers_killed_while_they_measure_cost_no_frame(tmp_path, dask):
-    """Frames are measured again; all recordings hold the same, so one done here is enough."""
+    """Frames are measured again; all recordings are equal, so that one reference suffices."""
     write_frame_archive(tmp_path / "archive", 40, 10)
     run_tasks(calibrate_block, blocks_of(tmp_path / "archive" / "M00", tmp_path / "one", 10))
     (expected,) = (tmp_path / "one").iterdir()
@@ -92,7 +92,7 @@ def test_workers_killed_while_they_measure_cost_no_frame(tmp_path, dask):
 
 @pytest.mark.parametrize("analysis", ["study", "discover"])
 def test_every_series_is_analysed_as_it_is_here(archive, tmp_path, dask, analysis):
-    """Monte-Carlo and surrogates included: their random numbers do not depend on the engine."""
+    """Monte-Carlo and surrogates too: their random numbers do not depend on the engine."""
     command = [sys.executable, "-m", "thermocald", "reprocess", archive, "--do", analysis,
                "--sets", "500", "--out"]  # fmt: skip
     for options in (["local"], ["cluster", "--engine", dask.address]):

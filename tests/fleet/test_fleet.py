@@ -1,4 +1,4 @@
-"""`thermocald fleet`: what is wrong with a fleet is named, and nothing else."""
+"""`thermocald fleet` reports the faults of a fleet and nothing else."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run(*arguments):
 
 @pytest.fixture
 def fleet(server):
-    """Ten sound cameras of one type, and cameras with a fault each, by its name."""
+    """Ten cameras of one type without faults, and cameras with one fault each, named after it."""
     now = time.time()
     base = replace(BASE, end=now - 20)
     cameras = [replace(base, station=f"gauge{i}", rates=rate) for i, rate in enumerate(RATES)]
@@ -75,16 +75,16 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
     summary = document["summary"]
     assert (summary["cameras"], summary["stations"], summary["sound"]) == (17, 17, 9)
     texts = {c["station"]: " ".join(f["text"] for f in c["findings"]) for c in document["cameras"]}
-    assert re.search(r"c moves by \+0\.(89|90)\d µm/K", texts["odd"])
+    assert re.search(r"c drifts by \+0\.(89|90)\d µm/K", texts["odd"])
     assert "25 rows wait" in texts["late"]
     assert "21.5 °C for" in texts["stuck"]
     assert "90 s ahead of" in texts["gauge3"]
     assert "no_targets" in texts["cold"]
-    assert "outside of" in texts["cold"]
+    assert "outside its calibrated range" in texts["cold"]
     html = page.read_text()
     drawn = [html.count(f">{name}<") for name in document["types"][0]["cameras"]]
     assert len(drawn) >= 14
-    assert min(drawn) >= 3  # a row in the drawing of each rate
+    assert min(drawn) >= 3  # a row in each rate's drawing
     assert "secret" not in html
     rates = {c["station"]: c["rates"] for c in document["cameras"]}
     for i, true in enumerate(RATES):
@@ -97,7 +97,7 @@ def test_faults_are_named_and_sound_cameras_are_not(fleet, tmp_path):
     # the table fits a terminal, and an address narrows it
     lines = run("fleet", fleet).splitlines()
     assert max(map(len, lines)) <= 80
-    assert lines[0].startswith("17 cameras at 17 stations: 9 sound, 1 late")
+    assert lines[0].startswith("17 cameras at 17 stations: 9 without findings, 1 late")
     assert any(line.startswith("odd/cam") for line in lines)
     document = json.loads(run("fleet", f"{fleet}?station=gauge3", "--json", "-"))
     assert [c["station"] for c in document["cameras"]] == ["gauge3"]

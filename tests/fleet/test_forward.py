@@ -1,4 +1,4 @@
-"""Forwarding: everything arrives once, whatever breaks on the way, and reads as it did at home."""
+"""Forwarding: all rows arrive once and unchanged, whatever fails on the way."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_what_a_person_must_mend_is_said(filled, server, user, name, words):
 
 
 def test_a_row_that_the_server_refuses_stops_no_other(filled, server):
-    """And the month whose first batch failed is made by the next one."""
+    """The partition of a month whose first batch failed is made by the next one."""
     store, _ = filled
     execute(server, "ALTER TABLE epoch ADD CHECK (number <> 7)")
     forwarder = Forwarder(store.path, address(server), "bank", batch=8)
@@ -184,7 +184,7 @@ def test_a_server_that_dies_and_comes_back_gets_everything_once(filled, server, 
 
 
 def test_a_damaged_row_is_not_sent_and_stops_no_other(filled, server):
-    """Bits that flipped on an SD card must not become a value at the server."""
+    """Bits flipped on an SD card must not become values on the server."""
     store, _ = filled
     store.add_readings([LoggedReading("air", 1.6e9 + i, {"t": 20.0}) for i in range(3)])
     other = sqlite3.connect(store.path)
@@ -207,7 +207,7 @@ def test_a_damaged_row_is_not_sent_and_stops_no_other(filled, server):
 def test_a_new_store_in_the_place_of_the_old_is_sent_from_its_start(
     server, tmp_path, head, field, make_epoch
 ):
-    """Even where the file system gives it the inode of the old one."""
+    """This holds even if the file system gives it the old one's inode."""
     path = tmp_path / "k.db"
     for created, epochs in ((1.0, 5), (2.0, 3)):
         with Store.open(path, "append") as store:

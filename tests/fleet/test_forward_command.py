@@ -1,4 +1,4 @@
-"""`thermocald forward` as the unit starts it: from the daemon's configuration."""
+"""`thermocald forward` with the daemon's configuration, as its unit starts it."""
 
 from __future__ import annotations
 

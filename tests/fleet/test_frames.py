@@ -1,4 +1,4 @@
-"""Chosen frames at the server: bounded, resumable, checked; retention goes on as it did."""
+"""Chosen frames on the server: limited, resumable, checked, without effect on retention."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The dashboard for Grafana: sound JSON, and every SQL in it runs on the schema."""
+"""The dashboard for Grafana: valid JSON, and all its SQL runs on the schema."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.commands import succeed
 from thermocald.store.server.connection import ServerAddress, grant
 from thermocald.store.server.reader import ServerWriter
 
-# what Grafana's PostgreSQL source puts in the place of its macros and variables
+# the values with which Grafana's PostgreSQL source replaces its macros and variables
 MACROS = {
     "$__unixEpochFrom()": "{first}", "$__unixEpochTo()": "{last}", "$__interval_ms": "60000",
     "${station:sqlstring}": "'bank','hill'",

@@ -1,4 +1,4 @@
-"""Archives calibrated again: every engine gives the same bits, and a bad block costs itself."""
+"""Reprocessed archives: every engine gives the same bits, and a bad block affects only itself."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_block_that_kills_its_process_costs_itself(archive, tmp_path):
 def test_bad_usage_is_said(archive, tmp_path):
     with pytest.raises(DataError, match="no recording"):
         find_blocks([tmp_path], tmp_path, ())
-    with pytest.raises(UsageError, match="there is `local`"):
+    with pytest.raises(UsageError, match="give `local` or"):
         run_tasks(calibrate_block, [], "fast")
     with pytest.raises(UsageError, match="there are calibrate, discover, study"):
         find_series_tasks([archive], tmp_path, "dream")

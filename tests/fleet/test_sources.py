@@ -1,4 +1,4 @@
-"""The commands read a server's address as they read a file, and give the same."""
+"""Commands read a server's address like a file, with the same results."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_server_gives_what_the_file_gives(places):
 @pytest.mark.slow
 def test_discover_and_correct_read_a_server_too(places, tmp_path):
     file, server = places
-    # what is discovered follows from these
+    # discovery depends only on these
     here, there = (tc.open(place).observed() for place in places)
     assert "secret" not in there.name
     assert np.array_equal(here.frame_times, there.frame_times)

@@ -1,4 +1,4 @@
-"""Which station and server rows are of: two of one name, one of two places, a copied store."""
+"""Stations' identities: two of one name, one at two places, a copied store."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def filled_store(path, head, field, make_epoch, make_result, epochs=5) -> Path:
 
 
 def findings(place) -> set[str]:
-    """The kinds of what an overview finds."""
+    """Return the kinds of an overview's findings."""
     now, cameras = read_overview(place, Path("x"))
     add_findings(cameras, [], now)
     return {finding["kind"] for camera in cameras for finding in camera.findings}
@@ -40,7 +40,7 @@ def two(tmp_path, head, field, make_epoch, make_result):
 
 
 def test_two_stations_of_one_name_are_told_apart_and_reported(server, two):
-    """As after a card was replaced, or with two daemons on one host: ids begin at 1 in both."""
+    """After a card was replaced, or with two daemons on one host, ids begin at 1 in both."""
     place = address(server)
     for path in two:
         with Store.open(path, "append", durable=False) as store:
@@ -191,7 +191,7 @@ CLONES = ["copied", "by backup", "with its cursor", "before the first report", "
 
 @pytest.mark.parametrize("how", CLONES)
 def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, make_result, how):
-    """An image of a card has the cursor too, and the store's inode and identity: what the two take
+    """A card's image has the cursor, the store's inode and identity too: only what the two take
     afterwards tells them apart.
     """
     place, one, clone = address(server), two[0], two[0].with_name("clone.db")
@@ -220,5 +220,5 @@ def test_a_cloned_card_loses_nothing_and_is_reported(server, two, make_epoch, ma
     for path in (*order, *order):
         Forwarder(path, place, names[path], cursors[path]).send_waiting()
     assert count(server, "series") == 1 + apart
-    assert count(server, "epoch") == (16 if apart else 11 + ahead)  # each is there
+    assert count(server, "epoch") == (16 if apart else 11 + ahead)  # all are there
     assert ("twins" in findings(place)) is not apart

@@ -1,4 +1,4 @@
-"""The summary that the server keeps says exactly what a scan of all epochs says."""
+"""The server's summary is exactly that of a scan of all epochs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def summary(server):
 
 
 def scanned(server):
-    """The same from every row of the table of epochs."""
+    """Return the summary from every row of the table of epochs."""
     rows = execute(
         server, "SELECT series, number, revision, frame_time, status, temperatures, "
         "c, sd_c, x0, sd_x0, y0, sd_y0 FROM epoch"
@@ -55,7 +55,7 @@ def scanned(server):
 
 
 def generated_rows(store, series, rng, count):
-    """Rows as a store gives them: late ones, revised ones, clocks that are wrong, no readings."""
+    """Make rows as from a store: late, revised, with a wrong clock, without readings."""
     usual = store.rows_after("epoch", 0, 1)[0]
     usual.pop("damage")
     rows = []
@@ -100,11 +100,11 @@ def test_late_repeated_and_revised_rows_count_exactly_once(server, filled):
 
 @pytest.mark.parametrize("days", [20, 100])
 def test_an_overview_reads_the_summary_of_a_long_series(server, days):
-    """Of 100 days it reads no epoch but the last ones, and samples at every time of day."""
+    """Of 100 days it reads only the last epochs, and samples at every time of day."""
     camera = GeneratedCamera("a", epochs=days * 24, interval=3600.0)
     with psycopg.connect(server.address(name="thermocald")) as connection:
         add_camera(connection, camera)
-        # what it would find there: the summary stays
+        # a scan needs these rows, the summary does not
         connection.execute("DELETE FROM epoch WHERE frame_time < %s", (camera.end - 86400 * 5,))
     assert summary(server) != scanned(server)
     with FleetReader(address(server)) as reader:

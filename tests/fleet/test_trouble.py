@@ -1,4 +1,4 @@
-"""What goes wrong between stations and a server: a clear word each, and nothing is lost."""
+"""Faults between stations and a server: each is reported clearly, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HOSTILE = ["x'); DROP TABLE epoch; --", 'a"b', "%s", "{0}", "$1", "; SELECT pg_s
 
 @pytest.mark.parametrize("evil", HOSTILE)
 def test_names_are_values_and_never_statements(server, tmp_path, head, field, make_epoch, evil):
-    """Of a station, camera, series, channel and extra column; read back by them, and narrowed."""
+    """Any names of station, camera, series, channel and extra column are stored and selected by."""
     channel = evil.translate(str.maketrans("", "", ",;='\"\\/")).strip()
     camera = replace(head.camera, name=evil)
     hostile = replace(head, series=evil, camera=camera,
@@ -74,7 +74,7 @@ def test_a_newer_server_is_told_from_an_older_one(filled, server):
 
 @pytest.fixture
 def small_disk():
-    """A disk of 16 MB of PostgreSQL's user's own."""
+    """A disk of 16 MB that belongs to PostgreSQL's user."""
     if os.geteuid() != 0 or shutil.which("mount") is None:
         pytest.skip("nothing can be mounted here: needs root")
     folder = tempfile.mkdtemp(prefix="thermocald-disk-")
@@ -138,7 +138,7 @@ def certificates(tmp_path_factory):
 
 @pytest.mark.slow
 def test_certificates(certificates, filled):
-    """A client certificate is enough; an expired one, on either side, or a foreign one, is said."""
+    """A client certificate suffices; an expired or foreign one is reported."""
     store, _ = filled
 
     def prepare(server):

@@ -1,4 +1,4 @@
-"""A whole fleet into one server that is killed, through a network that fails: equal in the end."""
+"""A whole fleet forwards to a server that is killed, through a failing network, without loss."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def forwarded(server, folder, stations, per_process, epochs, kills, cut_every_s):
-    """Run a fleet through everything; seconds from the last recovery to the last row's arrival."""
+    """Run a fleet through all faults; return seconds from the last recovery to the last row."""
     with UnreliableProxy(server.port, 21, cut_every_s) as proxy, ExitStack() as stack:
         address = server.address(name="thermocald").replace(f":{server.port}/", f":{proxy.port}/")
         processes = []
@@ -60,7 +60,7 @@ def forwarded(server, folder, stations, per_process, epochs, kills, cut_every_s)
 
 
 def require_equal(server, folder, stations):
-    """Every row of every store is at the server, bit for bit, and nothing else is."""
+    """Check that the server has exactly the rows of all stores, bit for bit."""
     epochs = """SELECT number, frame_time, temperatures, "c", "sd_x0", covariance, observations
                 FROM epoch JOIN series ON key = epoch.series WHERE station = %s ORDER BY number"""
     with psycopg.connect(server.address(name="thermocald")) as connection:

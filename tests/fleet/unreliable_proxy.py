@@ -1,4 +1,4 @@
-"""A network on loopback that fails: connections are cut at random and for a while not accepted."""
+"""A failing network on loopback: connections are cut at random, then refused for a while."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import threading
 
 
 class UnreliableProxy:
-    """Passes TCP on to a port; `calm()` ends the cuts. Use in a `with` block."""
+    """A TCP proxy of a port; `calm()` ends the cuts. Use it in a `with` block."""
 
     def __init__(self, target: int, seed: int, every_s: float) -> None:
         self.target, self.every_s = target, every_s
@@ -51,7 +51,7 @@ class UnreliableProxy:
             for writer in list(self._open):
                 if self._random.random() < 0.5:
                     self.cuts += 1
-                    writer.transport.abort()  # what was under way is lost in both directions
+                    writer.transport.abort()  # data under way are lost in both directions
             self._refusing = True
             await asyncio.sleep(self._random.uniform(0, self.every_s / 3))
             self._refusing = False

@@ -1,18 +1,14 @@
-"""Entries of a discovery: effects with estimates, sentences, evidence, and what is not separable.
+"""The entries of a discovery: effects with estimates, statements, evidence and alternatives.
 
-Shift or tilt: whether a recording separates a principal point that moves from a camera that
-turns.
+Shift or tilt. From a single station, a shift of the principal point and a rotation of the camera
+move the image alike; only the perspective differs. The reduced normal equations show whether a
+recording separates them: with both in the model along the effect's trajectory, by their correlation
+and by how much better one of them explains the image.
 
-Seen from one place both move the image alike; only the perspective differs. How far a recording
-shows that is in its reduced normal equations: with both in the model along the trajectory of the
-effect, their correlation, and by how much the one explains the image better than the other.
+Source: canonical correlations, Hotelling (1936), Biometrika 28, 321-377.
 
-Source: canonical correlations as Hotelling (1936), Biometrika 28, 321-377.
-
-Constants that trade off: two time constants of which the data determine the sum alone.
-
-Two lags of the same size do the same to first order; each by itself is then known to be a time
-constant and no more, while their sum is as well determined as one lag alone would be.
+Trade-offs. Two lags of the same size have the same effect to first order. The data then determine
+only their sum, as well as a single lag, and hardly each of them.
 """
 
 from __future__ import annotations
@@ -43,9 +39,9 @@ if TYPE_CHECKING:
 
 Estimate = dict[str, Any]
 
-_SURE = 3.0  # standard deviations of a thermometer's lag
-_EXCHANGED = 1e-9  # of the scaled normal matrix: along it nothing is known
-_TAKES_PART = 0.1  # of a unit vector along it
+_SURE = 3.0  # least lag of a thermometer, in its standard deviations
+_EXCHANGED = 1e-9  # eigenvalue of the scaled normal matrix below which a direction is undetermined
+_TAKES_PART = 0.1  # least component of a constant in such a direction's unit vector
 _UNLIKE = 0.01  # probability below which the gradients are not one lag times the rates
 
 
@@ -54,7 +50,7 @@ def _make_estimate(value: float, sd: float, unit: str) -> Estimate:
 
 
 def estimate_term(fit: Fit, number: int, evidence: ReducedSeries) -> dict[str, Estimate]:
-    """Return all parameters of one term: searched ones by name, coefficients as `a_<parameter>`."""
+    """Return a term's estimates: searched parameters by name, coefficients as `a_<parameter>`."""
     term = fit.terms[number]
     effect = term.kind
     units = effect.units()
@@ -84,11 +80,10 @@ def estimate_term(fit: Fit, number: int, evidence: ReducedSeries) -> dict[str, E
 
 
 def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
-    """The thermometer's own lag as an alternative to a thermal gradient; None where it is none.
+    """Return a lag of the thermometer as an alternative to a thermal gradient; None if it is none.
 
-    A thermometer that follows the camera with a lag τ reads T - τ dT/dt: every parameter that
-    drifts with T then has a gradient of τ times its rate, which nothing but chance gives a bent
-    mount.
+    A thermometer that follows the camera with a lag τ reads T - τ dT/dt. Every parameter that
+    drifts with T then has a gradient of τ times its rate, which a bent mount has only by chance.
     """
     from scipy.stats import chi2
 
@@ -121,19 +116,19 @@ def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
         "statement": "the thermometer lags behind the camera by "
         f"{say_estimate(_make_estimate(tau, sd, 's'))}: "
         f"it explains {', '.join(own.parameters)} by one number",
-        "experiment": "put a small, fast thermometer beside the one that was read and record "
-        "again: a lag of the thermometer goes, a gradient stays",
+        "experiment": "put a small, fast thermometer beside the present one and record again: a "
+        "lag of the thermometer disappears, a gradient remains",
     }
 
 
 def acts_on(parameters: tuple[str, ...]) -> list[str]:
-    """Name parameters in the words of the document."""
+    """Return the parameters' names in the document."""
     return [p if p not in FIELD_SCALES else f"object {p[-1]}" for p in parameters]
 
 
 @dataclass(frozen=True, eq=False)
 class EffectFound:
-    """One entry of `effects` in CONVENTIONS §4."""
+    """An effect found: an entry of `effects` in CONVENTIONS §4."""
 
     JSON: ClassVar = {"term": ""}
 
@@ -147,13 +142,13 @@ class EffectFound:
 
     @property
     def alternative_names(self) -> list[str]:
-        """Effects of the catalogue that the data cannot exclude."""
+        """The effects of the catalogue that the data cannot exclude."""
         others = ("resembles", "formula")
         return [a["effect"] for a in self.alternatives if not any(a.get(k) for k in others)]
 
 
 def effects_of(found: EffectFound) -> list[ModelEffect]:
-    """Return what was found as effects of a model; none where it has no name and no formula."""
+    """Return an effect found as a model's effects; none if it has neither a name nor a formula."""
     if found.term is None and found.effect not in catalogue.names():
         return []
     term = found.term
@@ -169,7 +164,7 @@ def effects_of(found: EffectFound) -> list[ModelEffect]:
 
 
 def terms_of(model: ThermalModel) -> list[tuple[str, dict[str, Any]]]:
-    """List the effects of a model that act on trajectories of parameters, with their values."""
+    """List a model's effects that act on the parameters' trajectories, with their values."""
     return [
         (e.name, dict(e.values))
         for e in model.effects
@@ -179,18 +174,17 @@ def terms_of(model: ThermalModel) -> list[tuple[str, dict[str, Any]]]:
 
 _SHIFT = ("x0", "y0")
 _TILT = ("omega", "phi")
-_BOTH = ("c", "kappa")  # a scale and a turn about the axis are seen whatever the rest is
+_BOTH = ("c", "kappa")  # a scale and a rotation about the axis are always determined
 
 
 def compare_shift_and_tilt(
     fitter: HypothesisFitter, fit: Fit, number: int
 ) -> tuple[dict[str, Any], str] | None:
-    """Compare a shift of the principal point with a tilt of the camera as the cause of one term.
+    """Compare a shift of the principal point with a tilt of the camera as the cause of a term.
 
-    Returns the document of the evidence, with the largest correlation of a combination of x0, y0
-    with one of omega, phi and the χ² that the shift explains beyond what the tilt does; and what is
-    added to the statement where the recording does not separate them. None where the term moves
-    neither.
+    Returns the evidence, which holds the largest correlation of a combination of x0, y0 with one of
+    omega, phi and the χ² that the shift explains beyond the tilt, and a clause for the statement,
+    empty if the recording separates them. Returns None if the term moves neither.
     """
     term = fit.terms[number]
     if not {*_SHIFT, *_TILT} & set(term.parameters):
@@ -199,8 +193,8 @@ def compare_shift_and_tilt(
     names = (*_SHIFT, *_TILT, *_BOTH, *rest)
     shift, tilt, both = np.arange(2), np.arange(2, 4), np.arange(4, len(names))
     own = -1 if term.is_drive else number
-    # of the estimates, c and kappa estimated too; an effect that is T itself has its shift in the
-    # base's rates
+    # correlation of the estimates, with c and kappa estimated too; the shift of an effect that is
+    # T itself is in the base's rates
     A, _ = normals_of_term(fitter, fit, term, names, leave=frozenset({own, -1}))
     Q = np.linalg.inv(unit_diagonal(A, 1e-12)[0])
     low_s, low_t = (np.linalg.cholesky(Q[np.ix_(i, i)]) for i in (shift, tilt))
@@ -225,10 +219,10 @@ def compare_shift_and_tilt(
 def find_trade_off(
     fitter: HypothesisFitter, fit: Fit, number: int
 ) -> tuple[dict[str, Any], str] | None:
-    """Find two time constants of a term that M1 does not separate; None where it does.
+    """Find two time constants of a term that M1 does not separate; None if it does.
 
-    Returns the document, and what is added to the statement. The standard deviation is that of the
-    one where the other is held, which is that of their sum.
+    Returns the evidence and a clause for the statement. The standard deviation of their sum is that
+    of the first with the second held.
     """
     term, K = fit.terms[number], len(fit.coefficients)
     loose = []
@@ -249,16 +243,17 @@ def find_trade_off(
     document = {
         "parameters": [first, second], "sum": total["value"], "sd": total["sd"], "unit": "s"
     }  # fmt: skip
-    return document, (f"; the time constants are not separable, their sum is {say_estimate(total)}")
+    return document, f"; the time constants are not separable, their sum is {say_estimate(total)}"
 
 
 def find_tied_constants(fitter: HypothesisFitter, fit: Fit, number: int) -> dict[str, Any] | None:
-    """Find the constants of a formula that M1 exchanges for its size or each other; None without.
+    """Find the constants of a formula that trade off against its size or each other in M1.
 
-    Of these M1 knows only what they make of its temperatures together (`known_together`). tanh far
-    below its middle is an exponential: middle and size are one number, and its slopes are nothing
-    but rounding, which looks like knowledge. So a temperature outside the recorded ones by more
-    than their range counts, whatever the normal equations say.
+    M1 determines only their joint effect at its temperatures (`known_together`). Far below its
+    middle, tanh is an exponential: middle and size are one number, and the slopes are rounding
+    errors that look like information. A temperature outside the recorded range by more than its
+    width therefore counts as traded off, whatever the normal equations show. Returns None if there
+    are no such constants.
     """
     e, term = fitter.series[0], fit.terms[number]
     recorded = np.concatenate([e.history.temperature(name) for name in e.history.readings])
@@ -268,7 +263,7 @@ def find_tied_constants(fitter: HypothesisFitter, fit: Fit, number: int) -> dict
     loose = axes[:, shares < _EXCHANGED]
     own, base = (next(b for b in fit.blocks if b.term == i) for i in (number, -1))
     values: dict[str, float] = {}
-    rows: list[Array] = []  # of the values, in the unknowns
+    rows: list[Array] = []  # partial derivatives of the values with respect to the unknowns
     exchanged = []
     for place, (owner, name) in enumerate(searched, len(fit.coefficients)):
         if owner == number:
@@ -295,7 +290,7 @@ def find_tied_constants(fitter: HypothesisFitter, fit: Fit, number: int) -> dict
 
 
 def list_image_effects(x: Examination) -> list[EffectFound]:
-    """Make the entries of what was found in image space."""
+    """List the entries of the effects found in image space."""
     out = []
     if "targets" in x.image_places:
         out.append(_describe_moved_targets(x))
@@ -314,7 +309,7 @@ def _describe_moved_targets(x: Examination) -> EffectFound:
     estimates: dict[str, Estimate] = {
         "targets": {"value": [names[r] for r in group.rows], "sd": None, "unit": "names"},
         "time": _make_estimate(group.time, group.sd_time, "s"),
-        # across the rays: the mean of the lengths
+        # mean length, across the rays
         "displacement": _make_estimate(lengths.mean(), sd, "mm"),
     }
     for axis, value in zip(("dX", "dY", "dZ"), group.vectors.mean(axis=0), strict=True):
@@ -335,7 +330,7 @@ def _describe_moved_targets(x: Examination) -> EffectFound:
             for g in x.displaced[0]
             if g is not group
         ],
-        "note": "displacements are across the rays; along them one camera sees nothing",
+        "note": "displacements are across the rays; a single camera sees none along them",
     }
     statement = effect.sentence(estimates)
     return EffectFound(effect.name, statement, where, estimates, evidence, [])
@@ -356,5 +351,5 @@ def _describe_noise_growth(e: ReducedSeries, growth: NoiseGrowth) -> EffectFound
     }
     statement = effect.sentence(estimates)
     if growth.gain <= growth.other_gain + noise_criteria.CLEAR:
-        statement += f"; it follows {growth.other} as well"
+        statement += f"; it follows {growth.other} equally well"
     return EffectFound(effect.name, statement, where, estimates, evidence, [])

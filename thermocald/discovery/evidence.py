@@ -1,15 +1,10 @@
-"""What a recording shows before any search: targets that jumped, boards that moved, wanderers.
+"""Movements of the test field: targets that jump, boards that move, targets that wander.
 
-They are looked for in what a free camera per epoch leaves, so that nothing the camera itself does
-can be mistaken for them, and taken out before the trajectories of parameters are examined.
+They are found in the residuals of a free camera per epoch, so that no change of the camera can be
+mistaken for them, and removed before the parameters' trajectories are examined. A board that was
+knocked or creeps is put back to its place; a target that jumps or wanders is left out.
 
-Source: a step at an unknown time as Page (1955), Biometrika 42, 523-527.
-
-Series of one camera: M1 to discover on, others to prove it on; recordings or in stores.
-
-Boards that moved and targets that wander: found, reported, and none of the camera's.
-
-A board that was knocked or creeps is put back where it was; a target that wanders is left out.
+Source: a step at an unknown time, Page (1955), Biometrika 42, 523-527.
 """
 
 from __future__ import annotations
@@ -46,13 +41,13 @@ if TYPE_CHECKING:
 
 
 def require_other_series(series: Sequence[SeriesInput]) -> None:
-    """Refuse series to prove it on that are of another camera or thermometer, or copies."""
+    """Refuse verification series of another camera or thermometer, and copies."""
     a = series[0]
     reference = next(iter(a.readings), None)
     for b in series[1:]:
         if a.camera != b.camera or a.sensor != b.sensor:
             raise DataError(
-                f"{b.name} is of another camera ({b.camera}, {b.sensor.width}×{b.sensor.height} px)"
+                f"{b.name} has another camera ({b.camera}, {b.sensor.width}×{b.sensor.height} px)"
                 f" than {a.name} ({a.camera}, {a.sensor.width}×{a.sensor.height} px); constants of "
                 "one camera cannot be verified on another"
             )
@@ -66,7 +61,7 @@ def require_other_series(series: Sequence[SeriesInput]) -> None:
             if np.array_equal(before.grid.points, other.grid.points, equal_nan=True):
                 raise DataError(
                     f"{other.name} holds the same observations as {before.name}; "
-                    "--verify needs measurements of their own (simulated ones another --seed)"
+                    "--verify needs a separate measurement (if simulated, with another --seed)"
                 )
 
 
@@ -74,23 +69,23 @@ _PASSES = 2
 
 
 def replace_moved_boards(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:
-    """Find the boards that moved, and put them back to where they were."""
+    """Find the boards that moved, and put them back to their places."""
     series = _field_series(evidence)
-    found = board_movements(series, wandering_targets(series))
-    if not found:
+    movements = board_movements(series, wandering_targets(series))
+    if not movements:
         return [], evidence
-    still = _put_boards_back(evidence, found)
+    still = _put_boards_back(evidence, movements)
     for _ in range(_PASSES):
-        found = [refined(_field_series(still), m) for m in found]
-        still = _put_boards_back(evidence, found)
-    return found, still
+        movements = [refined(_field_series(still), m) for m in movements]
+        still = _put_boards_back(evidence, movements)
+    return movements, still
 
 
-def _put_boards_back(evidence: ReducedSeries, found: list[FieldMovement]) -> ReducedSeries:
-    """Reduce the series with boards back in their places."""
+def _put_boards_back(evidence: ReducedSeries, movements: list[FieldMovement]) -> ReducedSeries:
+    """Reduce the series again with the boards in their places."""
     grid = evidence.source.grid
     points = np.array(grid.points)
-    for m in found:
+    for m in movements:
         points[:, m.rows] -= m.trajectory[:, None, None] * m.image
     return with_points(evidence, ObservationGrid(points, grid.weights))
 
@@ -98,19 +93,19 @@ def _put_boards_back(evidence: ReducedSeries, found: list[FieldMovement]) -> Red
 def drop_wandering_targets(evidence: ReducedSeries) -> tuple[list[FieldMovement], ReducedSeries]:
     """Find the targets that wander, and reduce the series without them.
 
-    Among few targets, those that wander make the noise: without them others may stand out.
+    Among few targets, wandering ones dominate the noise, and without them others may stand out.
     """
-    found: list[FieldMovement] = []
+    wandering: list[FieldMovement] = []
     still, every = evidence, int(evidence.weights[..., 0].any(axis=0).sum())
     while more := wandering_targets(_field_series(still)):
-        if len(found) + len(more) > MOST_TARGETS * every:
+        if len(wandering) + len(more) > MOST_TARGETS * every:
             break
-        found += more
-        rows = np.concatenate([m.rows for m in found])
+        wandering += more
+        rows = np.concatenate([m.rows for m in wandering])
         still = without_targets(evidence, np.union1d(evidence.excluded, rows))
         if every > FEW_TARGETS:
             break
-    return found, still
+    return wandering, still
 
 
 def _field_series(e: ReducedSeries) -> FieldSeries:
@@ -124,8 +119,10 @@ def _field_series(e: ReducedSeries) -> FieldSeries:
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """Targets that moved together: rows of the field, time s ± s from the series' start,
-    displacement (k, 3) mm as far as an image shows it (across the ray), sd (k, 3), step (k, 2) px.
+    """Targets that moved together.
+
+    rows: of the field; time, sd_time: s from the series' start; vectors, sd_vectors: (k, 3) mm,
+    the displacements across the rays, which is all that an image shows; steps: (k, 2) px.
     """
 
     rows: NDArray[np.int64]
@@ -141,7 +138,7 @@ def _find_steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Arra
     """Find the best step of each target: gain (T,), first epoch after it, share of movement."""
     w = np.sqrt(evidence.weights[..., :2])
     r = evidence.residuals * w
-    # noise may grow with heat: each epoch in units of its own spread
+    # noise may grow with heat, so each epoch is divided by its own spread
     own = np.array([mad_sd(x) if np.isfinite(x).any() else 1.0 for x in r])
     r = np.nan_to_num(r / np.maximum(own, 0.3)[:, None, None])
     there = np.isfinite(evidence.residuals[..., 0]).astype(float)
@@ -158,7 +155,7 @@ def _find_steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Arra
     best = np.argmax(gain, axis=0)
     columns = np.arange(gain.shape[1])
     top = gain[best, columns]
-    # how much of all slow movement is this one step?
+    # share of this step in all slow movement
     slow = cosines(evidence.times, 14)
     slow = slow / np.linalg.norm(slow, axis=1, keepdims=True)
     step = (np.arange(len(r))[:, None] > best[None]).astype(float)
@@ -172,9 +169,7 @@ def _find_steps(evidence: ReducedSeries) -> tuple[Array, NDArray[np.int64], Arra
 
 
 def _lasts(residuals: Array, first: int) -> bool:
-    """Test whether a step in residuals (E, 2) is in most epochs; a gross error moves a mean,
-    too.
-    """
+    """Test whether a step in residuals (E, 2) persists; a gross error, too, changes a mean."""
     before, after = residuals[:first], residuals[first:]
     mean = np.nanmean(after, axis=0) - np.nanmean(before, axis=0)
     middle = np.nanmedian(after, axis=0) - np.nanmedian(before, axis=0)
@@ -182,11 +177,12 @@ def _lasts(residuals: Array, first: int) -> bool:
 
 
 def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], ReducedSeries]:
-    """Find targets that jumped, and reduce the series without them.
+    """Find the targets that jumped, and reduce the series without them.
 
-    A marker jumps as a whole: where a few of its corners jump, it was badly seen, and is left out.
+    A marker jumps as a whole: if only some of its corners jump, it was badly measured and is left
+    out without being reported.
     """
-    found: dict[int, tuple[int, float]] = {}
+    jumps: dict[int, tuple[int, float]] = {}
     limit = criteria.STEP_CHI2 * evidence.correlation
     cleaned = evidence
     for _ in range(8):
@@ -195,10 +191,10 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
         sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
         there = np.isfinite(cleaned.residuals[..., 0]).sum(axis=0)
         size = 2.0 * sigma * np.sqrt(gain / np.maximum(there, 1))
-        # real targets wander: what many of them do is not a displacement
+        # real targets wander: a gain that many of them reach is no displacement
         common = 8.0 * float(np.percentile(gain[there > 0], 85)) if (there > 0).any() else 0.0
         top = float(gain.max(initial=0.0))
-        # one moved target drags the camera and with it all others: the largest go first
+        # a moved target drags the camera and so all others: the largest steps go first
         chosen = np.flatnonzero(
             (gain > max(limit, common, 0.3 * top))
             & (share > criteria.STEP_SHARE)
@@ -208,43 +204,43 @@ def find_displaced_targets(evidence: ReducedSeries) -> tuple[list[Displaced], Re
         if not len(chosen):
             break
         for row in chosen:
-            found[int(row)] = (int(first[row]), float(gain[row]))
-        if len(found) > 0.2 * evidence.source.grid.observed.any(axis=0).sum():
-            return [], evidence  # so many do not jump by themselves: it is the camera
-        groups = evidence.source.field.groups  # a marker goes as a whole
-        whole = np.flatnonzero(np.isin(groups, groups[sorted(found)]))
+            jumps[int(row)] = (int(first[row]), float(gain[row]))
+        if len(jumps) > 0.2 * evidence.source.grid.observed.any(axis=0).sum():
+            return [], evidence  # so many do not jump independently: the camera moved
+        groups = evidence.source.field.groups  # a marker is left out as a whole
+        whole = np.flatnonzero(np.isin(groups, groups[sorted(jumps)]))
         cleaned = without_targets(evidence, whole)
-    if not found:
+    if not jumps:
         return [], evidence
-    jumped = _keep_whole_markers(evidence, found)
+    jumped = _keep_whole_markers(evidence, jumps)
     return _group_steps(cleaned, jumped) if jumped else [], cleaned
 
 
 def _keep_whole_markers(
-    evidence: ReducedSeries, found: dict[int, tuple[int, float]]
+    evidence: ReducedSeries, jumps: dict[int, tuple[int, float]]
 ) -> dict[int, tuple[int, float]]:
-    """Drop the jumps that other corners of their marker did not make with them."""
+    """Drop the jumps that most corners of their marker did not make together."""
     groups = evidence.source.field.groups
     seen = evidence.source.grid.observed.any(axis=0)
     out = {}
-    for row, (first, gain) in found.items():
+    for row, (first, gain) in jumps.items():
         corners = np.flatnonzero((groups == groups[row]) & seen)
-        together = [r for r in corners.tolist() if r in found and abs(found[r][0] - first) <= 1]
+        together = [r for r in corners.tolist() if r in jumps and abs(jumps[r][0] - first) <= 1]
         if 4 * len(together) >= 3 * len(corners):
             out[row] = (first, gain)
     return out
 
 
 def left_by_cameras(e: ReducedSeries, rows: NDArray[np.int64]) -> Array:
-    """Return what the free cameras leave (E, n, 2) px of targets, used for them or not."""
+    """Return the targets' residuals about the free cameras, (E, n, 2) px, used in them or not."""
     misclosure = e.source.grid.points[:, rows] - e.at.predicted[rows]
     left: Array = misclosure - np.einsum("ek,tik->eti", e.values, e.columns[rows])
     return left
 
 
-def _group_steps(cleaned: ReducedSeries, found: dict[int, tuple[int, float]]) -> list[Displaced]:
-    """Measure the steps against the camera that the other targets give; one group per time."""
-    rows = np.array(sorted(found))
+def _group_steps(cleaned: ReducedSeries, jumps: dict[int, tuple[int, float]]) -> list[Displaced]:
+    """Measure the steps against the camera from the other targets; one group per time."""
+    rows = np.array(sorted(jumps))
     v = left_by_cameras(cleaned, rows)
     w = cleaned.weights[..., 0]
     sigma = float(1.0 / np.sqrt(np.mean(w[w > 0])))
@@ -279,14 +275,14 @@ def _group_steps(cleaned: ReducedSeries, found: dict[int, tuple[int, float]]) ->
                 np.array(vectors),
                 np.array(sds),
                 np.array(steps),
-                sum(found[int(rows[k])][1] for k in group),
+                sum(jumps[int(rows[k])][1] for k in group),
             )
         )
     return out
 
 
 def _find_best_step(v: Array) -> int:
-    """Find the first epoch after the step of one target (E, 2); gross errors are clipped."""
+    """Find the first epoch after a target's step in v (E, 2) px; gross errors are clipped."""
     there = np.isfinite(v[:, 0])
     x = np.where(there[:, None], v, 0.0)
     spread = np.nanmedian(np.abs(np.diff(v[there], axis=0))) * 6 + 1e-9

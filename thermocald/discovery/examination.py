@@ -1,4 +1,4 @@
-"""The examination: from evidence to the effects that explain it, or to none."""
+"""The examination of series: the search for the effects that explain them."""
 
 from __future__ import annotations
 
@@ -53,22 +53,21 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 _EFFECTS = 3
-_COMBINATIONS = 8  # of a level that are fitted in full
-_WIDTH = 4  # solutions of a level that grow further
-# effects of which one says how far the image moves
-_GUIDES = 3
+_COMBINATIONS = 8  # fitted in full per level
+_WIDTH = 4  # solutions of a level that are extended
+_GUIDES = 3  # effects fitted to estimate how far the image moves
 
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """What the search found.
+    """The result of the search.
 
-    base, best: solutions, in the series as examined: displaced targets out and noise weighted;
-    ranking: singles by score; rivals: solutions that cannot be excluded; adequacy: of best, per
-    series; cross_validation: gains (blocks,) of its effects on blocks of time left out; surrogates:
-    each of its effects against surrogates; mount: its movement, where it moves; knocks: of the
-    mount, terms of the base; as_slips: whether a slip inside the camera explains each as well;
-    field_movements: boards and targets that moved, per series.
+    base, best: solutions in the series as examined, without displaced targets and with weighted
+    noise. ranking: single effects by score. rivals: solutions that cannot be excluded. adequacy: of
+    best, per series. cross_validation: gains (blocks,) of its effects in blocks of time left out.
+    surrogates: the test of each of its effects. mount: its movement, if it moves; knocks: of the
+    mount, as terms of the base; as_slips: whether a slip inside the camera explains each equally
+    well. field_movements: of boards and targets, per series.
     """
 
     base: Solution
@@ -90,12 +89,12 @@ class Examination:
 
     @property
     def fitter(self) -> HypothesisFitter:
-        """The series as examined."""
+        """The fitter of the series as examined."""
         return self.best.fitter
 
     @property
     def image_places(self) -> list[str]:
-        """Where effects were seen that move no trajectory, in the document's order."""
+        """The places of effects that move no trajectory, in the document's order."""
         places = ["targets"] if self.displaced[0] else []
         return [*places, "noise"] if self.noise_growth else places
 
@@ -106,10 +105,10 @@ def examine_series(
     given: Sequence[tuple[str, dict[str, Any]]] = (),
     jobs: int = 1,
 ) -> Examination:
-    """Examine one series, or M1 with M2, which share their physical constants.
+    """Examine one series, or M1 and further series with the same physical constants.
 
-    given: effects that the model has already, with their values; they are fitted again and stay;
-    jobs: candidates that surrogates try at a time.
+    given: effects that the model has already, with values; they are fitted again and stay. jobs:
+    number of candidates tested with surrogates at a time.
     """
     say = progress or (lambda _: None)
     say("targets that moved")
@@ -121,7 +120,7 @@ def examine_series(
         field.append((*boards, *wandering))
         displaced.append(tuple(groups))
         cleaned.append(without)
-    # asked for where nothing of the field moves
+    # only after the movements of the field are removed
     distortion, _ = choose_distortion(cleaned)
     cleaned = [e.in_basis(distortion) for e in cleaned]
     series = [e.in_basis(distortion) for e in series]
@@ -131,15 +130,15 @@ def examine_series(
         cleaned = [reweight(e, n) for e, n in zip(cleaned, growth.noise, strict=True)]
     calibrated = calibrate_thermometers(cleaned)
     ready = [in_blocks(weight_slow_noise(e)) for e in calibrated]
-    found = None
+    result = None
     wanders = max(e.correlation for e in calibrated) > criteria.MEMORY
     if wanders:
-        found = _examine_beside_mount(calibrated, say, given, jobs)
-    if found is None:
+        result = _examine_beside_mount(calibrated, say, given, jobs)
+    if result is None:
         shaking = calibrated if not wanders and any(map(detect_tremble, calibrated)) else []
-        found = _examine_standing(ready, shaking, say, given, jobs)
+        result = _examine_standing(ready, shaking, say, given, jobs)
     return replace(
-        found, displaced=tuple(displaced), noise_growth=growth, original=tuple(series),
+        result, displaced=tuple(displaced), noise_growth=growth, original=tuple(series),
         field_movements=tuple(field),
     )  # fmt: skip
 
@@ -151,27 +150,28 @@ def _examine_standing(
     given: Sequence[tuple[str, dict[str, Any]]],
     jobs: int,
 ) -> Examination:
-    """Search where the mount stands still, and again with what the effects found make known.
+    """Search with a mount that stands still, and again with what the effects found show.
 
-    shaking: the series where all targets jump together. What a thermometer's errors take up of that
-    depends on the effect; unless an effect explains it, each is fitted with the tremble it leaves.
+    These show the projection's curvature and the noise that targets share. shaking: the series, if
+    all targets jump together. How much of these jumps a thermometer's errors explain depends on the
+    effect; unless an effect explains them, each is fitted beside the tremble that it leaves.
     """
 
     def search_in(series: list[ReducedSeries]) -> Examination:
         search = Search(HypothesisFitter(series), say)
-        return _search_standing(search, search.base(given), say, jobs)
+        return _search_standing(search, search.base(given), jobs)
 
     say("base model")
     search = Search(HypothesisFitter(ready), say)
     base = search.base(given)
-    # one effect moves the image by most of what it moves at all
+    # a single effect accounts for most of the image's movement
     guide = min([base, *search.expand(base, _GUIDES)], key=lambda s: s.score).fit
     bent = remove_curvature(search.fitter, guide)
-    found = search_in(bent) if bent else _search_standing(search, base, say, jobs)
+    found = search_in(bent) if bent else _search_standing(search, base, jobs)
     if not found.adequate:
         again = remove_curvature(found.fitter, found.best.fit)
         if again is not None and _is_explained(again, found):
-            say("curvature of the projection: once more")
+            say("curvature of the projection: searching again")
             found = search_in(again)
     noisy = add_jumps_to_noise(found.fitter, found.best.fit)
     if shaking and (noisy is not None or not found.adequate):
@@ -179,22 +179,20 @@ def _examine_standing(
         if alongside is not None:
             return alongside
     if noisy is not None and (found.adequate or _is_explained(noisy, found)):
-        say("noise that targets share: once more")
+        say("noise that targets share: searching again")
         found = search_in(noisy)
     return found
 
 
 def _is_explained(series: list[ReducedSeries], found: Examination) -> bool:
-    """Test whether the effects found leave nothing over in other states of the series."""
+    """Test whether the effects found are adequate in the series under another noise model."""
     fitter = HypothesisFitter(series)
     refined = fitter.refine(fitter.fit(found.best.terms, found.best.fit.coefficients))
     return _is_adequate(examine_all(fitter, refined), found.base_adequacy)
 
 
-def _search_standing(
-    search: Search, base: Solution, say: Callable[[str], None], jobs: int
-) -> Examination:
-    """Search where the mount stands still: combinations grow while the score improves."""
+def _search_standing(search: Search, base: Solution, jobs: int) -> Examination:
+    """Search with a mount that stands still, extending combinations while the score improves."""
     fitter = search.fitter
     kept = len(base.terms)
     base_adequacy = examine_all(fitter, base.fit)
@@ -202,19 +200,19 @@ def _search_standing(
     frontier = [base]
     complete = False
     for level in range(1, _EFFECTS + 1):
-        say(f"effect {level}: alongside {' or '.join(', '.join(s.names) for s in frontier)}"
-            if level > 1 else "effect 1: alongside the base")  # fmt: skip
+        beside = " or ".join(", ".join(s.names) for s in frontier) if level > 1 else "the base"
+        search.progress(f"effect {level}: alongside {beside}")
         if level == 1:
             grown = ranking = search.expand(base)
         else:
-            # once nothing is left over, other effects have to promise more than the best explains
+            # beyond an adequate solution, others must promise more than it explains
             below = best.score if complete else np.inf
             more = search.expand_all(frontier, _WIDTH, _COMBINATIONS, below)
             grown = [search.shrink(s, kept) for s in more]
         seen += grown
         if complete:
             equal = [s for s in frontier if s.score < best.score + criteria.BAND]
-            grown = [s for s in grown if _is_worth_it(base, best, equal, s)]
+            grown = [s for s in grown if _may_replace(base, best, equal, s)]
         if not grown:
             break
         champion = min(grown, key=lambda s: s.score)
@@ -223,19 +221,19 @@ def _search_standing(
         best = search.with_events_moved(champion)
         seen.append(best)
         complete = _is_adequate(examine_all(fitter, best.fit), base_adequacy)
-        # what is adequate may still lack something too fast for the absolute test, and one effect
-        # with many coefficients may stand for two others that have not been tried together yet
+        # an adequate solution may still lack an effect too fast for the absolute test, and an
+        # effect with many coefficients may imitate two that have not been combined yet
         frontier = [best]
         if complete or level == 1:  # the best solutions, one per set of names
             sets = {tuple(sorted(s.names)): s for s in sorted(grown, key=lambda s: -s.score)}
             frontier = sorted(sets.values(), key=lambda s: s.score)[:_WIDTH]
-    # larger combinations that were not accepted are no rivals
+    # rejected larger combinations are no rivals
     seen = [s for s in seen if len(s.terms) <= len(best.terms)]
     if len(best.terms) > kept:
         best, seen = _compare_ties(search, best, seen)
-        # The likelihood holds every trajectory of the temperature for equally probable. A lag
-        # smooths the thermometer's noise, a delay does not; so a smooth image, which all
-        # temperatures give, would speak for a lag whatever the cause: the fit alone decides.
+        # The likelihood takes all trajectories of the temperature as equally probable. A lag
+        # smooths the thermometer's noise, a delay does not, so a smooth image would always favour
+        # a lag: only the fit decides.
         other = search.with_other_delay(best)
         if other is not None:
             seen = [*seen, other]
@@ -247,7 +245,7 @@ def _search_standing(
     adequacy = examine_all(fitter, best.fit)
     complete = _is_adequate(adequacy, base_adequacy)
     if len(best.terms) > kept and len(fitter.series) < 2:
-        # where single targets wander much, one series alone carries no name
+        # if single targets wander much, one series alone names no effect
         complete = complete and fitter.series[0].correlation <= criteria.WANDERING
     return Examination(
         base, best, tuple(ranking), _list_rivals(best, seen), base_adequacy, adequacy,
@@ -256,12 +254,12 @@ def _search_standing(
 
 
 def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ...]:
-    """List the solutions that cannot be excluded in favour of the best, best first."""
+    """List the solutions that cannot be excluded beside the best one, best first."""
     out: list[Solution] = []
     for s in sorted(seen, key=lambda s: s.score):
         mine = [t for t in best.terms if t.effect not in s.names]
         theirs = [t for t in s.terms if t.effect not in best.names]
-        # one way of following the temperature in place of another is judged by the fit alone
+        # one drive in place of another is compared by the fit alone
         swapped = len(mine) == len(theirs) == 1 and mine[0].is_drive and theirs[0].is_drive
         close = (
             s.fit.chi2 < best.fit.chi2 + criteria.DRIVES_BAND
@@ -277,7 +275,7 @@ def _list_rivals(best: Solution, seen: Sequence[Solution]) -> tuple[Solution, ..
 def _compare_ties(
     search: Search, best: Solution, seen: list[Solution]
 ) -> tuple[Solution, list[Solution]]:
-    """Compare near ties again, each under the thermometer noise that suits it best."""
+    """Compare near ties again, each with the thermometer noise that fits it best."""
     close = {s.terms: s for s in seen if s.score < best.score + 60.0}
     if len({s.names for s in close.values()}) < 2:
         return best, seen
@@ -291,13 +289,13 @@ def _compare_ties(
     return again[0], [*again, *others]
 
 
-def _is_worth_it(
+def _may_replace(
     base: Solution, best: Solution, equal: Sequence[Solution], champion: Solution
 ) -> bool:
-    """Decide whether effects take the place of `best`, which explains all, or of one `equal` to it.
+    """Decide whether a solution replaces `best`, which is adequate, or one `equal` to it.
 
-    One effect more has to be worth more than the finer points of the others; others in their
-    place have to exclude them, and to fit better: a smoother temperature alone is no reason.
+    One more effect must explain more than a refinement of the others would; other effects must
+    exclude these and also fit better, not only by a smoother temperature.
     """
     fewer = [s for s in equal if set(s.names) <= set(champion.names)]
     if not fewer:
@@ -312,7 +310,7 @@ def _is_worth_it(
 
 
 def _measure_px(without: Solution, with_it: Solution) -> float:
-    """Return the RMS px that one more effect explains."""
+    """Return the RMS that one more effect explains, px."""
     gain = max(without.score - with_it.score, 0.0)
     series = without.fitter.series
     coordinates = 2.0 * sum(float(e.n.sum()) for e in series)
@@ -321,7 +319,7 @@ def _measure_px(without: Solution, with_it: Solution) -> float:
 
 
 def _is_adequate(now: Sequence[Adequacy], base: Sequence[Adequacy]) -> bool:
-    """Test whether a solution leaves nothing, or next to nothing of what the base left."""
+    """Test whether a solution leaves no misfit, or next to none of the base model's."""
     return all(
         a.adequate or a.misfit_px < criteria.LEFT_SHARE * b.misfit_px
         for a, b in zip(now, base, strict=True)
@@ -334,9 +332,9 @@ def _examine_beside_mount(
     given: Sequence[tuple[str, dict[str, Any]]],
     jobs: int,
 ) -> Examination | None:
-    """Search alongside a mount that moves; None where the movement is not one of a mount.
+    """Search beside a moving mount; None if the movement is too smooth for a mount.
 
-    A smooth influence that was not recorded is not a wander of a mount.
+    It is then an influence that was not recorded.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(
@@ -351,7 +349,7 @@ def _examine_beside_mount(
     search = Search(fitter, say, like)
     best, blocks, tests = _keep_named(search, base, whole, jobs)
     if any(t.kind.is_event and t not in best.terms for t in whole.terms):
-        # steps that cannot be named are still there
+        # steps that cannot be named stay in the model
         base, whole, knocks = split_knocks(whole, len(given), slips=True)
         best, blocks, tests = _keep_named(search, base, whole, jobs)
     if not is_convincing(base, best):
@@ -362,7 +360,7 @@ def _examine_beside_mount(
     for s in sorted(seen, key=lambda s: s.score):
         names = [t.effect for t in s.terms if t not in knocks]
         own = [t.effect for t in best.terms if t not in knocks]
-        # between two readings the temperature is unknown: a delay and its rate look alike
+        # between readings the temperature is unknown, so that a delay and its rate look alike
         differ = [t for t in (*s.terms, *best.terms) if (t in s.terms) != (t in best.terms)]
         band = criteria.DRIVES_BAND if any(t.kind.delay for t in differ) else criteria.BAND
         close = s.score < best.score + band and len(names) <= len(own)
@@ -378,9 +376,9 @@ def _examine_beside_mount(
 def _keep_named(
     search: Search, base: Solution, best: Solution, jobs: int
 ) -> tuple[Solution, list[Array], tuple[SurrogateTest, ...]]:
-    """Drop the effects that do not predict blocks left out, or that surrogates speak against.
+    """Drop the effects that do not predict blocks left out or do not pass the surrogate test.
 
-    Returns also what the others gain on each block, and their surrogates.
+    Returns also the gains of the others in each block, and their tests.
     """
     kept = len(base.terms)
     while len(best.terms) > kept:
@@ -388,7 +386,7 @@ def _keep_named(
         bad = [i for i, g in enumerate(blocks) if not is_confirmed(g)]
         if bad:
             worst = min(bad, key=lambda i: float(blocks[i].sum()))
-            search.progress(f"{best.names[kept + worst]} does not predict the blocks left out")
+            search.progress(f"{best.names[kept + worst]} does not predict blocks left out")
             best = _drop_effect(search, base, best, kept + worst)
             continue
         tests = []
@@ -399,13 +397,13 @@ def _keep_named(
         worst = max(range(len(tests)), key=lambda i: tests[i].p)
         if tests[worst].passed:
             return best, blocks, tuple(tests)
-        search.progress(f"{best.names[kept + worst]} is not more than noise may give")
+        search.progress(f"{best.names[kept + worst]} may be noise: surrogates reach it")
         best = _drop_effect(search, base, best, kept + worst)
     return best, [], ()
 
 
 def _drop_effect(search: Search, base: Solution, best: Solution, number: int) -> Solution:
-    """Leave one effect out of a solution, and fit the others again."""
+    """Fit a solution again without one of its effects."""
     terms = [t for i, t in enumerate(best.terms) if i != number]
     penalties = [p for i, p in enumerate(best.penalties) if i != number]
     return search.refine(terms, penalties) if len(terms) > len(base.terms) else base

@@ -1,8 +1,9 @@
-"""The experiment that separates two effects best within limits, and whether it has separated them.
+"""The experiment that separates two effects best, and the test whether it has separated them.
 
-Programmes of some kinds (a long hold, two cycles, a staircase, slow and fast, pulses) are run on a
-body with one time constant, as a relay with a thermostat would heat it. Each effect is then what
-the other, with any of its constants, and the base model leave of it, over the noise of an epoch.
+Several kinds of programme (a long hold, two cycles, a staircase, slow and fast, pulses) are
+simulated for a body with one time constant that a relay with a thermostat heats. The size of an
+effect is what the base model and the other effect, with any of its constants, leave of it, relative
+to the noise of an epoch.
 """
 
 from __future__ import annotations
@@ -32,49 +33,49 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Separation:
-    """How two alternatives compare on what was recorded.
+    """The comparison of two alternatives in the recorded series.
 
-    difference: by how much the worse one scores worse; needed: the difference at which it is
-    excluded; there: whether the better one explains more than the base model does.
+    difference: between their scores; needed: the difference from which the worse one is excluded;
+    detected: whether the better one explains more than the base model.
     """
 
     better: str
     worse: str
     difference: float
     needed: float
-    there: bool
+    detected: bool
 
     @property
     def separated(self) -> bool:
         """Whether one of the two is excluded."""
-        return self.there and self.difference > self.needed
+        return self.detected and self.difference > self.needed
 
     @property
     def sentence(self) -> str:
-        """For people."""
-        if not self.there:
-            return f"neither {self.better} nor {self.worse} shows yet"
+        """The comparison as a sentence."""
+        if not self.detected:
+            return f"neither {self.better} nor {self.worse} is detected yet"
         if self.separated:
             return (
                 f"{self.better}: {self.worse} is excluded, its score is {self.difference:.0f} "
-                f"worse (needed {self.needed:.0f})"
+                f"worse ({self.needed:.0f} needed)"
             )
         return (
             f"{self.better} scores {self.difference:.0f} better than {self.worse}; "
-            f"needed are {self.needed:.0f}"
+            f"{self.needed:.0f} needed"
         )
 
 
 def read_alternatives(text: str) -> tuple[str, str]:
-    """Read the two effects of `A,B`; UsageError where a series of epochs does not show both."""
+    """Read the two effects of `A,B`; raises UsageError unless trajectories can show both."""
     names = [n.strip() for n in text.split(",")]
     if len(names) != 2 or names[0] == names[1]:
-        raise UsageError(f"--until-separated {text}: write two effects, such as A,B")
+        raise UsageError(f"--until-separated {text}: give two different effects, as A,B")
     for name in names:
         if catalogue.get(name).seen_in != "trajectory":
             raise UsageError(
-                f"--until-separated {text}: {name} is seen in the image, not in the time series of "
-                "the camera's parameters; heating differently does not separate it"
+                f"--until-separated {text}: {name} shows in the image and not in the time series "
+                "of the camera's parameters; no heating programme separates it"
             )
     return names[0], names[1]
 
@@ -84,11 +85,10 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
     ready = [in_blocks(weight_slow_noise(e)) for e in calibrate_thermometers(series)]
     search = Search(HypothesisFitter(ready))
     base = search.base()
-    found = sorted(
+    drives = all(catalogue.get(name).is_drive for name in (first, second))
+    better, worse = sorted(
         (_find_best(search, base, name) for name in (first, second)), key=lambda s: s.score
     )
-    drives = all(catalogue.get(name).is_drive for name in (first, second))
-    better, worse = found
     return Separation(
         better.names[-1], worse.names[-1], worse.score - better.score,
         criteria.DRIVES_BAND if drives else criteria.BAND, better.score < base.score,
@@ -96,22 +96,22 @@ def compare_effects(series: Sequence[ReducedSeries], first: str, second: str) ->
 
 
 def _find_best(search: Search, base: Solution, name: str) -> Solution:
-    """Find the best solution with one effect, over the sets of parameters that it may act on."""
+    """Find the best solution with one effect, over the sets of parameters that it can act on."""
     promises = [search.scan(c, base) for c in search.candidates if c.effect == name]
     if not promises:
         raise UsageError(
-            f"{name} cannot be looked for in this series: it needs a quantity that was not recorded"
+            f"{name} cannot be tested in this series: it needs a quantity that was not recorded"
         )
     best = max(promises, key=lambda p: p.net)
     return search.refine((*base.terms, best.term), (*base.penalties, best.penalty))
 
 
-_STEP_S = 60.0  # of a ramp, which a thermostat follows as a staircase
+_STEP_S = 60.0  # steps by which a thermostat follows a ramp
 _FINE_S = 2.0
-_NOISE_PX = 0.01  # of an epoch: its image points, and a thermometer of 0.02 K
+_NOISE_PX = 0.01  # of an epoch: its image points, and a thermometer with 0.02 K
 _HYSTERESIS_K = 0.5
 _LEAST_S = 900.0
-_LEAST_K = 5.0  # of warming, for anything to be seen
+_LEAST_K = 5.0  # least warming that shows effects
 _KINDS: dict[str, tuple[tuple[float, float, float], ...]] = {
     "one long hold": ((0.08, 0.09, 1.0), (0.62, 0.63, 0.0)),
     "two equal cycles": (
@@ -127,16 +127,14 @@ _KINDS: dict[str, tuple[tuple[float, float, float], ...]] = {
     "a small loop, then a large one": (
         (0.05, 0.06, 0.5), (0.22, 0.23, 0.0), (0.43, 0.44, 1.0), (0.7, 0.71, 0.0)),
 }  # fmt: skip
-"""What is done: from one share of the time to another, straight to a share of the highest warming,
-which then is held; 0 at first.
+"""Each kind's ramps: (start and end as shares of the time, share of the highest warming at the
+end, which is then held); it begins with 0.
 """
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What heating must not exceed: the highest temperature °C, its rise K/min, the share of time
-    that the heater is on.
-    """
+    """The limits of heating: highest temperature °C, its rate K/min, share of time with heat."""
 
     max_c: float
     max_rate: float = 3.0
@@ -145,7 +143,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Body:
-    """How the camera warms: ambient °C, by how much it warms at last K, time constant s."""
+    """A camera's warming: ambient temperature °C, final rise K, time constant s."""
 
     ambient: float = 22.0
     rise: float = 35.0
@@ -154,8 +152,11 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A programme: what is done, steps (seconds, hold °C or None) of the heating output, expected
-    temperature at the epochs, share of time with heat, by how many sd it separates.
+    """A heating programme.
+
+    steps: (seconds, °C to hold or None) for the heating output; temperature: expected at the
+    epochs, °C; duty: share of time with heat; sigmas: standard deviations by which it separates the
+    effects.
     """
 
     name: str
@@ -166,19 +167,19 @@ class Experiment:
     sigmas: float
 
     def programme(self) -> list[dict[str, Any]]:
-        """Return the steps as a session takes them."""
+        """Return the steps in the form that a session takes."""
         return [{"seconds": s, "hold_c": h} for s, h in self.steps]
 
 
 def estimate_body(times: Array, temperature: Array) -> Body:
-    """Estimate how a camera warmed and cooled in a recording; the usual where it hardly did.
+    """Estimate a camera's warming from a recording; typical values if its temperature was steady.
 
     times (R,) s, temperature (R,) °C.
     """
     usual = Body(ambient=float(np.min(temperature)))
     rate = np.gradient(temperature, times)
     falling = (rate < 0.3 * rate.min()) if rate.min() < 0 else np.zeros(len(rate), dtype=bool)
-    falling[1:] &= falling[:-1]  # not the reading at which the heat was switched off
+    falling[1:] &= falling[:-1]  # without the reading at which the heat was switched off
     if np.ptp(temperature) < _LEAST_K or falling.sum() < 8:
         return usual
     slope, _ = np.polyfit(temperature[falling], rate[falling], 1)
@@ -196,10 +197,10 @@ def rank_experiments(
     interval: float,
     strength_px: float = 0.1,
 ) -> list[Experiment]:
-    """Rank all programmes within the limits, the one that separates best first.
+    """Rank the programmes within the limits, the one that separates best first.
 
-    strength_px: what each effect leaves of itself to the base model under two equal cycles. Raises
-    DataError where the limits allow no heating worth it.
+    strength_px: what the base model leaves of each effect under two equal cycles. Raises DataError
+    if the limits allow too little heating.
     """
     highest = min(limits.max_c - _HYSTERESIS_K, body.ambient + 0.9 * body.rise)
     if highest - body.ambient < _LEAST_K:
@@ -235,7 +236,7 @@ def rank_experiments(
 def _limit_programme(
     name: str, limits: Limits, body: Body, times: Array, highest: float
 ) -> tuple[tuple[tuple[float, float | None], ...], Array, float]:
-    """Make the programme of one kind as hot as duty allows: steps, temperature (E,), duty."""
+    """Return a kind's hottest programme within the duty: steps, temperature (E,) °C, duty."""
     while True:
         steps = tuple(_steps(name, limits, body, float(times[-1]), highest))
         temperature, duty = _simulate(steps, body, times)
@@ -247,7 +248,7 @@ def _limit_programme(
 def _steps(
     name: str, limits: Limits, body: Body, duration: float, highest: float
 ) -> Iterator[tuple[float, float | None]]:
-    """Yield the kind's profile as steps of a thermostat, none rising faster than the limit."""
+    """Yield a kind's profile as steps of a thermostat, none of which exceeds the limit's rate."""
     changes = np.array(_KINDS[name])
     shares, levels = changes[:, :2].ravel(), np.repeat([0.0, *changes[:, 2]], 2)[1:-1]
     at = np.arange(0.0, duration + _STEP_S, _STEP_S)
@@ -266,14 +267,14 @@ def _steps(
 
 
 def _hold(value: float, body: Body) -> float | None:
-    """Return a step's temperature, 0.1 °C; None where there is nothing to heat."""
+    """Return a step's temperature, rounded to 0.1 °C; None without heating."""
     return round(value, 1) if value > body.ambient + 0.5 else None
 
 
 def _simulate(
     steps: tuple[tuple[float, float | None], ...], body: Body, times: Array
 ) -> tuple[Array, float]:
-    """Simulate temperature (E,) at some times and share of time with heat, under a thermostat."""
+    """Simulate a thermostat: temperature (E,) °C at `times`, and share of time with heat."""
     fine = np.arange(0.0, times[-1] + _FINE_S, _FINE_S)
     ends = np.cumsum([s for s, _ in steps])
     which = np.minimum(np.searchsorted(ends, fine, side="right"), len(steps) - 1)
@@ -292,7 +293,7 @@ def _simulate(
     return np.interp(times, fine, out), heated / len(fine)
 
 
-# -- what the effects make of it -----------------------------------------------------------------
+# -- effects -----------------------------------------------------------------------------------
 
 
 def _history(times: Array, temperature: Array, body: Body) -> History:
@@ -302,7 +303,7 @@ def _history(times: Array, temperature: Array, body: Body) -> History:
 
 
 def _trajectories(name: str, history: History) -> list[Array]:
-    """Return what an effect looks like (E, m) at each of its trial constants."""
+    """Return an effect's trajectories (E, m), one for each of its trial constants."""
     effect = catalogue.get(name)
     trials: list[dict[str, Any]] = [{}]
     for key, parameter in effect.nonlinear.items():
@@ -338,8 +339,9 @@ def _values(parameter: Parameter, history: History) -> Array:
 
 
 def _measure_left(name: str, other: str | None, history: History) -> float:
-    """Return the RMS that the base model leaves of an effect in the middle of its trial constants;
-    with another effect beside it, that one's constants are the best.
+    """Return the RMS that the base model leaves of an effect with medium constants.
+
+    other: another effect beside the base model, with the constants that leave least.
     """
     every = _trajectories(name, history)
     y = every[len(every) // 3][:, 0]

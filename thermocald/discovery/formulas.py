@@ -1,23 +1,22 @@
-"""The search for a formula: a library on a grid, the best made exact, then one operator further.
+"""The search for a formula: a library on a grid, then exact constants, then further operators.
 
-Scored as the catalogue's effects are (`search`): the gain in χ² less
+Formulas are scored like the catalogue's effects (`search`), by the gain in χ² less
 
     coefficients · ln n + constants · ln n + 2 ln(trials) + margin,
 
-n the number of epochs, trials how many formulas were tried. Everything runs on condensed evidence.
+where n is the number of epochs and trials the number of formulas tried.
 
-The library: formulas that are tried first, on a grid of constants, and those one step further.
+The library holds the formulas that are tried first, on a grid of constants, and extends them by one
+operator:
 
     recorded quantity → memory (lag, play, …) → shape (power, threshold, …) → memory (integral, …)
 
-Grids follow what was recorded: thresholds lie within the range, time constants within the duration.
+The grids follow the recording: thresholds are within its range, time constants within its duration.
 
-Condensed evidence: what a trajectory of a few parameters would explain, by two products.
-
-The likelihood of the base model is a quadratic form in any further trajectory of the camera's
-parameters; on rows of neighbouring epochs, with levels and the base's own rates eliminated, its
-matrix is a few hundred square. Its root whitens trajectory and data once, and thousands of
-candidates cost milliseconds.
+The search runs on condensed evidence. The likelihood of the base model is a quadratic form in any
+further trajectory of the camera's parameters. On rows of neighbouring epochs, with levels and the
+base's own rates eliminated, its matrix has a few hundred rows. Its root whitens trajectories and
+data once, so that thousands of candidates take milliseconds.
 """
 
 from __future__ import annotations
@@ -42,21 +41,18 @@ if TYPE_CHECKING:
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.likelihood import Weighting
 
-_ROWS = 90  # of one series
-
+_ROWS = 90  # per series
 _KNOTS = 400
-
-_NULL = 1e-9  # of the largest eigenvalue: levels, the base's own rates
+_NULL = 1e-9  # share of the largest eigenvalue: below are levels and the base's own rates
 
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """Series on few rows, whitened.
+    """Series condensed to few rows and whitened.
 
-    histories: one per series, asked for the rows' times; edges: where each series begins among the
-    rows; root (k, rows, r): whitens trajectories of each parameter; data (r,), whitened; amplitude
-    (k, rows): the trajectories that the data have themselves, px-scaled; epochs: how many the
-    series hold.
+    histories: one per series, at the rows' times; edges: the first row of each series, and the
+    number of rows; root (k, rows, r): whitens trajectories of each parameter; data (r,), whitened;
+    amplitude (k, rows): the data's own trajectories, px-scaled; epochs: number in all series.
     """
 
     histories: tuple[History, ...]
@@ -67,7 +63,7 @@ class Condensed:
     epochs: int
 
     def gains(self, trajectories: Array) -> Array:
-        """Return χ² (G,) that trajectories (rows, G) explain, each in all parameters together."""
+        """Return the χ² (G,) that trajectories (rows, G) explain, each in all parameters."""
         out: Array = np.sum((self.regressors(trajectories) @ self.data) ** 2, axis=1)
         return out
 
@@ -87,14 +83,14 @@ class Condensed:
 
     @property
     def power(self) -> float:
-        """χ² of everything that the base model leaves in these parameters."""
+        """The χ² of all that the base model leaves in these parameters."""
         return float(self.data @ self.data)
 
     def surrogates(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw whitened data (r, count) whose trajectories are moved in time against the recording.
+        """Draw whitened data (r, count) with trajectories moved in time against the recording.
 
-        Each series by itself: shifted in a circle, half of them reversed, half turned in sign. So
-        they are as smooth as the misfit, and their cause was not recorded.
+        Each series' are shifted cyclically, half of them reversed, and half inverted in sign. They
+        are as smooth as the misfit, but their cause was not recorded.
         """
         out = np.zeros((len(self.data), count))
         for i in range(count):
@@ -108,20 +104,20 @@ class Condensed:
         return out
 
 
-def condensed(
+def condense(
     fitter: HypothesisFitter,
     fit: Fit,
     parameters: Sequence[str],
     weightings: Sequence[Weighting] | None = None,
 ) -> Condensed:
-    """Condense the evidence of all series about some parameters, beside a fitted hypothesis.
+    """Condense the evidence of all series on some parameters, beside a fitted hypothesis.
 
-    weightings: covariances of another hypothesis, whose reading errors are nearer to the truth.
+    weightings: covariances of another hypothesis whose reading errors are closer to the truth.
     """
     k, directions = len(parameters), unit_directions(parameters)
     pools, histories = [], []
     for e in fitter.series:
-        # rows of neighbouring epochs (E, m), and the history at their mean times on some knots
+        # the epochs of each row (E, m), and the history at the rows' mean times, on some knots
         group = np.arange(len(e.times)) // int(np.ceil(len(e.times) / _ROWS))
         pool = (group[:, None] == np.arange(group[-1] + 1)).astype(float)
         h = e.history
@@ -156,7 +152,7 @@ def condensed(
 
 
 class Library:
-    """The formulas over what all of some histories hold."""
+    """The formulas of the quantities that all histories hold."""
 
     def __init__(self, histories: Sequence[History]) -> None:
         self.evaluators = tuple(Evaluator(h) for h in histories)
@@ -178,9 +174,7 @@ class Library:
         return True
 
     def values(self, node: Node) -> Array:
-        """Return the trajectory (rows,) of a bound formula over all histories, one after the
-        other.
-        """
+        """Return the trajectory (rows,) of a bound formula, all histories concatenated."""
         return np.concatenate([e.values(node) for e in self.evaluators])
 
     def span(self, node: Node) -> tuple[float, float]:
@@ -191,10 +185,10 @@ class Library:
     # -- first tries -----------------------------------------------------------------------------
 
     def first(self) -> list[Node]:
-        """List everything that is tried before anything is known."""
+        """List the formulas that are tried first."""
         out: list[Node] = []
         for leaf in self.leaves:
-            for inner in self.remembered(leaf):
+            for inner in self.with_memory(leaf):
                 out += [inner, *self.shapes(inner)]
             out += self.waves(leaf)
             for rated in self.rates(leaf):
@@ -203,13 +197,13 @@ class Library:
             out += [_apply(n, changed) for n in ("square", "cube", "magnitude", "signed_square")]
             out.append(_apply("product", changed, Node(TIME)))
             for shape in (*self.offsets(leaf), *self.shapes(leaf)):
-                out += self.remembered(shape, few=True)
+                out += self.with_memory(shape, few=True)
                 out.append(_apply("integral", shape))
         out += self.products()
         return _keep_distinct(out)
 
-    def remembered(self, node: Node, few: bool = False) -> list[Node]:
-        """Send a quantity through each operator with memory."""
+    def with_memory(self, node: Node, few: bool = False) -> list[Node]:
+        """Apply each operator with memory to a quantity."""
         low, high = self.span(node)
         out = [] if few else [node]
         taus = self.taus[::2] if few else self.taus
@@ -224,12 +218,12 @@ class Library:
         return out
 
     def rates(self, node: Node) -> list[Node]:
-        """List the rates of a quantity, at once and smoothed."""
+        """List the rates of a quantity, direct and smoothed."""
         smooth = [_apply("rate", _apply("lag", node, tau)) for tau in self.taus[1:5]]
         return [_apply("rate", node), *smooth]
 
     def offsets(self, node: Node, few: bool = False) -> list[Node]:
-        """Count a quantity from somewhere else."""
+        """Shift a quantity's origin."""
         low, high = self.span(node)
         width = high - low
         far = low + width * np.array([-3.0, -1.0, -0.2, 0.5, 1.2, 2.0, 4.0])
@@ -237,7 +231,7 @@ class Library:
         return [_apply("offset", node, a) for a in places]
 
     def shapes(self, node: Node, about_zero: bool = False) -> list[Node]:
-        """Send a quantity through each pointwise operator."""
+        """Apply each pointwise operator to a quantity."""
         low, high = self.span(node)
         width = max(high - low, 1e-12)
         inside = np.linspace(low, high, 11)[1:-1]
@@ -261,7 +255,7 @@ class Library:
         return out
 
     def waves(self, node: Node) -> list[Node]:
-        """Let a quantity come back to the same again and again, as interference does."""
+        """Make waves of a quantity, as from interference."""
         low, high = self.span(node)
         periods = (high - low) * np.array([0.2, 0.3, 0.45, 0.7])
         return [_apply("wave", node, P, phi) for P in periods for phi in np.arange(4) * np.pi / 4]
@@ -284,14 +278,14 @@ class Library:
     # -- one step further --------------------------------------------------------------------------
 
     def further(self, node: Node) -> list[Node]:
-        """Add one operator to a formula: around it, at its quantities, or as a factor."""
-        out = [*self.remembered(node)[1:], _apply("rate", node), _apply("integral", node)]
+        """Add one operator to a formula: outside, at one of its quantities, or as a factor."""
+        out = [*self.with_memory(node)[1:], _apply("rate", node), _apply("integral", node)]
         out += self.shapes(node)
         out += [_apply("product", o, node) for leaf in self.leaves
                 for o in self.offsets(leaf, few=True)]  # fmt: skip
         out.append(_apply("product", node, Node(TIME)))
         for leaf in {n for n in node.walk() if n.is_leaf and n.operator != TIME}:
-            out += [_replace_leaf(node, leaf, inner) for inner in self.remembered(leaf)[1:]]
+            out += [_replace_leaf(node, leaf, inner) for inner in self.with_memory(leaf)[1:]]
             out += [_replace_leaf(node, leaf, other) for other in self.leaves if other != leaf]
         deepest = max(node.depth, 4)
         return [n for n in _keep_distinct(out) if n.depth <= deepest]
@@ -310,21 +304,21 @@ def _replace_leaf(node: Node, leaf: Node, by: Node) -> Node:
 
 
 def _keep_distinct(nodes: Sequence[Node]) -> list[Node]:
-    """Keep each once; a thermometer itself is the catalogue's."""
+    """Remove duplicates and bare thermometers, which the catalogue covers."""
     return [n for n in dict.fromkeys(nodes) if n.inputs or n.operator]
 
 
-_WIDTH = 16  # structures whose constants are made exact
-_KEPT = 800  # formulas of a library that are tried again under other covariances
-_FURTHER = 3  # of them that are taken one operator further
-_STEPS = 2  # how many operators further
+_WIDTH = 16  # structures whose constants are fitted exactly
+_KEPT = 800  # formulas of a library that are tried again with other covariances
+_FURTHER = 3  # formulas that are extended by an operator
+_STEPS = 2  # extensions
 _ITERATIONS = 6
-_SIMPLER = 0.25  # log of what is left: one operator more has to leave a quarter less
+_SIMPLER = 0.25  # log of the misfit: one more operator must leave a quarter less
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A formula with its constants, the χ² it explains, what the search for it costs, its rank."""
+    """A formula with its constants, the χ² it explains, the search's penalty, and its rank."""
 
     node: Node
     gain: float
@@ -333,19 +327,21 @@ class Found:
 
 
 class FormulaSearch:
-    """One search over what some series recorded."""
+    """A search for formulas of the quantities that some series recorded."""
 
     def __init__(
         self, evidence: Condensed, margin: float, before: FormulaSearch | None = None
     ) -> None:
-        """before: a search over the same series with other covariances; its worst are left out."""
+        """Evaluate the library; before: a search in the same series with other covariances, of
+        which only the best formulas are tried again.
+        """
         self.margin = margin
         self.evidence = evidence
         if before is None:
             self.library = Library(evidence.histories)
             self.nodes = self.library.first()
             self.tried = len(self.nodes)
-            self.nodes, self.stack = self._finite(self.nodes)
+            self.nodes, self.stack = self._keep_finite(self.nodes)
         else:
             self.library, self.tried = before.library, before.tried
             kept = np.sort(np.argsort(-before.gains)[:_KEPT])
@@ -353,39 +349,37 @@ class FormulaSearch:
         self.regressors = evidence.regressors(self.stack)
         self.gains: Array = np.sum((self.regressors @ evidence.data) ** 2, axis=1)
 
-    def _finite(self, nodes: Sequence[Node]) -> tuple[list[Node], Array]:
-        """Keep the formulas that have values everywhere and change; also their trajectories (rows,
-        G).
-        """
+    def _keep_finite(self, nodes: Sequence[Node]) -> tuple[list[Node], Array]:
+        """Return the formulas that are finite and vary, and their trajectories (rows, G)."""
         with np.errstate(all="ignore"):
             stack = np.stack([self.library.values(n) for n in nodes], axis=1)
             good = np.isfinite(stack).all(axis=0) & (np.ptp(stack, axis=0) > 0)
         return [n for n, ok in zip(nodes, good, strict=True) if ok], stack[:, good]
 
     def best(self, further: bool = True) -> list[Found]:
-        """Rank formulas, best first, each structure once; further: with operators added, too."""
-        found = self._exact(self.nodes, self.gains, _WIDTH)
+        """Rank formulas, best first, each structure once; further: also extend them."""
+        ranking = self._fit_structures(self.nodes, self.gains, _WIDTH)
         for _ in range(_STEPS if further else 0):
-            if self._left(found[0].gain) < 0.5 * len(self.evidence.data):
+            if self._left(ranking[0].gain) < 0.5 * len(self.evidence.data):
                 break
             more: list[Node] = []
-            for one in found[:_FURTHER]:
+            for one in ranking[:_FURTHER]:
                 more += self.library.further(one.node)
-            before = found[0]
+            before = ranking[0]
             self.tried += len(more)
-            kept, stack = self._finite(more)
-            tried = self._exact(kept, self.evidence.gains(stack), _WIDTH // 2)
-            found = sorted([*found, *tried], key=lambda f: f.rank, reverse=True)
-            if found[0].rank <= before.rank:
+            kept, stack = self._keep_finite(more)
+            tried = self._fit_structures(kept, self.evidence.gains(stack), _WIDTH // 2)
+            ranking = sorted([*ranking, *tried], key=lambda f: f.rank, reverse=True)
+            if ranking[0].rank <= before.rank:
                 break
-        return found
+        return ranking
 
     def _rank(self, node: Node, gain: float) -> float:
-        """Rank by what is left; a further operator has to leave a quarter less."""
+        """Return the rank, from the misfit left; a further operator must leave a quarter less."""
         return -float(np.log(self._left(gain))) - _SIMPLER * node.size
 
-    def _exact(self, nodes: Sequence[Node], gains: Array, width: int) -> list[Found]:
-        """Fit the constants of the best structures."""
+    def _fit_structures(self, nodes: Sequence[Node], gains: Array, width: int) -> list[Found]:
+        """Fit the constants of the best `width` structures of some formulas."""
         ranks = [-self._rank(n, float(g)) for n, g in zip(nodes, gains, strict=True)]
         order = np.argsort(ranks)
         seen: dict[Node, Node] = {}
@@ -399,7 +393,7 @@ class FormulaSearch:
         return sorted(out, key=lambda f: f.rank, reverse=True)
 
     def _refine(self, node: Node) -> Found:
-        """Find the constants that explain most: Gauss-Newton, the coefficients eliminated."""
+        """Find the constants that explain most, by Gauss-Newton with coefficients eliminated."""
         structure, values = node.named()
         constants = list(structure.free())
         x = np.array([values[name] for name, _, _ in constants])
@@ -454,14 +448,14 @@ class FormulaSearch:
         return out
 
     def _step(self, owner: Node, constant: Constant, value: float) -> float:
-        """Return a step of a constant that changes the formula somewhat."""
+        """Return a step of a constant that changes the formula's values slightly."""
         if constant.positive or constant.role == "phase":
             return 0.05 * max(abs(value), 1.0 if constant.role == "phase" else 0.0)
         low, high = self.library.span(owner.inputs[0])
         return 0.03 * (high - low)
 
     def _limits(self, owner: Node, constant: Constant) -> tuple[float, float]:
-        """Return where a constant may be: a threshold near the range of what it is applied to."""
+        """Return a constant's limits; a threshold is near the range of its operator's input."""
         low, high = self.library.span(owner.inputs[0])
         width = high - low
         if constant.role == "time_constant":
@@ -474,14 +468,12 @@ class FormulaSearch:
         return (1e-3 * width, 10.0 * width) if constant.positive else (-np.inf, np.inf)
 
     def _left(self, gain: float) -> float:
-        """Return the χ² that is left beyond the noise, never quite none."""
+        """Return the χ² left beyond the noise, always positive."""
         r = len(self.evidence.data)
         return max(self.evidence.power - gain - r, 0.0) + 0.1 * r
 
     def surrogates(self, count: int, rng: np.random.Generator) -> tuple[float, Array]:
-        """Return the share of the misfit that the library explains at best, of data and
-        surrogates.
-        """
+        """Return the largest share of the misfit a formula explains, in data and in surrogates."""
         data = self.evidence.surrogates(count, rng)
         power = np.maximum(np.sum(data**2, axis=0), 1e-300)
         G, k, r = self.regressors.shape

@@ -1,8 +1,8 @@
-"""The gap between simulation and measurement, as CONVENTIONS §4 prints it.
+"""The gap between simulation and measurement, as CONVENTIONS §4 defines it.
 
-rms_px: image points measured minus simulated. chi2_reduced: the same over its noise, image noise
-and what the thermometers' noise does to the prediction; 1 is the floor. object_mm_at_10m: rms_px
-on a plane at 10 m.
+rms_px: image points, measured minus simulated. chi2_reduced: the same over its noise, which is that
+of the image and that of the thermometers propagated to the prediction; 1 is the floor.
+object_mm_at_10m: rms_px on a plane at 10 m.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _DISTANCE_MM = 10_000.0
 
 @dataclass(frozen=True)
 class Gap:
-    """One G of CONVENTIONS §4.
+    """A gap, G of CONVENTIONS §4.
 
-    floor: of chi2_reduced, what the measurement leaves about its own cameras.
+    floor: of chi2_reduced, from the measurement's residuals about its own cameras.
     """
 
     JSON: ClassVar = {"floor": ""}
@@ -45,10 +45,10 @@ class Gap:
 
 
 def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
-    """Fit a hypothesis to the first series alone and carry its constants to the others.
+    """Fit a hypothesis to the first series alone and apply its constants to the others.
 
-    What a series has of its own is estimated again: of an oscillation the phase, of a slip time and
-    height.
+    What each series has separately is estimated again: an oscillation's phase, a slip's time and
+    size.
     """
     fit = fitter.refine(fitter.fit(terms, only=[0]), only=[0])
     x = fit.coefficients.copy()
@@ -78,30 +78,30 @@ def fit_first(fitter: HypothesisFitter, terms: Sequence[Term]) -> Fit:
 
 
 def image_chi2(evidence: ReducedSeries, fit: Fit, series: int) -> float:
-    """Sum squared parameter misfits in the metric of the image points, levels estimated again."""
+    """Return χ² of a series' misfit in the image, with the level estimated again."""
     return float(evidence.squares(evidence.values - fit.parameters(series)).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One step: what was added, and the gap then on each recording, M1 first."""
+    """A step of the discovery: the effect added, and the gap after it in each series, M1 first."""
 
     added: str
     gaps: tuple[Gap, ...]
 
     @property
     def fit(self) -> Gap:
-        """The gap on M1."""
+        """The gap in M1."""
         return self.gaps[0]
 
     @property
     def verify(self) -> Gap | None:
-        """The gap on M2; None where there is none."""
+        """The gap in M2, None if there is no M2."""
         return self.gaps[1] if len(self.gaps) > 1 else None
 
 
 def measure_stage(x: Examination, added: str, fit: Fit, known: int) -> Stage:
-    """Measure the gaps at a fit when the first `known` effects of image space are in the model."""
+    """Measure the gaps at a fit, with the first `known` effects of image space in the model."""
     every = range(len(x.fitter.series))
     return Stage(added, tuple(measure_gap(x, fit, s, known) for s in every))
 
@@ -109,19 +109,18 @@ def measure_stage(x: Examination, added: str, fit: Fit, known: int) -> Stage:
 def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: float = 0.0) -> Gap:
     """Measure the gap of one series at a fit.
 
-    known: how many effects of image space the model knows; explained: χ² that a bridge takes up
-    alongside the model.
+    known: number of effects of image space in the model; explained: χ² that a bridge explains
+    beside the model.
     """
     e, in_model = x.fitter.series[series], x.image_places[:known]
     residuals = np.nan_to_num(e.residuals)
     within = float(np.sum(e.weights[..., :2] * residuals**2))
     coordinates = 2.0 * float(e.n.sum())
     targets = float((e.n.sum() > 0) * np.sum(e.weights[..., 0].any(axis=0)))
-    # what a camera does within one block of a long series is not part of the comparison
+    # changes of a camera within a block of a long series are not compared
     unused = e.blocks.within_free if e.blocks is not None else 0.0
     free = max(coordinates - 2.0 * targets - e.rank - unused, 1.0)
-    # `with_correlated_noise` has put correlated noise into the weights; the floor is that of single
-    # epochs
+    # the weights include correlated noise; the floor is that of single epochs
     k = e.correlation
     total = within + k * max(fit.chi2_of(series) - explained, 0.0)
     image = within + k * max(image_chi2(e, fit, series) - explained, 0.0)
@@ -134,7 +133,7 @@ def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: fl
     rms = e.sigma_px * float(np.sqrt(image / free))
     floor = 1.0
     if e.movement is not None:
-        # the camera's own noise, on this recording: what no smooth trajectory takes up
+        # the camera's own noise in this series, which no smooth trajectory explains
         floor = chi2 - k * examine(x.fitter, fit, series).excess / free
     mm = rms * e.source.sensor.pixel_pitch / float(e.at.iop[0]) * _DISTANCE_MM
     return Gap(rms, chi2, mm, floor)
@@ -143,8 +142,9 @@ def measure_gap(x: Examination, fit: Fit, series: int, known: int, explained: fl
 def _measure_moved(
     evidence: ReducedSeries, displaced: Sequence[Displaced], known: bool
 ) -> tuple[float, float]:
-    """Return χ² of the displaced targets about the camera of the others, and its degrees of
-    freedom.
+    """Return displaced targets' χ² about the others' camera, and its degrees of freedom.
+
+    known: whether their displacement is in the model.
     """
     total = count = 0.0
     w = evidence.weights[..., 0]

@@ -1,9 +1,10 @@
-"""The search where the camera moves on its mount: each hypothesis alongside the movement it leaves.
+"""The search for effects of a camera that moves on its mount.
 
-What no effect explains is a wander of the mount with a size of its own for each hypothesis, so that
-a cause is held against what a moving mount would do by chance. Knocks of the mount, steps that a
-turn and a shift of the camera explain as well as a slip inside of it, are no effects: they are
-found, kept alongside the base model, and reported with time and size.
+Each hypothesis is fitted beside a movement of the mount, whose size is estimated from what the
+hypothesis leaves unexplained, so that a cause is compared with a mount that moves by chance. A
+knock of the mount is a step that a rotation and a shift of the camera explain at least as well as a
+slip inside it. Knocks are no effects: they are added to the base model and reported with time and
+size.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ _WIDTH = 4  # solutions of a level whose movement is estimated
 _LEVELS = 5
 _EFFECTS = 3
 _KNOCKS = 3
-_PROMISE = 0.3  # of which a scan has to promise, in the noise before
+_PROMISE = 0.3  # share of a further effect's least gain that a scan before it must promise
 _CORNERS = (0.0, 3.0)
-_REST = 0.05
-# further estimates of the movement without an effect, and the share by which one has to come nearer
-# to the score with an effect
+_REST = 0.05  # share of the movement before that is added to a first guess
+# iterations of the movement without an effect, and the share of the distance to the score with an
+# effect that each must gain
 _TURNS = 5
 _SETTLED = 0.1
 
@@ -45,10 +46,10 @@ def search_beside_mount(
     say: Callable[[str], None],
     given: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> tuple[Solution, list[Solution], list[Solution], Search]:
-    """Add effects and knocks, one by one, while the penalised likelihood improves.
+    """Add effects and knocks one by one while the penalised likelihood improves.
 
-    Returns the best, single effects by score, every solution that was looked at, each with its
-    movement, and a search whose trajectories serve in the fitter of the best.
+    Returns the best solution, the single effects by score, all solutions tried, each with its
+    movement, and a search whose trajectories can be reused in the best solution's fitter.
     """
     first = Search(fitter)
     start = first.base(given)
@@ -62,7 +63,7 @@ def search_beside_mount(
         say(f"alongside the mount: {', '.join(best.names) or 'the base'}")
         search = Search(best.fitter, like=first)
         grown: list[Solution] = []
-        # a scan is right to some percent, and a further effect has to be worth much
+        # a scan is accurate to a few percent, and a further effect must gain much
         further = any(not t.kind.is_event for t in best.terms[len(start.terms) :])
         least = _PROMISE * _least_further(plain, best) if further else 0.0
         for solution in _add_delays(search, search.expand(best, 6, least)[:_WIDTH]):
@@ -72,7 +73,7 @@ def search_beside_mount(
             break
         if level == 0:
             ranking = sorted(grown, key=lambda s: s.score)
-            # a movement estimated to its end takes up drifts too: a scan would find nothing in it
+            # after the scan: a converged movement explains drifts too, and a scan would find none
             plain = best = _settle(plain, ranking[0].score)
         seen += grown
         allowed = [g for g in grown if _is_allowed(g, best, plain, len(start.terms))]
@@ -83,8 +84,9 @@ def search_beside_mount(
 
 
 def _add_delays(search: Search, solutions: list[Solution]) -> list[Solution]:
-    """Add, for the first delay of the temperature, the other kind of delay too: a scan
-    without the movement of the mount may leave it out.
+    """Add the other kind of delay to the first solution with a delay of the temperature.
+
+    A scan without the movement of the mount may miss it.
     """
     for solution in solutions:
         other = search.with_other_delay(solution)
@@ -101,38 +103,39 @@ def _fit_beside(solution: Solution, mount: Mount, turns: int) -> Solution:
     return Solution(fit, solution.penalties, own, mount)
 
 
-def _settle(found: Solution, best: float) -> Solution:
-    """Estimate the movement again from what it leaves over, while it may come below another score:
-    a direction that the first estimate has at zero stays there.
+def _settle(solution: Solution, best: float) -> Solution:
+    """Estimate the movement again from its residuals while the score may come below `best`.
+
+    A direction that the first estimate sets to zero would otherwise stay zero.
     """
     for _ in range(_TURNS):
-        if found.score < best:
+        if solution.score < best:
             break
-        more = _profile(found, found)
-        if more.score > found.score:
+        more = _profile(solution, solution)
+        if more.score > solution.score:
             break
-        change, found = found.score - more.score, more
-        if change < _SETTLED * (found.score - best):
+        change, solution = solution.score - more.score, more
+        if change < _SETTLED * (solution.score - best):
             break
-    return found
+    return solution
 
 
 def _profile(best: Solution, solution: Solution) -> Solution:
-    """Fit a solution with the movement that it leaves; its non-linear parameters refined in it.
+    """Fit a solution beside the movement that it leaves, and refine its non-linear parameters.
 
-    best: what it was found beside, in the same fitter, with its movement.
+    best: the solution that it extends, in the same fitter, with its movement.
     """
     assert best.mount is not None
     guess = guess_mount_motion(best.fitter, solution.fit, best.mount.combinations)
-    # a share of the movement before: what starts at zero stays there
+    # with a share of the movement before, since a direction that starts at zero stays zero
     mount = replace(best.mount, covariance=guess + _REST * best.mount.covariance)
-    found = _fit_beside(solution, mount, 5)
-    fit = found.fitter.refine(found.fit, max_iterations=3)
-    return replace(found, fit=fit, as_slips=best.as_slips)
+    fitted = _fit_beside(solution, mount, 5)
+    fit = fitted.fitter.refine(fitted.fit, max_iterations=3)
+    return replace(fitted, fit=fit, as_slips=best.as_slips)
 
 
 def _try_knock(best: Solution, trial: Solution) -> Solution | None:
-    """Explain the same event as a knock of the mount, where that does as well; else None."""
+    """Explain an event as a knock of the mount; None if that explains it less well."""
     term = trial.terms[-1]
     if not term.kind.is_event:
         return None
@@ -160,38 +163,37 @@ def _is_allowed(grown: Solution, best: Solution, plain: Solution, given: int) ->
 
 
 def _least_further(plain: Solution, best: Solution) -> float:
-    """Return what an effect after the first has to gain."""
+    """Return the least gain of an effect after the first."""
     return max(criteria.MOUNT_FURTHER, criteria.MOUNT_SHARE * (plain.score - best.score))
 
 
 def split_knocks(
     solution: Solution, given: int, slips: bool = False
 ) -> tuple[Solution, Solution, tuple[Term, ...]]:
-    """Fit the base model with the knocks, and all of it, in its fitter; also return the knocks.
+    """Fit the base model with the knocks, and the whole solution; also return the knocks.
 
-    given: how many terms the model has already; slips: take steps inside the camera for nuisances
-    as knocks are.
+    given: number of terms that the model has already; slips: treat steps inside the camera as
+    nuisances too.
     """
     every = list(zip(solution.terms, solution.penalties, strict=True))
     first, rest = every[:given], every[given:]
     knocks = [x for x in rest if x[0].kind.is_event and (slips or x[0].parameters == EOP_NAMES)]
     effects = [x for x in rest if x not in knocks]
 
-    def fitted(parts: list[tuple[Term, float]]) -> Solution:
+    def fit_terms(parts: list[tuple[Term, float]]) -> Solution:
         fitter = solution.fitter
         fit = fitter.refine(fitter.fit([t for t, _ in parts]), max_iterations=3)
         return replace(solution, fit=fit, penalties=tuple(p for _, p in parts))
 
-    base = fitted(first + knocks)
-    whole = fitted(first + knocks + effects) if effects else base
+    base = fit_terms(first + knocks)
+    whole = fit_terms(first + knocks + effects) if effects else base
     return base, whole, tuple(t for t, _ in knocks)
 
 
 def is_convincing(base: Solution, best: Solution) -> bool:
-    """Test whether the effects of `best` are worth their penalties, and hold in both series.
+    """Test whether the effects of `best` gain more than their penalties, and in every series.
 
-    Constants from all series but one are held against that one, and from two each against the
-    other; events are new each time.
+    Constants from all other series are tested on each series; events are estimated anew in each.
     """
     if base.score <= best.score:
         return False
@@ -199,12 +201,12 @@ def is_convincing(base: Solution, best: Solution) -> bool:
     every = range(len(fitter.series))
     if len(every) < 2 or all(t.is_separate for t in best.terms[len(base.terms) :]):
         return True
-    own, there = [], []
+    inside, outside = [], []  # gains in χ² in the fitted series, per series, and in the other
     for left in every:
         rest = [s for s in every if s != left]
         without = fitter.fit(base.terms, only=rest)
         whole = fitter.refine(fitter.fit(best.terms, only=rest), only=rest)
-        own.append(sum(without.chi2_of(s) - whole.chi2_of(s) for s in rest) / len(rest))
-        there.append(without.chi2_of(left) - whole.chi2_of(left))
-    least = criteria.MOUNT_WORSE * max(own)
-    return min(there) > -least and sum(there) > least
+        inside.append(sum(without.chi2_of(s) - whole.chi2_of(s) for s in rest) / len(rest))
+        outside.append(without.chi2_of(left) - whole.chi2_of(left))
+    least = criteria.MOUNT_WORSE * max(inside)
+    return min(outside) > -least and sum(outside) > least

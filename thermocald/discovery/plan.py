@@ -1,8 +1,8 @@
-"""The plan: what an experiment would show, before anything is heated.
+"""The plan: the effects that a set-up could reveal, predicted before the camera is heated.
 
-Recordings of the set-up are simulated without any effect; each effect in turn is then put into
-their normal equations at a given strength and looked for. The confusion matrix says which
-effects would be found, which stay ambiguous with which, and what to do to tell them apart.
+Recordings of the set-up are simulated without effects. Each effect in turn is then added to their
+normal equations with a given strength, and searched for. The confusion matrix shows which effects
+would be found, which remain ambiguous, and which experiment separates them.
 """
 
 from __future__ import annotations
@@ -36,27 +36,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plan:
-    """found: {effect: {what was said: how often}}; repetitions; strength px."""
+    """The predicted power of a set-up; found: {effect: {verdict: count}}."""
 
     found: dict[str, dict[str, int]]
     repetitions: int
     strength_px: float
 
     def power(self, effect: str) -> float:
-        """Return the share of repetitions that found an effect, alone or with others not
-        excluded.
-        """
-        said = self.found[effect]
-        right = sum(n for name, n in said.items() if effect in name.replace("?", "").split(" or "))
-        return right / max(sum(said.values()), 1)
+        """Return the share of repetitions that found an effect, alone or with alternatives."""
+        verdicts = self.found[effect]
+        right = sum(n for name, n in verdicts.items() if effect in name.split(" or "))
+        return right / max(sum(verdicts.values()), 1)
 
     def ambiguous(self) -> list[tuple[str, str, str]]:
-        """List pairs that this set-up leaves open, with the experiment that would tell them
-        apart.
-        """
+        """List the pairs that the set-up does not separate, each with an experiment that does."""
         pairs: dict[tuple[str, str], str] = {}
-        for effect, said in self.found.items():
-            for name in said:
+        for effect, verdicts in self.found.items():
+            for name in verdicts:
                 for other in name.split(" or "):
                     if other != effect and other in catalogue.names():
                         key = (min(effect, other), max(effect, other))
@@ -79,9 +75,9 @@ class Plan:
 
     def __str__(self) -> str:
         out = [f"effects of {self.strength_px:g} px RMS, {self.repetitions} recordings each:"]
-        for name, said in self.found.items():
-            words = ", ".join(f"{k} × {n}" for k, n in sorted(said.items()))
-            out.append(f"  {name:26s} found {self.power(name):4.0%}   said: {words}")
+        for name, verdicts in self.found.items():
+            counts = ", ".join(f"{k} × {n}" for k, n in sorted(verdicts.items()))
+            out.append(f"  {name:26s} found {self.power(name):4.0%}   verdicts: {counts}")
         out += [f"  ambiguous: {a} and {b}; {e}" for a, b, e in self.ambiguous()]
         return "\n".join(out)
 
@@ -94,10 +90,10 @@ def set_ups(
     programme: Path | None,
     seeds: int,
 ) -> list[tuple[SeriesInput, Simulation | None]]:
-    """Prepare recordings of the set-up with no effect but the model's, one per seed, each with the
-    simulation that it came from.
+    """Prepare recordings of the set-up without effects but the model's, each with its simulation.
 
-    A measured series may stand for the set-up: then its own epochs and noise are used, once.
+    There is one per seed. A measured series represents the set-up by its own epochs and noise,
+    once.
     """
     if source is not None:
         return [(source, None)]
@@ -113,7 +109,7 @@ def set_ups(
     out: list[tuple[SeriesInput, Simulation | None]] = []
     for seed in range(seeds):
         simulation = given_simulation(preset, model, None, field, programme, seed, "plan")
-        if preset is not None:  # its camera counts, not how it drifts
+        if preset is not None:  # only for its camera, without the preset's effects
             bare = simulation.model.without(*(e.name for e in simulation.model.effects))
             simulation = replace(simulation, model=bare)
         out.append((_record(simulation), simulation))
@@ -132,9 +128,9 @@ def _record(simulation: Simulation) -> SeriesInput:
 def plan_power(
     inputs: Sequence[tuple[SeriesInput, Simulation | None]],
     strength_px: float,
-    advance: Callable[[], None],
+    advance: Callable[[int], None],
 ) -> Plan:
-    """Put every effect into every recording of `set_ups` and look for it."""
+    """Add every effect to every recording of `set_ups` and search for it."""
     found: dict[str, dict[str, int]] = {}
     rng = np.random.default_rng(0)
     for source, simulation in inputs:
@@ -147,18 +143,18 @@ def plan_power(
                 continue
             done.add(candidate.effect)
             if candidate.kind.is_drive:
-                changed = _put_drive(simulation, fitter, candidate, strength_px)
+                changed = _add_drive(simulation, fitter, candidate, strength_px)
             else:
-                changed = _put_effect(fitter, candidate, strength_px, rng)
-            said = _say(changed, given)
+                changed = _add_effect(fitter, candidate, strength_px, rng)
+            verdict = _examine(changed, given)
             row = found.setdefault(candidate.effect, {})
-            row[said] = row.get(said, 0) + 1
-            advance()
+            row[verdict] = row.get(verdict, 0) + 1
+            advance(1)
     return Plan(found, len(inputs), strength_px)
 
 
-def _say(evidence: ReducedSeries, given: Sequence[tuple[str, dict[str, Any]]]) -> str:
-    """Say what an examination finds beyond the effects that the model has."""
+def _examine(evidence: ReducedSeries, given: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """Return the effects that an examination finds beyond the model's own."""
     x = examine_series([evidence], given=given)
     if not x.adequate:
         return "unexplained"
@@ -167,12 +163,12 @@ def _say(evidence: ReducedSeries, given: Sequence[tuple[str, dict[str, Any]]]) -
     return " or ".join(dict.fromkeys("+".join(names[known:]) or "none" for names in every))
 
 
-def _put_effect(
+def _add_effect(
     fitter: HypothesisFitter, candidate: Candidate, strength_px: float, rng: np.random.Generator
 ) -> ReducedSeries:
-    """Put one effect into the normal equations, scaled to what the base leaves over."""
+    """Add an effect to the normal equations; the base model leaves `strength_px` of it."""
     e, h = fitter.series[0], fitter.series[0].history
-    # the readings themselves, which the evidence has smoothed: a camera feels every kink
+    # the readings without the evidence's smoothing, since a camera follows every kink
     readings = {n: h.readings[n] + c.deviation for n, c in e.thermometers.items()}
     seen = HypothesisFitter([replace(e, history=replace(h, readings=readings))])
     value = _choose_place(candidate, e, rng)
@@ -186,15 +182,15 @@ def _put_effect(
     return e.with_values(e.values + moved * size)
 
 
-def _put_drive(
+def _add_drive(
     simulation: Simulation | None,
     fitter: HypothesisFitter,
     candidate: Candidate,
     strength_px: float,
 ) -> ReducedSeries:
-    """Let the camera follow a drive, at the value that leaves the strength.
+    """Make the camera follow a drive; the base model leaves `strength_px` of it.
 
-    Simulated again where that can be: the truth behind the readings is not in them.
+    A simulation is run again, since the readings do not hold the true temperatures.
     """
     base = fitter.fit(())
     rates = base.direction(base.blocks[0])[0]
@@ -216,7 +212,7 @@ def _put_drive(
 
 
 def _choose_place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generator) -> float | None:
-    """Choose a non-linear parameter where the effect is well seen, None where there is none."""
+    """Choose a non-linear parameter with which the effect shows well, None if it has none."""
     if not len(candidate.grid):
         return None
     if candidate.kind.nonlinear[candidate.name].role == "period":
@@ -225,9 +221,7 @@ def _choose_place(candidate: Candidate, e: ReducedSeries, rng: np.random.Generat
 
 
 def _measure_left(fitter: HypothesisFitter, moved: Array) -> float:
-    """Return the RMS px that the base model, fitted, leaves of a movement (E, P) of the
-    parameters.
-    """
+    """Return the RMS, px, that the fitted base model leaves of a movement (E, P) of parameters."""
     e = fitter.series[0]
     T = fitter.drive_trajectory([], 0)
     T = T - T.mean()

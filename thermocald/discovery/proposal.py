@@ -1,8 +1,8 @@
-"""A proposal: a formula that takes the place of a name, where the data allow one.
+"""The proposal of a formula in place of a name, if the data allow one.
 
-Searched on both series together under the likelihood of the catalogue, it has to pass what a
-name has to pass, and more: surrogates whose cause was not recorded reach its share of the misfit
-in less than one of a hundred, and constants from either series alone close the gap of the other.
+A formula is searched in both series together with the likelihood of the catalogue. It must pass the
+tests of a name, and more: fewer than one in a hundred surrogates whose cause was not recorded reach
+its share of the misfit, and constants from either series alone close the gap of the other.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.discovery import criteria
-from thermocald.discovery.formulas import FormulaSearch, condensed
+from thermocald.discovery.formulas import FormulaSearch, condense
 from thermocald.discovery.gap import image_chi2
 from thermocald.discovery.validation import SurrogateTest
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
@@ -34,19 +34,19 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 
-_FITTED = 8  # formulas of a pass that are fitted in full
-_REFINED = 2  # of them with exact constants
+_FITTED = 8  # formulas per pass that are fitted in full
+_REFINED = 2  # of these, with exact constants
 _TURNS = 3
 _SEED = 16
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """What was found.
+    """A formula proposed.
 
-    base, best: solutions in the series that it was found on; closed: share of the misfit of
-    M2 that constants of M1 explain, and of M1 by constants of M2; surrogates: shares of
-    surrogates; rivals: other formulas, as simple, and by how much they score worse.
+    base, best: solutions without and with it, in the series where it was found; closed: share of
+    M2's misfit that constants from M1 explain, and of M1's by M2's; surrogates: the test with the
+    shares in surrogates; rivals: other formulas, as simple, and by how much they score worse.
     """
 
     base: Solution
@@ -59,18 +59,18 @@ class Proposal:
 def propose(
     x: Examination, parameters: Sequence[str], progress: Callable[[str], None] | None = None
 ) -> Proposal | None:
-    """Find a formula for what an examination leaves without a name; None where the data allow none.
+    """Find a formula for what an examination leaves unnamed; None if the data allow none.
 
-    parameters: columns in which the image moves. One series alone allows none.
+    parameters: columns in which the image moves. A single series allows no formula.
     """
-    # what moves the image little may still be seen well
+    # with the base's own, which may be well determined even if they move the image little
     moving = [p for p in PARAMETER_NAMES if p in {*parameters, *BASE}]
     if len(x.fitter.series) < 2:
         return None
     (progress or (lambda _: None))("beyond the catalogue")
     base = _straighten(x)
     fitter = base.fitter
-    search = FormulaSearch(condensed(fitter, base.fit, moving), criteria.MARGIN)
+    search = FormulaSearch(condense(fitter, base.fit, moving), criteria.MARGIN)
     test = SurrogateTest(
         *search.surrogates(criteria.FORMULA_SURROGATES, np.random.default_rng(_SEED))
     )
@@ -81,9 +81,9 @@ def propose(
     for turn in range(_TURNS):
         before = best
         if turn:
-            here = condensed(fitter, base.fit, moving, best.fit.weightings)
+            here = condense(fitter, base.fit, moving, best.fit.weightings)
             search = FormulaSearch(here, criteria.MARGIN, search)
-        _try(base, moving, search.best(further=turn > 0), tried)
+        _fit_formulas(base, moving, search.best(further=turn > 0), tried)
         best = min([base, *tried.values()], key=lambda s: s.score)
         if best.score > before.score - criteria.MARGIN or all(
             a.adequate for a in examine_all(fitter, best.fit)
@@ -95,7 +95,7 @@ def propose(
     closed = _cross_check(base, best)
     if closed is None:
         return None
-    by_m1, by_m2 = closed  # NaN: M2 does not determine them
+    by_m1, by_m2 = closed  # by_m2 is NaN if M2 does not determine the constants
     if not (
         by_m1 > criteria.CLOSED_ALONE
         if np.isnan(by_m2)
@@ -112,9 +112,7 @@ def propose(
 
 
 def _straighten(x: Examination) -> Solution:
-    """Take the curvature of the projection along everything that moves off the series, and fit the
-    base model in them.
-    """
+    """Remove the projection's curvature along all movements from the series; fit the base model."""
     series: list[ReducedSeries] = []
     for s, (e, a) in enumerate(zip(x.fitter.series, x.base_adequacy, strict=True)):
         bridge = a.trajectories.T @ a.amplitudes
@@ -124,13 +122,13 @@ def _straighten(x: Examination) -> Solution:
     return replace(x.base, fit=fit, fitter=fitter)
 
 
-def _try(
+def _fit_formulas(
     base: Solution,
     parameters: Sequence[str],
     formulas: Sequence[Found],
     tried: dict[str, Solution],
 ) -> None:
-    """Fit formulas in the full likelihood, those that are best then exactly."""
+    """Fit formulas in the full likelihood, the best of them with exact constants, into `tried`."""
     here: dict[str, Solution] = {}
     for found in formulas[:_FITTED]:
         structure, values = found.node.named()
@@ -153,7 +151,7 @@ def _fit(
     only: Sequence[int] | None = None,
     refined: bool = False,
 ) -> Fit | None:
-    """Fit in the full likelihood; None where a formula is too steep for the readings' noise."""
+    """Fit in the full likelihood; None if a formula is too steep for the readings' noise."""
     try:
         fit = fitter.fit(terms, only=only)
         fit = fitter.refine(fit, 4, only) if refined else fit
@@ -163,18 +161,18 @@ def _fit(
 
 
 def _leaves_nothing(fitter: HypothesisFitter, fit: Fit) -> bool:
-    """Test whether no smooth trajectory is significant any more, however small."""
+    """Test whether no smooth trajectory remains significant, however small."""
     return all(a.significance < noise_criteria.SIGNIFICANT for a in examine_all(fitter, fit))
 
 
 def _simplify(base: Solution, best: Solution) -> Solution:
-    """Leave out operators that it does as well without, one after the other."""
+    """Remove operators one by one while the formula fits as well without them."""
     fitter = base.fitter
     nothing_left = _leaves_nothing(fitter, best.fit)
     while True:
         term = best.terms[-1]
         node = parse(term.effect).bound(dict(term.nonlinear))
-        found = []
+        solutions = []
         for simpler in node.simpler():
             structure, values = simpler.named()
             if not structure.inputs:
@@ -185,14 +183,14 @@ def _simplify(base: Solution, best: Solution) -> Solution:
                 penalties = (*base.penalties, best.penalties[-1] - criteria.MARGIN)
                 solution = replace(base, fit=fit, penalties=penalties)
                 if solution.score < best.score or (nothing_left and _leaves_nothing(fitter, fit)):
-                    found.append(solution)
-        if not found:
+                    solutions.append(solution)
+        if not solutions:
             return best
-        best = min(found, key=lambda s: s.score)
+        best = min(solutions, key=lambda s: s.score)
 
 
 def _choose_parameters(base: Solution, best: Solution) -> Solution:
-    """Choose the parameters in which the formula is needed, one after the other."""
+    """Choose the parameters in which the formula is needed, one by one."""
     term, fitter = best.terms[-1], base.fitter
     A, c = normals_of_term(fitter, base.fit, term, PARAMETER_NAMES, best.fit.weightings)
     n = float(np.log(sum(int((e.n > 0).sum()) for e in fitter.series)))
@@ -226,8 +224,9 @@ def _choose_parameters(base: Solution, best: Solution) -> Solution:
 
 
 def _cross_check(base: Solution, best: Solution) -> tuple[float, float] | None:
-    """Return the share of the misfit of M2 that constants of M1 alone explain, and the other way,
-    NaN where M2 alone does not determine them; None where M1 does not.
+    """Return the share of M2's misfit that constants from M1 alone explain, and the reverse.
+
+    The latter is NaN if M2 alone does not determine the constants. None if M1 does not.
     """
     shares, fitter = [], base.fitter
     for here, there in ((0, 1), (1, 0)):
@@ -238,7 +237,7 @@ def _cross_check(base: Solution, best: Solution) -> tuple[float, float] | None:
                 return None
             shares.append(float("nan"))
             continue
-        # mean squares px² beyond the noise of the free cameras
+        # mean squares, px², beyond the noise of the free cameras
         e = fitter.series[there]
         noise = e.rank * float((e.n > 0).sum() - 1)
         unit = e.sigma_px**2 * e.correlation / (2.0 * float(e.n.sum()))

@@ -1,13 +1,11 @@
-"""The result of a discovery: verdict, effects with sentences and evidence, gaps, alternatives.
+"""The result of a discovery: verdict, effects with evidence and alternatives, gaps, and the model.
 
-What the test field did while the camera was watched: boards that moved, targets that wander.
+It also describes the movements of the test field and the mount during the series.
 
-What the mount did while the camera was watched: its movement, and when it was knocked.
-
-What was found is also the next version of a thermal model that `simulate` runs. Its level, camera
-and orientation at T₀ with all effects at zero: the readings' errors move it as they move the
-drifts, and so do the drifts' own. Level and drifts are one system of normal equations, from which
-the thermometers' errors are eliminated; what the field's coordinates do to the level is added.
+The model is the next version of a thermal model, which `simulate` runs. Its level is the camera and
+its orientation at T₀ with all effects at zero. Level and drifts are one system of normal equations,
+from which the thermometers' errors are eliminated, so that these and the drifts' errors are
+propagated to the level; the errors of the field's coordinates are added.
 """
 
 from __future__ import annotations
@@ -63,16 +61,16 @@ if TYPE_CHECKING:
 
 
 def field_lines(x: Examination) -> list[str]:
-    """Describe the movements of the test field for people."""
+    """Return a line for each movement of the test field."""
     return [
         f"{m.sentence} in {e.source.name}; this is not counted as an effect"
-        for e, found in zip(x.original, x.field_movements, strict=True)
-        for m in found
+        for e, movements in zip(x.original, x.field_movements, strict=True)
+        for m in movements
     ]
 
 
 def mount_lines(x: Examination) -> list[str]:
-    """Describe the movement of the mount for people."""
+    """Return lines about the movement of the mount and its knocks."""
     if x.mount is None:
         return []
     sizes = " and ".join(f"{x.mount.size_px(e):.3f}" for e in x.fitter.series)
@@ -87,22 +85,22 @@ def mount_lines(x: Examination) -> list[str]:
 
 
 def say_adequate(x: Examination) -> str:
-    """Say what reproduces the recording where no effect was found, and what would not show."""
+    """Return a sentence on what reproduces the recording if no effect was found."""
     if any(x.as_slips):
         return (
-            "the model reproduces the recording but for steps that are a knock of the mount or a "
-            "slip inside the camera: a second camera on the same mount tells them apart"
+            "the model reproduces the recording except for steps, which are a knock of the mount "
+            "or a slip inside the camera: a second camera on the same mount tells them apart"
         )
     if x.mount is not None:
         return (
-            "the model and a mount that moves reproduce the recording; an effect that moves the "
-            "image as the mount does would not show"
+            "the model and a moving mount reproduce the recording; an effect that moves the image "
+            "as the mount does cannot be seen"
         )
-    return "the model reproduces the recording; nothing is missing that it could show"
+    return "the model reproduces the recording; no effect that it can show is missing"
 
 
 def _list_knocks(x: Examination) -> list[dict[str, Any]]:
-    """Describe the knocks of the mount, one for each series in which one came."""
+    """Return the document of each knock of the mount, in each series in which it occurred."""
     out = []
     fit = x.base.fit
     for block in fit.blocks:
@@ -129,9 +127,10 @@ def _list_knocks(x: Examination) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """Verdict, effects, the staircase of the gap; fits: base and final, constants from M1 alone.
+    """The result of a discovery.
 
-    doubts: what cannot have been meant in what was recorded, a sentence each.
+    stages: the gap before and after each effect; base_fit, final_fit: constants from M1 alone;
+    doubts: probable mistakes in the recorded data, one sentence each.
     """
 
     verdict: str
@@ -144,21 +143,21 @@ class Discovery:
     doubts: tuple[str, ...] = ()
 
     def excess_closed(self) -> float | None:
-        """Return the share of the excess of reduced χ² over the floor that is closed on M2."""
+        """Return the share of reduced χ²'s excess over the floor in M2 that the effects explain."""
         before, after = self.stages[0].verify, self.stages[-1].verify
         if before is None or after is None or before.chi2_reduced - before.floor < criteria.EXCESS:
             return None
         return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 
     def effects_with_gaps(self) -> list[tuple[EffectFound, Gap, Gap]]:
-        """Return each effect with the gap on M1 before and after it: the last stages."""
+        """Return each effect with the gap in M1 before and after it, from the last stages."""
         gaps = [stage.fit for stage in self.stages[-len(self.effects) - 1 :]]
         return list(zip(self.effects, gaps[:-1], gaps[1:], strict=True))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `discover --json` writes, CONVENTIONS §4.
+        """Return what `discover --json` writes (CONVENTIONS §4).
 
-        What the mount and the test field did stands under `mount` and `field`.
+        Movements of the mount and the test field are under `mount` and `field`.
         """
         x = self.examination
         gaps = zip(self.stages[0].gaps, self.stages[-1].gaps, strict=True)
@@ -167,7 +166,7 @@ class Discovery:
             {**jsonable(e), "gap_before": before, "gap_after": after}
             for e, before, after in self.effects_with_gaps()
         ]
-        if effects:  # where the base model is wrong stands with the first of its causes
+        if effects:  # the misfit of the base model is given with the first of its causes
             effects[0]["evidence"]["base_misfit"] = describe_misfit(x)
         document: dict[str, Any] = {
             "format": "thermocald-discovery/1",
@@ -186,26 +185,26 @@ class Discovery:
             document["mount"] = {
                 "movement_px": [x.mount.size_px(e) for e in x.fitter.series],
                 "knocks": _list_knocks(x),
-                "note": "movement of the mount is estimated with the effects and is none of the "
+                "note": "the movement of the mount is estimated with the effects and is not the "
                 "camera's",
             }
         movements = [
             {"recording": e.source.name, **m.as_dict()}
-            for e, found in zip(x.original, x.field_movements, strict=True)
-            for m in found
+            for e, moved in zip(x.original, x.field_movements, strict=True)
+            for m in moved
         ]
         if movements:
             document["field"] = {
                 "movements": movements,
-                "note": "boards are put back where they were, wandering targets are left out; "
-                "neither is the camera's",
+                "note": "moved boards are put back to their places and wandering targets are left "
+                "out; neither movement is the camera's",
             }
         written: dict[str, Any] = jsonable(document)
         return written
 
     @property
     def headline(self) -> str:
-        """Verdict and names in one line: A or B where B cannot be excluded, a knock too."""
+        """Verdict and names in one line: `A or B` if B cannot be excluded; a knock likewise."""
         names = [" or ".join([e.effect, *e.alternative_names]) for e in self.effects]
         if any(self.examination.as_slips):
             names.append("slip or a knock of the mount")
@@ -218,9 +217,10 @@ def discover_series(
     given: Sequence[tuple[str, dict[str, Any]]] = (),
     jobs: int = 1,
 ) -> Discovery:
-    """Examine M1, or M1 and others, and put what was found into words and numbers.
+    """Examine M1, or M1 and further series, and describe the effects found.
 
-    jobs: candidates that surrogates try at a time, with the same bits for any number.
+    given: the effects, with values, of the model to start from; jobs: number of candidates tested
+    with surrogates at a time; the result is the same for any number.
     """
     x = examine_series(series, progress, given, jobs)
     terms = x.best.terms if x.adequate else x.base.terms
@@ -242,7 +242,7 @@ def discover_series(
 
 
 def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
-    """Describe one term beyond the base model; fit: constants of M1 alone."""
+    """Describe a term beyond the base model; fit: constants from M1 alone."""
     term = fit.terms[k]
     e = x.fitter.series[0]
     number = k - len(x.base.terms)
@@ -268,11 +268,12 @@ def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
     statement = term.kind.sentence(estimates)
     part = compare_shift_and_tilt(x.fitter, x.best.fit, k)
     if part is not None:
-        evidence["shift_and_tilt"], said = part
-        statement += said
+        evidence["shift_and_tilt"], clause = part
+        statement += clause
     alternatives = _list_alternatives(x, term, first=number == 0)
     if alternatives:
-        statement += f". Not excluded instead: {', '.join(a['effect'] for a in alternatives)}"
+        names = ", ".join(a["effect"] for a in alternatives)
+        statement += f". Alternatives not excluded: {names}"
     if (lags := lagging_thermometer(fit, k)) is not None:
         alternatives.append(lags)
         statement += f". Or {lags['statement']}"
@@ -293,10 +294,10 @@ def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
 def _widen_estimates(
     x: Examination, fit: Fit, k: int, estimates: dict[str, dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Give estimates the standard deviations they have alongside one coefficient more.
+    """Widen the standard deviations to those with one more coefficient in the term.
 
-    That a lens's A2 drifts by less than the data show does not make A1 as sure as if A2 stood
-    still.
+    That a drift of a lens's A2 is too small to show does not make A1 as certain as if A2 were
+    constant.
     """
     richer = enrich_term(fit.terms[k])
     if richer is None:
@@ -310,7 +311,7 @@ def _widen_estimates(
 
 
 def _find_epochs(x: Examination, fit: Fit, k: int) -> list[int]:
-    """Return first and last epoch in which the effect moves the image by a quarter of its most."""
+    """Return the first and last epoch with more than a quarter of the effect's largest movement."""
     e = x.fitter.series[0]
     other = x.fitter.fit([t for i, t in enumerate(fit.terms) if i != k], only=[0])
     size = np.sqrt(np.maximum(e.squares(fit.parameters(0) - other.parameters(0)), 0.0))
@@ -319,7 +320,10 @@ def _find_epochs(x: Examination, fit: Fit, k: int) -> list[int]:
 
 
 def _list_alternatives(x: Examination, term: Term, first: bool) -> list[dict[str, Any]]:
-    """List solutions that the data cannot exclude, at the effect that they replace."""
+    """List the solutions with another effect in place of this one that the data cannot exclude.
+
+    first: whether this is the first effect, which also lists solutions that replace none.
+    """
     out = []
     for rival in x.rivals:
         mine, theirs = list(x.best.names), list(rival.names)
@@ -347,8 +351,9 @@ def _conclude_unexplained(
     known: int,
     progress: Callable[[str], None] | None,
 ) -> Discovery:
-    """Describe what the catalogue does not explain: a formula where the data allow one, else
-    described and bridged, not named.
+    """Describe what the catalogue does not explain, by a formula if the data allow one.
+
+    Otherwise it is described and bridged by a smooth term, without a name.
     """
     described = describe_unnamed(x)
     resembling: list[dict[str, Any]] = [
@@ -395,11 +400,10 @@ _P = len(PARAMETER_NAMES)
 
 
 def estimate_level(fitter: HypothesisFitter, fit: Fit) -> tuple[Array, Array]:
-    """Estimate the level (16,) of the first series about its linearisation, px-scaled, and its sds
-    (16,).
+    """Estimate the first series' level (16,) about its linearisation, px-scaled, and sds (16,).
 
-    The scales of the test field are held. The sds hold the noise of image and thermometers, the
-    drifts' own errors, and the stated errors of the test field's coordinates.
+    The scales of the test field are held. The sds include the noise of image and thermometers, the
+    drifts' errors, and the stated errors of the test field's coordinates.
     """
     weighting, index = fit.weightings[0], fit.designs[0][2]
     X, V, places = fitter.tangent(fit, fit.searched, 0, centred=False)
@@ -411,14 +415,14 @@ def estimate_level(fitter: HypothesisFitter, fit: Fit) -> tuple[Array, Array]:
     T = np.eye(_P + len(fit.covariance))[np.concatenate([_P + places, np.arange(_P)])]
     normal = T.T @ np.block([[A, coupling[:_P].T], [coupling[:_P], own]]) @ T
     empty = np.diag(normal) <= 0
-    normal[empty, empty] = 1e12  # a coefficient of another series
+    normal[empty, empty] = 1e12  # coefficients of other series
     along = fitter.series[0].along[:_P, :_P]
     Q = scaled_inverse(normal)[:_P, :_P] + _field_errors(fitter.series[0])
     return along @ level, np.sqrt(np.einsum("ij,jk,ik->i", along, Q, along))
 
 
 def _field_errors(series: ReducedSeries) -> Array:
-    """Return the covariance (16, 16) that the errors of the targets' coordinates give the level."""
+    """Return the level's covariance (16, 16) from the errors of the targets' coordinates."""
     weights = series.weights[..., :2].sum(axis=0)
     A = series.columns[..., :_P]
     WA = A * weights[..., None]
@@ -430,9 +434,9 @@ def _field_errors(series: ReducedSeries) -> Array:
 
 
 def build_model(discovery: Discovery, old: ThermalModel | None = None) -> ThermalModel:
-    """Build the model with what was found; constants as M1 alone gave them.
+    """Build the thermal model with the effects found; its constants are those from M1 alone.
 
-    An effect keeps what is its own in each series (a time, a phase) as M1 had it.
+    What an effect has separately in each series (a time, a phase) is that of M1.
     """
     x, fit = discovery.examination, discovery.final_fit
     e = x.fitter.series[0]
@@ -452,7 +456,7 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
         kept = ("statement", "evidence", "alternatives")
         evidence[entry["effect"]] = {key: entry[key] for key in kept}
         if "bridge" in entry["evidence"]:
-            evidence["unnamed"]["note"] = "bridged by a smooth term in M1 alone; not transferable"
+            evidence["unnamed"]["note"] = "bridged by a smooth term for M1 only; not transferable"
     T = e.history.temperature()
     weights = e.weights[..., :2] / e.source.per_row[:, None, None]
     return ThermalModel(
@@ -461,7 +465,7 @@ def build_model(discovery: Discovery, old: ThermalModel | None = None) -> Therma
         T0=e.T0,
         interior=InteriorOrientation.from_array(values[:10]),
         rates=rates,
-        effects=tuple(one for found in discovery.effects for one in effects_of(found)),
+        effects=tuple(one for entry in discovery.effects for one in effects_of(entry)),
         distortion=e.distortion,
         exterior=ExteriorOrientation.from_array(values[10:]),
         image_sigma=float(1.0 / np.sqrt(np.mean(weights[weights > 0]))),

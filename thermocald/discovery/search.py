@@ -1,19 +1,16 @@
-"""The search: all candidates compete, combinations grow step by step, superfluous effects go.
+"""The search: candidates compete, combinations grow effect by effect, superfluous ones are dropped.
 
-A scan over each candidate's grid costs one matrix product on the epochs' normal equations; the
-best are fitted in full, with the thermometer's error carried through them. The score is
+A candidate is an effect of the catalogue with a parameter set and a grid. In place of a good start
+value, each non-linear parameter is scanned over all values that the recording could show. A scan
+takes one matrix product on the epochs' normal equations; the best candidates are fitted in full,
+with the thermometer's errors propagated through them. The score is
 
     -2 log L + Σ over effects (coefficients · ln n + 2 ln(trials) + 2 ln(candidates) + margin),
 
-n the number of epochs, trials the number of independent places the scan looked at.
+where n is the number of epochs and trials the number of independent values in the scan.
 
-Source: Schwarz (1978), Annals of Statistics 6, 461-464; the trials as Gross, Vitells (2010),
+Source: Schwarz (1978), Annals of Statistics 6, 461-464; the trials: Gross, Vitells (2010),
 European Physical Journal C 70, 525-530 (look-elsewhere effect).
-
-The candidates: every effect of the catalogue with its parameter sets and a grid to search.
-
-The grid replaces a lucky start: each non-linear parameter is scanned over everything that the
-recording could show, and how many independent trials that makes is part of the penalty.
 """
 
 from __future__ import annotations
@@ -41,13 +38,13 @@ MOUNT = ("omega", "phi", "kappa")
 
 
 def list_candidates(series: Sequence[ReducedSeries]) -> list[Candidate]:
-    """List all candidates that the recordings could show."""
+    """List the candidates that the recordings could show."""
     first = series[0]
     out: list[Candidate] = []
     for name in catalogue.names():
         effect = catalogue.get(name)
         if effect.seen_in != "trajectory" or (effect.kind == "image" and not effect.columns):
-            continue  # found in image space
+            continue  # is found in image space
         sets: tuple[tuple[str, ...], ...] = effect.parameter_sets or (effect.usual or BASE,)
         if effect.is_drive:
             sets = (BASE,)
@@ -67,7 +64,7 @@ def list_candidates(series: Sequence[ReducedSeries]) -> list[Candidate]:
 
 
 def enrich_term(term: Term) -> Term | None:
-    """Return the term with a parameter set of one coefficient more; None where there is none."""
+    """Return the term with the parameter set of one more coefficient, None if there is none."""
     for parameters in term.kind.parameter_sets:
         more = len(parameters) == len(term.parameters) + 1
         if more and set(term.parameters) < set(parameters):
@@ -82,7 +79,7 @@ def _varies(evidence: ReducedSeries, channel: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Scanned:
-    """What a scan of one candidate promises: the best term, gain in χ² less penalty, penalty."""
+    """The best term in a candidate's scan; net: its gain in χ² less its penalty."""
 
     term: Term
     net: float
@@ -91,12 +88,11 @@ class Scanned:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A fitted hypothesis with its penalties, and the fitter that it was fitted in; the smaller the
-    score the better.
+    """A fitted hypothesis with its penalties and its fitter; a lower score is better.
 
-    mount: the movement beside it, which the fitter's series have, None where the mount stands
-    still; as_slips: whether a slip inside the camera explains each knock of the mount as well, in
-    order.
+    mount: the movement beside it, which the fitter's series include, None if the mount stands
+    still; as_slips: for each knock of the mount in order, whether a slip inside the camera explains
+    it equally well.
     """
 
     fit: Fit
@@ -119,7 +115,7 @@ class Solution:
 
 
 class Search:
-    """One examination of a fitter's series."""
+    """A search for effects in a fitter's series."""
 
     def __init__(
         self,
@@ -127,14 +123,14 @@ class Search:
         progress: Callable[[str], None] | None = None,
         like: Search | None = None,
     ) -> None:
-        """like: a search in the same histories under other noise, whose trajectories serve."""
+        """Prepare a search; like: one in the same histories, whose trajectories are reused."""
         self.fitter = fitter
         self.candidates: list[Candidate] = (
             like.candidates if like else list_candidates(fitter.series)
         )
         self.scanner: Scanner = Scanner(fitter, like.scanner if like else None)
         self.epochs = sum(int((e.n > 0).sum()) for e in fitter.series)
-        # the more noise is correlated, the less is known of it
+        # the more the noise is correlated, the less certain is its model
         self.margin = criteria.MARGIN * max(e.correlation for e in fitter.series)
         self.progress = progress or (lambda _: None)
         self._trials: dict[tuple[str, tuple[str, ...]], float] = {}
@@ -143,7 +139,7 @@ class Search:
         self._known: dict[frozenset[tuple[str, tuple[str, ...]]], Solution] = {}
 
     def base(self, given: Sequence[tuple[str, dict[str, Any]]] = ()) -> Solution:
-        """Fit the base model, with the effects that a model has already."""
+        """Fit the base model with the effects that the model has already."""
         count = len(self.fitter.series)
         terms = [make_known_term(name, values, count) for name, values in given]
         fit = self.fitter.fit(terms)
@@ -153,27 +149,27 @@ class Search:
     # -- scanning --------------------------------------------------------------------------
 
     def scan(self, candidate: Candidate, solution: Solution) -> Scanned:
-        """Find the best place of one candidate added to a solution."""
+        """Scan a candidate beside a solution."""
         return self.promise(candidate, self.scanner.scan(candidate, solution.fit))
 
-    def promise(self, candidate: Candidate, found: Scan) -> Scanned:
-        """Return what a scan of a candidate promises."""
+    def promise(self, candidate: Candidate, scan: Scan) -> Scanned:
+        """Return the best term of a candidate's scan."""
         once = 2 * float(np.log(len(self.candidates))) + self.margin
-        count, each = found.coefficients, float(np.log(self.epochs))
+        count, each = scan.coefficients, float(np.log(self.epochs))
         if not candidate.kind.is_event:
             key = (candidate.effect, candidate.parameters)
             if key not in self._trials:
                 self._trials[key] = self.scanner.trials(candidate)
-            best = int(np.argmax(found.gains))
+            best = int(np.argmax(scan.gains))
             value = float(candidate.grid[best]) if len(candidate.grid) else None
             penalty = (count + (value is not None)) * each + once
             penalty += 2 * float(np.log(max(self._trials[key], 1.0)))
             term = candidate.term(value, len(self.fitter.series))
-            return Scanned(term, float(found.gains[best]) - penalty, penalty)
-        # an event comes in each series at its own time, or in none but the first
+            return Scanned(term, float(scan.gains[best]) - penalty, penalty)
+        # an event occurs in the first series, and in others if it shows there, at its own time
         fresh: list[tuple[tuple[str, float], ...] | None] = []
         total, penalty, single = 0.0, once, (count + 2) * each
-        for s, gains in enumerate(found.events):
+        for s, gains in enumerate(scan.events):
             best = int(np.argmax(gains))
             if gains[best] > single + self.margin or s == 0:
                 fresh.append(((candidate.name, float(self.fitter.series[s].times[best + 1])),))
@@ -181,26 +177,26 @@ class Search:
                 penalty += single
             else:
                 fresh.append(None)
-        term = replace(candidate.term(None, len(found.events)), fresh=tuple(fresh))
+        term = replace(candidate.term(None, len(scan.events)), fresh=tuple(fresh))
         return Scanned(term, total - penalty, penalty)
 
     # -- growing and shrinking ----------------------------------------------------------------
 
     def refine(self, terms: Sequence[Term], penalties: Sequence[float]) -> Solution:
-        """Fit a hypothesis in full, once; its penalties depend on how it was found."""
+        """Fit a hypothesis in full, only once; its penalties depend on how it was found."""
         key = tuple(terms)
         if key not in self._refined:
             self._refined[key] = self.fitter.refine(self.fitter.fit(terms), max_iterations=5)
-        found = Solution(self._refined[key], tuple(penalties), self.fitter)
-        same = _kinds(terms)
-        if same not in self._known or found.score < self._known[same].score:
-            self._known[same] = found
-        return found
+        solution = Solution(self._refined[key], tuple(penalties), self.fitter)
+        kinds = _kinds(terms)
+        if kinds not in self._known or solution.score < self._known[kinds].score:
+            self._known[kinds] = solution
+        return solution
 
     def expand(self, solution: Solution, width: int = 6, least: float = 0.0) -> list[Solution]:
-        """Find the best solutions with one effect more, best first.
+        """Find the best extensions of a solution by one effect, best first.
 
-        least: what a scan of an effect but an event has to promise beyond its penalty.
+        least: gain beyond its penalty that a scan must promise, except for an event.
         """
         grown = [self._with(solution, p) for p in self._promises(solution, width, least)]
         return sorted(grown, key=lambda s: s.score)
@@ -208,9 +204,9 @@ class Search:
     def expand_all(
         self, solutions: Sequence[Solution], width: int, most: int, below: float = np.inf
     ) -> list[Solution]:
-        """Find the best with one effect more of several solutions: `most` sets of effects at most.
+        """Find the best extensions of several solutions by one effect, at most `most` sets.
 
-        below: the score that a scan has to promise.
+        below: the score that a scan must promise to reach.
         """
         every = [(s, p) for s in solutions for p in self._promises(s, width)]
         pairs = [(s, p) for s, p in every if s.score - p.net < below]
@@ -227,10 +223,10 @@ class Search:
         return self.refine((*solution.terms, promise.term), penalties)
 
     def _promises(self, solution: Solution, width: int, least: float = 0.0) -> list[Scanned]:
-        """Scan every candidate that a solution does not have: the `width` most promising effects
-        first, each with the sets that promise as much as its best.
+        """Return the `width` most promising effects beside a solution, best first.
 
-        A scan is right to some percent, with a drive to half: what promises a tenth cannot win.
+        Each comes with all parameter sets that promise about as much as its best one. A scan is
+        accurate to a few percent, for a drive to half: what promises a tenth cannot win.
         """
         if solution.fit not in self._scanned:
             self._scanned[solution.fit] = [
@@ -256,7 +252,7 @@ class Search:
         return out
 
     def with_other_delay(self, solution: Solution) -> Solution | None:
-        """Put another kind of delay of the temperature in place of a solution's own."""
+        """Replace a solution's delay of the temperature by the best other kind; None if none."""
         delays = [c for c in self.candidates if c.kind.delay]
         for i, term in enumerate(solution.terms):
             if not term.kind.delay:
@@ -265,17 +261,18 @@ class Search:
             others = [c for c in delays if c.effect not in solution.names]
             if seconds <= 0 or not others:
                 return None
-            found = []
+            solutions = []
             for candidate in others:
                 swapped = candidate.term(seconds, len(self.fitter.series))
                 terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
-                found.append(self.refine(terms, solution.penalties))
-            return min(found, key=lambda s: s.fit.chi2)
+                solutions.append(self.refine(terms, solution.penalties))
+            return min(solutions, key=lambda s: s.fit.chi2)
         return None
 
     def with_events_moved(self, solution: Solution) -> Solution:
-        """Move the events to where they explain most now that the other effects are known
-        too: they were found without some of them.
+        """Move the events to the times at which they explain most beside the other effects.
+
+        They were found without some of these.
         """
         for i, term in enumerate(solution.terms):
             if not term.kind.is_event:
@@ -296,13 +293,13 @@ class Search:
         return solution
 
     def shrink(self, solution: Solution, kept: int = 0) -> Solution:
-        """Drop every effect that is no longer worth its penalty; the first `kept` stay."""
+        """Drop effects that gain less than their penalty; the first `kept` stay."""
         while len(solution.terms) > kept + 1:
             fewer = []
             for number in range(kept, len(solution.terms)):
                 terms = tuple(t for j, t in enumerate(solution.terms) if j != number)
                 penalties = [p for j, p in enumerate(solution.penalties) if j != number]
-                # as it was found before, where the rest was fitted already
+                # the rest may have been fitted before, perhaps with a better score
                 fewer.append(self._known.get(_kinds(terms)) or self.refine(terms, penalties))
             best = min(fewer, key=lambda s: s.score)
             if best.score > solution.score:
@@ -312,5 +309,5 @@ class Search:
 
 
 def _kinds(terms: Sequence[Term]) -> frozenset[tuple[str, tuple[str, ...]]]:
-    """Return what a hypothesis consists of, whatever its numbers."""
+    """Return the effects and parameters of a hypothesis, without their values."""
     return frozenset((t.effect, t.parameters) for t in terms)

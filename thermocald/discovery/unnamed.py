@@ -1,4 +1,4 @@
-"""What none of the catalogue explains: the misfit, described, or a formula in place of a name."""
+"""The description of a misfit without a name, and of a formula in place of a name."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
     from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
-# a shift of the image is attributed to the principal point before a tilt
+# a shift of the image is attributed to the principal point rather than to a tilt
 _IN_ORDER = (range(3), range(3, 10), range(10, 16), range(16, len(COLUMNS)))
 
 
 def describe_unnamed(x: Examination) -> EffectFound:
-    """Describe in time, space and correlations what the base model leaves in M1.
+    """Describe what the base model leaves in M1 by time, space and correlations.
 
-    Its size is what it moves the image points by, in px, and its parameters are the fewest whose
-    movement of the image is nearly all of it.
+    The size is the movement of the image points, px; the parameters are the fewest that explain
+    nearly all of this movement.
     """
     a, e = x.base_adequacy[0], x.fitter.series[0]
     rest = a.trajectories.T @ a.amplitudes  # (E, P), px-scaled
@@ -49,7 +49,7 @@ def describe_unnamed(x: Examination) -> EffectFound:
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     u, s, _ = np.linalg.svd(rest @ root, full_matrices=False)
     course_px = u[:, 0] * s[0]
-    T = e.history.temperature()  # on all epochs; the rows may be blocks of them
+    T = e.history.temperature()  # at all epochs, while the rows may be blocks of epochs
     recorded: dict[str, Array] = {
         "temperature": e.averaged(T),
         "rate of temperature": e.averaged(_rate(T, e.history.times)),
@@ -76,7 +76,7 @@ def describe_unnamed(x: Examination) -> EffectFound:
     statement = (
         f"something that no effect of the catalogue explains moves the image by {size:.3f} px RMS, "
         f"in {moving}; strongest correlation {correlation[strongest]:+.2f} with "
-        f"{strongest}. A smooth term bridges it in this series alone"
+        f"{strongest}. A smooth term bridges it in this series only"
     )
     return EffectFound(
         "unnamed",
@@ -94,7 +94,7 @@ def describe_unnamed(x: Examination) -> EffectFound:
             "correlation": correlation,
             "share_of_first_pattern": float(s[0] ** 2 / np.sum(s**2)),
             "significance_sigmas": float(a.significance),
-            # what takes the rest up in this series alone: amplitudes of cos(k π t / duration),
+            # explains the rest in this series only: amplitudes of cos(k π t / duration),
             # k = 1, 2, …, t from the first frame, in each parameter's own unit
             "bridge": {
                 "transferable": False,
@@ -112,10 +112,10 @@ def describe_unnamed(x: Examination) -> EffectFound:
 
 
 def _choose_movers(metric: Array, moved: Array) -> list[str]:
-    """Choose the fewest parameters that move the image by nearly all that is left, interior first.
+    """Choose the fewest parameters that explain nearly all of the image's movement, interior first.
 
     metric (P, P): mean products of the image's partial derivatives; moved (P, P): mean products of
-    the rest.
+    the parameters' movements.
     """
     total = float(np.sum(metric * moved))
     chosen: list[int] = []
@@ -137,9 +137,9 @@ def _choose_movers(metric: Array, moved: Array) -> list[str]:
 
 
 NO_PROPOSAL = {
-    True: "no formula over what was recorded explains it on both recordings: its cause was not "
+    True: "no formula of the recorded quantities explains it in both recordings: its cause was not "
     "recorded, or the operators do not describe it",
-    False: "a formula is proposed only where a second recording can test it: give --verify",
+    False: "a formula is proposed only if a second recording can test it: give --verify",
 }
 """Why there is no proposal, by whether there is a second recording."""
 _EXPERIMENT = "record over a wider range of temperatures, and at other rates"
@@ -147,19 +147,19 @@ _RIVALS = 4
 
 
 def describe_proposal(
-    described: EffectFound, found: Proposal, x: Examination, fit: Fit
+    described: EffectFound, proposal: Proposal, x: Examination, fit: Fit
 ) -> EffectFound:
-    """Describe a formula that takes the place of a name.
+    """Describe a formula proposed in place of a name.
 
-    described: what it explains; x: the examination with the series that the formula was found on;
-    fit: constants of M1 alone.
+    described: the misfit that it explains; x: the examination with the series in which the formula
+    was found; fit: constants from M1 alone.
     """
-    number = len(found.best.terms) - 1
-    term = found.best.terms[number]
+    number = len(proposal.best.terms) - 1
+    term = proposal.best.terms[number]
     estimates = estimate_term(fit, number, x.fitter.series[0])
     trade_off = None
     tied = find_tied_constants(x.fitter, fit, number)
-    if tied and tied["exchanged"]:  # what the inverse says of them is of the others held
+    if tied and tied["exchanged"]:  # the inverse holds their sds with the others held, so none
         estimates = {
             k: {**v, "sd": None} if k in tied["parameters"] or k.startswith("a_") else v
             for k, v in estimates.items()
@@ -168,31 +168,31 @@ def describe_proposal(
         trade_off = find_trade_off(x.fitter, fit, number)
     sentence = catalogue.get(term.effect).sentence(estimates)
     evidence = {k: v for k, v in described.evidence.items() if k != "bridge"}
-    by_m1, by_m2 = found.closed
+    by_m1, by_m2 = proposal.closed
     evidence["proposal"] = {
         "formula": term.effect,
         "transferable": True,
         "closed_on_verify_by_fit": by_m1,
         "closed_on_fit_by_verify": by_m2 if by_m2 == by_m2 else None,
-        "score_gain": float(found.base.score - found.best.score),
-        "penalty": float(found.best.penalties[-1]),
-        "false_alarm_probability": found.surrogates.p,
+        "score_gain": float(proposal.base.score - proposal.best.score),
+        "penalty": float(proposal.best.penalties[-1]),
+        "false_alarm_probability": proposal.surrogates.p,
         "surrogates": {
-            "count": len(found.surrogates.surrogates),
-            "explained": float(found.surrogates.gain),
-            "largest_of_surrogates": float(found.surrogates.surrogates.max()),
+            "count": len(proposal.surrogates.surrogates),
+            "explained": float(proposal.surrogates.gain),
+            "largest_of_surrogates": float(proposal.surrogates.surrogates.max()),
         },
         "absolute_test": jsonable(x.adequacy),
     }
     if trade_off is not None:
-        evidence["not_separable"], said = trade_off
-        sentence += said
+        evidence["not_separable"], clause = trade_off
+        sentence += clause
     elif tied:
         evidence["not_separable"] = tied
         sentence += f"; {say_together(tied)}"
     return replace(
         described,
-        statement=f"{sentence}; no effect of the catalogue, proposed from what was recorded",
+        statement=f"{sentence}; a formula from the recorded quantities, no effect of the catalogue",
         where={**described.where, "parameters": list(term.parameters)},
         estimates={**described.estimates, **estimates},
         evidence=evidence,
@@ -204,7 +204,7 @@ def describe_proposal(
                 "experiment": _EXPERIMENT,
                 "formula": True,
             }
-            for t, d in found.rivals[:_RIVALS]
+            for t, d in proposal.rivals[:_RIVALS]
             if d < criteria.FORMULA_BAND
         ],
         term=term,
@@ -212,11 +212,11 @@ def describe_proposal(
 
 
 def describe_misfit(x: Examination) -> dict[str, Any]:
-    """Describe where the base model fails in M1, as an effect's evidence has it.
+    """Return where the base model fails in M1, for an effect's evidence.
 
-    against: size in px RMS and significance of the misfit against what was recorded, and in each
-    parameter; targets: those that jumped; image_regions: what a free camera leaves on a grid of
-    3 × 3 over the image, in units of the noise.
+    against: size, px RMS, and significance of the misfit along each recorded quantity and in each
+    parameter; targets: those that jumped; image_regions: a free camera's residuals in units of the
+    noise, on a grid of 3 × 3 over the image.
     """
     e, fit = x.fitter.series[0], x.base.fit
     C, V, index = fit.designs[0]
@@ -232,7 +232,7 @@ def describe_misfit(x: Examination) -> dict[str, Any]:
 
     total = x.base_adequacy[0]
     rows.append(("all slow trajectories in all parameters", total.misfit_px, total.significance))
-    T = e.history.temperature()  # on all epochs; the rows may be blocks of them
+    T = e.history.temperature()  # at all epochs, while the rows may be blocks of epochs
     trajectories: dict[str, Array] = {
         "time": e.times - e.times.mean(),
         "temperature, bent": e.averaged((T - T.mean()) ** 2),
@@ -258,7 +258,7 @@ def describe_misfit(x: Examination) -> dict[str, Any]:
 
 
 def _test_noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
-    """Return the spread of sigma0 over the series, and how unlikely it is for a constant noise."""
+    """Return the spread of sigma0 in the series, and its significance against constant noise."""
     ok = n > 0
     free = 2.0 * n[ok] - columns
     z = float(np.sum(free * (sigma0[ok] - np.average(sigma0[ok], weights=free)) ** 2)) * 2
@@ -267,7 +267,7 @@ def _test_noise(sigma0: Array, n: Array, columns: int) -> tuple[float, float]:
 
 
 def _measure_regions(e: ReducedSeries) -> list[dict[str, Any]]:
-    """Return the RMS of what a free camera leaves, on a grid of 3 × 3, in units of the noise."""
+    """Return the RMS of a free camera's residuals in units of the noise, on a grid of 3 × 3."""
     place = e.at.predicted
     row = np.clip((3 * place[:, 1] / e.source.sensor.height).astype(float), 0, 2.99)
     column = np.clip((3 * place[:, 0] / e.source.sensor.width).astype(float), 0, 2.99)
@@ -284,7 +284,7 @@ def _measure_regions(e: ReducedSeries) -> list[dict[str, Any]]:
 
 
 def _rate(T: Array, times: Array) -> Array:
-    """Rate (E,) of a temperature, K/s, also where epochs have the same time."""
+    """Return the rate (E,) of a temperature, K/s; several epochs may have the same time."""
     distinct, first = np.unique(times, return_index=True)
     rate: Array = np.interp(times, distinct, np.gradient(T[first], distinct))
     return rate

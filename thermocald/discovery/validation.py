@@ -1,25 +1,21 @@
-"""Proof of an effect: blocks of time left out, and surrogates that keep the noise, not the cause.
+"""The validation of an effect: blocks of time left out, and surrogates with noise but no cause.
 
-What the best hypothesis leaves over is moved in time against the temperatures (shifted in a circle,
-reversed, its sign turned, or cut into blocks that change places), put on top of the model without
-the effect in question, and searched again with every candidate. How often the largest penalised
-gain among all candidates reaches the one that was found is the probability of a false name, after
-the search.
-
-One surrogate among the first few that reaches it decides that there is no name: the probability is
-then that of a sequential test.
+Surrogates. The residuals of the best hypothesis are moved in time against the temperatures (shifted
+cyclically, reversed, inverted in sign, or cut into blocks that are permuted), added to the model
+without the effect, and searched again with every candidate. The probability of a false name, after
+the search, is the share of surrogates whose largest penalised gain reaches the effect's. If one of
+the first few surrogates reaches it, the effect is not named, and the probability is that of a
+sequential test.
 
 Source: Theiler et al. (1992), Physica D 58, 77-94 (surrogate data); Davison, Hinkley (1997),
 Bootstrap Methods, section 8.2 (blocks) and 4.2 (p-values from simulations); Besag, Clifford (1991),
 Biometrika 78, 301-304 (sequential p-values).
 
-Cross-validation in blocks of time: does what was fitted to the rest predict them?
+Cross-validation. Each series is cut into blocks. One block of every series is left out, the
+coefficients are fitted to the others, and the block's likelihood is evaluated with them and a level
+of its own. An effect that only follows the noise, or imitates another trajectory, predicts nothing.
 
-Each series is cut into blocks; a block of every series is left out, the coefficients are fitted to
-the others, and the likelihood of the block is taken at them, with a level of its own. An effect
-that only follows the noise, or bends to a trajectory that is not its own, predicts nothing.
-
-Source: cross-validation in blocks as Burman, Chow, Nolan (1994), Biometrika 81, 351-358.
+Source: cross-validation in blocks, Burman, Chow, Nolan (1994), Biometrika 81, 351-358.
 """
 
 from __future__ import annotations
@@ -48,17 +44,17 @@ if TYPE_CHECKING:
     from thermocald.thermal.scan import Scan
 
 BLOCKS = 6
-_PRIOR = 1e-6  # of a coefficient's whole information, where the other blocks hold none
+_PRIOR = 1e-6  # share of a coefficient's information, in case the other blocks hold none
 
 
 def _predict_blocks(
     fitter: HypothesisFitter, fit: Fit, series: Sequence[int]
 ) -> tuple[Array, Array]:
-    """Return χ² and -2 log likelihood (blocks,) of the blocks as predicted without them.
+    """Return χ² and -2 log likelihood (blocks,) of each block, predicted from the others.
 
-    series: those that take part. Non-linear parameters stay as they are. The coefficients' own
-    uncertainty is in the prediction: a step that happened in the block itself is not foreseen, and
-    not held against its cause.
+    series: those that take part. Non-linear parameters are held. The prediction includes the
+    coefficients' uncertainty, so that a step within the block, which the others cannot predict,
+    does not count against its cause.
     """
     chi2, objective = np.zeros(BLOCKS), np.zeros(BLOCKS)
     for k in range(BLOCKS):
@@ -72,7 +68,7 @@ def _predict_blocks(
         )
         tested = _keep_epochs(fitter, masks).fit(fit.terms, fit.coefficients, 1, series)
         whole = np.diag(fit.normals(series)[0])
-        own = np.where(whole > 0, _PRIOR * whole, 1.0)  # 1: of a series that takes no part
+        own = np.where(whole > 0, _PRIOR * whole, 1.0)  # 1 for a series that takes no part
         known = trained.normals(series)[0] + np.diag(own)
         B, c = tested.normals(series)
         g = c - B @ trained.coefficients
@@ -86,10 +82,9 @@ def _predict_blocks(
 
 
 def measure_block_gains(fitter: HypothesisFitter, fit: Fit, kept: int = 0) -> list[Array]:
-    """Return by how much each effect beyond the first `kept` improves the prediction of blocks
-    (blocks,).
+    """Return the gains (blocks,) of each effect beyond the first `kept` in predicting blocks.
 
-    The others are fitted again without it; in -2 log likelihood, all series together.
+    A gain is in -2 log likelihood, of all series, relative to the other effects fitted without it.
     """
     every = range(len(fitter.series))
     whole = _predict_blocks(fitter, fit, every)[1]
@@ -101,7 +96,7 @@ def measure_block_gains(fitter: HypothesisFitter, fit: Fit, kept: int = 0) -> li
 
 
 def is_confirmed(gain: Array) -> bool:
-    """Test whether a cause predicts blocks it has not seen, and makes none of them worse."""
+    """Test whether a cause improves the prediction of the blocks and worsens none of them."""
     total = float(gain.sum())
     return total > 0 and float(gain.min()) > -(
         criteria.BLOCK_WORSE + criteria.BLOCK_WORSE_SHARE * total
@@ -109,7 +104,7 @@ def is_confirmed(gain: Array) -> bool:
 
 
 def cross_validation(fitter: HypothesisFitter, fit: Fit) -> tuple[float, float]:
-    """Return χ² per degree of freedom on blocks of M1 that the fit did not see, and on M1."""
+    """Return χ² per degree of freedom in blocks of M1 predicted from the others, and in M1."""
     e = fitter.series[0]
     outside = float(_predict_blocks(fitter, fit, [0])[0].sum())
     free = e.rank * float((e.n > 0).sum())
@@ -117,7 +112,7 @@ def cross_validation(fitter: HypothesisFitter, fit: Fit) -> tuple[float, float]:
 
 
 def _keep_epochs(fitter: HypothesisFitter, masks: Sequence[NDArray[np.bool_]]) -> HypothesisFitter:
-    """Keep the weight of some epochs alone; trajectories are the same."""
+    """Return a fitter with the weights of some epochs only and the same trajectories."""
     pairs = zip(fitter.series, masks, strict=True)
     part = HypothesisFitter([replace(e.weighted(m.astype(float)), n=e.n * m) for e, m in pairs])
     part.thermometer_factor = fitter.thermometer_factor
@@ -125,20 +120,20 @@ def _keep_epochs(fitter: HypothesisFitter, masks: Sequence[NDArray[np.bool_]]) -
     return part
 
 
-_FIRST = 20  # surrogates after which a name that one of them reaches is given up
+_FIRST = 20  # surrogates, one of which suffices to drop a name
 _SEED = 20
 
 
 @dataclass(frozen=True, eq=False)
 class SurrogateTest:
-    """One effect against surrogates: its penalised gain, those of the surrogates (S,)."""
+    """The test of an effect against surrogates: its penalised gain, and theirs (S,)."""
 
     gain: float
     surrogates: Array
 
     @property
     def p(self) -> float:
-        """Probability of a false name: share of surrogates that reach the gain."""
+        """The probability of a false name: the share of surrogates that reach the gain."""
         return (1 + int(np.sum(self.surrogates >= self.gain))) / (1 + len(self.surrogates))
 
     @property
@@ -155,10 +150,10 @@ def compare_with_surrogates(
     count: int = criteria.SURROGATES,
     jobs: int = 1,
 ) -> SurrogateTest:
-    """Test one effect: `without` is the best solution without it, in the same fitter.
+    """Test one effect; `without` is the best solution without it, in the same fitter.
 
-    gain: by how much the penalised score improves with it; jobs: candidates tried at a time, with
-    the same bits for any number.
+    gain: improvement of the penalised score by the effect; jobs: number of candidates tried at a
+    time; the result is the same for any number.
     """
     rng = np.random.default_rng(_SEED)
     scans: list[tuple[Candidate, Scan, float]] = []
@@ -173,17 +168,17 @@ def compare_with_surrogates(
             every = range(len(best.weightings))
             data = [_draw_data(search, best, without.fit, s, rng, few) for s in every]
             gains = partial(_measure_gains, without.fit, data)
-            # threads: nearly all of it is linear algebra, and the stacks would have to be copied
+            # threads, since nearly all is linear algebra and processes would copy the stacks
             with ThreadPoolExecutor(jobs) as pool:
-                found = list(pool.map(gains, scans) if jobs > 1 else map(gains, scans))
-            tops = np.append(tops, np.max(found, axis=0))
+                every_gain = list(pool.map(gains, scans) if jobs > 1 else map(gains, scans))
+            tops = np.append(tops, np.max(every_gain, axis=0))
     return SurrogateTest(gain, tops)
 
 
 def _draw_data(
     search: Search, best: Fit, without: Fit, series: int, rng: np.random.Generator, count: int
 ) -> Array:
-    """Draw data of surrogates (E, P, count) as weighted: summed along trajectories, right-hand
+    """Draw weighted data (E, P, count) of surrogates; summed along trajectories they are right-hand
     sides.
     """
     w = best.weightings[series]
@@ -197,7 +192,7 @@ def _draw_data(
 
 
 def _move_in_time(y: Array, rng: np.random.Generator) -> Array:
-    """Move a trajectory (E, m) in time in one of four ways."""
+    """Move a trajectory (E, m) in time: shifted, reversed or in permuted blocks, of either sign."""
     E = len(y)
     way = rng.integers(3)
     if way == 2:
@@ -212,9 +207,9 @@ def _move_in_time(y: Array, rng: np.random.Generator) -> Array:
 
 
 def _measure_gains(fit: Fit, data: list[Array], tried: tuple[Candidate, Scan, float]) -> Array:
-    """Return the largest penalised gain (count,) of one candidate over its grid.
+    """Return a candidate's largest penalised gain (count,) over its grid.
 
-    Of its scan all but the right-hand sides serves any data.
+    All of its scan but the right-hand sides is valid for any data.
     """
     candidate, scan, penalty = tried
     base_c = np.zeros((len(fit.coefficients), data[0].shape[2]))

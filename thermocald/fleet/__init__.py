@@ -1,1 +1,1 @@
-"""Many cameras: rows forwarded to a server, and what a whole fleet looks like."""
+"""Fleets of cameras: forwarding to a server, overview, and reprocessing of archives."""

@@ -1,15 +1,15 @@
-"""Store and forward: a station's store stays the truth, and the server gets every row of it.
+"""Forwarding of a station's store to a server, which receives every row of it.
 
     store (SQLite, read only) ─► batch after the cursor ─► server ─► cursor ─► next batch
 
-It runs in a process of its own and only reads the store, so that a slow, full or absent server
-never delays a tick. A batch that fails is sent again, with growing pauses; a row that the server
-refuses for what it holds is found by halving, noted and passed over. The cursor is a small file
-next to the store, replaced as a whole; losing it costs time and nothing else, as the server passes
-over rows that it has already.
+Forwarding runs in a separate process and only reads the store, so that a slow, full or absent
+server never delays a tick. A batch that fails is sent again, with growing pauses. A row whose
+values the server refuses is found by halving the batch, noted and skipped. The cursor is a small
+file beside the store, replaced as a whole. If it is lost, only time is lost, since the server skips
+rows that it has already.
 
-Frames are far larger than all else: a rule chooses among those that the daemon keeps, and a daily
-limit bounds them. Retention deletes a frame when its time has come, whether it was sent or not.
+Frames are by far the largest data: a rule chooses among those that the daemon keeps, and a daily
+limit applies. Retention deletes a frame at its age, whether it was sent or not.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ _COUNTED = (*KEPT, "frame")
 
 
 class Cursor(BaseModel):
-    """The last ids sent of each growing table, to one server and from one store.
+    """The last id sent of each growing table, from one store to one server.
 
-    server: its whole address but a password; identity, inode: of the store and its file, since
-    another store under the old name, or a restored one, is sent from its start; sent: {table: id},
-    `frame`: the last epoch whose frame was looked at; refused: rows that the server does not take,
-    {table: ids}, for a person to look at; day, frame_bytes: what frames have taken on that day
-    (UTC, days since 1970).
+    server: its address without the password. identity, inode: of the store and its file, since
+    another store of the same name, or a restored one, is sent from its start. sent: {table: id};
+    `frame`: the last epoch whose frame was examined. refused: {table: ids} of rows that the server
+    refuses, for a person to examine. day, frame_bytes: size of the frames sent on that day (UTC,
+    days since 1970).
     """
 
     model_config = ConfigDict(strict=True, extra="forbid")
@@ -64,9 +64,9 @@ class Cursor(BaseModel):
 
     @classmethod
     def read(cls, path: Path, store: Store, server: str, station: str) -> Self:
-        """As left by an earlier run, or at the start if there is none, or it is of something else.
+        """Read the cursor of an earlier run; a new one if there is none for this store and server.
 
-        Raises StoreError where the store is missing.
+        Raises StoreError if the store is missing.
         """
         try:
             inode = store.path.stat().st_ino
@@ -74,42 +74,43 @@ class Cursor(BaseModel):
             raise StoreError(f"{store.path}: cannot be read: {error.strerror}") from error
         fresh = cls(server=server, station=station, identity=store.identity, inode=inode)
         try:
-            found = cls.model_validate_json(path.read_text(encoding="utf-8"))
+            old = cls.model_validate_json(path.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return fresh
-        found.sent = {**fresh.sent, **found.sent}
+        old.sent = {**fresh.sent, **old.sent}
         names = ("server", "station", "identity", "inode")
-        same = all(getattr(found, name) == getattr(fresh, name) for name in names)
-        return found if same and {*found.sent} == {*_COUNTED} else fresh
+        same = all(getattr(old, name) == getattr(fresh, name) for name in names)
+        return old if same and {*old.sent} == {*_COUNTED} else fresh
 
     @property
     def rows_refused(self) -> int:
         return sum(map(len, self.refused.values()))
 
     def write(self, path: Path) -> None:
-        """Replace the file as a whole. Raises OutputError where it cannot be written."""
+        """Replace the file as a whole; raises OutputError if it cannot be written."""
         write_text(path, json.dumps(self.model_dump()))
 
 
 log = logging.getLogger(__name__)
 
-_FRAMES = 1000  # looked at together
+_FRAMES = 1000  # read from the store at a time
 _DAY_S = 86400
 _LARGEST = 64_000_000
-"""Bytes of a frame: a raw of 48 megapixels is below, and a row of PostgreSQL may be far larger."""
+"""Limit of a frame's size in bytes: above a raw image of 48 megapixels, and far below the size of a
+row that PostgreSQL accepts."""
 
 
 BATCH = 200
-"""Rows of a transaction: about 1 MB of epochs with 150 targets."""
+"""Rows per transaction: about 1 MB of epochs with 150 targets."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 2.0, 300.0
-# a thousand stations that connect more often keep a server busy with that alone
+# more frequent connections of a thousand stations would keep a server busy
 _IDLE_S = 30.0
 _REPORT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What one round sent: rows by table and frames, and how many the server refused."""
+    """The numbers of rows and frames that a round sent, by table, and of those refused."""
 
     sent: Mapping[str, int]
     refused: int
@@ -120,10 +121,10 @@ class Progress:
 
 
 class Forwarder:
-    """Sends one store to one server as one station.
+    """The sender of a station's store to a server.
 
-    cursor: the file that holds how far; by default next to it; frames: the folder in which the
-    daemon keeps them; rule: which of them are sent too, and how much a day; None: none.
+    cursor: the cursor's file, by default beside the store; frames: the folder in which the daemon
+    keeps them; rule: which frames are sent too, and how much per day; None: no frames.
     """
 
     def __init__(
@@ -144,13 +145,13 @@ class Forwarder:
         self._path = cursor or store.with_name(f"{store.name}.forwarded")
         self._clock = time.time
         self._reported = -_REPORT_S
-        self._waiting = 0  # as last reported
-        self._full_on = -1  # the day whose limit of frames was reported
+        self._waiting = 0  # rows, as last reported
+        self._full_on = -1  # day for which the limit of frames was reported
 
     def send_waiting(self) -> Progress:
-        """Send all that waits, batch by batch, until nothing waits.
+        """Send all waiting rows and frames, batch by batch.
 
-        What was sent stays sent when it raises. Raises ServerGone (try again), ServerError,
+        After an error, what was sent remains sent. Raises ServerGone (try again), ServerError,
         StoreError.
         """
         with Store.open(self.store) as store:
@@ -171,10 +172,10 @@ class Forwarder:
             return Progress(count, cursor.rows_refused - before)
 
     def _send_rows(self, store: Store, writer: ServerWriter, cursor: Cursor, table: str) -> int:
-        """Send the rows of a table that wait; how many the server took."""
+        """Send the waiting rows of a table; return how many the server accepted."""
         count, series = 0, {one.id: one for one in store.all_series()}
         while True:
-            if self._report_is_due:  # also while much waits
+            if self._report_is_due:  # between batches too, if many rows wait
                 self._report(store, writer, cursor)
             rows = store.rows_after(table, cursor.sent[table], self.batch)
             if not rows:
@@ -202,14 +203,14 @@ class Forwarder:
         rows: list[dict[str, Any]],
         series: Mapping[int, StoredSeries],
     ) -> list[int]:
-        """Send rows; the ids of those that the server refuses for what they hold."""
+        """Send rows; return the ids of those whose values the server refuses."""
         try:
             writer.write(table, rows, series)
         except ServerError as error:
             if not error.about_values:
                 raise
             if len(rows) == 1:
-                log.error("%s %s is refused and passed over: %s", table, rows[0]["id"], error)
+                log.error("%s %s is refused and skipped: %s", table, rows[0]["id"], error)
                 return [int(rows[0]["id"])]
             half = len(rows) // 2
             return [
@@ -219,9 +220,9 @@ class Forwarder:
         return []
 
     def _send_frames(self, store: Store, writer: ServerWriter, cursor: Cursor) -> int:
-        """Send the chosen frames that wait, up to the day's limit; how many the server took.
+        """Send the chosen waiting frames up to the day's limit; return how many were accepted.
 
-        A frame that retention has deleted is passed over.
+        A frame that retention has deleted is skipped.
         """
         count = 0
         files = FileFolder(self.frames)
@@ -241,7 +242,7 @@ class Forwarder:
                     except ServerError as error:
                         if not error.about_values:
                             raise
-                        log.error("frame %s is refused and passed over: %s", frame.path, error)
+                        log.error("frame %s is refused and skipped: %s", frame.path, error)
                         cursor.refused.setdefault("frame", []).append(frame.id)
                     cursor.frame_bytes += len(data)
                 cursor.sent["frame"] = frame.id
@@ -251,7 +252,7 @@ class Forwarder:
         return count
 
     def _wants(self, frame: KeptFrame) -> bool:
-        """Whether the frame of an epoch is one to send."""
+        """Return whether the rule chooses an epoch's frame."""
         if frame.path is None or self.rule.frames == "all":
             return frame.path is not None
         if self.rule.frames == "events":
@@ -262,13 +263,13 @@ class Forwarder:
         day = int(self._clock() // _DAY_S)
         if day != cursor.day:
             cursor.day, cursor.frame_bytes = day, 0
-        # one frame a day goes through whatever its size, else nothing ever would
+        # one frame a day is sent whatever its size, else a low limit would stop all of them
         most = int(self.rule.frames_mb_per_day * 1e6)
         if not cursor.frame_bytes or cursor.frame_bytes + size <= most:
             return True
         if self._full_on != day:
             log.warning(
-                "%d MB of frames were sent today; the others wait for tomorrow",
+                "%d MB of frames were sent today; the others are sent from tomorrow on",
                 cursor.frame_bytes // 10**6,
             )
             self._full_on = day
@@ -279,9 +280,9 @@ class Forwarder:
         return time.monotonic() - self._reported >= _REPORT_S
 
     def _report(self, store: Store, writer: ServerWriter, cursor: Cursor) -> None:
-        """Tell the server how this station is."""
+        """Report this station's state to the server."""
         waiting = store.rows_waiting(cursor.sent)
-        # where the answer is lost the server may have this report or the last one
+        # if the answer is lost, the server may have this report or the last one
         self._waiting = max(self._waiting, waiting)
         writer.report(waiting, cursor.rows_refused, time.time())
         self._waiting = waiting
@@ -295,21 +296,21 @@ def _read_frame(files: FileFolder, frame: KeptFrame) -> bytes | None:
         if path is None:
             return None
         if path.stat().st_size > _LARGEST:
-            log.warning("%s: has more than %d MB and is not sent", path, _LARGEST // 10**6)
+            log.warning("%s: is larger than %d MB; it is not sent", path, _LARGEST // 10**6)
             return None
         return path.read_bytes()
     except FileNotFoundError:
         return None
     except OSError as error:
-        log.warning("%s: cannot be read and is not sent: %s", path, error.strerror)
+        log.warning("%s: cannot be read: %s; it is not sent", path, error.strerror)
         return None
 
 
 def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None:
-    """Send what waits, again and again, until `wait(seconds)` says that it should end.
+    """Send waiting rows repeatedly until `wait(seconds)` returns True.
 
-    An error that a person must mend is logged and tried again at the longest pause: nothing is lost
-    meanwhile, the store keeps it.
+    An error that a person must mend is logged, and the next attempt follows the longest pause;
+    nothing is lost, since the rows stay in the store.
     """
     pause, trouble = _FIRST_PAUSE_S, ""
     while True:
@@ -319,13 +320,13 @@ def forward_forever(forwarder: Forwarder, wait: Callable[[float], bool]) -> None
             if str(error) != trouble:
                 log.warning("%s; rows wait in the store", error)
             trouble = str(error)
-            passing = isinstance(error, ServerGone)
-            pause = min(2 * pause, _LONGEST_PAUSE_S) if passing else _LONGEST_PAUSE_S
+            may_pass = isinstance(error, ServerGone)
+            pause = min(2 * pause, _LONGEST_PAUSE_S) if may_pass else _LONGEST_PAUSE_S
             if wait(pause):
                 return
             continue
         if trouble:
-            log.info("%s is reached again, %d rows sent", forwarder.address, progress.rows)
+            log.info("%s can be reached again, %d rows sent", forwarder.address, progress.rows)
         pause, trouble = _FIRST_PAUSE_S, ""
         if wait(_IDLE_S):
             return

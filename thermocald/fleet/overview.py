@@ -1,16 +1,14 @@
-"""What a fleet looks like: of each camera how far behind it is, how it moves with temperature, and
-what a person should look at.
+"""The overview of a fleet: each camera's delay, rates with temperature, and findings.
 
-The rates of c, x0 and y0 come from epochs that are spread over all that a camera has measured. They
-hold no effect but a straight line: they compare specimens, a model to correct with is made by
-`thermocald fit`.
+The rates of c, x0 and y0 are slopes of straight lines through epochs that are spread over all that
+a camera has measured. They compare specimens; a model for corrections is made by `thermocald fit`.
 
-A finding is one word and one sentence. `late`: no epoch for a while, because of the station, its
-network, or its daemon; `sensor`: a thermometer that gives nothing, the same for hours, or what
-cannot be; `calibrate`: no result, an old one, a temperature outside what was calibrated, a camera
-that moved; `odd`: rates unlike those of the other cameras of its type; `clock`: a station whose
-clock is not that of the server; `refused`: rows that the server does not take; `twins`: two
-stations of one name, or with copies of one store.
+A finding has a kind and a sentence. `late`: no epoch for a while, because of the station, its
+network or its daemon. `sensor`: a thermometer with no readings, the same for hours, or impossible
+ones. `calibrate`: no result, an old one, a temperature outside the calibrated range, or a camera
+that moved. `odd`: rates unlike those of the other cameras of its type. `clock`: a station's clock
+that differs from the server's. `refused`: rows that the server refuses. `twins`: two stations with
+the same name or with copies of one store.
 """
 
 from __future__ import annotations
@@ -41,15 +39,15 @@ if TYPE_CHECKING:
 
 RATED = ("c", "x0", "y0")
 ODD = 0.01
-"""Probability below which a camera is called unlike its type."""
+"""Probability below which a camera counts as unlike its type."""
 _FEWEST_SAMPLES = 6
 _FEWEST_SPECIMENS = 4
-_RESOLUTION = 0.02  # K, of a thermometer that does not state one
+_RESOLUTION = 0.02  # K, assumed for a thermometer that does not state it
 _LEAST_RANGE_K = 2.0
 
 
 def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[FleetCamera]]:
-    """The server's time (s UTC) and all cameras that an address selects; path: for messages.
+    """Read the server's time (s UTC) and the cameras that an address selects; path: for messages.
 
     Raises ServerGone, ServerError, StoreVersionError.
     """
@@ -63,15 +61,15 @@ def read_overview(address: ServerAddress, path: Path) -> tuple[float, list[Fleet
 
 
 def camera_types(cameras: Sequence[FleetCamera]) -> list[dict[str, Any]]:
-    """The types of which enough specimens are known, as documents; sets `odd` of their cameras.
+    """Return the documents of the types with enough specimens, and set their cameras' `odd`.
 
-    rates: the mean of a type's specimens, its sd, and their standard deviation about it, mm/K.
+    rates: the mean of a type's specimens, its sd, and the specimens' sd about it, mm/K.
     """
     groups: dict[str, list[FleetCamera]] = defaultdict(list)
     for camera in cameras:
         if len(camera.rates) == len(RATED):
             groups[camera.type].append(camera)
-    found = []
+    types = []
     for name, group in sorted(groups.items()):
         if len(group) < _FEWEST_SPECIMENS:
             continue
@@ -80,32 +78,32 @@ def camera_types(cameras: Sequence[FleetCamera]) -> list[dict[str, Any]]:
         covariances = np.einsum("ij,jk->ijk", sds**2, np.eye(len(RATED)))
         for camera, odd in zip(group, odd_specimens(values, covariances), strict=True):
             camera.odd = float(odd)
-        # what is odd is not of the type: it would hide behind a scatter of its own making
+        # without odd specimens, whose scatter would hide them
         like = np.array([c.odd >= ODD for c in group])
         if like.sum() < _FEWEST_SPECIMENS:
             like[:] = True
-        people = population(values[like], covariances[like])
-        between = np.sqrt(np.diag(people.between))
-        sd_mean = np.sqrt(np.diag(people.mean_covariance))
+        specimens = population(values[like], covariances[like])
+        between = np.sqrt(np.diag(specimens.between))
+        sd_mean = np.sqrt(np.diag(specimens.mean_covariance))
         rates = {
             rated: {"value": mean, "sd": sd, "unit": "mm/K", "sd_between": scatter}
             for rated, mean, sd, scatter in zip(
-                RATED, people.mean.tolist(), sd_mean.tolist(), between.tolist(), strict=True
+                RATED, specimens.mean.tolist(), sd_mean.tolist(), between.tolist(), strict=True
             )
         }
-        found.append({"type": name, "cameras": [c.name for c in group], "rates": rates})
-    return found
+        types.append({"type": name, "cameras": [c.name for c in group], "rates": rates})
+    return types
 
 
 def _complete(camera: FleetCamera, state: StationState | None, now: float) -> None:
-    """Fill what follows from a camera's last epochs and its samples; now: s UTC."""
+    """Fill a camera's fields from its last epochs and its samples; now: s UTC."""
     recent = camera.recent
     reference = next(iter(camera.head.channels), "")
     known = [t for e in recent if math.isfinite(t := e.temperatures.get(reference, math.nan))]
     on_the_way = [e.received - e.frame_time for e in recent if math.isfinite(e.received)]
     camera.state = state
     sensor = camera.head.camera.sensor
-    # what the camera says that it is, else what its images are like
+    # the model that the camera reports, else the size of its images and pixels
     model = str(camera.identity.get("model") or camera.identity.get("card") or "").strip()
     size = f"{sensor.width}×{sensor.height}"
     camera.type = f"{model} {size}" if model else f"{size}, {sensor.pixel_pitch * 1000:g} µm"
@@ -120,7 +118,7 @@ def _complete(camera: FleetCamera, state: StationState | None, now: float) -> No
 
 
 def _find_rates(camera: FleetCamera) -> None:
-    """Fill the rates by parameter, and the largest recent departure from their lines."""
+    """Fill a camera's rates by parameter, and its largest recent shift from their lines."""
     samples = camera.samples[np.isfinite(camera.samples).all(axis=1)]
     if len(samples) < _FEWEST_SAMPLES:
         return
@@ -144,7 +142,7 @@ def _find_rates(camera: FleetCamera) -> None:
 
 
 def _about_series_means(values: Array, of: Array) -> Array:
-    """Values (n,) minus the mean of their series: another set-up has another level."""
+    """Return values (n,) minus the mean of their series, since each set-up has its own level."""
     centred = values.copy()
     for one in np.unique(of):
         centred[of == one] -= values[of == one].mean()
@@ -152,9 +150,9 @@ def _about_series_means(values: Array, of: Array) -> Array:
 
 
 def _shift(residual: Array) -> tuple[float, float]:
-    """How far the last tenth of the residuals (n,) is from the others: size, and in its sds.
+    """Return the shift of the last tenth of residuals (n,) from the others: size, and in its sds.
 
-    Robust against single errors: medians, and the scatter from the median absolute deviation.
+    Medians and the median absolute deviation make it robust against single errors.
     """
     last = max(3, len(residual) // 10)
     before, after = residual[:-last], residual[-last:]
@@ -171,7 +169,7 @@ _FUTURE_S = 60.0
 _FEWEST = 10
 _STUCK_S = 6 * 3600.0
 _PLAUSIBLE_C = (-60.0, 125.0)
-_POWER_ON_C = 85.0  # of a DS18B20 that has measured nothing
+_POWER_ON_C = 85.0  # a DS18B20's reading before its first measurement
 _LEAST_OK = 0.5
 _OLD_S = 30 * 86400.0
 _OUTSIDE_K = 2.0
@@ -184,14 +182,14 @@ def add_findings(
     """Fill `findings` of all cameras; now: s UTC, by the server's clock."""
     of_name = {name: kind for kind in types for name in kind["cameras"]}
     for camera in cameras:
-        found = chain(
+        findings = chain(
             _late(camera, now),
             _sensors(camera),
             _calibration(camera, now),
             _odd(camera, of_name.get(camera.name)),
             _clock(camera),
         )
-        camera.findings = [{"kind": kind, "text": text} for kind, text in found]
+        camera.findings = [{"kind": kind, "text": text} for kind, text in findings]
 
 
 def _late(camera: FleetCamera, now: float) -> Findings:
@@ -203,22 +201,22 @@ def _late(camera: FleetCamera, now: float) -> Findings:
             why = "; its station has never reported"
         elif now - state.contact > _SILENT_S:
             ago = short_duration(now - state.contact)
-            why = f"; its station was last heard {ago} ago: power or network"
+            why = f"; its station last reported {ago} ago: check its power and network"
         elif state.waiting:
-            why = f"; {state.waiting} rows wait at its station and are coming"
+            why = f"; {state.waiting} rows wait at its station and are being sent"
         else:
-            why = ", though its station reports: the camera or its daemon stands"
+            why = ", though its station reports: check the camera and its daemon"
         yield "late", since + why
     if camera.state is not None and camera.state.stores > 1:
         text = (
-            f"{camera.state.stores} stores report under its station's name: the card of one is a "
-            "copy; give each station its own name (forward.station)"
+            f"{camera.state.stores} stores report under its station's name, perhaps from a copied "
+            "card; give each station its own name (forward.station)"
         )
         yield "twins", text
     if camera.copied:
         text = (
-            "epochs of one number were taken at two times: its store runs at two stations, or a "
-            "backup was restored; move the store of a copied card away, and it makes its own"
+            "epochs with the same number have different times: its store is used at two stations, "
+            "or a backup was restored; move a copied card's store away, so that a new one is made"
         )
         yield "twins", text
     if camera.state is not None and (count := camera.state.refused):
@@ -233,23 +231,23 @@ def _sensors(camera: FleetCamera) -> Findings:
 
 
 def _trouble(camera: FleetCamera, read: Sequence[float], *, reference: bool) -> str:
-    """What is wrong with a thermometer's last readings (newest first); empty: nothing."""
+    """Return what is wrong with a thermometer's last readings, newest first; empty if nothing."""
     known = [t for t in read if math.isfinite(t)]
     if not known:
         return f"no reading in the last {len(read)} epochs"
     if not any(map(math.isfinite, read[:_FEWEST])):
-        return f"has stopped, no reading in the last {_FEWEST} epochs"
+        return f"has stopped: no reading in the last {_FEWEST} epochs"
     if not _PLAUSIBLE_C[0] < known[0] < _PLAUSIBLE_C[1]:
-        return f"reads {known[0]:g} °C, which cannot be"
+        return f"reads {known[0]:g} °C, which is impossible"
     if len(known) >= _FEWEST and {*known} == {_POWER_ON_C}:
-        return "reads 85 °C, which a DS18B20 gives that has measured nothing"
+        return "reads 85 °C, the value of a DS18B20 that has not measured"
     if reference and (since := _stuck_for(camera, known)) >= _STUCK_S:
         return f"has read exactly {known[0]:g} °C for {short_duration(since)}"
     return ""
 
 
 def _stuck_for(camera: FleetCamera, known: Sequence[float]) -> float:
-    """For how long the reference has not changed by a bit, s."""
+    """Return for how long the reference's reading has been exactly the same, s."""
     if len(known) < _FEWEST or len({*known}) > 1:
         return 0.0
     since = camera.recent[-1].frame_time
@@ -265,8 +263,7 @@ def _calibration(camera: FleetCamera, now: float) -> Findings:
     if len(recent) >= _FEWEST and camera.ok < _LEAST_OK:
         failed = [e.status for e in recent if e.status not in WITH_VALUES]
         often = max(sorted({*failed}), key=failed.count)
-        lack = f"{len(failed)} of the last {len(recent)} epochs have no result: {often}"
-        yield "calibrate", lack
+        yield "calibrate", f"{len(failed)} of the last {len(recent)} epochs have no result: {often}"
     if not math.isfinite(camera.last_ok):
         yield "calibrate", "was never calibrated"
         return
@@ -276,18 +273,18 @@ def _calibration(camera: FleetCamera, now: float) -> Findings:
     outside = max(low - camera.temperature, camera.temperature - high)
     if outside > _OUTSIDE_K:
         text = (
-            f"{camera.temperature:.1f} °C is {outside:.0f} K outside of {low:.0f} to {high:.0f} °C "
-            "that it was calibrated at"
+            f"{camera.temperature:.1f} °C is {outside:.0f} K outside its calibrated range of "
+            f"{low:.0f} to {high:.0f} °C"
         )
         yield "calibrate", text
     if not camera.rates and math.isfinite(low):
         text = (
-            f"calibrated from {low:.0f} to {high:.0f} °C only: how it moves with temperature is "
-            "not known; warm it up, or take its type's model (fit --type)"
+            f"calibrated only from {low:.0f} to {high:.0f} °C, so that its rates are unknown; warm "
+            "it up, or use its type's model (fit --type)"
         )
         yield "calibrate", text
     if camera.shift_px > _SHIFT_PX and camera.shift_sds > _SHIFT_SDS:
-        yield "calibrate", f"has lately moved by {camera.shift_px:.1f} px from its own line"
+        yield "calibrate", f"has recently moved by {camera.shift_px:.1f} px from its straight line"
 
 
 def _odd(camera: FleetCamera, kind: dict[str, Any] | None) -> Findings:
@@ -302,7 +299,7 @@ def _odd(camera: FleetCamera, kind: dict[str, Any] | None) -> Findings:
     name = max(RATED, key=distance)
     usual = kind["rates"][name]
     text = (
-        f"{name} moves by {camera.rates[name].value * 1e3:+.3f} µm/K, the others "
+        f"{name} drifts by {camera.rates[name].value * 1e3:+.3f} µm/K, the others "
         f"by {usual['value'] * 1e3:+.3f} ± {usual['sd_between'] * 1e3:.3f} (p = {camera.odd:.1g})"
     )
     yield "odd", text
@@ -311,7 +308,10 @@ def _odd(camera: FleetCamera, kind: dict[str, Any] | None) -> Findings:
 def _clock(camera: FleetCamera) -> Findings:
     clock = camera.clock_s
     if clock is not None and abs(clock) > _CLOCK_S:
-        far = f"{short_duration(abs(clock))} {'ahead of' if clock > 0 else 'behind'}"
-        yield "clock", f"its station's clock is {far} the server's; epochs keep the station's time"
+        offset = f"{short_duration(abs(clock))} {'ahead of' if clock > 0 else 'behind'}"
+        yield (
+            "clock",
+            f"its station's clock is {offset} the server's; epochs have its time",
+        )
     elif camera.lag_s < -_FUTURE_S:
         yield "clock", f"its last epoch is {short_duration(-camera.lag_s)} in the future"

@@ -1,7 +1,7 @@
-"""A fleet as a document, as lines of a terminal, and as a page.
+"""A fleet as a document, as a command's output, and as a page.
 
-What somebody should look at, every camera, and the rates of each type, whose specimens are drawn
-together, so that an odd one is seen and not only named.
+It has the findings, every camera, and the rates of each type, whose specimens are drawn together so
+that an odd one can be seen.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ if TYPE_CHECKING:
 
     from thermocald.store.server.fleet_reader import FleetCamera
 
-# kind of a finding → what one camera is, what several are, what to do
+# kind of a finding → words for one camera, for several, and what to do
 _FINDINGS = {
-    "late": ("late", "late", "Late stations: look at their power and network."),
+    "late": ("late", "late", "Late stations: check their power and network."),
     "sensor": ("dead sensor", "with a dead sensor",
-               "Dead sensors: exchange the thermometer; the frames go on."),
+               "Dead sensors: replace the thermometer; frames are still taken."),
     "calibrate": ("needs calibration", "in need of calibration",
                   "Cameras beyond their calibrated range: record there and fit again."),
     "odd": ("unlike its type", "unlike their type",
-            "Cameras unlike their type: look whether the lens or the mount is loose."),
+            "Cameras unlike their type: check whether the lens or the mount is loose."),
     "clock": ("wrong clock", "with a wrong clock",
-              "Wrong clocks: let the station synchronise before its temperatures are used."),
+              "Wrong clocks: synchronise the station before its temperatures are used."),
     "refused": ("rows refused", "with refused rows",
-                "Refused rows: see the finding for the reason."),
-    "twins": ("twin", "with a twin", "Twins: give each station a name and a store of its own."),
+                "Refused rows: see the station's log for the reason."),
+    "twins": ("twin", "with a twin", "Twins: give each station its own name and store."),
 }  # fmt: skip
 _MOST_LABELLED = 40
 _WIDTH = 80
-_MOST_SOUND = 40
+_MOST_WITHOUT = 40  # cameras without a finding that are printed
 _LONGEST_NAME = 34
 
 
 def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
-    """Everything about the cameras that some addresses select; several servers are one fleet.
+    """Return the document of the cameras that addresses select, on several servers as one fleet.
 
     Raises UsageError, ServerGone, ServerError, StoreVersionError.
     """
@@ -54,8 +54,8 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
     now = 0.0
     addresses = [ServerAddress.parse(source) for source in sources]
     for address, source in zip(addresses, sources, strict=True):
-        now, found = read_overview(address, source)
-        cameras += found
+        now, selected = read_overview(address, source)
+        cameras += selected
     types = camera_types(cameras)
     add_findings(cameras, types, now)
     counts = Counter(kind for c in cameras for kind in {f["kind"] for f in c.findings})
@@ -76,16 +76,16 @@ def fleet_document(sources: Sequence[Path]) -> dict[str, Any]:
 
 
 def fleet_lines(document: dict[str, Any]) -> list[str]:
-    """Return the lines that `fleet` prints of a document."""
+    """Return the lines that `fleet` prints for a document."""
     cameras = document["cameras"]
     if not cameras:
         return ["no epochs there yet; stations send theirs with `thermocald forward`"]
     summary = document["summary"]
     head = f"{summary['cameras']} cameras at {summary['stations']} stations: "
-    head = ", ".join([f"{head}{summary['sound']} sound", *_counts(summary)])
+    head = ", ".join([f"{head}{summary['sound']} without findings", *_counts(summary)])
     lines = textwrap.wrap(head, _WIDTH)
     shown = [c for c in cameras if c["findings"]]
-    shown += [c for c in cameras if not c["findings"]][:_MOST_SOUND]
+    shown += [c for c in cameras if not c["findings"]][:_MOST_WITHOUT]
     name = min(_LONGEST_NAME, max(14, *(len(_name(c)) for c in shown)))
     heads = f"{'last':>7} {'waiting':>7} {'ok':>6} {'°C':>6} {'c µm/K':>16}"
     lines += ["", f"{'station/camera':<{name}} {heads}"]
@@ -99,7 +99,7 @@ def fleet_lines(document: dict[str, Any]) -> list[str]:
                 subsequent_indent="      ",
             )
     if hidden := len(cameras) - len(shown):
-        lines.append(f"and {hidden} more without a finding (--json has them all)")
+        lines.append(f"and {hidden} more without findings (--json has them all)")
     for kind in document["types"]:
         rate = kind["rates"]["c"]
         lines += textwrap.wrap(
@@ -118,8 +118,8 @@ def _counts(summary: Mapping[str, int]) -> list[str]:
 
 
 def _rate(camera: Mapping[str, Any], name: str) -> str:
-    found = camera["rates"].get(name)
-    return f"{found['value'] * 1e3:+.3f} ± {found['sd'] * 1e3:.3f}" if found else "–"
+    rate = camera["rates"].get(name)
+    return f"{rate['value'] * 1e3:+.3f} ± {rate['sd'] * 1e3:.3f}" if rate else "–"
 
 
 def _known(value: float | None, form: str) -> str:
@@ -136,9 +136,9 @@ def _row(camera: dict[str, Any], width: int) -> str:
 
 
 def render_fleet(document: Mapping[str, Any]) -> str:
-    """Return the page as HTML text; document: of `fleet_document`."""
+    """Return the page of a `fleet_document` as HTML text."""
     summary, cameras = document["summary"], document["cameras"]
-    found = tuple(
+    findings = tuple(
         (f"{_name(c)}, {_FINDINGS[f['kind']][0]}", f["text"])
         for c in cameras
         for f in c["findings"]
@@ -151,20 +151,20 @@ def render_fleet(document: Mapping[str, Any]) -> str:
     proof = drawn[0][1].pop(0) if drawn and drawn[0][1] else None
     title = f"{summary['cameras']} cameras at {summary['stations']} stations"
     answer = Answer(
-        f"{summary['sound']} of {summary['cameras']} cameras are sound"
+        f"{summary['sound']} of {summary['cameras']} cameras have no finding"
         + (f"; {', '.join(counts)}." if counts else "."),
         proof=proof,
         next_steps=tuple(text for kind, (*_, text) in _FINDINGS.items() if summary[kind]),
         not_covered=(
             (
-                "Rates are straight lines with their standard deviations, from epochs spread over "
-                "all that a camera has measured: they compare specimens. A model to correct with "
-                "is made by thermocald fit."
+                "Rates are slopes of straight lines with their standard deviations, from epochs "
+                "spread over all that a camera has measured: they compare specimens. A model for "
+                "corrections is made by thermocald fit."
             ),
         ),
     )
     sections = [
-        *([Section("To look at", items=found)] if found else []),
+        *([Section("Findings", items=findings)] if findings else []),
         Section("Cameras", tables=(_table(cameras),)),
         *(
             Section(f"Type {kind['type']}: {len(kind['cameras'])} cameras", figures=tuple(figures))
@@ -200,15 +200,15 @@ def _table(cameras: Sequence[Mapping[str, Any]]) -> Table:
             "y₀ µm/K": lambda c: _rate(c, "y0"),
             "type": lambda c: str(c["type"]),
         },
-        "●: see above.",
+        "●: has findings.",
     )
 
 
 def _drawing(
     name: str, rate: str, kind: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]
 ) -> Figure:  # fmt: skip
-    """A type's specimens, from the lowest rate to the highest, in the band of the type."""
-    found = sorted(
+    """Draw the rates of a type's specimens, in order, and the type's band."""
+    specimens = sorted(
         (
             1e3 * c["rates"][rate]["value"],
             1e3 * BAND * c["rates"][rate]["sd"],
@@ -220,18 +220,18 @@ def _drawing(
     )
     of_type = kind["rates"][rate]
     mean, spread = 1e3 * of_type["value"], 1e3 * BAND * of_type["sd_between"]
-    labelled = len(found) <= _MOST_LABELLED
+    labelled = len(specimens) <= _MOST_LABELLED
     with drawing_style():
-        drawing = new_drawing(5.0, 0.9 + (0.2 if labelled else 0.05) * len(found))
+        drawing = new_drawing(5.0, 0.9 + (0.2 if labelled else 0.05) * len(specimens))
         axis = drawing.subplots()
         axis.axvspan(mean - spread, mean + spread, color=PALETTE[0], alpha=0.12, lw=0)
         axis.axvline(mean, color=PALETTE[0], lw=1)
-        for place, (value, half, _, odd) in enumerate(found):
+        for place, (value, half, _, odd) in enumerate(specimens):
             axis.errorbar(value, place, xerr=half, fmt="o", ms=3, lw=1.2,
                           color=PALETTE[1] if odd else "#333333")  # fmt: skip
         axis.set_yticks(
-            range(len(found)) if labelled else [],
-            [shortened(specimen, 22) for *_, specimen, _ in found] if labelled else [],
+            range(len(specimens)) if labelled else [],
+            [shortened(specimen, 22) for *_, specimen, _ in specimens] if labelled else [],
         )
         axis.grid(visible=False, axis="y")
         label_axes(axis, f"{parameter_label(rate)} in µm/K")

@@ -1,11 +1,11 @@
-"""Archives calibrated again, block by block, on the cores of this machine or on a Dask cluster.
+"""Reprocessing of archives, block by block, on this machine's cores or on a Dask cluster.
 
-    recordings ─► blocks of epochs ─► frame, observations, adjustment ─► one Parquet file a block
+    recordings ─► blocks of epochs ─► frame, observations, adjustment ─► a Parquet file per block
 
-A block depends on nothing but its recording: it begins with a search of the whole frame, whoever
-computes it, so a cluster gives the same bits as one core. A file that is there is not made again,
-which is how an interrupted run goes on. A block that fails is reported and costs nothing but
-itself; one whose process dies is tried again before it is given up.
+A block depends only on its recording: it begins with a search of the whole frame, so that a cluster
+gives the same bits as one core. An existing file is not made again, so that an interrupted run
+continues. A block that fails is reported and does not affect the others; one whose process dies is
+tried again first.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _ROUNDS = 3
-"""How often a task is handed to a cluster whose workers died of it, or of something else."""
+"""How often a task is given to a cluster whose workers died during it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a task; `error` is empty where it is done.
+    """The outcome of a task; `error` is empty if it succeeded.
 
-    epochs, calibrated: of a block, how many there are and how many have a result; not_written: the
-    exit status where it is the file of results that could not be written, else 0.
+    epochs, calibrated: numbers of a block's epochs, and of those with a result; not_written: the
+    exit status if the file of results could not be written, else 0.
     """
 
     task: Any
@@ -64,11 +64,11 @@ def run_tasks(
     jobs: int = 1,
     report: Callable[[Outcome], None] = lambda _: None,
 ) -> list[Outcome]:
-    """Do all tasks and return what became of each, in the order in which they are done.
+    """Run all tasks and return their outcomes in the order of completion.
 
-    work: a function of a module; engine: `local`, with `jobs` processes, or the address of a Dask
-    scheduler, `tcp://host:8786`, whose workers see the same files; report: is told of each task as
-    it is done. Raises UsageError, ServerGone.
+    work: a module's function. engine: `local`, with `jobs` processes, or the address of a Dask
+    scheduler, `tcp://host:8786`, whose workers see the same files. report: called with each outcome
+    on completion. Raises UsageError, ServerGone.
     """
     do = partial(_attempt, work)
     if engine == "local":
@@ -76,7 +76,7 @@ def run_tasks(
     elif "://" in engine:
         done = _cluster(do, tasks, engine)
     else:
-        raise UsageError(f"--engine {engine}: there is `local`, or a scheduler's tcp://HOST:PORT")
+        raise UsageError(f"--engine {engine}: give `local` or a Dask scheduler's tcp://HOST:PORT")
     outcomes = []
     for outcome in done:
         outcomes.append(outcome)
@@ -85,7 +85,7 @@ def run_tasks(
 
 
 def _attempt(work: Callable[[Any], Outcome], task: Any) -> Outcome:
-    """Do a task; what its data or its output do not allow is an outcome."""
+    """Run a task; an error of its data or output becomes its outcome."""
     try:
         return work(task)
     except OutputError as error:
@@ -95,7 +95,7 @@ def _attempt(work: Callable[[Any], Outcome], task: Any) -> Outcome:
 
 
 def _processes(do: Callable[[Any], Outcome], tasks: Sequence[Any], jobs: int) -> Iterator[Outcome]:
-    """On processes of this machine; where one dies, its tasks are tried again one by one."""
+    """Run tasks in processes; those of a process that dies are tried again one by one."""
     again = []
     with processes(jobs) as pool:
         futures = {pool.submit(do, task): task for task in tasks}
@@ -134,7 +134,7 @@ def _cluster(do: Callable[[Any], Outcome], tasks: Sequence[Any], address: str) -
                 if future.status == "finished":
                     yield future.result()
                 elif left and isinstance(cause, distributed.KilledWorker):
-                    # its workers died: of it, or because somebody ends workers now and then
+                    # its workers died, which need not be the task's fault
                     again.append(task)
                 else:
                     why = (str(cause).splitlines() or [type(cause).__name__])[0]
@@ -146,12 +146,12 @@ def _cluster(do: Callable[[Any], Outcome], tasks: Sequence[Any], address: str) -
 
 
 BLOCK = 360
-"""Epochs of a block: an hour at 10 s. The search that it begins with is a hundredth of its work."""
+"""Epochs per block: an hour at 10 s, of whose work the search at its start is a hundredth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Epochs of a recording by their position, `first` to before `stop`, and where they go."""
+    """A recording's epochs from position `first` to before `stop`, and their Parquet file."""
 
     recording: Path
     first: int
@@ -161,9 +161,9 @@ class Block:
 
 
 def find_series(sources: Sequence[Path]) -> dict[str, Path]:
-    """Find {name of a file: place} of every series below some folders, or at some addresses.
+    """Find {file name: place} of every series below folders or at addresses.
 
-    Raises DataError where there is none, or where two would be written to one place.
+    Raises DataError if there is none, or if two would be written to one file.
     """
     found: dict[str, Path] = {}
     for source in sources:
@@ -172,7 +172,7 @@ def find_series(sources: Sequence[Path]) -> dict[str, Path]:
             if found.setdefault(name, place) != place:
                 raise DataError(
                     f"{source_name(place)} and {source_name(found[name])} are the same series "
-                    f"{name}; reprocess them into folders of their own"
+                    f"{name}; reprocess them into separate folders"
                 )
     if not found:
         raise DataError(f"{', '.join(map(source_name, sources))}: no recording or series is there")
@@ -196,9 +196,9 @@ def _at_server(address: Path) -> Iterator[tuple[tuple[str, str, str], Path]]:
 def find_blocks(
     archives: Sequence[Path], out: Path, free: tuple[str, ...], size: int = BLOCK
 ) -> list[Block]:
-    """Find the blocks of all recordings at or below some folders, but those that are done.
+    """Find the blocks that are not done yet of all series below folders or at addresses.
 
-    Raises DataError as `find_series`.
+    Raises the errors of `find_series`.
     """
     blocks: list[Block] = []
     for name, path in find_series(archives).items():
@@ -211,7 +211,7 @@ def find_blocks(
 
 
 def calibrate_block(block: Block) -> Outcome:
-    """Calibrate one block and write its file, whole or not at all."""
+    """Calibrate a block and write its file, whole or not at all."""
     recording = open_recording(block.recording)
     camera = recording.camera
     calibrator = Calibrator.of_recording(recording, AdjustmentSettings(free=block.free))

@@ -34,15 +34,9 @@ def import_(
     pixel_pitch: PixelPitchOption = None,
     camera: Path | None = typer.Option(None, help="A camera file of any format."),
     series: str = typer.Option("M1", help="Name of this series."),
-    dry_run: bool = typer.Option(
-        False, "--dry-run", help="Show what would be written, without writing it."
-    ),
-    camera_timezone: str | None = expert(
-        None, help="Time zone of the camera; overrides what EXIF states."
-    ),
-    camera_clock: str = expert(
-        "0", help="By how much the camera's clock was ahead, such as +00:03:12."
-    ),
+    dry_run: bool = typer.Option(False, "--dry-run", help="Show only what would be written."),
+    camera_timezone: str | None = expert(None, help="Time zone of the camera; overrides EXIF."),
+    camera_clock: str = expert("0", help="Advance of the camera's clock, such as +00:03:12."),
     times: str = expert(
         "exif",
         help="Source of the photographs' times: exif, name (of the file), file (its date).",
@@ -119,9 +113,7 @@ def archive(
     ),
     frames: Path | None = expert(None, help="Folder of the daemon's frames."),
     series: str | None = typer.Option(None, help="CAMERA/SERIES or SERIES; default: all."),
-    skip_existing: bool = expert(
-        False, "--skip-existing", help="Skip recordings that exist already."
-    ),
+    skip_existing: bool = expert(False, "--skip-existing", help="Skip recordings that exist."),
     finished: bool = expert(
         False, "--finished", help="Only finished series: the camera has begun another one since."
     ),
@@ -197,9 +189,7 @@ _NAMES = {"csv": "observations.csv", "parquet": "observations.parquet"}
 def convert(
     recording: Path = typer.Argument(..., help="The recording's folder; changed in place."),
     to: str = typer.Option("parquet", help="csv, or parquet (needs pyarrow)."),
-    keep: bool = typer.Option(
-        False, "--keep", help="Keep the original file, with `.old` added to its name."
-    ),
+    keep: bool = typer.Option(False, "--keep", help="Keep the original file, renamed to `.old`."),
 ) -> None:
     """Rewrite a recording's observations as Parquet, which is read ten times as fast, or as CSV.
 

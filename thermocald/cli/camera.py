@@ -87,12 +87,8 @@ def convert(
     source: Path = typer.Argument(..., metavar="FILE", help="The camera file to convert."),
     to: str = typer.Option(..., help=f"Format to write: {_FORMATS}."),
     out: Path = typer.Option(..., "--out", "-o", help="The file to write."),
-    from_: str | None = expert(
-        None, "--from", help="Format of FILE; default: recognised from its content."
-    ),
-    pixel_pitch: float | None = typer.Option(
-        None, help="Pixel pitch, mm, if FILE does not give it."
-    ),
+    from_: str | None = expert(None, "--from", help="Format of FILE; default: by its content."),
+    pixel_pitch: float | None = typer.Option(None, help="Pixel pitch, mm, if FILE gives none."),
     json: JsonOption = None,
 ) -> None:
     """Convert a camera file to another format.
@@ -111,9 +107,7 @@ def at(
     temperature: float = typer.Option(..., help="Steady temperature of the camera, °C."),
     to: str = typer.Option("json", help=f"Format to write: {_FORMATS}, pyorc."),
     out: Path | None = typer.Option(None, "--out", "-o", help="The file to write."),
-    renew: Path | None = typer.Option(
-        None, help="With --to pyorc: the camera configuration to update."
-    ),
+    renew: Path | None = typer.Option(None, help="With --to pyorc: the configuration to update."),
     reference: Path | None = typer.Option(
         None, help="With --to pyorc: the image in which the control points were clicked."
     ),
@@ -184,23 +178,15 @@ group = subcommands(at=at, convert=convert, diff=diff)
 def predict(
     model: ModelOption,
     temperature: float | None = typer.Option(None, help="Steady temperature of the camera, °C."),
-    log: Path | None = typer.Option(
-        None, help="Log of temperatures: a logger's file, a recording or a store."
-    ),
+    log: Path | None = typer.Option(None, help="Temperatures: a log file, a recording or a store."),
     test: Path | None = typer.Option(
         None, help="Test the model: compare its prediction with this recording or store."
     ),
-    programme: Path | None = typer.Option(
-        None, help="Give advice on warming up for this programme (YAML)."
-    ),
+    programme: Path | None = typer.Option(None, help="Programme (YAML) for advice on warming up."),
     camera: Path | None = typer.Option(None, help="Camera file (YAML), for --programme."),
-    channel: list[str] | None = expert(
-        None, help="NAME=°C: temperature of a further thermometer; repeatable."
-    ),
+    channel: list[str] | None = expert(None, help="NAME=°C of a further thermometer; repeatable."),
     distance: float = expert(10.0, min=0.01, help="Distance to the object, m."),
-    wanted: float = expert(
-        5.0, "--wanted-mm", min=1e-3, help="Largest acceptable error on the object, mm."
-    ),
+    wanted: float = expert(5.0, "--wanted-mm", min=1e-3, help="Tolerated error on the object, mm."),
     extrapolate: ExtrapolateOption = False,
     log_options: Any = None,
     json: JsonOption = None,
@@ -249,9 +235,7 @@ def correct(
         min=0.0,
         help="Standard deviation of a reading, K; default: as estimated by the model's fit.",
     ),
-    image_size: str | None = expert(
-        None, "--size", help="WIDTHxHEIGHT of the images, px, if they are binned."
-    ),
+    image_size: str | None = expert(None, "--size", help="WIDTHxHEIGHT of binned images, px."),
     extrapolate: ExtrapolateOption = False,
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
@@ -308,12 +292,8 @@ def measure(
     seen: str = typer.Option(
         ..., metavar="TIME", help="Time at which the control points were observed in the image."
     ),
-    plane: Path = typer.Option(
-        ..., help="The surface (YAML): level, plane, line or profile, and its sd."
-    ),
-    length_unit: str = typer.Option(
-        "mm", help="Unit of the control points and the surface: mm or m."
-    ),
+    plane: Path = typer.Option(..., help="Surface (YAML): level, plane, line or profile, with sd."),
+    length_unit: str = typer.Option("mm", help="Unit of control points and surface: mm or m."),
     extrapolate: ExtrapolateOption = False,
     timezone: TimezoneOption = None,
     ambiguous: str = "order",

@@ -73,7 +73,7 @@ PANELS = {
         "predict": Entry("camera", "Predict the camera at a temperature or along a log"),
         "correct": Entry("camera", "Correct image points or images for the temperature"),
         "measure": Entry("camera", "Measure in metres on a water surface, a plane or a staff"),
-        "camera": Entry("camera", "Convert, compare and predict camera files", True),
+        "camera": Entry("camera", "Convert and compare camera files; predict a camera", True),
     },
     "Test field": {
         "testfield": Entry("testfield", "Print, import, survey and check a test field", True)

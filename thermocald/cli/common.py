@@ -47,7 +47,7 @@ PixelPitchOption = Annotated[
 ]
 LogOption = Annotated[
     Path,
-    typer.Option("--log", help="Log of temperatures: a logger's file, a recording or a store."),
+    typer.Option("--log", help="Temperatures: a log file, a recording or a store."),
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="Thermal model (YAML).")]
 ExtrapolateOption = Annotated[
@@ -57,9 +57,7 @@ ExtrapolateOption = Annotated[
 SeedOption = Annotated[int, expert(..., "--seed", min=0, help="Seed of the random numbers.")]
 TimezoneOption = Annotated[
     str | None,
-    typer.Option(
-        "--timezone", help="Time zone of times that state none: Europe/Berlin, UTC, +02:00."
-    ),
+    typer.Option("--timezone", help="Time zone of times without one: Europe/Berlin, UTC, +02:00."),
 ]
 FreeOption = Annotated[
     str,
@@ -94,21 +92,15 @@ def _log_options(
     name: list[str] | None = typer.Option(
         None, metavar="COLUMN=LABEL", help="Label for a column of the log; repeatable."
     ),
-    unit: str | None = typer.Option(
-        None, help="Unit of the log's temperatures, if it states none: degC, K, degF."
-    ),
-    date_order: str | None = expert(
-        None, help="Order of dates such as 06/07/2026: dmy (day first) or mdy."
-    ),
+    unit: str | None = typer.Option(None, help="Unit, if the log states none: degC, K, degF."),
+    date_order: str | None = expert(None, help="Order of dates such as 06/07/2026: dmy or mdy."),
     time_column: list[str] | None = expert(
         None, help="Name of the log's time column; twice for a date and a time column."
     ),
     log_timezone: str | None = expert(
         None, help="Time zone of the logger; overrides --timezone and what the log states."
     ),
-    log_clock: str = expert(
-        "0", help="By how much the logger's clock was ahead, such as +00:03:12."
-    ),
+    log_clock: str = expert("0", help="Advance of the logger's clock, such as +00:03:12."),
     ambiguous: str = expert(
         "order",
         help="How to read the hour that occurs twice in autumn: order (by the order of the rows), "

@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 
 
 def demo(
-    out: Path = typer.Option(
-        Path("thermocald-demo"), help="Folder for the store and the recording."
-    ),
+    out: Path = typer.Option(Path("thermocald-demo"), help="Folder for store and recording."),
     epochs: int = typer.Option(150, min=10, help="Number of epochs, of 10 s each."),
     seed: SeedOption = 0,
     discovery: bool = typer.Option(
@@ -97,9 +95,7 @@ def _print_discovery(document: dict[str, Any]) -> None:
 
 def simulate(
     preset: str | None = typer.Option(None, help="A camera of the reference study; see --list."),
-    model: Path | None = typer.Option(
-        None, help="Thermal model (YAML); replaces the model of the preset."
-    ),
+    model: Path | None = typer.Option(None, help="Thermal model (YAML); replaces the preset's."),
     camera: Path | None = typer.Option(None, help="Camera file (YAML): heat, thermometers, noise."),
     testfield: str | None = typer.Option(None, help="A testfield.csv, or markers, circles, plain."),
     programme: Path | None = typer.Option(
@@ -109,9 +105,7 @@ def simulate(
     frames: bool = typer.Option(
         False, "--frames", help="Render frames instead of simulating measured image points."
     ),
-    effect: list[Path] | None = expert(
-        None, help="Effect file (YAML) to add, such as a proposal; repeatable."
-    ),
+    effect: list[Path] | None = expert(None, help="Effect file (YAML) to add; repeatable."),
     seed: SeedOption = 0,
     series: str = typer.Option("M1", help="Name of the series, for a preset."),
     model_out: Path | None = expert(None, help="Also write the simulated thermal model."),

@@ -34,15 +34,9 @@ def run(
         False, "--mock", help="Use a rendered camera that warms up, and a mock thermometer."
     ),
     recording: Path | None = typer.Option(None, help="Play back a recording instead of devices."),
-    store: Path | None = typer.Option(
-        None, help="Store for the epochs; overrides the configuration."
-    ),
-    epochs: int = typer.Option(
-        0, min=0, help="Stop after this many epochs per camera; 0: no limit."
-    ),
-    fast: bool = expert(
-        False, "--fast", help="Play back the recording as fast as it can be calibrated."
-    ),
+    store: Path | None = typer.Option(None, help="The store; overrides the configuration."),
+    epochs: int = typer.Option(0, min=0, help="Stop after this many epochs per camera; 0: never."),
+    fast: bool = expert(False, "--fast", help="Play back as fast as epochs can be calibrated."),
     hang_after: float = expert(
         60.0, min=0.5, help="Seconds without an answer after which a device counts as hung."
     ),
@@ -100,9 +94,7 @@ def run(
 
 def dashboard(
     store: Path | None = typer.Option(None, help="The daemon's store."),
-    live: Path | None = expert(
-        None, help="Folder of the daemon's live state; default: found from the store."
-    ),
+    live: Path | None = expert(None, help="Folder of the daemon's live state."),
     host: str = expert(
         "127.0.0.1", help="Address to listen on; one open to other machines needs --token-file."
     ),
@@ -259,9 +251,7 @@ def devices(json: JsonOption = None) -> None:
 
 
 def doctor(
-    root: Path = expert(
-        Path("/"), help="Root folder of the machine to examine, such as a mounted card."
-    ),
+    root: Path = expert(Path("/"), help="Root folder of the machine, such as a mounted card."),
     json: JsonOption = None,
 ) -> None:
     """Report what this machine lacks: camera stack, groups, I2C, clock, power, disk.

@@ -76,9 +76,7 @@ def grant(
 
 
 def dashboard(
-    output: str = typer.Option(
-        "-", "-o", "--output", help="The file to write; - is standard output."
-    ),
+    output: str = typer.Option("-", "-o", "--output", help="File to write; - is standard output."),
 ) -> None:
     """Write a dashboard to import into Grafana; its data source is the PostgreSQL server.
 
@@ -199,9 +197,7 @@ def reprocess(
         ..., metavar="ARCHIVE…", help="Folders that hold recordings, or postgresql://…"
     ),
     out: Path = typer.Option(..., help="Folder for the results."),
-    do: str = typer.Option(
-        "calibrate", help="calibrate (every epoch), discover or study (every series)."
-    ),
+    do: str = typer.Option("calibrate", help="calibrate epochs, or discover or study series."),
     engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
     jobs: JobsOption = 1,
     free: FreeOption = DEFAULT_FREE,

@@ -35,15 +35,11 @@ def start(
     programme: Path | None = typer.Option(
         None, help="Programme of the heating output (YAML), a list of steps."
     ),
-    output: Path = typer.Option(
-        Path(), "--output", "-o", help="Folder for the recording and the report."
-    ),
+    output: Path = typer.Option(Path(), "--output", "-o", help="Folder for recording and report."),
     check: bool = typer.Option(
         True, "--check/--no-check", help="Check light, focus and geometry first."
     ),
-    report: bool = typer.Option(
-        True, "--report/--no-report", help="Finish with the report of a study."
-    ),
+    report: bool = typer.Option(True, "--report/--no-report", help="Finish with a study's report."),
     wait: bool = typer.Option(
         True, "--wait/--no-wait", help="Wait until a running daemon has taken all epochs."
     ),
@@ -56,12 +52,8 @@ def start(
     max_temperature: float | None = expert(
         None, help="Highest temperature of a planned programme, °C; default: the output's limit."
     ),
-    max_rate: float = expert(
-        3.0, min=0.1, max=60.0, help="Fastest rise of a planned programme, K/min."
-    ),
-    max_duty: float = expert(
-        0.8, min=0.05, max=1.0, help="Largest share of the time with the heating on."
-    ),
+    max_rate: float = expert(3.0, min=0.1, max=60.0, help="Fastest planned rise, K/min."),
+    max_duty: float = expert(0.8, min=0.05, max=1.0, help="Largest share of time with heating."),
     dry_run: bool = expert(False, "--dry-run", help="Print the planned programme and exit."),
 ) -> None:
     """Take a series of epochs, showing progress, then write its recording and its report.

@@ -115,9 +115,7 @@ def export(
     units: str = typer.Option(
         "", help="Units instead of mm and rad: px, um, deg, separated by commas; columns name them."
     ),
-    time_: str = typer.Option(
-        "seconds", "--time", help="Form of the times: seconds (since 1970, UTC) or iso."
-    ),
+    time_: str = typer.Option("seconds", "--time", help="Times: seconds (since 1970, UTC) or iso."),
     separator: str = typer.Option(",", help="Column separator: , ; | tab"),
     decimal: str = typer.Option(".", help="Decimal mark: . or ,"),
     extra: bool = expert(
@@ -176,14 +174,10 @@ def study(
     ),
     json: JsonOption = None,
     report: Path | None = typer.Option(None, help="Write the report to an HTML file."),
-    figures: Path | None = typer.Option(
-        None, help="Write all figures to this folder, as SVG and PNG."
-    ),
+    figures: Path | None = typer.Option(None, help="Write all figures here, as SVG and PNG."),
     window: int = expert(31, min=3, help="Number of epochs in the window of the F-test; odd."),
     alpha: float = expert(0.05, min=1e-6, max=0.5, help="Significance level of the F-test."),
-    sets: int = expert(
-        50_000, min=2, help="Number of interior orientations drawn (Monte-Carlo simulation)."
-    ),
+    sets: int = expert(50_000, min=2, help="Number of draws of the Monte-Carlo simulation."),
     seed: SeedOption = 0,
     distance: float = expert(10.0, min=0.01, help="Distance of the object plane, m."),
     grid: int = expert(
@@ -258,23 +252,17 @@ def discover(
     verify: list[Path] | None = typer.Option(
         None, help="M2: another series of this camera, to verify the effect; repeatable."
     ),
-    model: Path | None = typer.Option(
-        None, help="The thermal model so far (YAML); default: the base model."
-    ),
+    model: Path | None = typer.Option(None, help="Model so far (YAML); default: the base model."),
     json: JsonOption = None,
     model_out: Path | None = typer.Option(None, help="Write the model with the effects found."),
-    effect_out: Path | None = expert(
-        None, help="Write the effects found to an effect file (YAML)."
-    ),
+    effect_out: Path | None = expert(None, help="Write the effects found to a file (YAML)."),
     report: Path | None = typer.Option(None, help="Write a report to an HTML file."),
     jobs: JobsOption = 1,
     plan: bool = typer.Option(
         False, "--plan", help="Predict which effects a set-up would reveal, before any heating."
     ),
     preset: str | None = typer.Option(None, help="With --plan: a camera of the reference study."),
-    testfield: str | None = typer.Option(
-        None, help="With --plan: a testfield.csv, or markers, circles, plain."
-    ),
+    testfield: str | None = typer.Option(None, help="With --plan: a testfield.csv."),
     programme: Path | None = typer.Option(None, help="With --plan: the programme (YAML)."),
     strength: float = expert(0.1, min=0.001, help="With --plan: size of an effect, px."),
     seeds: int = expert(2, min=1, max=50, help="With --plan: number of repetitions."),

@@ -49,13 +49,9 @@ def _board(
     charuco: str | None = typer.Option(None, help="A ChArUco board, such as 11x8 squares."),
     chessboard: str | None = typer.Option(None, help="A chessboard, such as 9x6 inner corners."),
     aprilgrid: str | None = typer.Option(None, help="An AprilGrid of Kalibr, such as 6x6 tags."),
-    square: float | None = typer.Option(None, min=0.1, help="Side of a square of the board, mm."),
-    marker: float | None = typer.Option(
-        None, min=0.1, help="Side of a marker or tag of the board, mm."
-    ),
-    spacing: float = expert(
-        0.3, help="Gap between the tags of an AprilGrid, as a fraction of a tag's side."
-    ),
+    square: float | None = typer.Option(None, min=0.1, help="Side of a square, mm."),
+    marker: float | None = typer.Option(None, min=0.1, help="Side of a marker or tag, mm."),
+    spacing: float = expert(0.3, help="Gap between AprilGrid tags, relative to a tag's side."),
     dictionary: str = expert(
         "DICT_5X5_1000", help="Dictionary of a ChArUco board, by its OpenCV name."
     ),
@@ -88,12 +84,8 @@ def print_(
     landscape: Landscape = None,
     diameter: Diameter = None,
     bits: int | None = expert(None, help="Bits of the ring codes: 12, 14, or 0 for no codes."),
-    plain: bool = expert(
-        True, "--plain/--no-plain", help="Plain circles between the coded targets."
-    ),
-    markers: str | None = expert(
-        None, help="Add markers of this dictionary, such as DICT_APRILTAG_36h11."
-    ),
+    plain: bool = expert(True, "--plain/--no-plain", help="Plain circles between coded targets."),
+    markers: str | None = expert(None, help="Add markers of a dictionary: DICT_APRILTAG_36h11."),
     light: bool = expert(False, "--light", help="White targets on black."),
     first_code: int = expert(0, min=0, help="Skip this many codes, for a second field."),
     pitch: float | None = expert(None, help="Spacing of the coded targets, mm."),
@@ -147,9 +139,7 @@ def import_(
     rings: int | None = expert(
         None, help="FILE lists ring-coded targets whose codes have this many bits: 12 or 14."
     ),
-    diameter: float | None = typer.Option(
-        None, min=0.1, help="Diameter of the ring-coded targets, mm."
-    ),
+    diameter: float | None = typer.Option(None, min=0.1, help="Diameter of the coded targets, mm."),
     sigma: float | None = typer.Option(
         None, min=1e-4, help="Standard deviation of a coordinate, mm, if the board was measured."
     ),

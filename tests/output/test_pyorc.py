@@ -123,7 +123,7 @@ def test_opencv_pose_is_the_same_camera():
     [(["--to", "pyorc", "-o", "x.json"], "needs --renew"),
      (["--to", "ros", "--renew", "site.json", "-o", "x.yaml"], "needs --renew"),
      (["--to", "pyorc", "--renew", "model.yaml", "-o", "x.json"], "cannot be read as JSON"),
-     (["--to", "pyorc", "--renew", "site.json", "--frame", "a.png", "-o", "x.json"], "together")],
+     (["--to", "pyorc", "--renew", "site.json", "--frame", "a.png", "-o", "x.json"], "give both")],
 )  # fmt: skip
 def test_what_is_missing_is_said(tmp_path, monkeypatch, options, words):
     write_model(tmp_path / "model.yaml")

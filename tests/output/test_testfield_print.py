@@ -257,12 +257,12 @@ def test_every_paper_has_a_sensible_default(name, landscape):
         (Design((210, 297), 60.0), "smaller discs or larger paper"),
         (Design((841, 1189), 8.0, bits=12), "--bits 14"),
         (Design((841, 1189), 3.0, bits=14), "more than the 516"),
-        (Design((210, 297), 7.0, bits=13), "12 and 14"),
+        (Design((210, 297), 7.0, bits=13), "12 or 14"),
         (Design((210, 297), 7.0, bits=0), "cannot be identified"),
         (Design((210, 297), 7.0, dictionary="DICT_KLINGON"), "DICT_KLINGON"),
         (Design((210, 297), 0.5), "0.5 mm"),
         (Design((210, 297), 7.0, sheets=2), "three of a corner"),
-        (Design((210, 297), 7.0, pitch=10.0), "need 29.75 mm"),
+        (Design((210, 297), 7.0, pitch=10.0), "need at least 29.75 mm"),
     ],
 )
 def test_impossible_designs_are_refused(design, reason, tmp_path):

@@ -8,7 +8,7 @@ import json
 import logging
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -244,6 +244,14 @@ def show(result: Any, json: str | None, *lines: object) -> None:
     write_json(result, json)
     if json != "-":
         typer.echo("\n".join(map(str, lines or [result])))
+
+
+def session_line(one: Mapping[str, Any]) -> str:
+    """Return the line of a session's status."""
+    why = f": {one['why']}" if one["why"] else ""
+    start = f", {one['start']}" if one["start"] else ""
+    taken = f"{one['taken']} of {one['epochs']} epochs"
+    return f"{one['camera']}/{one['series']}{start}: {taken}, {one['state']}{why}"
 
 
 def warned(camera: ThermalCamera) -> ThermalCamera:

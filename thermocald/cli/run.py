@@ -22,7 +22,14 @@ from typing import Annotated, Any
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import ConfigOption, JsonOption, require_config, say, show
+from thermocald.cli.common import (
+    ConfigOption,
+    JsonOption,
+    require_config,
+    say,
+    session_line,
+    show,
+)
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import duration, with_sd
@@ -311,7 +318,7 @@ def status_lines(document: dict[str, Any]) -> list[str]:
     for name, camera in document["cameras"].items():
         lines += _camera(name, camera)
     for one in document["sessions"].values():
-        lines += _wrapped(_session(one))
+        lines += _wrapped(f"session {session_line(one)}")
     others = [
         (name, device)
         for kind in ("thermometers", "outputs")
@@ -394,13 +401,6 @@ def _device(device: dict[str, Any]) -> str:
     if device["faults"]:
         text += f", {device['faults']} fault{'' if device['faults'] == 1 else 's'}"
     return text + (f": {device['why']}" if device["why"] else "")
-
-
-def _session(one: dict[str, Any]) -> str:
-    why = f": {one['why']}" if one["why"] else ""
-    start = f", {one['start']}" if one["start"] else ""
-    taken = f"{one['taken']} of {one['epochs']} epochs"
-    return f"session {one['camera']}/{one['series']}{start}: {taken}, {one['state']}{why}"
 
 
 def status_warnings(document: dict[str, Any]) -> list[str]:

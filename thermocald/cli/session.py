@@ -10,7 +10,14 @@ import typer
 
 import thermocald as tc
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import ConfigOption, JsonOption, require_config, say, write_json
+from thermocald.cli.common import (
+    ConfigOption,
+    JsonOption,
+    require_config,
+    say,
+    session_line,
+    write_json,
+)
 from thermocald.errors import DataError, UsageError
 from thermocald.files import make_folder
 
@@ -106,11 +113,8 @@ def status(config: ConfigOption = None, json: JsonOption = None) -> None:
     write_json({"format": "thermocald-sessions/1", "sessions": sessions}, json)
     if json == "-":
         return
-    for name, one in sessions.items():
-        why = f": {one['why']}" if one["why"] else ""
-        start = f" ({one['start']})" if one["start"] else ""
-        taken = f"{one['taken']} of {one['epochs']}"
-        say(f"{name}/{one['series']}{start}: {taken}, {one['state']}{why}")
+    for one in sessions.values():
+        say(session_line(one))
     if not sessions:
         say("no sessions")
 

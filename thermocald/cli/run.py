@@ -162,7 +162,7 @@ def status(
     show(document, json, *status_lines(document))
     store_ = document["store"]
     if store_["lost"]:
-        raise DataError(f"{store_['lost']} epochs are lost: taken but not stored")
+        raise DataError(f"{store_['lost']} epochs were lost: taken but not stored")
     if store_["state"] == "out":
         raise DataError(f"the store cannot be written; {store_['waiting']} epochs wait in memory")
 

@@ -13,6 +13,7 @@ from thermocald.cli.common import (
     PhotosArgument,
     PixelPitchOption,
     StoreArgument,
+    StoreConfigOption,
     TimezoneOption,
     progress,
     say,
@@ -108,9 +109,7 @@ def import_(
 def archive(
     store: StoreArgument = None,
     folder: Path = typer.Option(Path(), "--to", help="Folder for the recordings."),
-    config: Path | None = typer.Option(
-        None, "--config", "-c", help="Take the store and the frames from this configuration."
-    ),
+    config: StoreConfigOption = None,
     frames: Path | None = expert(None, help="Folder of the daemon's frames."),
     series: str | None = typer.Option(None, help="CAMERA/SERIES or SERIES; default: all."),
     skip_existing: bool = expert(False, "--skip-existing", help="Skip recordings that exist."),
@@ -154,12 +153,8 @@ def archive(
 def backup(
     store: StoreArgument = None,
     to: Path | None = typer.Argument(None, help="A file that does not exist yet, or a folder."),
-    config: Path | None = typer.Option(
-        None, "--config", "-c", help="Take the store from this configuration."
-    ),
-    keep: int = typer.Option(
-        0, min=0, help="In a folder, delete all backups but the newest N; 0 deletes none."
-    ),
+    config: StoreConfigOption = None,
+    keep: int = typer.Option(0, min=0, help="In a folder, keep only the newest N; 0 keeps all."),
     json: JsonOption = None,
 ) -> None:
     """Copy a store, then verify every row of the copy.

@@ -289,9 +289,7 @@ def measure(
         ...,
         help="Control points and their image points: target, X, Y, Z, sX, sY, sZ, x, y, sx, sy.",
     ),
-    seen: str = typer.Option(
-        ..., metavar="TIME", help="Time at which the control points were observed in the image."
-    ),
+    seen: str = typer.Option(..., metavar="TIME", help="When the control points were observed."),
     plane: Path = typer.Option(..., help="Surface (YAML): level, plane, line or profile, with sd."),
     length_unit: str = typer.Option("mm", help="Unit of control points and surface: mm or m."),
     extrapolate: ExtrapolateOption = False,

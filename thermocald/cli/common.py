@@ -25,34 +25,29 @@ if TYPE_CHECKING:
     from thermocald import ThermalCamera
 
 JsonOption = Annotated[
-    str | None,
-    typer.Option("--json", help="Write the result to a JSON file; - is standard output."),
+    str | None, typer.Option("--json", help="Write the result as JSON; - is standard output.")
 ]
 ConfigOption = Annotated[
     Path | None,
     typer.Option(
-        "--config",
-        "-c",
-        help="Configuration file; default: ./config.yaml, then /etc/thermocald/config.yaml.",
+        "--config", "-c", help="Configuration; default: ./config.yaml, /etc/thermocald/config.yaml."
     ),
 ]
-StoreArgument = Annotated[
-    Path | None, typer.Argument(help="The store; a daemon may be writing to it.")
+StoreConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", help="Configuration with the store and other settings."),
 ]
+StoreArgument = Annotated[Path | None, typer.Argument(help="The store; a daemon may be using it.")]
 PhotosArgument = Annotated[
     list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of photographs.")
 ]
 PixelPitchOption = Annotated[
     float | None, typer.Option("--pixel-pitch", help="Pixel pitch, mm.", min=1e-5, max=1.0)
 ]
-LogOption = Annotated[
-    Path,
-    typer.Option("--log", help="Temperatures: a log file, a recording or a store."),
-]
+LogOption = Annotated[Path, typer.Option("--log", help="Temperatures: log file, recording, store.")]
 ModelOption = Annotated[Path, typer.Option("--model", help="Thermal model (YAML).")]
 ExtrapolateOption = Annotated[
-    bool,
-    expert(..., "--extrapolate", help="Allow temperatures far outside the range of the fit."),
+    bool, expert(..., "--extrapolate", help="Allow temperatures far outside the fit's range.")
 ]
 SeedOption = Annotated[int, expert(..., "--seed", min=0, help="Seed of the random numbers.")]
 TimezoneOption = Annotated[
@@ -64,8 +59,7 @@ FreeOption = Annotated[
     expert(
         ...,
         "--free",
-        help="Parameters of the interior orientation to estimate, separated by commas, or none; "
-        "the others are held fixed.",
+        help="Interior orientation parameters to estimate, or none; the rest is held fixed.",
     ),
 ]
 DEFAULT_FREE = "c,x0,y0,A1,A2,A3,B1,B2"
@@ -103,8 +97,7 @@ def _log_options(
     log_clock: str = expert("0", help="Advance of the logger's clock, such as +00:03:12."),
     ambiguous: str = expert(
         "order",
-        help="How to read the hour that occurs twice in autumn: order (by the order of the rows), "
-        "earlier, later, refuse.",
+        help="The hour that occurs twice in autumn: order (of rows), earlier, later, refuse.",
     ),
     separator: str | None = expert(None, help="Column separator of the log: ';' ',' tab."),
     decimal: str | None = expert(None, help="Decimal mark of the log: , or ."),

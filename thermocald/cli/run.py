@@ -25,6 +25,7 @@ from thermocald.cli.commands import expert
 from thermocald.cli.common import (
     ConfigOption,
     JsonOption,
+    StoreConfigOption,
     require_config,
     say,
     session_line,
@@ -102,17 +103,11 @@ def run(
 def dashboard(
     store: Path | None = typer.Option(None, help="The daemon's store."),
     live: Path | None = expert(None, help="Folder of the daemon's live state."),
-    host: str = expert(
-        "127.0.0.1", help="Address to listen on; one open to other machines needs --token-file."
-    ),
+    host: str = expert("127.0.0.1", help="Address; other than loopback needs --token-file."),
     port: int = expert(8437, min=1, max=65535, help="Port to listen on."),
     token_file: Path | None = expert(None, help="File with the access token."),
-    name: list[str] | None = expert(
-        None, help="Further host name under which the page may be opened; repeatable."
-    ),
-    config: Path | None = typer.Option(
-        None, "--config", "-c", help="Take all of these from a configuration file."
-    ),
+    name: list[str] | None = expert(None, help="Further host name of the page; repeatable."),
+    config: StoreConfigOption = None,
 ) -> None:
     """Serve a daemon's web page from a separate process that only reads.
 

@@ -21,6 +21,7 @@ from thermocald.cli.common import (
     JobsOption,
     JsonOption,
     StoreArgument,
+    StoreConfigOption,
     log_to_stderr,
     progress,
     say,
@@ -38,10 +39,7 @@ if TYPE_CHECKING:
 
 
 _Address = Annotated[
-    str,
-    typer.Argument(
-        metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, with the database's owner."
-    ),
+    str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, by its owner.")
 ]
 
 
@@ -94,9 +92,7 @@ def forward(
     to: str | None = typer.Option(
         None, metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…"
     ),
-    config: Path | None = typer.Option(
-        None, "--config", "-c", help="Take the store and `forward:` from this configuration."
-    ),
+    config: StoreConfigOption = None,
     station: str | None = expert(None, help="Name of this station; default: the host's name."),
     once: bool = typer.Option(
         False, "--once", help="Send the waiting rows and exit; default: run until stopped."
@@ -201,12 +197,7 @@ def reprocess(
     engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
     jobs: JobsOption = 1,
     free: FreeOption = DEFAULT_FREE,
-    sets: int = expert(
-        100_000,
-        min=100,
-        max=10_000_000,
-        help="Number of draws in a study's Monte-Carlo simulation.",
-    ),
+    sets: int = expert(100_000, min=100, max=10_000_000, help="Draws of a study's simulation."),
     json: JsonOption = None,
 ) -> None:
     """Calibrate every epoch of every recording again, or analyse every series separately.

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from thermocald.daemon.session import Session
 
 CameraOption = Annotated[
-    str | None,
-    typer.Option("--camera", help="Camera of the configuration; default: the only one."),
+    str | None, typer.Option("--camera", help="Camera, if the configuration has several.")
 ]
 
 
@@ -39,9 +38,7 @@ def start(
     epochs: int = typer.Option(150, min=1, help="Number of epochs."),
     config: ConfigOption = None,
     mock: bool = typer.Option(False, "--mock", help="Use a rendered camera, without hardware."),
-    programme: Path | None = typer.Option(
-        None, help="Programme of the heating output (YAML), a list of steps."
-    ),
+    programme: Path | None = typer.Option(None, help="Programme of the heating output (YAML)."),
     output: Path = typer.Option(Path(), "--output", "-o", help="Folder for recording and report."),
     check: bool = typer.Option(
         True, "--check/--no-check", help="Check light, focus and geometry first."
@@ -53,9 +50,7 @@ def start(
     until_separated: str | None = typer.Option(
         None, metavar="A,B", help="Plan the heating to separate two effects; stop once they are."
     ),
-    evidence: Path | None = expert(
-        None, help="An earlier recording in which the two effects could not be separated."
-    ),
+    evidence: Path | None = expert(None, help="A recording that could not separate A and B."),
     max_temperature: float | None = expert(
         None, help="Highest temperature of a planned programme, °C; default: the output's limit."
     ),

@@ -46,12 +46,7 @@ def replay(
     log: Path | None = typer.Option(
         None, help="With --model: log of temperatures, a logger's file, a recording or a store."
     ),
-    times: str = expert(
-        "exif",
-        "--times",
-        help="With --model: source of the photographs' times: exif, name (of the file), file (its "
-        "date).",
-    ),
+    times: str = expert("exif", "--times", help="With --model: as for `import --times`."),
     recording_out: Path | None = typer.Option(
         None,
         "--recording-out",
@@ -112,9 +107,7 @@ def export(
     ),
     free: FreeOption = DEFAULT_FREE,
     series: str | None = typer.Option(None, help="Series of a store: CAMERA/SERIES or SERIES."),
-    units: str = typer.Option(
-        "", help="Units instead of mm and rad: px, um, deg, separated by commas; columns name them."
-    ),
+    units: str = typer.Option("", help="px, um, deg instead of mm and rad; columns name them."),
     time_: str = typer.Option("seconds", "--time", help="Times: seconds (since 1970, UTC) or iso."),
     separator: str = typer.Option(",", help="Column separator: , ; | tab"),
     decimal: str = typer.Option(".", help="Decimal mark: . or ,"),
@@ -180,9 +173,7 @@ def study(
     sets: int = expert(50_000, min=2, help="Number of draws of the Monte-Carlo simulation."),
     seed: SeedOption = 0,
     distance: float = expert(10.0, min=0.01, help="Distance of the object plane, m."),
-    grid: int = expert(
-        3, "--grid", min=2, max=9, help="Image points per row and column (Monte-Carlo simulation)."
-    ),
+    grid: int = expert(3, "--grid", min=2, max=9, help="Image points per row and column."),
     focus: float = expert(1.0, min=0.01, help="Focus distance for the depth of field, m."),
     f_number: float = expert(2.0, min=0.1, help="f-number of the lens."),
     confusion: float | None = expert(
@@ -304,9 +295,7 @@ def fit(
     ),
     output: Path = typer.Option(..., "-o", "--output", help="The model file to write."),
     effect: list[str] | None = typer.Option(
-        None,
-        help="NAME[:PARAMETER=VALUE,…], with start values: an effect to fit besides the base "
-        "model; repeatable.",
+        None, help="NAME[:PARAMETER=VALUE,…]: an effect to add to the base model; repeatable."
     ),
     model: Path | None = typer.Option(
         None, help="Fit the effects of this thermal model (YAML), such as one from `discover`."

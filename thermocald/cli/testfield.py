@@ -20,9 +20,7 @@ CameraFile = Annotated[
     Path | None,
     typer.Option("--camera", help="A camera file of any format that `camera convert` reads."),
 ]
-Paper = Annotated[
-    str, typer.Option("--paper", help="Paper size: A4, A3, A2, A1, A0, or WIDTHxHEIGHT in mm.")
-]
+Paper = Annotated[str, typer.Option("--paper", help="A4, A3, A2, A1, A0, or WIDTHxHEIGHT in mm.")]
 Flat = Annotated[
     bool,
     typer.Option(
@@ -33,10 +31,7 @@ Flat = Annotated[
 ]
 Landscape = Annotated[
     bool | None,
-    expert(
-        "--landscape/--portrait",
-        help="Orientation of the sheets; default: landscape for a corner, else portrait.",
-    ),
+    expert("--landscape/--portrait", help="Default: landscape for a corner, else portrait."),
 ]
 Diameter = Annotated[
     float | None,
@@ -136,9 +131,7 @@ def import_(
     out: Path = typer.Option(
         Path("testfield.csv"), "--out", "-o", help="The testfield.csv to write."
     ),
-    rings: int | None = expert(
-        None, help="FILE lists ring-coded targets whose codes have this many bits: 12 or 14."
-    ),
+    rings: int | None = expert(None, help="FILE lists targets with ring codes of 12 or 14 bits."),
     diameter: float | None = typer.Option(None, min=0.1, help="Diameter of the coded targets, mm."),
     sigma: float | None = typer.Option(
         None, min=1e-4, help="Standard deviation of a coordinate, mm, if the board was measured."

@@ -49,7 +49,8 @@ def page_with(tmp_path):
         live.mkdir()
         status = {
             "version": "0", "pid": 1, "utc": 1.6e9, "started": 1.6e9, "stalled": [],
-            "clock": {"trusted": True}, "store": {"state": "ok", "waiting": 0, "path": str(path)},
+            "clock": {"trusted": True}, "store": {"state": "ok", "waiting": 0, "path": str(path),
+                                                  "lost": 2, "lost_why": "the disk was full"},
             "frames": {"paused": ""}, "cameras": {}, "thermometers": {"housing": _OPEN},
             "outputs": {"mqtt": {**_OPEN, "device": "out", "why": "no broker", "since": 1.6e9}},
         }  # fmt: skip
@@ -133,6 +134,8 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     page.wait_for_timeout(1000)
     assert page.evaluate(_SHOWN) == _all_of(int(wanted[-2:]))
     assert "out since 2020-09-13 12:26:40 UTC: no broker" in page.text_content("#devices")
+    warned = "2 epochs lost, taken but not stored: the disk was full"
+    assert page.text_content("#warnings") == warned
 
 
 @pytest.mark.slow

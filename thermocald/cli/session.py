@@ -16,7 +16,7 @@ from thermocald.cli.common import (
     require_config,
     say,
     session_line,
-    write_json,
+    show,
 )
 from thermocald.errors import DataError, UsageError
 from thermocald.files import make_folder
@@ -105,13 +105,8 @@ def status(config: ConfigOption = None, json: JsonOption = None) -> None:
     Example: thermocald session status --config /etc/thermocald/config.yaml
     """
     sessions = _ask(config, "session status")["sessions"]
-    write_json({"format": "thermocald-sessions/1", "sessions": sessions}, json)
-    if json == "-":
-        return
-    for one in sessions.values():
-        say(session_line(one))
-    if not sessions:
-        say("no sessions")
+    lines = map(session_line, sessions.values()) if sessions else ["no sessions"]
+    show({"format": "thermocald-sessions/1", "sessions": sessions}, json, *lines)
 
 
 def stop(camera: CameraOption = None, config: ConfigOption = None) -> None:

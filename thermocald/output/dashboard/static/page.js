@@ -163,7 +163,10 @@ function showDevices() {
 
 function showWarnings() {
   const found = [...(status.stalled || [])];
-  if (status.store && status.store.state !== "ok") found.push(`store: ${status.store.state} ${status.store.why}`);
+  const store = status.store || { state: "ok" };
+  if (store.state !== "ok") found.push(`store: ${store.state}: ${store.why}`);
+  if (store.lost) found.push(`${counted(store.lost, "epoch")} lost, taken but not stored: ${store.lost_why}`);
+  if (store.notice) found.push(`store: ${store.notice}`);
   if (status.frames && status.frames.paused) found.push(status.frames.paused);
   if (status.clock && !status.clock.trusted) found.push("the clock is not synchronised: times may be wrong");
   const text = found.join("\n");

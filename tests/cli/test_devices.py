@@ -110,7 +110,7 @@ def test_check_shows_every_device_though_the_first_fails(sysfs, check):
     error, lines, document = check(document, "--probe")
     assert isinstance(error, DeviceError)
     assert error.exit_status == 3
-    assert "2 of 4 devices gave nothing: gone, away" in str(error)
+    assert "2 of 4 devices failed: gone, away" in str(error)
     shown = {line.split()[1]: line for line in lines if line.startswith("  ")}
     assert "FAILED: " in shown["gone"]
     assert "'tmp421' is not there" in shown["away"]

@@ -298,8 +298,7 @@ def check(
     failed = [probe.name for probe in probes if probe.error]
     if failed:
         raise DeviceError(
-            f"{len(failed)} of {len(probes)} devices gave nothing: {', '.join(failed)}; "
-            "see their lines"
+            f"{len(failed)} of {len(probes)} devices failed: {', '.join(failed)}; see their lines"
         )
 
 

@@ -319,7 +319,7 @@ def render_field_check(result: FieldCheck) -> str:
 
 
 def _sd(value: float) -> str:
-    return f"{plain(value, 'px', 2)}" if value < 1e300 else "nothing"
+    return f"{plain(value, 'px', 2)}" if value < 1e300 else "undetermined"
 
 
 def _seen(result: FieldCheck, field: TestField, model: CameraModel) -> Figure:

@@ -84,7 +84,7 @@ class _StatusCollector:
                 ("store_ok", "Whether the store can be written.", store["state"] == "ok"),
                 ("store_waiting", "Epochs waiting in memory.", store["waiting"]),
                 ("store_lost", "Epochs taken but not stored.", store["lost"]),
-                ("clock_trusted", "Whether the clock is right.", status["clock"]["trusted"]),
+                ("clock_trusted", "Whether UTC is synchronised.", status["clock"]["trusted"]),
             ]
         for name, about, value in single:
             yield GaugeMetricFamily(f"thermocald_{name}", about, value=float(value))
@@ -236,7 +236,7 @@ def _same(a: str, b: str) -> bool:
 
 
 def _digest(token: str) -> str:
-    """Return the cookie's value: not every token fits into a header, and it stays secret there."""
+    """Return a token's hash for the cookie: a header cannot hold every token, nor should it."""
     return hashlib.sha256(token.encode(errors="replace")).hexdigest()
 
 

@@ -37,7 +37,7 @@ def application(loaded: str | None = None) -> typer.Typer:
     """
     app = typer.Typer(
         cls=Group,
-        help="Thermal calibration of low-cost cameras: live, with true standard deviations.",
+        help="Thermal calibration of low-cost cameras: live, with realistic standard deviations.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,

@@ -165,7 +165,7 @@ STEPS = tuple(" ".join(step.split()) for step in _TEXT.strip().split("\n\n"))
 def draw_plan(sheets: Sequence[Sheet]) -> Any:
     """Draw the plan as a matplotlib Figure of the sheets' page size."""
     width, height = sheets[0].design.page
-    figure = Figure(figsize=(width / 25.4, height / 25.4))
+    figure = Figure(figsize=(width / _MM_PER_INCH, height / _MM_PER_INCH))
     portrait = height > width
     size = min(width, height) / 297 * 13  # points
     figure.text(0.08, 0.95, "How to mount this corner", fontsize=1.6 * size, va="top")

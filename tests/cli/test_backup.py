@@ -1,4 +1,4 @@
-"""`thermocald backup` and what `check` says of a store, as a user runs them."""
+"""`thermocald backup`, and `check` of a store, as a user runs them."""
 
 from __future__ import annotations
 

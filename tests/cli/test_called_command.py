@@ -1,4 +1,4 @@
-"""Only the command that is called is imported: it starts sooner, and the daemon is smaller."""
+"""Only the command that is run is imported: it starts faster, and the daemon is smaller."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_the_others_are_not_imported():
 
 
 def test_the_list_imports_none_and_cuts_no_line_off():
-    """Groups in the order of work; every line whole at 80 columns."""
+    """The panels are in order of use; every line fits into 80 columns."""
     done = subprocess.run(
         [sys.executable, "-c", _SAY, "--help"], capture_output=True, text=True, check=True,
         env={**os.environ, "COLUMNS": "80"},
@@ -66,7 +66,7 @@ def test_a_shell_completes_commands_and_options(monkeypatch, typed, expected):
 
 
 def test_options_for_experts_stand_apart():
-    """Below what everybody needs, and none of them is lost."""
+    """They are listed below the usual options, and all of them are listed."""
     text = call("study", "--help").stdout
     usual, advanced = text.split("Advanced:")
     assert "--report" in usual

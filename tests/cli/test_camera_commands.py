@@ -29,7 +29,7 @@ FREE = ("c", "x0", "y0", "A1", "A2")
 
 
 def covariance(seed=0):
-    """Of a calibration of a dozen photographs: c and A1 go together."""
+    """The covariance of a calibration from a dozen photographs: c and A1 are correlated."""
     rng = np.random.default_rng(seed)
     sd = np.array([4e-4, 3e-4, 3e-4, 2e-5, 4e-6])
     r = np.eye(5)
@@ -57,7 +57,7 @@ def drawn(temperature, rng, extra=None):
 
 
 def write_document(path, temperature, rng, start=None):
-    """As `calibrate --json` writes it."""
+    """Write a calibration as `calibrate --json` does."""
     found, C = drawn(temperature, rng)
     rows = [IOP_NAMES.index(n) for n in FREE]
     sd = np.sqrt(np.diag(C))
@@ -119,7 +119,7 @@ def written(path, camera, C=None):
 
 
 def test_two_cameras_differ_by_what_was_put_in(tmp_path):
-    """A principal point that moves by 1 px moves every point by 1 px; a rotation takes most up."""
+    """A principal point moved by 1 px moves every point by 1 px; a rotation absorbs most of it."""
     moved = COLD.with_values(x0=COLD.x0 + SENSOR.pixel_pitch)
     a = written(tmp_path / "a.json", COLD, covariance(1))
     b = written(tmp_path / "b.json", moved, covariance(2))
@@ -139,7 +139,7 @@ def test_two_cameras_differ_by_what_was_put_in(tmp_path):
 
 
 def test_the_image_s_standard_deviations_are_those_of_drawn_cameras():
-    """300 pairs drawn from their covariances: scatter of RMS and of the largest against stated."""
+    """The RMS and the largest difference of 300 drawn pairs scatter as their sds state."""
     rng = np.random.default_rng(3)
     warm, C, D = interior(45.0), covariance(1), covariance(2)
     found, stated = [], []
@@ -156,7 +156,7 @@ def test_the_image_s_standard_deviations_are_those_of_drawn_cameras():
         stated.append(difference._image_sds(worst)[::-1])
     scatter, sds = np.std(found, axis=0), np.median(stated, axis=0)
     assert scatter[0] == pytest.approx(sds[0], rel=0.15)
-    # the largest of many points is larger than one that was chosen beforehand, and scatters less
+    # the largest of many values exceeds one chosen beforehand, and scatters less
     assert 0.6 * sds[1] < scatter[1] < 1.15 * sds[1]
 
 
@@ -192,7 +192,7 @@ def test_calibrations_at_three_temperatures_give_the_model(tmp_path):
 
 
 def test_the_logger_tells_the_temperature_of_photographs(tmp_path):
-    """Cold in the morning, warm at noon; the times are those of EXIF, in the zone that is said."""
+    """Cold in the morning, warm at noon; the times are EXIF's, in the given time zone."""
     rng = np.random.default_rng(6)
     starts = {20: datetime(2026, 6, 14, 8, 0), 45: datetime(2026, 6, 14, 12, 0)}
     for T, start in starts.items():
@@ -238,7 +238,7 @@ def test_calibrations_that_give_no_model_are_refused(tmp_path, inputs, said):
 
 
 def test_the_rates_sds_are_true_and_a_drift_of_the_distortion_is_seen():
-    """400 draws of calibrations at 20, 32, 50 °C whose temperatures are wrong by 0.1 K."""
+    """400 drawn calibrations at 20, 32, 50 °C, with temperature errors of 0.1 K (sd)."""
     rng = np.random.default_rng(8)
     errors, alarms = [], 0
 

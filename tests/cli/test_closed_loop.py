@@ -1,7 +1,7 @@
-"""`--until-separated` as a closed loop: planner, relay, a camera in a heated box, comparison, end.
+"""`--until-separated` as a closed loop: planner, relay, a camera in a heated box, and the stop.
 
 The relay is the driver on mock pins under a virtual clock; the box warms while its pin is on. Image
-points are those of the simulator, with an effect hidden; nothing is compared but by the program.
+points are simulated with a hidden effect; only the program itself compares the effects.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def config(tmp_path):
 
 
 class Box:
-    """A camera in a box that a relay heats: one time constant, observations as they are taken."""
+    """A camera in a box that a relay heats, with one time constant, observed step by step."""
 
     def __init__(self, hidden: str) -> None:
         self.field = demonstration_field("plain")
@@ -66,7 +66,7 @@ class Box:
         self.temperatures.append(last + (goal - last) * (1 - np.exp(-INTERVAL / TAU)))
 
     def epoch(self) -> Epoch:
-        """What is seen now, and a reading with 0.04 K of noise."""
+        """Return the observations at this time, and a reading with a noise of 0.04 K."""
         times = INTERVAL * np.arange(len(self.temperatures))
         readings = {"housing": np.array(self.temperatures)}
         history = History(times[-1:], times, readings, "housing", self.model.T0)

@@ -33,7 +33,7 @@ def test_replay_writes_one_json_document_and_nothing_else(recording):
 
 
 def test_a_store_gives_what_is_stored(recording, tmp_path):
-    """As the dashboard does: the epochs as they were adjusted, not the series adjusted again."""
+    """The epochs are exported as they were adjusted, as on the dashboard: not adjusted again."""
     store = tmp_path / "t.db"
     finish("replay", recording, "--store", store)
     from_store = run("export", store, "--format", "csv")
@@ -104,7 +104,7 @@ def test_export_of_several_series_names_the_option(recording, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
-        (("export", "{recording}", "--format", "xlsx"), 2, "csv, json and parquet"),
+        (("export", "{recording}", "--format", "xlsx"), 2, "one of csv, json, parquet"),
         (("replay", "{recording}", "--free", "c,zoom"), 2, "'zoom' is no parameter"),
         (("replay", "{recording}", "--exterior", "both"), 2, "per_epoch, series, mount, auto"),
         (("export", "{recording}", "-o", "{image}/new/x.csv"), 2, "cannot be written"),
@@ -159,7 +159,7 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
                "--free", "none", "--json", "-")  # fmt: skip
     assert json.loads(done.stdout)["interior"]["c"] == c
 
-    # what a copy has measured was measured before
+    # a copy of a photograph adds no information
     copy = tmp_path / "copy.png"
     copy.write_bytes(images[0].read_bytes())
     done = run("calibrate", *images, copy, "--testfield", tmp_path / "field.csv", "--camera",
@@ -170,7 +170,7 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
 
 
 def test_the_demo_finds_what_was_put_in(tmp_path):
-    """Ten epochs: drift found within 4 sd of the drift put in, and files that can be read."""
+    """Ten epochs: the estimated drift is within 4 sd of the true one, and the files can be read."""
     out = tmp_path / "demo"
     done = finish("demo", "--out", out, "--epochs", 10, "--no-discovery", "--json", "-")
     document = json.loads(done.stdout)
@@ -215,7 +215,7 @@ def test_a_page_of_no_store_is_an_error(tmp_path):
 
 
 def printed_by(code):
-    """Words that a fresh interpreter prints."""
+    """Return the words that a new interpreter prints."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return done.stdout.split()
 

@@ -1,4 +1,4 @@
-"""`thermocald devices` and the probe: over a sysfs tree, without hardware."""
+"""`thermocald devices` and `check --probe`, on a sysfs tree without hardware."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_the_command(sysfs, tmp_path):
 
 @pytest.fixture
 def check(tmp_path):
-    """Runs `thermocald check config.yaml --probe`: (its error, its lines, its JSON)."""
+    """Run `thermocald check config.yaml --probe`; return its error, lines and JSON."""
 
     def run(document, *more):
         path = tmp_path / "config.yaml"
@@ -110,7 +110,7 @@ def test_check_shows_every_device_though_the_first_fails(sysfs, check):
     error, lines, document = check(document, "--probe")
     assert isinstance(error, DeviceError)
     assert error.exit_status == 3
-    assert "2 of 4 devices gave nothing: gone, away" in str(error)
+    assert "2 of 4 devices failed: gone, away" in str(error)
     shown = {line.split()[1]: line for line in lines if line.startswith("  ")}
     assert "FAILED: " in shown["gone"]
     assert "'tmp421' is not there" in shown["away"]
@@ -142,7 +142,7 @@ def test_check_goes_on_after_a_driver_with_a_mistake(sysfs, check, monkeypatch):
 
 
 def test_check_refuses_what_a_driver_does_not_take(sysfs, check):
-    """The constructors are asked without a probe: no hardware is needed to see a wrong address."""
+    """Without a probe, devices are only constructed: a wrong address shows without hardware."""
     document = devices_of_which_the_first_fails(sysfs)
     document["thermometers"].append({"name": "box", "driver": "mcp9808", "address": 0x48})
     error, _, said = check(document)

@@ -1,4 +1,4 @@
-"""The command: document, model, report, refusals."""
+"""`thermocald discover`: document, model, report, refusals."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ discover = partial(succeed, "discover")
 
 @pytest.fixture(scope="module")
 def found(recordings):
-    """What is discovered in M1 and verified on M2; model.yaml and report.html beside them."""
+    """The result of M1 verified on M2, with model.yaml and report.html beside the recordings."""
     return discover(
         recordings / "M1", "--verify", recordings / "M2", "--json", "-", "--model-out",
         recordings / "model.yaml", "--report", recordings / "report.html",
@@ -64,7 +64,7 @@ def test_everything_is_written(recordings, found):
 
 
 def test_with_the_model_found_nothing_is_missing(recordings, found):
-    """The new model is read back: it explains the recording, and no effect is found twice."""
+    """The new model, read back, explains the recording: no effect is found a second time."""
     result = discover(recordings / "M1", "--model", recordings / "model.yaml", "--json", "-")
 
     assert json.loads(result.stdout)["verdict"] == "adequate"
@@ -103,7 +103,7 @@ def test_plan(tmp_path):
 
 @pytest.mark.slow
 def test_plan_of_a_preset():
-    """Every effect of 0.1 px is found, or stays with the one that it is mistaken for."""
+    """Every effect of 0.1 px is found, or listed with the effect that it resembles."""
     result = discover("--plan", "--preset", "rpi-v2.1-heating", "--seeds", "1", "--json", "-")
     document = json.loads(result.stdout)
     undecided = {name for pair in document["ambiguous"] for name in pair["effects"]}
@@ -114,7 +114,7 @@ def test_plan_of_a_preset():
 
 @pytest.mark.slow
 def test_plan_of_a_programme(recordings, found, tmp_path):
-    """A model and a programme of one's own stand for the set-up."""
+    """The set-up is a user's model and programme."""
     model, programme = recordings / "model.yaml", tmp_path / "programme.yaml"
     programme.write_text(PROGRAMME)
     result = discover("--plan", "--model", model, "--programme", programme, "--seeds", "1",

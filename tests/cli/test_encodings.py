@@ -1,4 +1,4 @@
-"""Every command that prints, in the encodings of terminals, with names that no text can hold."""
+"""Every command that prints, in the encodings of terminals, with names that are not text."""
 
 from __future__ import annotations
 

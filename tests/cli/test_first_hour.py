@@ -1,9 +1,9 @@
-"""The first hour of new users, command by command, on what the commands themselves print.
+"""The first hour of a new user, command by command, with the files that the commands write.
 
 The corner is photographed from its own PDF (`printed_sheets`), the camera drifts by a known amount,
 the logger writes as a German one does, or the camera is a phone's on an adb server; ChArUco and
-AprilGrid are as their programs draw them. At the end stands the drift with its standard deviation,
-held against the truth.
+AprilGrid are drawn by their own programs. The result, the drift with its standard deviation, is
+compared with the truth.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 SENSOR = Sensor(1640, 1232, 0.00224)
 COLD = InteriorOrientation(3.05, 0.02, -0.01, A1=-2e-3)
 RATE_C, RATE_X0 = 0.2e-3, -0.4e-3
-"""What the camera does, mm/K."""
+"""The true rates of the camera, mm/K."""
 EPOCHS = 12
 START = datetime(2026, 6, 14, 12, 0, 0)
 
@@ -55,7 +55,7 @@ def temperature_of(epoch):
 
 
 def write_photograph(file, grey, moment, model="imx219", **tags):
-    """A JPEG with EXIF into a path or a buffer; tags: further ones."""
+    """Write a JPEG with EXIF to a path or a buffer; tags: further EXIF tags."""
     told = {MODEL: model, TAKEN: moment.strftime("%Y:%m:%d %H:%M:%S"), FOCAL: 3.04}
     more = {int(number, 16): value for number, value in tags.items()}
     save_photograph(file, told | more, grey, format="JPEG", quality=95)
@@ -71,7 +71,7 @@ def write_log(path):
 
 
 def exported(recording):
-    """The rows of its export, of one orientation."""
+    """Return the rows of a recording's export with one exterior orientation."""
     return list(
         csv.DictReader(run("export", recording, "--exterior", "series").stdout.splitlines())
     )
@@ -87,7 +87,7 @@ def require_drift(first, last, warm):
 
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory):
-    """A corner printed, put up (as its PDF says), surveyed from eight photographs; its sheets."""
+    """A printed corner, mounted as its PDF shows, surveyed from eight photographs; its sheets."""
     place = tmp_path_factory.mktemp("first-hour")
     checked = run("testfield", "check", "--paper", "A3")
     assert checked.stdout.startswith("good: every image")
@@ -135,7 +135,7 @@ def test_imported_photographs_of_the_printed_corner_show_the_drift(corner):
 
 
 class Handset(FakePhone):
-    """A phone before the corner: its camera app delivers what its warming camera sees."""
+    """A phone in front of the corner, whose app takes the images of its warming camera."""
 
     def __init__(self, frames):
         super().__init__(shoot=Handset.take)
@@ -199,7 +199,7 @@ def test_a_phone_before_the_printed_corner_shows_the_drift(corner, monkeypatch):
     rows = exported("phone-1-M1")
     assert len(rows) == EPOCHS
     assert sum(r["status"] == "ok" for r in rows) >= EPOCHS - 1
-    # which frame it was: the one that was taken last before the phone's own time of exposure
+    # the frame is the last one taken before the phone's time of exposure
     taken = np.array(sorted(phone.course))
     known = [phone.course[taken[np.abs(taken - float(r["frame_time"])).argmin()]] for r in rows]
     hot = max(range(len(rows)), key=lambda i: temperature_of(known[i]))
@@ -234,7 +234,7 @@ def board_photographs(place, sheet, field, name, temperatures):
 
 @pytest.mark.parametrize("kind", ["charuco", "aprilgrid"])
 def test_the_owner_of_a_board_finds_the_drift_between_cold_and_warm(tmp_path, kind):
-    """One flat board in ten poses, cold and warm: the difference of both calibrations."""
+    """The difference of calibrations from a flat board in ten poses, cold and warm."""
     if kind == "charuco":
         sheet = board_images.charuco_sheet(11, 8, 30.0, 22.5, "DICT_5X5_250", False)
         run(

@@ -78,7 +78,7 @@ def test_photographs_and_a_german_log_become_a_recording(place):
 
 
 def test_every_reading_of_the_log_is_kept(place):
-    """Nine readings of six photographs; what analyses read lies between the photographs too."""
+    """There are nine readings for six photographs; analyses use those in between too."""
     from thermocald.thermal.source import series_input
 
     run(*arguments(place, "--timezone", "Europe/Berlin"))
@@ -172,7 +172,7 @@ def test_times_from_names(place):
 
 @pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
 def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path, zone):
-    """The readers that both commands use for their --log and for the points."""
+    """Tested with the readers that both commands use for --log and the points."""
     from thermocald.analysis.thermal.correction import row_blocks
     from thermocald.store.logger.clock import device_clock
     from thermocald.store.logger.temperatures import LogOptions, read_log
@@ -199,7 +199,7 @@ def test_correct_and_predict_take_no_time_for_utc_that_does_not_say_so(tmp_path,
 
 
 def test_the_readme_leads_to_a_plot_in_ten_commands():
-    """As many as it lists, with options that exist; test_first_hour walks them."""
+    """At most ten, with options that exist; test_first_hour runs them."""
     from pathlib import Path
 
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")

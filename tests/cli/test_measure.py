@@ -1,4 +1,4 @@
-"""`thermocald measure`: control points on a cold morning, places on the water in the sun."""
+"""`thermocald measure`: control points on a cold morning, water points in the sun."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_model(path) -> None:
 
 
 def world(folder, seed: int, places: np.ndarray = PLACES) -> np.ndarray:
-    """One gauge as it comes out: files beside the model; the places, m."""
+    """Write one simulated gauge beside the model; return the true places, m."""
     rng = np.random.default_rng(seed)
     off = {n: rng.normal(0, SD[n]) for n in NAMES}
     rate = {n: RATES[n] + rng.normal(0, SD_RATE) for n in NAMES}
@@ -97,7 +97,7 @@ def measured(folder, *more: object):
 
 @pytest.fixture(scope="module")
 def draws(tmp_path_factory):
-    """Places of forty gauges: normalised errors, and errors with and without the thermal model."""
+    """Errors at forty gauges: normalised, and with and without the thermal model."""
     errors, with_model, without = [], [], []
     for seed in range(40):
         folder = tmp_path_factory.mktemp("gauge")
@@ -121,7 +121,7 @@ def test_standard_deviations_of_places_are_true(draws):
 
 
 def test_the_thermal_model_is_worth_it(draws):
-    """32 K move the camera by ten pixels; most of that is taken off."""
+    """32 K shift the image by ten pixels; the model removes most of that."""
     _, with_model, without = draws
     assert np.median(without) / np.median(with_model) > 5
 
@@ -133,7 +133,7 @@ TOUCHED = np.array([[-2_500 - 700 / 0.72, 12_000, 400], [2_500 + 700 / 0.72, 12_
 
 
 def level(folder, seed: int):
-    """What `measure` prints and says of the level where the water touches the cross-section."""
+    """Run `measure` for the water level on the cross-section."""
     write_model(folder / "model.yaml")
     world(folder, seed, TOUCHED)
     rows = [[float(v) for v in point] for point in SECTION / 1000 + ORIGIN_M]
@@ -143,9 +143,9 @@ def level(folder, seed: int):
 
 @pytest.mark.slow
 def test_the_level_of_the_water_has_a_true_sd(tmp_path_factory):
-    """Two banks, sixty gauges; both heights share camera and pose, and their mean knows it."""
+    """Two banks, sixty gauges: the sd of the mean includes the shared camera and pose."""
     done = [level(tmp_path_factory.mktemp("level"), 500 + seed) for seed in range(60)]
-    # of sixty times twelve control points one is thrown out now and then, and the rest doubted
+    # of sixty times twelve control points one is rejected now and then, and the rest flagged
     assert sum("global_test" in d.stderr for d in done) <= 2
     found = [json.loads(d.stdout)["levels"][0] for d in done if not d.returncode]
     assert len(found) >= 58
@@ -153,7 +153,7 @@ def test_the_level_of_the_water_has_a_true_sd(tmp_path_factory):
     assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.2)
     assert np.median([f["sd"] for f in found]) < 0.01
     assert {f["places"] for f in found} == {2}
-    # the difference of both banks, over what it should be
+    # the difference of both banks over its standard deviation
     assert np.sqrt(np.mean([f["sigma0"] ** 2 for f in found])) == pytest.approx(1.0, abs=0.25)
 
 
@@ -217,7 +217,7 @@ def degrees(_, row):
 
 
 def beyond_the_camera(_, row):
-    """Behind it: its centre is at Y = 312999 m."""
+    """Points behind the camera, whose centre is at Y = 312999 m."""
     return {"Y": 2 * 312_999.0 - float(row["Y"])}
 
 

@@ -1,6 +1,6 @@
-"""Where a command cannot write: one sentence, exit status 2 or 3, and nothing half-written.
+"""A command that cannot write prints one sentence, exits with 2 or 3, leaves no partial file.
 
-Every registered command with an option that names an output is here: a new one fails the test.
+Every command with an option that names an output is listed here: a missing one fails the test.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ COMMANDS: dict[str, list[str]] = {
 
 
 class World:
-    """What commands read, made when a command first asks for it: world["M1"] is a path."""
+    """The inputs of commands, made when first needed: world["M1"] is a path."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -161,14 +161,14 @@ class World:
         return self.folder / "log.csv"
 
     def words(self, name: str, **places: Path) -> list[str]:
-        """A command's words, in which what it reads is here, and what it writes in `places`."""
+        """Return a command's words, with inputs from this world and outputs in `places`."""
         words = [*name.split(" as ")[0].split(), *COMMANDS[name]]
         fields = {field for word in words for _, field, _, _ in Formatter().parse(word)}
         known = {field: self[field] for field in fields - {None, *places}}
         return [word.format(**known, **places) for word in words]
 
     def files(self) -> list[Path]:
-        """All that is there, but what SQLite keeps next to a store that was read."""
+        """Return all files, except those that SQLite keeps beside a store that was read."""
         return sorted(p for p in self.folder.rglob("*") if not p.match("*.db-*"))
 
     def _made(self, *arguments: str, name: str) -> Path:
@@ -198,7 +198,7 @@ def capabilities(dropped: int):
 
 @pytest.fixture
 def refusing(tmp_path):
-    """kind → a folder that cannot be written: mounted read-only, full, or another user's."""
+    """Map a kind to a folder that cannot be written: read-only, full, or another user's."""
     tool = shutil.which("mount")
     with ExitStack() as undo:
 
@@ -409,9 +409,9 @@ MEASURED = {
 
 
 def test_what_was_measured_is_never_written_over(world, tmp_path):
-    """`-o thermocald.db` in place of `--store`: a month of epochs for a table.
+    """`-o thermocald.db` by mistake for `--store` would replace a month of epochs by a table.
 
-    By every name of the file; that every command looks is in test_wrong_usage.
+    Under every name of the file; test_wrong_usage checks that every command refuses it.
     """
     with Store.open(tmp_path / "t.db", "append") as store:
         store.add_event(Event(1.0, "started", "kept"))

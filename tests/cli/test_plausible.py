@@ -1,4 +1,4 @@
-"""What cannot be true of a camera is refused or flagged, and the option that mends it is named."""
+"""Implausible camera data are refused or flagged, and the option that corrects them is named."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_photographs_of_another_focal_length_are_flagged_at_calibrate(tmp_path, 
     assert len(calibration.as_dict()["doubts"]) == doubts
     said = str(calibration)
     assert ("doubtful: the principal distance is" in said) == bool(doubts)
-    # what the camera file says comes before EXIF
+    # the camera file has priority over EXIF
     stated = CameraSpec("camera", model.sensor, found.interior.c)
     assert Calibration(found, stated).as_dict()["doubts"] == []
 

@@ -1,4 +1,4 @@
-"""What a new user reads: durations, standard deviations, paths, where files are looked for."""
+"""Texts that new users read: durations, standard deviations, paths, places of files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from thermocald.physics.testfields import corner_field
 
 @pytest.fixture(scope="module")
 def minute(tmp_path_factory):
-    """Seven epochs: a minute. In a folder whose name is longer than a terminal is wide."""
+    """Seven epochs, one minute, in a folder whose name is longer than a terminal's line."""
     place = tmp_path_factory.mktemp("texts") / ("a-long-name-of-a-folder-" * 4)
     place.mkdir()
     field = corner_field("circles", 4, 150.0)
@@ -33,12 +33,12 @@ def minute(tmp_path_factory):
      (1500, "25 minutes"), (7200, "2.0 hours"), (86400 * 12, "12 days")],
 )  # fmt: skip
 def test_durations_are_as_a_person_says_them(seconds, text):
-    """They were `in 1 minutes` and `for 0.0 h`."""
+    """Wrong forms were `in 1 minutes` and `for 0.0 h`."""
     assert duration(seconds) == text
 
 
 def test_a_standard_deviation_is_never_shown_as_nothing():
-    """It was `± 0 mm`, and `-7.91883e-07 ± 3.4e-08`."""
+    """Wrong forms were `± 0 mm` and `-7.91883e-07 ± 3.4e-08`."""
     assert with_sd(-7.91883e-07, 3.4e-08, "mm⁻²") == "(−7.92 ± 0.34)·10⁻⁷ mm⁻²"
     rng = np.random.default_rng(0)
     for _ in range(500):

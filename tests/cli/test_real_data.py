@@ -1,4 +1,4 @@
-"""The main job on real input: fixed cameras, tags on walls, a hand-held board (issue 2)."""
+"""The main task on real data: fixed cameras, tags on walls, a hand-held board (issue 2)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from thermocald.photogrammetry.field.testfield import Observations, TestField
 def test_fixed_cameras(shared, camera, exterior):
     """Scatter explained by the stated sds, and no drift: nothing happens in 50 s.
 
-    Within a tenth as the program chooses; a mode asked for against it may be conservative.
+    Within a tenth in the mode that the program chooses; other modes may be conservative.
     """
     path = shared / "data" / f"aviary-cam{camera}"
     done = finish("replay", path, "--exterior", exterior, "--json", "-")
@@ -43,7 +43,7 @@ def test_fixed_cameras(shared, camera, exterior):
 
 
 def test_tags_on_walls(shared, tmp_path):
-    """A pose where there are tags enough, a reason elsewhere; never a camera from 1 to 3 tags."""
+    """A pose if there are enough tags, otherwise a reason; never a camera from 1 to 3 tags."""
     walls(tmp_path)
     done = finish("calibrate", shared / "data" / "frc", "--testfield", tmp_path / "walls.csv",
                "--camera", tmp_path / "lifecam.yaml", "--json", "-")  # fmt: skip
@@ -111,7 +111,7 @@ def test_a_hand_held_board_is_called_weak(shared):
 
 @pytest.mark.slow
 def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
-    """Every photograph has its word and none ends the others; the camera is the one of the rest."""
+    """Every photograph has a status, none stops the others; the camera is that of the good ones."""
     folder = tmp_path / "photographs"
     shutil.copytree(shared / "data" / "chessboard", folder)
     images = {p.name: cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in sorted(folder.iterdir())}

@@ -1,4 +1,4 @@
-"""`session start --until-separated`: a planned programme through the relay, until it is enough."""
+"""`session start --until-separated`: a planned programme on the relay, until effects separate."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def heated(folder, period_s):
 
 @pytest.fixture
 def config(tmp_path, monkeypatch):
-    """On mock pins, epochs as fast as they come."""
+    """Run it on mock pins, with epochs as fast as possible."""
     monkeypatch.setenv("GPIOZERO_PIN_FACTORY", "mock")
     monkeypatch.chdir(tmp_path)
     document = heated(tmp_path, 0.4)

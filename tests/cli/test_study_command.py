@@ -27,7 +27,7 @@ def recording(tmp_path_factory):
 
 @pytest.fixture
 def run():
-    """Runs the command with arguments; errors of ours come out as they are raised."""
+    """Run the command with arguments; the program's errors are raised."""
     return partial(succeed, "study")
 
 
@@ -42,7 +42,7 @@ def test_json_on_standard_output_is_one_document_and_nothing_else(run, recording
     assert series["epochs"] == 60
     dependence = series["temperature_dependence"]["temperature"]["parameters"]
     assert min(abs(dependence[n]["r"]) for n in ("c", "x0", "y0")) > 0.98
-    # 8 px and 3 µm over 8 K are the preset's.
+    # the preset has 8 px and 3 µm over 8 K
     slope, sd = dependence["c"]["slope"], dependence["c"]["sd_slope"]
     assert abs(slope - 0.003 / 8) < max(5 * sd, 0.05 * 0.003 / 8)
 
@@ -73,7 +73,7 @@ def test_a_store_gives_the_same_as_its_recording(run, recording, tmp_path):
     ]
     one, other = (d["cameras"][0]["series"][0]["deviations"] for d in documents)
     for name in ("c", "x0", "y0"):
-        # A store keeps image points to 1e-5 px.
+        # a store has image points to 1e-5 px
         assert other[name]["change"] == pytest.approx(one[name]["change"], rel=1e-3)
         assert other[name]["sd_change"] == pytest.approx(one[name]["sd_change"], rel=1e-2)
 
@@ -127,8 +127,8 @@ def test_frames_that_are_not_measured_yet_are_measured_and_clipped(run, tmp_path
 def test_the_reference_table_is_reproduced(run):
     """Bounds of the issue: shares 3 points, means 0.1 cm, maxima 15 %, |r| 0.98.
 
-    The F-test of c is the one figure that is not: a camera that approaches its equilibrium as
-    exp(-t/300 s) no longer moves its principal distance beyond its standard deviation at the end.
+    Only the F-test of c is outside: a camera that approaches its equilibrium as exp(-t/300 s)
+    no longer changes its principal distance by more than its standard deviation at the end.
     """
     result = run("--reference", "--json", "-")
     figures = json.loads(result.stdout)["reference"]

@@ -99,7 +99,7 @@ def test_survey_writes_the_field_and_everything_about_it(photographs, tmp_path):
     surveyed = read_testfield(out)
     known = truth.points[[truth.index[name] for name in surveyed.names]]
     moved, _ = cases.onto(surveyed.points, known)
-    # JPEG: its errors are the image's, not the program's
+    # JPEG: these errors come from the image, not from the program
     assert np.sqrt(np.mean((moved - known) ** 2)) < 490 / 20_000
     document = json.loads((tmp_path / "survey.json").read_text())
     assert document["format"] == "thermocald-survey/1"
@@ -213,8 +213,8 @@ def test_camera_convert(tmp_path):
 
 
 def test_a_turned_camera_does_not_turn_its_picture(tmp_path):
-    """The orientation that cameras write into EXIF says how to show a picture, not how the sensor
-    saw it: OpenCV would turn it, and with it the principal point.
+    """The orientation in EXIF is for display, not the sensor's: if OpenCV rotated the image, the
+    principal point would rotate with it.
     """
     from thermocald.photogrammetry.targets.image_file import decode_grey
 

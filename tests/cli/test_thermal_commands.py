@@ -28,7 +28,7 @@ from thermocald.store.recording.testfield_file import write_testfield
 
 
 def simulated(seed=1, effect=None, epochs=90, interval=20.0, series="M1", kind="plain", name="rpi"):
-    """A camera heated by a lamp for a quarter of an hour, its board now and then."""
+    """A camera heated by a lamp for a quarter of an hour, and its board at intervals."""
     field = demonstration_field(kind)
     model = demonstration_model(field)
     if effect is not None:
@@ -152,7 +152,7 @@ def test_an_effect_twice_is_refused(folder):
 
 @pytest.mark.parametrize("series", ["M2", "binned", "swapped"])
 def test_a_model_is_tested_on_another_series(folder, series):
-    """Also where pixels were binned, or where another thermometer stands first."""
+    """Also if pixels were binned, or another thermometer is listed first."""
     test = ("--test", folder / series, "--json", "-")
     result = succeed("predict", "--model", folder / "cam.yaml", *test)
     (found,) = json.loads(result.stdout)["series"]
@@ -161,7 +161,7 @@ def test_a_model_is_tested_on_another_series(folder, series):
 
 
 def test_correct_takes_the_noise_of_the_thermometer_from_the_model(folder, tmp_path):
-    """What the fit found, not what thermometers usually have."""
+    """The estimate of the fit is used, not a typical value."""
     times = times_of(folder)
     points = tmp_path / "points.csv"
     points.write_text(f"time,x,y\n{times[20]:.3f},500,400\n")
@@ -252,7 +252,7 @@ def test_what_is_no_series_of_one_camera_is_not_fitted_together(folder, tmp_path
 
 
 def test_the_model_s_own_thermometer_is_taken_from_a_log(folder, tmp_path):
-    """Whichever column stands first; another one where it is named."""
+    """Its column is used wherever it is, unless another is named."""
     rows = (folder / "M1" / "epochs.csv").read_text().splitlines()
     cells = [row.split(",") for row in rows]
     own, board = cells[0].index("temperature"), cells[0].index("board_temperature")
@@ -327,7 +327,7 @@ def test_images_are_corrected_and_said_how_much_and_never_overwritten(folder, tw
 
 @pytest.mark.parametrize("kind", ["jpg", "png"])
 def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
-    """Of one that is unreadable the line is said; the other is corrected."""
+    """An unreadable image is reported with its line; the other one is corrected."""
     image_module = pytest.importorskip("PIL.Image")
     grey = np.random.default_rng(1).integers(0, 255, (308, 410), np.uint8)
     tags = {MODEL: "imx219", TAKEN: "2026:06:14 12:00:00"}
@@ -352,7 +352,7 @@ def test_corrected_images_keep_what_exif_says(folder, tmp_path, kind):
 
 
 def test_rows_of_standard_input_are_corrected_as_they_come(folder):
-    """Each is answered before the next is written; one that cannot be is named by its line."""
+    """Each is answered before the next is sent; one that cannot be corrected is reported."""
     times = times_of(folder)
     command = [sys.executable, "-m", "thermocald", "correct", "-", "--model", folder / "cam.yaml",
                "--log", folder / "M1" / "epochs.csv"]  # fmt: skip
@@ -396,7 +396,7 @@ def test_a_file_and_standard_input_give_the_same(folder, tmp_path):
 
 @pytest.mark.parametrize("head", ["temperature [degF]", "Temp (°F)", "T [F]", "tempF", "Temp_f"])
 def test_a_log_in_fahrenheit_is_converted_wherever_it_is_read(folder, tmp_path, head):
-    """`predict` as `correct`: the same camera as from the log in °C."""
+    """`predict` and `correct` give the same camera as with the log in °C."""
     for name, title, values in (("c", "temperature", (25.0, 30.0)), ("f", head, (77.0, 86.0))):
         rows = "".join(f"2026-06-14 12:0{i}:00Z,{v}\n" for i, v in enumerate(values))
         (tmp_path / f"{name}.csv").write_text(f"time,{title}\n{rows}")
@@ -426,7 +426,7 @@ def test_fit_measures_frames_first(tmp_path):
 
 @pytest.fixture(scope="module")
 def camera():
-    """The demonstration's camera without what a format may lack, so that all are exact."""
+    """The demonstration's camera without parameters that a format lacks, so that all are exact."""
     field = demonstration_field("markers")
     model = demonstration_model(field)
     return CameraModel(model.sensor, model.interior.with_values(A3=0.0, C1=0.0, C2=0.0))

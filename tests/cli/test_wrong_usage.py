@@ -1,4 +1,4 @@
-"""What is typed wrongly is answered by one line: what, where, what to do; and before any work."""
+"""Wrong usage is answered by one line (what, where, what to do), before any work is done."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ OUTPUTS = [
 
 @pytest.fixture
 def occupied(tmp_path):
-    """What may not be replaced, by what it is."""
+    """Places that must not be replaced, by their kind."""
     places = {
         "a folder": "folder", "a store": "k.db", "its -wal": "k.db-wal", "a recording": "M1",
         "its head": "M1/recording.yaml", "its Parquet": "M1/observations.parquet",
@@ -107,7 +107,7 @@ TAKEN["either"] = TAKEN["file"] - {"a folder", "a recording"}
 def test_what_may_not_be_replaced_is_refused_before_the_work(
     name, option, occupied, tmp_path, monkeypatch
 ):
-    """Whatever else the command needs does not exist: nobody has looked for it."""
+    """The command's other inputs do not exist: it must not have read them yet."""
     monkeypatch.chdir(tmp_path)
     words = name.split()
     for other in COMMANDS[name]:

@@ -103,6 +103,6 @@ def test_a_page_that_is_open_says_when_acquisition_ended(daemon, shown, page_of)
     daemon.stop()
     page.wait_for_function(
         "() => document.querySelector('#connection').textContent"
-        ".startsWith('acquisition has ended: no daemon runs since 20')"
+        ".startsWith('acquisition has stopped: no daemon has run since 20')"
     )
-    assert "what was stored is below" in page.text_content("#state")
+    assert "stored data are shown below" in page.text_content("#state")

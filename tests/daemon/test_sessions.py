@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 from functools import partial
 
@@ -132,6 +133,8 @@ def test_status_and_stop(live, command, daemon):
     out = call("session", "status", "--json", "-", folder=daemon.folder).stdout
     one = json.loads(out)["sessions"]["phone-1"]
     assert (one["series"], one["start"], one["state"]) == ("M7", "warm", "running")
+    line = call("session", "status", folder=daemon.folder).stdout
+    assert re.fullmatch(r"phone-1/M7, warm: \d+ of 1000 epochs, running\n", line)
     assert "of 1000 epochs, stopped" in command("stop").said()
     taken = daemon.session()["taken"]
     assert daemon.session()["state"] == "stopped"

@@ -1,4 +1,4 @@
-"""Studies to be reported: small, and made in the test itself."""
+"""Small studies for the reports, made in the tests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SPEC.loader.exec_module(_WARM_UP)
 
 @pytest.fixture(scope="session")
 def warm_up():
-    """Builds series of a camera that warms up; its fields say how."""
+    """A builder of series of a camera that warms up, set by its fields."""
     return _WARM_UP.WarmUp
 
 
@@ -34,5 +34,5 @@ def warm_study(warm_up):
 
 @pytest.fixture(scope="session")
 def empty_study(warm_up):
-    """A series of a single epoch, of which nearly nothing can be said."""
+    """A series of a single epoch, which allows almost no statement."""
     return study([warm_up(epochs=1)()], StudySettings(sets=500))

@@ -1,4 +1,4 @@
-"""Printed boards of other programs: found in the PDF by OpenCV, and by us in photographs of it."""
+"""Printed boards of other programs: OpenCV detects them in the PDF, the program in photographs."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ def test_a_printed_board_is_found_where_its_csv_says(tmp_path, kind):
     rows = [field.index[name] for name in theirs]
     plane = np.column_stack([field.points[rows, :2], np.ones(len(rows))])
     placed = np.linalg.lstsq(plane, np.array(list(theirs.values())), rcond=None)[0]
-    # the page's own scale, y down: only where the board lies on it is free
+    # the page's scale with y down: only the board's position is free
     assert placed[:2] == pytest.approx(np.diag([1, -1]) * DPI / 25.4, rel=2e-3, abs=0.01)
     off = np.linalg.norm(plane @ placed - np.array(list(theirs.values())), axis=1)
-    # tags are not refined by OpenCV, and good to a pixel or two
+    # OpenCV does not refine tags: accurate to a pixel or two
     assert off.max() < (2.5 if kind == "aprilgrid" else 0.5)
 
     mm = DPI / 25.4
@@ -92,13 +92,13 @@ def test_a_printed_board_is_found_where_its_csv_says(tmp_path, kind):
     _, turn, shift = cv2.solvePnP(points, ideal, np.eye(3), None)
     again, _ = cv2.projectPoints(points, turn, shift, np.eye(3), None)
     residual_mm = (again.reshape(-1, 2) - ideal) * np.linalg.norm(stand - middle)
-    # the rasteriser sets the sides of squares at whole pixels of the page
+    # the rasteriser rounds the sides of squares to whole pixels
     assert np.sqrt(np.mean(residual_mm**2)) < 0.6 / mm
 
 
 @pytest.mark.slow
 def test_printed_rings_are_found_by_the_numbers_of_other_programs(tmp_path):
-    """Printed here, listed as Metashape lists them, imported, detected in a photograph."""
+    """Printed, listed as by Metashape, imported, and detected in a photograph."""
     arguments = ["testfield", "print", "--flat", "--paper", "A4", "--bits", "12", "--no-plain"]
     succeed(*arguments, "--out", tmp_path)
     printed = read_testfield(tmp_path / "testfield.csv")

@@ -1,4 +1,4 @@
-"""The page's server: what it gives, and all that it refuses."""
+"""The page's server: its answers and its refusals."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def store_path(tmp_path_factory):
 
 @pytest.fixture
 def folders(tmp_path, store_path):
-    """The store, and the live folder of a daemon that runs."""
+    """The store and the live folder of a running daemon."""
     path = store_path
     live = tmp_path / "live"
     live.mkdir()
@@ -106,7 +106,7 @@ def client_of(folders):
 
 
 def test_charts_csv_status_frame_and_events(client_of):
-    """Charts are means over bins, and the last hour is the last hour; the CSV has every epoch."""
+    """Charts are means over bins, limited to the last hour; the CSV has every epoch."""
     client = client_of()
     query = {"camera": "rpi", "series": "M1", "points": 100}
     every = client.get("/api/columns", params=query).json()
@@ -149,7 +149,7 @@ def test_health_and_metrics(client_of, folders):
 
 
 def test_the_camera_of_now_in_opencv_terms_and_for_ros(client_of, folders):
-    """Both are one camera, which OpenCV projects as the program does."""
+    """Both describe one camera, with which OpenCV projects as the program does."""
     import cv2
     import yaml
 
@@ -184,7 +184,7 @@ def test_the_camera_of_now_in_opencv_terms_and_for_ros(client_of, folders):
 
 
 def test_a_weak_epoch_of_whose_variance_rounding_left_nothing(folders):
-    """A complex number ended the daemon: its status could not be written."""
+    """A complex number stopped the daemon: its status could not be written."""
     from thermocald.daemon.live_state import LiveState
     from thermocald.photogrammetry.camera.camera_model import Sensor
     from thermocald.photogrammetry.camera.conversions import opencv_terms
@@ -320,7 +320,7 @@ def test_dns_rebinding_and_foreign_pages_are_refused(client_of, base, headers, s
 
 
 def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
-    """SIGTERM with a stream open: it is told when acquisition ended, and nothing is logged."""
+    """SIGTERM with an open stream: the page learns when acquisition stopped; nothing is logged."""
     store, live = folders
     with Store.open(store, "append") as opened:
         opened.add_event(Event(1.7e9, "stopped", "thermocald stopped"))
@@ -337,7 +337,7 @@ def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
             socket.create_connection(("127.0.0.1", port)) as stuck,
         ):
             stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            stuck.sendall(_CSV_REQUEST)  # of which it takes up nothing
+            stuck.sendall(_CSV_REQUEST)  # and reads nothing of the answer
             told = (line for line in page.iter_lines() if line.startswith("data: "))
             assert json.loads(next(told)[6:])["pid"] == 1
             (live / "status.json").unlink()
@@ -348,7 +348,7 @@ def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
 
 
 def test_a_series_is_read_page_by_page(client_of, monkeypatch):
-    """One page in memory, whatever the length; and no transaction is open between them."""
+    """Only one page of rows is in memory, and no transaction is open between pages."""
     from thermocald.output.dashboard import view
     from thermocald.store.database import columns
 

@@ -1,4 +1,4 @@
-"""The page in a real browser, with several cameras: the one that is chosen rules all of it."""
+"""The page in a real browser, with several cameras: all of it shows the chosen one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.series import EpochResult
 
 _OPEN = {"device": "open", "why": "", "since": None, "faults": 0}
-# c of camera k is k mm: what belongs to which camera can be read off
+# c of camera k is k mm, which identifies the camera of a value
 _SHOWN = """() => ({
   selected: document.querySelector('#camera').value,
   figure: Number([...document.querySelectorAll('#figures dt')].find(e => e.textContent === 'c')
@@ -41,7 +41,7 @@ def _name(k: int) -> str:
 
 @pytest.fixture
 def page_with(tmp_path):
-    """number of cameras → (address of a page with so many, a call that has the daemon run)."""
+    """Map a number of cameras to a page's address and a call that makes the daemon run."""
     servers = []
 
     def serve(cameras: int):
@@ -49,7 +49,8 @@ def page_with(tmp_path):
         live.mkdir()
         status = {
             "version": "0", "pid": 1, "utc": 1.6e9, "started": 1.6e9, "stalled": [],
-            "clock": {"trusted": True}, "store": {"state": "ok", "waiting": 0, "path": str(path)},
+            "clock": {"trusted": True}, "store": {"state": "ok", "waiting": 0, "path": str(path),
+                                                  "lost": 2, "lost_why": "the disk was full"},
             "frames": {"paused": ""}, "cameras": {}, "thermometers": {"housing": _OPEN},
             "outputs": {"mqtt": {**_OPEN, "device": "out", "why": "no broker", "since": 1.6e9}},
         }  # fmt: skip
@@ -96,7 +97,7 @@ def page_with(tmp_path):
 def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     url, start = page_with(cameras)
     page = page_of(url)
-    # the curves are there before the daemon says which cameras it has
+    # the curves are shown before the daemon has reported its cameras
     page.wait_for_function("() => (document.querySelector('#course').data || []).length")
     start()
     page.wait_for_function("() => document.querySelector('#figures dd') !== null")
@@ -110,16 +111,16 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     right = page.evaluate(
         "[...document.querySelectorAll('section')].map(e => e.getBoundingClientRect().right)"
     )
-    assert max(right) - min(r for r in right if r > 800) < 1  # no part of the width is left empty
+    assert max(right) - min(r for r in right if r > 800) < 1  # the whole width is used
     keep(page, f"dashboard-{cameras}-1280")
     page.set_viewport_size({"width": 390, "height": 900})
     page.wait_for_timeout(500)  # the curves are drawn anew
     assert page.evaluate(_WIDER, 390) == []
-    assert page.evaluate(_HIDDEN) == 0  # a device's reason is not below the edge of its card
+    assert page.evaluate(_HIDDEN) == 0  # a device's reason is within its card
     keep(page, f"dashboard-{cameras}-390")
     page.set_viewport_size({"width": 1280, "height": 900})
 
-    # answers of cameras that are no longer wanted come late
+    # answers for cameras that are no longer chosen arrive late
     slow, wanted = (_name(1), _name(cameras)) if first != 1 else (_name(cameras), _name(1))
     page.evaluate(
         """slow => { const get = window.fetch; window.fetch = async (path, ...more) => {
@@ -133,11 +134,13 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     page.wait_for_timeout(1000)
     assert page.evaluate(_SHOWN) == _all_of(int(wanted[-2:]))
     assert "out since 2020-09-13 12:26:40 UTC: no broker" in page.text_content("#devices")
+    warned = "2 epochs lost, taken but not stored: the disk was full"
+    assert page.text_content("#warnings") == warned
 
 
 @pytest.mark.slow
 def test_on_paper_the_curves_keep_to_their_card(page_with, page_of):
-    """And the page says whose they are."""
+    """The page also names their camera."""
     url, start = page_with(2)
     page = page_of(url)
     start()

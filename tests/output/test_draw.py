@@ -1,4 +1,4 @@
-"""Panels as people see them: labels inside the drawing, legends clear of the data."""
+"""Panels: labels are inside the drawing, legends do not cover the data."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from thermocald.figures import Curve, Panel, draw_panel
 
 @pytest.mark.parametrize("lowest", [-1234.0, -0.0123, -9.9e-5, 3.0405])
 def test_the_y_label_is_inside_the_drawing_and_clear_of_the_numbers(lowest):
-    """Of `Δx₀ in µm` a half was cut off where ticks had more digits than was reckoned with."""
+    """Half of `Δx₀ in µm` was cut off if ticks had more digits than expected."""
     x = np.linspace(0, 25, 150)
     curves = tuple(Curve(f"M{i}", x, lowest * np.sin(x / (7 + i))) for i in (1, 2))
     for panel in (Panel("x", "time in min", "Δx₀ in µm", curves[:1]),

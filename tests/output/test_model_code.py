@@ -1,4 +1,4 @@
-"""The model as C and as Python: compiled, run, and held against the model to 1e-9 px."""
+"""The model as C and as Python: compiled, run, and equal to the model to 1e-9 px."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ _MARKS = re.compile(
 )
 _TEXT = """() => { const all = document.body.cloneNode(true);
   all.querySelectorAll('script, style').forEach(e => e.remove()); return all.textContent; }"""
-# Quadrilaterals of texts in one drawing that cross; a hair's breadth is none.
+# Texts in one drawing that overlap by more than a tolerance.
 _OVERLAPS = """() => {
   const quad = text => {
     const b = text.getBBox(), m = text.getScreenCTM(), e = 0.12 * b.height;
@@ -86,16 +86,16 @@ _EMPTY = """() => [...document.querySelectorAll('figure .panel svg')].filter(svg
       && !p.closest('[id*="matplotlib.axis"]'));
   return !marks.some(p => p.tagName === 'use' || p.getBBox().width > 2 || p.getBBox().height > 2);
 }).map(svg => svg.getAttribute('aria-label'))"""
-# Texts of a drawing that its edge cuts.
+# Texts that are cut off at the edge of their drawing.
 _CUT = """() => [...document.querySelectorAll('svg text')].filter(t => {
   const box = t.getBoundingClientRect(), all = t.closest('svg').getBoundingClientRect();
   return t.textContent.trim() && (box.left < all.left - 2 || box.right > all.right + 2
     || box.top < all.top - 2 || box.bottom > all.bottom + 2);
 }).map(t => t.textContent)"""
-# Tables that go on beyond the page.
+# Tables that are wider than the page.
 _SCROLLED = """() => [...document.querySelectorAll('.scroll')]
   .filter(e => e.scrollWidth > e.clientWidth + 1).map(e => e.getAttribute('aria-label'))"""
-# Drawings that must be dragged sideways, and letters too small to read on a phone.
+# Drawings that must be scrolled sideways, and letters too small to read on a phone.
 _DRAGGED = """() => [...document.querySelectorAll('.panel')].filter(p =>
   p.scrollWidth > p.clientWidth + 1
   || p.querySelector('svg')?.getBoundingClientRect().right > innerWidth)
@@ -248,7 +248,7 @@ _QUICK = ("field-check", "study", "epochs", "calibration", "fleet")
 
 @pytest.fixture(scope="module")
 def page_text(warm_study, warm_up, empty_study, tmp_path_factory):
-    """name → the report as HTML, made once."""
+    """Map a name to the report as HTML, made once."""
     made: dict[str, str] = {}
 
     def text(name: str) -> str:
@@ -266,7 +266,7 @@ def page_text(warm_study, warm_up, empty_study, tmp_path_factory):
 
 @pytest.fixture
 def open_page(page_of, tmp_path):
-    """(HTML, width) → the page from a file, without a network, every section unfolded."""
+    """Open HTML of a width from a file, without a network, with every section unfolded."""
 
     def open_(html: str, width: int, **options):
         file = tmp_path / "report.html"
@@ -338,7 +338,7 @@ def test_the_epochs_report_opens_with_the_drift(page_text, open_page):
 
 @pytest.mark.parametrize("name", ["calibration", "field-check"])
 def test_down_in_a_figure_is_down_in_the_image(name, page_text, open_page):
-    """Where y is named as growing downwards, its ticks grow so."""
+    """If a label states that y grows downwards, its ticks do."""
     page = open_page(page_text(name), 1280)
     axes = page.evaluate("""() => [...document.querySelectorAll('svg g[id*="matplotlib.axis_"]')]
       .filter(a => a.textContent.includes('y in px, down'))
@@ -351,7 +351,7 @@ def test_down_in_a_figure_is_down_in_the_image(name, page_text, open_page):
 
 
 def test_a_name_from_right_to_left_exchanges_no_numbers(page_text, open_page):
-    """Found by looking: a camera of 3280 × 2464 px read as one of 2464 × 3280."""
+    """Seen once: a camera of 3280 × 2464 px looked like one of 2464 × 3280."""
     page = open_page(page_text("calibration"), 1280)
     places = page.evaluate("""() => {
       const walk = document.createTreeWalker(document.querySelector('.device'), 4);
@@ -367,14 +367,14 @@ def test_a_name_from_right_to_left_exchanges_no_numbers(page_text, open_page):
 
 
 def keep(page, name: str) -> None:
-    """Keep a picture of the whole page where THERMOCALD_PAGES says."""
+    """Write an image of the whole page to the folder THERMOCALD_PAGES."""
     if folder := os.environ.get("THERMOCALD_PAGES"):
         Path(folder).mkdir(parents=True, exist_ok=True)
         (Path(folder) / f"{name}.png").write_bytes(page.screenshot(full_page=True))
 
 
 def test_every_fault_of_a_page_would_be_seen(open_page):
-    """The test above can fail: a page with each of the faults."""
+    """The test above fails for a page with each of the faults."""
     html = """<body><p>x is <bound method A.b of <a object at 0x7f>, nan or None</p>
       <div style="width:2000px">wide</div><figure><div class="panel"><svg aria-label="drawing"
       width="300" height="100"><g id="matplotlib.axis_1"><g id="xtick_1"><text x="9" y="20">1</text>

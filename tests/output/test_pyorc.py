@@ -1,4 +1,4 @@
-"""pyorc's camera configuration renewed: read by the real package, and the real river."""
+"""Updated camera configurations of pyorc, read by the real package; a real river."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def configuration(path: Path, n: int = 8) -> tuple[Path, np.ndarray]:
 
 
 def renewed(tmp_path: Path) -> tuple[dict, np.ndarray, np.ndarray]:
-    """What `camera at --to pyorc` writes, points mm, and where the true camera sees them."""
+    """Return what `camera at --to pyorc` writes, the points in mm, and their true image points."""
     write_model(tmp_path / "model.yaml")
     old, points = configuration(tmp_path / "site.json")
     done = finish(
@@ -123,7 +123,7 @@ def test_opencv_pose_is_the_same_camera():
     [(["--to", "pyorc", "-o", "x.json"], "needs --renew"),
      (["--to", "ros", "--renew", "site.json", "-o", "x.yaml"], "needs --renew"),
      (["--to", "pyorc", "--renew", "model.yaml", "-o", "x.json"], "cannot be read as JSON"),
-     (["--to", "pyorc", "--renew", "site.json", "--frame", "a.png", "-o", "x.json"], "together")],
+     (["--to", "pyorc", "--renew", "site.json", "--frame", "a.png", "-o", "x.json"], "give both")],
 )  # fmt: skip
 def test_what_is_missing_is_said(tmp_path, monkeypatch, options, words):
     write_model(tmp_path / "model.yaml")
@@ -161,7 +161,7 @@ def test_control_points_that_pyorc_would_not_take_are_said(tmp_path, gcps, words
 
 
 def river_camera() -> Camera:
-    """The Geul's camera as pyorc solved it, known to a hundredth of its focal length."""
+    """The Geul's camera as solved by pyorc, with an sd of a hundredth of its focal length."""
     document = json.loads((RIVER / "geul-pyorc.json").read_text())
     f, (k1, k2) = document["camera_matrix"][0][0], np.ravel(document["dist_coeffs"])[:2]
     pitch = 0.003
@@ -193,7 +193,7 @@ def pyorc_residuals() -> np.ndarray:
 
 @pytest.mark.skipif(not RIVER.is_dir(), reason="the river's frames are not here: ../shared/data")
 def test_the_crosses_of_the_geul():
-    """A pose with sds from six points; frames that are found again to a tenth of a pixel.
+    """A pose with sds from six points, which are found in other frames to a tenth of a pixel.
 
     pyorc's own camera was fitted to the clicks; with a prior of 2 % on its focal length ours fits
     as well, and in the other frames the same points give the same pose.
@@ -202,9 +202,9 @@ def test_the_crosses_of_the_geul():
     path = RIVER / "geul-pyorc.json"
     first = renew_configuration(path, camera)
     assert first.pose.status == "ok"
-    assert first.pose.sigma0 < 3  # 20 mm and 1 px are what nobody stated
+    assert first.pose.sigma0 < 3  # 20 mm and 1 px are assumed
     theirs = pyorc_residuals()
-    # theirs are the smallest that their camera allows, ours are weighed against the survey's
+    # pyorc's residuals are minimal in the image, ours are weighted with the survey's
     assert np.square(first.pose.residuals).sum() < 1.1 * np.square(theirs).sum()
     found = [
         renew_configuration(path, camera, RIVER / "geul-0.jpg", RIVER / f"geul-{k}.jpg")
@@ -240,7 +240,7 @@ def pyorc_heights() -> np.ndarray:
 @pytest.mark.skipif(not RIVER.is_dir(), reason="the river's frames are not here: ../shared/data")
 @pytest.mark.parametrize("frame", [None, RIVER / "geul-0.jpg"], ids=["clicked", "measured"])
 def test_levels_at_the_geul_have_true_sds(frame):
-    """A staff at each cross, read with the pose of the other five: its height is surveyed.
+    """A staff at each cross, read with the pose of the other five, against its surveyed height.
 
     The six fit with a sigma0 of 2; so much larger than 20 mm and 1 px are the sigmas then.
     """

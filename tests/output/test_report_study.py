@@ -1,4 +1,4 @@
-"""The report of a study: whole in one file, in words, and small; its figures and its JSON."""
+"""The report of a study: complete in one small file, with text, figures and JSON."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from thermocald.output.study.summary import study_document
 
 @pytest.fixture(scope="module")
 def told(warm_up, tmp_path_factory):
-    """The first series shows a clip; camera and second series are called as no page likes it."""
+    """The first series has a clip; camera and second series have names with HTML in them."""
     folder = tmp_path_factory.mktemp("clip")
     frame = np.full((30, 40), 50, np.uint8)
     frame[10, 5] = 250
@@ -79,7 +79,7 @@ def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told
     assert (cut[:, 2] == 50).all()
     assert len(re.findall(r'src="data:image/png;base64,', html)) == 2
     assert "Image around target 17" in html
-    # how a camera says that its picture is to be shown does not turn where the target was
+    # the orientation for display in EXIF does not rotate the target's position
     turned = np.zeros((30, 40), np.uint8)
     turned[10, 5] = 250
     save_photograph(tmp_path / "turned.jpg", {ORIENTATION: 6}, turned, quality=100)

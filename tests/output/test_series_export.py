@@ -1,4 +1,4 @@
-"""Exports for people: units in the columns' names, and back through `import` to the last digit."""
+"""Exports in other units, named in the columns, and read back by `import` to the last digit."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_parquet_is_bit_for_bit(recording, tmp_path):
 
 
 def test_extra_columns_of_a_store_are_exported_and_imported_the_same(recording, tmp_path):
-    """What the camera reported of itself, by epoch; an epoch without it stays empty."""
+    """Settings that the camera reported, by epoch; an epoch without them is empty."""
     opened = read_recording(recording)
     settings = {"camera_exposure_s": 0.01999, "camera_gain": 1.5, "camera_focus": -0.25}
     with Store.open(tmp_path / "t.db", "append") as store:

@@ -1,4 +1,4 @@
-"""Printed test fields: rasterised as a printer would, targets lie where the CSV says."""
+"""Printed test fields: on the rasterised page, targets are where the CSV states."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MM = DPI / 25.4  # px
 
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
-    """design → the folder it is printed into and what was printed, once."""
+    """Map a design to its folder and the printed field, made once."""
 
     @cache
     def print_once(design):
@@ -85,7 +85,7 @@ def test_rasterised_discs_are_where_the_csv_says(printed, paper, options):
     circles = [i for i, kind in enumerate(field.kinds) if kind == "circle"]
     assert len(circles) >= 30
     expected = page_px(field, circles, page, image)
-    # beyond the disc, but neither its ring nor its name
+    # outside the disc, but without its ring and name
     reach = 1.3 / 2 * design.diameter * MM
     found = np.array([centroid(image, p, reach, design.light) for p in expected])
     # a hundredth of a millimetre: a tenth of a printer's dot
@@ -192,7 +192,7 @@ def test_corner_is_three_perpendicular_sheets_with_distinct_codes(printed):
 
 
 def test_the_plan_and_the_coordinates_agree_on_left_and_right(printed):
-    """Who looks into the corner sees sheet 2 on the left; letters are on edges that coincide."""
+    """Looking into the corner, sheet 2 is on the left; letters are on edges that coincide."""
     sheets = printed(CORNER)[1].sheets
     field = field_of(sheets)
     camera = CameraModel(Sensor(3280, 2464, 0.00112), InteriorOrientation(3.04))
@@ -257,12 +257,12 @@ def test_every_paper_has_a_sensible_default(name, landscape):
         (Design((210, 297), 60.0), "smaller discs or larger paper"),
         (Design((841, 1189), 8.0, bits=12), "--bits 14"),
         (Design((841, 1189), 3.0, bits=14), "more than the 516"),
-        (Design((210, 297), 7.0, bits=13), "12 and 14"),
+        (Design((210, 297), 7.0, bits=13), "12 or 14"),
         (Design((210, 297), 7.0, bits=0), "cannot be identified"),
         (Design((210, 297), 7.0, dictionary="DICT_KLINGON"), "DICT_KLINGON"),
         (Design((210, 297), 0.5), "0.5 mm"),
         (Design((210, 297), 7.0, sheets=2), "three of a corner"),
-        (Design((210, 297), 7.0, pitch=10.0), "need 29.75 mm"),
+        (Design((210, 297), 7.0, pitch=10.0), "need at least 29.75 mm"),
     ],
 )
 def test_impossible_designs_are_refused(design, reason, tmp_path):

@@ -1,4 +1,4 @@
-"""The command line: one application with every command of `commands`.
+"""The command line: one application with all commands of `commands`.
 
 Exit status: 0 done, 1 the data do not allow it, 2 wrong usage or configuration, 3 a device failed.
 """
@@ -13,8 +13,8 @@ import signal
 import sys
 from typing import Any
 
-# Small matrices: threads of the linear algebra would only wait for one another (30 × slower on two
-# busy cores). It must be set before NumPy is imported.
+# The matrices are small: threads of the linear algebra would only wait for one another (30 × slower
+# on two busy cores). This has to be set before NumPy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
@@ -26,18 +26,18 @@ from thermocald.errors import ThermocaldError
 from thermocald.files import cannot_write
 
 _INTERRUPTED = 130
-_USAGE_ERROR: Any = typer.BadParameter.__base__  # of click, which Typer brings along
+_USAGE_ERROR: Any = typer.BadParameter.__base__  # click's, which Typer depends on
 _VERBOSE = ("--verbose", "-v")
 
 
 def application(loaded: str | None = None) -> typer.Typer:
-    """Return the application with every command.
+    """Return the application with all commands.
 
-    loaded: the only one that is imported, "" for none; the others are listed.
+    loaded: the only command to import, "" for none; the others are only listed. None: all.
     """
     app = typer.Typer(
         cls=Group,
-        help="Thermal calibration of low-cost cameras: live, with true standard deviations.",
+        help="Thermal calibration of low-cost cameras: live, with realistic standard deviations.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
@@ -47,17 +47,17 @@ def application(loaded: str | None = None) -> typer.Typer:
     return app
 
 
-def _called() -> str:
-    """Return the command that is called, "" where it is none: a help, a wrong word."""
+def _command_name() -> str:
+    """Return the name of the command to run, "" for a help or a word that is not a command."""
     words = sys.argv
-    if "_THERMOCALD_COMPLETE" in os.environ:  # a shell asks how it goes on
+    if "_THERMOCALD_COMPLETE" in os.environ:  # a shell asks for completions
         typed = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
         words = typed.split()
     word = next((word for word in words[1:] if word not in _VERBOSE), "")
     return word if word in COMMANDS else ""
 
 
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(__version__)
         raise typer.Exit
@@ -65,25 +65,29 @@ def _say_version(wanted: bool) -> None:
 
 def _options(
     version: bool = typer.Option(
-        False, "--version", help="Say the version and stop.", is_eager=True, callback=_say_version
+        False,
+        "--version",
+        help="Print the version and exit.",
+        is_eager=True,
+        callback=_print_version,
     ),
-    verbose: bool = typer.Option(False, *_VERBOSE, help="Log more."),
+    verbose: bool = typer.Option(False, *_VERBOSE, help="Log information too, not only warnings."),
 ) -> None:
-    del version  # said already, before a command is asked for
+    del version  # its callback has printed it
     log_to_stderr("INFO" if verbose else "WARNING")
 
 
 def main() -> None:
-    """Run the command line; every foreseen error is one line, none is a traceback."""
-    with contextlib.suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGTERM, _end)  # so that nothing half-written stays
-    _settle_process()
+    """Run the command line; print every foreseen error in one line, without a traceback."""
+    with contextlib.suppress(ValueError):  # raised outside the main thread
+        signal.signal(signal.SIGTERM, _end)  # an exception, so that half-written files are removed
+    _prepare_process()
     try:
-        status = application(_called())(prog_name="thermocald", standalone_mode=False)
+        status = application(_command_name())(prog_name="thermocald", standalone_mode=False)
         sys.stdout.flush()
         sys.exit(status or 0)
     except _USAGE_ERROR as error:
-        sys.exit(_say_usage(error))
+        sys.exit(_print_usage_error(error))
     except ThermocaldError as error:
         say(f"error: {error}")
         sys.exit(error.exit_status)
@@ -93,15 +97,15 @@ def main() -> None:
     except UnicodeEncodeError as error:
         if error.encoding != "utf-8":
             raise
-        # bytes of a file's name, which neither a server nor a library of C++ can be given
+        # a file name that is not UTF-8 can be passed neither to a server nor to a C++ library
         say(f"error: {error.object[:200]}: is not UTF-8 text; choose another name")
         sys.exit(2)
     except BrokenPipeError:
-        # The reader of our output has gone, as `head` does.
+        # The reader of our output has closed the pipe, as `head` does.
         sys.stderr.close()
         sys.exit(0)
     except OSError as error:
-        # a folder that may not be written, a full disk: wherever it shows first
+        # a folder without write permission or a full disk, wherever it is noticed first
         if error.filename is None and error.errno is None:
             raise
         where = "its folder" if isinstance(error, FileNotFoundError) else "standard output"
@@ -109,29 +113,34 @@ def main() -> None:
         what = error.strerror if isinstance(error.filename, str) and _is_read(error) else None
         say(f"error: {error.filename}: cannot be read: {what}" if what else f"error: {failed}")
         with contextlib.suppress(OSError):
-            sys.stdout.close()  # else Python writes what is left in it again, and fails again
+            sys.stdout.close()  # otherwise Python flushes it at exit, and fails again
         sys.exit(failed.exit_status)
 
 
-def _say_usage(error: Any) -> int:
-    """Say in one line what of the command was not understood; a help where nothing was typed."""
+def _print_usage_error(error: Any) -> int:
+    """Print a usage error in one line, or the help for a group without a command."""
     status: int = error.exit_code
     command = "thermocald" if error.ctx is None else error.ctx.command_path
-    said = error.format_message()
-    if not said or "Usage:" in said:  # the whole help, where nothing was typed
+    message = error.format_message()
+    if not message or "Usage:" in message:  # a group without a command: the whole help
         error.show()
         return status
-    said = re.sub(r"^Invalid value for '([^']+)': (?:Input )?", r"\1: ", said)
-    said = said[0].lower() + said[1:]
-    say(f"error: {' '.join(said.split()).rstrip('.')}; see '{command} --help'")
+    message = re.sub(r"^Invalid value for '([^']+)': (?:Input )?", r"\1: ", message)
+    message = message[0].lower() + message[1:]
+    say(f"error: {' '.join(message.split()).rstrip('.')}; see '{command} --help'")
     return status
 
 
-def _settle_process() -> None:
-    """Let no file be written by everybody, or read by nobody, and no output fail for its script."""
+def _prepare_process() -> None:
+    """Set up the umask and the standard streams.
+
+    New files are never writable by everybody and always accessible to their owner. A character that
+    the output's encoding lacks is escaped.
+    """
     given = os.umask(0o077)
     os.umask((given | 0o002) & ~0o700)
-    # what was closed (`>&-`): no store may take its number, and a result for it is an error
+    # a stream closed by the shell (`>&-`): its number must not go to a store, and writing a result
+    # to it must fail
     while (number := os.open(os.devnull, os.O_RDWR if sys.stderr is None else os.O_RDONLY)) < 3:
         pass
     os.close(number)
@@ -146,5 +155,5 @@ def _end(*_: object) -> None:
 
 
 def _is_read(error: OSError) -> bool:
-    """Whether it is an input that is missing or may not be read."""
+    """Return whether the error concerns a missing input, not an output."""
     return isinstance(error, FileNotFoundError) and not os.path.lexists(str(error.filename))

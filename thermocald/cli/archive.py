@@ -1,4 +1,4 @@
-"""`thermocald import`, `archive`, `backup`, `convert`: a recording or a store in another form."""
+"""`thermocald import`, `archive`, `backup`, `convert`: write recordings and copies of stores."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from thermocald.cli.common import (
     PhotosArgument,
     PixelPitchOption,
     StoreArgument,
+    StoreConfigOption,
     TimezoneOption,
     progress,
     say,
@@ -26,7 +27,7 @@ from thermocald.errors import RecordingError, UsageError
 @takes_log_options
 def import_(
     photos: PhotosArgument,
-    log: Path = typer.Option(..., help="The logger's file, in any dialect of CSV."),
+    log: Path = typer.Option(..., help="The logger's file, any dialect of CSV."),
     testfield: Path | None = typer.Option(None, help="The surveyed test field, testfield.csv."),
     out: Path | None = typer.Option(
         None, "--out", "-o", help="The recording to write (a new folder)."
@@ -34,28 +35,25 @@ def import_(
     pixel_pitch: PixelPitchOption = None,
     camera: Path | None = typer.Option(None, help="A camera file of any format."),
     series: str = typer.Option("M1", help="Name of this series."),
-    dry_run: bool = typer.Option(
-        False, "--dry-run", help="Show what would be written, and write nothing."
-    ),
-    camera_timezone: str | None = expert(
-        None, help="The camera's time zone, whatever EXIF says of it."
-    ),
-    camera_clock: str = expert("0", help="How far the camera's clock was ahead: +00:03:12."),
+    dry_run: bool = typer.Option(False, "--dry-run", help="Show only what would be written."),
+    camera_timezone: str | None = expert(None, help="Time zone of the camera; overrides EXIF."),
+    camera_clock: str = expert("0", help="Advance of the camera's clock, such as +00:03:12."),
     times: str = expert(
-        "exif", help="Where the photographs' times are: exif, name (of the file), file (its date)."
+        "exif",
+        help="Source of the photographs' times: exif, name (of the file), file (its date).",
     ),
     principal_distance: float | None = expert(
-        None, help="Principal distance, mm; by default EXIF's focal length.", min=0.1
+        None, help="Principal distance, mm; default: the focal length in EXIF.", min=0.1
     ),
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
     log_options: Any = None,
     json: JsonOption = None,
 ) -> None:
-    """Make a recording of photographs with EXIF times and a logger's file.
+    """Make a recording from photographs with EXIF times and a logger's file.
 
-    Times without a zone are refused until --timezone says it; columns are guessed and shown, or
-    named. --dry-run shows everything that was understood.
+    Times without a zone are refused unless --timezone is given. Columns are guessed, and the guess
+    is shown, unless they are named. --dry-run shows how the files were interpreted.
 
     Example: thermocald import photos/ --log logger.csv --timezone Europe/Berlin --testfield
     surveyed.csv --out M1
@@ -71,7 +69,7 @@ def import_(
     if not dry_run and (field is None or out is None):
         missing = "--testfield" if testfield is None else "--out"
         raise UsageError(
-            f"{missing} is missing: give it, or --dry-run to see what is understood of the files"
+            f"{missing} is missing: give it, or --dry-run to see how the files are interpreted"
         )
     recording, notes = read_series(
         read_photographs(photos, times),
@@ -83,7 +81,7 @@ def import_(
         say(line)
     if not dry_run and out is not None:
         write_photographs(out, recording)
-        # what EXIF does not tell of the pixels, the camera that some photographs give does
+        # a calibration of some photographs shows whether the camera data from EXIF are plausible
         doubts = doubt_lines(calibration_doubts(read_recording(out)))
         for line in doubts:
             say(line)
@@ -104,33 +102,29 @@ def import_(
         },
         "notes": notes,
     }  # fmt: skip
-    said = f"{out}: {len(columns)} epochs; next: thermocald replay {out}"
-    show(document, json, "nothing was written (--dry-run)" if dry_run else said)
+    summary = f"{out}: {len(columns)} epochs; next: thermocald replay {out}"
+    show(document, json, "nothing was written (--dry-run)" if dry_run else summary)
 
 
 def archive(
     store: StoreArgument = None,
-    folder: Path = typer.Option(Path(), "--to", help="The folder in which recordings are written."),
-    config: Path | None = typer.Option(
-        None, "--config", "-c", help="Store and frames of this configuration."
-    ),
-    frames: Path | None = expert(None, help="The daemon's folder of frames."),
+    folder: Path = typer.Option(Path(), "--to", help="Folder for the recordings."),
+    config: StoreConfigOption = None,
+    frames: Path | None = expert(None, help="Folder of the daemon's frames."),
     series: str | None = typer.Option(None, help="CAMERA/SERIES or SERIES; default: all."),
-    skip_existing: bool = expert(
-        False, "--skip-existing", help="Pass over recordings that are there already."
-    ),
+    skip_existing: bool = expert(False, "--skip-existing", help="Skip recordings that exist."),
     finished: bool = expert(
-        False, "--finished", help="Only series that have ended, since the camera began another."
+        False, "--finished", help="Only finished series: the camera has begun another one since."
     ),
     retention: bool = expert(
-        False, "--retention", help="Then delete frames as the configuration's limits say."
+        False, "--retention", help="Then delete frames by the limits of the configuration."
     ),
     json: JsonOption = None,
 ) -> None:
-    """Write every series as a recording `<camera>-<series>`, a folder that replays anywhere.
+    """Write every series as a recording `<camera>-<series>`, a folder that `replay` reads.
 
-    Readings that belong to no epoch become `thermometer-<name>.csv`, unless --finished or --series
-    is given.
+    Readings that belong to no epoch are written to `thermometer-<name>.csv`, unless --finished or
+    --series is given.
 
     Example: thermocald archive thermocald.db --to recordings
     """
@@ -140,12 +134,12 @@ def archive(
 
     read = None
     if retention and config is None:
-        raise UsageError("--retention needs --config FILE: it holds the limits")
+        raise UsageError("--retention needs --config FILE, which holds the limits")
     if config is not None:
         read = load_config(config)
         store, frames = store or read.store.path, frames or read.frames.folder
     if store is None:
-        raise UsageError("which store? give its file, or --config FILE")
+        raise UsageError("STORE is missing: give its file, or --config FILE")
     if finished and not store.exists():
         say(f"{store}: nothing was stored yet")
         return
@@ -159,16 +153,14 @@ def archive(
 def backup(
     store: StoreArgument = None,
     to: Path | None = typer.Argument(None, help="A file that does not exist yet, or a folder."),
-    config: Path | None = typer.Option(
-        None, "--config", "-c", help="The store of this configuration."
-    ),
-    keep: int = typer.Option(0, min=0, help="In a folder: delete all but the newest N; 0: none."),
+    config: StoreConfigOption = None,
+    keep: int = typer.Option(0, min=0, help="In a folder, keep only the newest N; 0 keeps all."),
     json: JsonOption = None,
 ) -> None:
-    """Copy a store and read the copy again: every row must be as it was written.
+    """Copy a store, then verify every row of the copy.
 
-    In a folder the copy is called `<store>-<UTC>.db`. A store that is damaged is not copied: exit
-    status 1, and older backups stay.
+    In a folder, the copy is named `<store>-<UTC>.db`. A damaged store is not copied: the exit
+    status is 1, and older backups are left as they are.
 
     Example: thermocald backup thermocald.db backups/
     """
@@ -182,7 +174,7 @@ def backup(
     document = back_up(store, to, keep)
     say(f"{document['backup']}: {document['epochs']} epochs, every row verified")
     for path in document["deleted"]:
-        say(f"{path}: deleted, {keep} newer ones are kept")
+        say(f"{path}: deleted; {keep} newer backups are left")
     write_json(document, json)
 
 
@@ -192,13 +184,11 @@ _NAMES = {"csv": "observations.csv", "parquet": "observations.parquet"}
 def convert(
     recording: Path = typer.Argument(..., help="The recording's folder; changed in place."),
     to: str = typer.Option("parquet", help="csv, or parquet (needs pyarrow)."),
-    keep: bool = typer.Option(
-        False, "--keep", help="Keep the other file, under its name with `.old`."
-    ),
+    keep: bool = typer.Option(False, "--keep", help="Keep the original file, renamed to `.old`."),
 ) -> None:
-    """Rewrite a recording's observations as Parquet, which reads ten times as fast, or as CSV.
+    """Rewrite a recording's observations as Parquet, which is read ten times as fast, or as CSV.
 
-    Every number stays the same to the bit. Other files of the recording are not touched.
+    Every number is preserved bit for bit. The recording's other files are not changed.
 
     Example: thermocald convert M1 --to parquet
     """
@@ -206,12 +196,12 @@ def convert(
     from thermocald.store.recording.reader import open_recording
 
     if to not in _NAMES:
-        raise UsageError(f"--to {to}: there are {', '.join(_NAMES)}")
-    open_recording(recording)  # a folder that is not a recording is left alone
+        raise UsageError(f"--to {to}: must be one of {', '.join(_NAMES)}")
+    open_recording(recording)  # raises for a folder that is not a recording
     target = recording / _NAMES[to]
     source = recording / next(name for key, name in _NAMES.items() if key != to)
     if target.exists():
-        say(f"{target} is there already")
+        say(f"{target} exists already")
         return
     if not source.exists():
         raise RecordingError(f"{recording}: has no observations, only frames; nothing to convert")

@@ -1,8 +1,4 @@
-"""`thermocald calibrate`, `camera`, `predict`, `correct`, `measure`: a camera and its use.
-
-It is calibrated, converted, compared; at a temperature, with what was measured with it; places in
-metres from its image points.
-"""
+"""`thermocald calibrate`, `camera`, `predict`, `correct`, `measure`: calibrate and use a camera."""
 
 from __future__ import annotations
 
@@ -37,39 +33,39 @@ from thermocald.errors import DataError, UsageError
 
 def calibrate(
     images: list[Path] = typer.Argument(
-        ..., metavar="IMAGE_OR_FOLDER…", help="Photographs, or folders of them."
+        ..., metavar="IMAGE_OR_FOLDER…", help="Photographs, or folders of photographs."
     ),
-    testfield: Path = typer.Option(..., help="testfield.csv, in mm."),
+    testfield: Path = typer.Option(..., help="The test field, testfield.csv, in mm."),
     camera: Path | None = typer.Option(
         None,
-        help="Camera file: width, height, pixel_pitch, principal_distance, interior; or one "
-        "of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON, as initial values.",
+        help="Camera file with initial values: width, height, pixel_pitch, principal_distance, "
+        "interior; or a file of OpenCV, ROS, COLMAP, mrcal, Kalibr, Metashape, AICON.",
     ),
     pixel_pitch: float | None = typer.Option(
         None,
         min=1e-5,
         max=1.0,
-        help="Size of a pixel in mm, without --camera or where that lacks it.",
+        help="Pixel pitch, mm, if there is no --camera or its file does not give it.",
     ),
     camera_out: Path | None = typer.Option(
-        None, help="Write the camera: .json with covariance (what every --camera takes), or .yaml."
+        None, help="Write the camera: .json with covariance (every --camera reads it), or .yaml."
     ),
-    report: Path | None = typer.Option(None, help="Write residuals and coverage as one HTML file."),
+    report: Path | None = typer.Option(None, help="Write residuals and coverage to an HTML file."),
     free: FreeOption = DEFAULT_FREE,
     json: JsonOption = None,
 ) -> None:
     """Calibrate a camera from photographs of a test field.
 
-    All photographs share one interior orientation. Where their geometry does not carry it and the
-    camera file has one, that is held and each photograph gets its pose.
+    All photographs share one interior orientation. If their geometry cannot determine it and the
+    camera file gives one, that one is held fixed and only the poses are estimated.
 
     Example: thermocald calibrate photos/ --testfield testfield.csv --pixel-pitch 0.00112
     --camera-out camera.json --report calibration.html
     """
     if camera_out is not None and camera_out.suffix.lower() not in (".json", ".yaml", ".yml"):
         raise UsageError(
-            f"{camera_out}: --camera-out writes .json or .yaml; for another program convert it "
-            "with `thermocald camera convert`"
+            f"{camera_out}: --camera-out writes .json or .yaml; for another format use "
+            "`thermocald camera convert`"
         )
     with progress(None, "measuring") as advance:
         result = tc.calibrate(
@@ -88,19 +84,17 @@ _FORMATS = "opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json"
 
 
 def convert(
-    source: Path = typer.Argument(..., metavar="FILE", help="A camera file."),
+    source: Path = typer.Argument(..., metavar="FILE", help="The camera file to convert."),
     to: str = typer.Option(..., help=f"Format to write: {_FORMATS}."),
     out: Path = typer.Option(..., "--out", "-o", help="The file to write."),
-    from_: str | None = expert(
-        None, "--from", help="Format of FILE; default: told by its content."
-    ),
-    pixel_pitch: float | None = typer.Option(
-        None, help="Size of a pixel in mm, where FILE does not say it."
-    ),
+    from_: str | None = expert(None, "--from", help="Format of FILE; default: by its content."),
+    pixel_pitch: float | None = typer.Option(None, help="Pixel pitch, mm, if FILE gives none."),
     json: JsonOption = None,
 ) -> None:
-    """Convert a camera file, exactly where the conventions allow, else by a fit whose residual is
-    stated.
+    """Convert a camera file to another format.
+
+    The conversion is exact where the conventions of both formats allow it; otherwise it is a fit
+    whose residual is reported.
 
     Example: thermocald camera convert calibration.xml --to opencv --out camera.yaml
     """
@@ -109,21 +103,21 @@ def convert(
 
 
 def at(
-    model: Path = typer.Argument(..., metavar="MODEL", help="A thermal model, from `fit`."),
-    temperature: float = typer.Option(..., help="°C: a camera that has long been there."),
+    model: Path = typer.Argument(..., metavar="MODEL", help="Thermal model (YAML), from `fit`."),
+    temperature: float = typer.Option(..., help="Steady temperature of the camera, °C."),
     to: str = typer.Option("json", help=f"Format to write: {_FORMATS}, pyorc."),
     out: Path | None = typer.Option(None, "--out", "-o", help="The file to write."),
-    renew: Path | None = typer.Option(None, help="With --to pyorc: its camera configuration."),
+    renew: Path | None = typer.Option(None, help="With --to pyorc: the configuration to update."),
     reference: Path | None = typer.Option(
-        None, help="With --to pyorc: the image its points were clicked in."
+        None, help="With --to pyorc: the image in which the control points were clicked."
     ),
     frame: Path | None = typer.Option(
-        None, help="With --to pyorc: measure its points in this image."
+        None, help="With --to pyorc: the image in which to measure the control points."
     ),
     extrapolate: ExtrapolateOption = False,
     json: JsonOption = None,
 ) -> None:
-    """Give the camera at one temperature, as a file of any program.
+    """Predict the camera at one temperature and write it in any supported format.
 
     Example: thermocald camera at camera.thermal.yaml --temperature 35 --to ros -o cam.yaml
 
@@ -133,7 +127,7 @@ def at(
     from thermocald.output import series_export
 
     if (to == "pyorc") != (renew is not None) or (renew is not None and out is None):
-        raise UsageError("--to pyorc needs --renew, its camera configuration, and --out")
+        raise UsageError("--to pyorc needs --renew FILE (its camera configuration) and --out FILE")
     thermal = tc.load_camera(model)
     if renew is not None:
         thermal = thermal.for_images(*series_export.image_size(renew))
@@ -158,16 +152,16 @@ def at(
 
 def diff(
     cold: Path = typer.Argument(..., help="A camera file of any format."),
-    warm: Path = typer.Argument(..., help="Another, of the same sensor."),
+    warm: Path = typer.Argument(..., help="A second camera file, of the same sensor."),
     pixel_pitch: PixelPitchOption = None,
     report: Path | None = typer.Option(
-        None, help="Draw where in the image they differ, one HTML file."
+        None, help="Write a map of the differences in the image to an HTML file."
     ),
     json: JsonOption = None,
 ) -> None:
-    """Compare two cameras: parameters, and by how much the image differs (WARM minus COLD).
+    """Compare two cameras: differences of parameters and of image points (WARM minus COLD).
 
-    With standard deviations where both files have a covariance.
+    Standard deviations are given if both files have a covariance.
 
     Example: thermocald camera diff cold.json warm.json
     """
@@ -183,23 +177,21 @@ group = subcommands(at=at, convert=convert, diff=diff)
 @takes_log_options
 def predict(
     model: ModelOption,
-    temperature: float | None = typer.Option(None, help="°C: a camera that has long been there."),
-    log: Path | None = typer.Option(None, help="A logger's file, a recording, or a store."),
+    temperature: float | None = typer.Option(None, help="Steady temperature of the camera, °C."),
+    log: Path | None = typer.Option(None, help="Temperatures: a log file, a recording or a store."),
     test: Path | None = typer.Option(
-        None, help="Recording or store: how well the model predicts it."
+        None, help="Test the model: compare its prediction with this recording or store."
     ),
-    programme: Path | None = typer.Option(
-        None, help="Warm-up advice for what is done to the camera."
-    ),
-    camera: Path | None = typer.Option(None, help="Camera file, for --programme."),
-    channel: list[str] | None = expert(None, help="NAME=°C of another thermometer; repeatable."),
-    distance: float = expert(10.0, min=0.01, help="Distance of the object, m."),
-    wanted: float = expert(5.0, "--wanted-mm", min=1e-3, help="Wanted error on the object, mm."),
+    programme: Path | None = typer.Option(None, help="Programme (YAML) for advice on warming up."),
+    camera: Path | None = typer.Option(None, help="Camera file (YAML), for --programme."),
+    channel: list[str] | None = expert(None, help="NAME=°C of a further thermometer; repeatable."),
+    distance: float = expert(10.0, min=0.01, help="Distance to the object, m."),
+    wanted: float = expert(5.0, "--wanted-mm", min=1e-3, help="Tolerated error on the object, mm."),
     extrapolate: ExtrapolateOption = False,
     log_options: Any = None,
     json: JsonOption = None,
 ) -> None:
-    """Predict the interior orientation with standard deviations.
+    """Predict the interior orientation and its standard deviations.
 
     Example: thermocald predict --model camera.thermal.yaml --temperature 35
     """
@@ -234,25 +226,26 @@ def correct(
     points: Path = typer.Argument(
         ...,
         metavar="POINTS.csv",
-        help="Columns time, x, y (px) and others; or time, image; - for standard input.",
+        help="Columns time, x, y (px) and any others; or time, image; - is standard input.",
     ),
-    out: Path | None = typer.Option(None, help="CSV to write (points), or folder (images)."),
-    to: float | None = expert(None, help="°C to correct to; default: the model's T0."),
+    out: Path | None = typer.Option(None, help="CSV file (points) or folder (images) to write."),
+    to: float | None = expert(None, help="Temperature to correct to, °C; default: the model's T0."),
     temperature_sd: float | None = expert(
         None,
         min=0.0,
-        help="Standard deviation of a reading, K; default: what the model's fit found.",
+        help="Standard deviation of a reading, K; default: as estimated by the model's fit.",
     ),
-    image_size: str | None = expert(None, "--size", help="WIDTHxHEIGHT where images are binned."),
+    image_size: str | None = expert(None, "--size", help="WIDTHxHEIGHT of binned images, px."),
     extrapolate: ExtrapolateOption = False,
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
     log_options: Any = None,
     json: JsonOption = None,
 ) -> None:
-    """Correct image points, or images, that were taken at known temperatures.
+    """Correct image points or images for the temperature at which they were taken.
 
-    A row that cannot be corrected is named by its line and does not stop the others; exit status 1.
+    A row that cannot be corrected is reported with its line number; the others are corrected, and
+    the exit status is 1.
 
     Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
     """
@@ -293,21 +286,22 @@ def measure(
         ..., metavar="POINTS.csv", help="Columns time, name, x, y, sx, sy (px)."
     ),
     control: Path = typer.Option(
-        ..., help="Control points: target, X, Y, Z, sX, sY, sZ and x, y, sx, sy."
+        ...,
+        help="Control points and their image points: target, X, Y, Z, sX, sY, sZ, x, y, sx, sy.",
     ),
-    seen: str = typer.Option(..., metavar="TIME", help="When the control points were seen there."),
-    plane: Path = typer.Option(..., help="YAML: level, or plane, or line; and sd."),
-    length_unit: str = typer.Option("mm", help="Unit of control points and plane: mm or m."),
+    seen: str = typer.Option(..., metavar="TIME", help="When the control points were observed."),
+    plane: Path = typer.Option(..., help="Surface (YAML): level, plane, line or profile, with sd."),
+    length_unit: str = typer.Option("mm", help="Unit of control points and surface: mm or m."),
     extrapolate: ExtrapolateOption = False,
     timezone: TimezoneOption = None,
     ambiguous: str = "order",
     log_options: Any = None,
     json: JsonOption = None,
 ) -> None:
-    """Measure where image points lie on a water surface, a plane or a staff.
+    """Measure the positions of image points on a water surface, a plane or a staff.
 
-    Each place has its standard deviation, and stands beside what the camera would have given
-    without its thermal model.
+    Each position has a standard deviation, and is compared with the position that would result
+    without the thermal model.
 
     Example: thermocald measure points.csv --model camera.thermal.yaml --log weather.csv
     --control gcp.csv --seen 2026-05-04T09:00:00Z --plane water.yaml --length-unit m

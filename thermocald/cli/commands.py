@@ -1,4 +1,4 @@
-"""Every command with its line in `thermocald --help`, in the order of the work."""
+"""Every command with its line in `thermocald --help`, in the order of use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 from thermocald.errors import UsageError
 from thermocald.files import Output, check_output
 
-# what the options of all commands write, and where one of a command is no file
+# what an option writes: in all commands, then in the commands where it differs
 _OUTPUTS: dict[str, Output] = {
     **dict.fromkeys(
         ("camera_out", "code", "effect_out", "json", "model_out", "out", "output", "report"), "file"
@@ -32,16 +32,16 @@ _OUTPUTS: dict[str, Output] = {
     "testfield print out": "folder",
 }  # fmt: skip
 ADVANCED = "Advanced"
-"""The section of options that only experts need."""
+"""The help section of the options that only experts need."""
 
 
-def expert(default: Any, *names: str, **told: Any) -> Any:
-    """Return an option of the advanced ones; arguments as those of `typer.Option`."""
-    return typer.Option(default, *names, rich_help_panel=ADVANCED, **told)
+def expert(default: Any, *names: str, **settings: Any) -> Any:
+    """Return an option of the advanced section; the arguments are those of `typer.Option`."""
+    return typer.Option(default, *names, rich_help_panel=ADVANCED, **settings)
 
 
 class Entry(NamedTuple):
-    """A command: the module of `thermocald.cli` that has it, and what it does in one line."""
+    """A command: its module in `thermocald.cli`, and one line that describes it."""
 
     module: str
     line: str
@@ -51,42 +51,42 @@ class Entry(NamedTuple):
 # only the module of the command that is called is imported
 PANELS = {
     "Measure": {
-        "demo": Entry("demo", "Try it all on a rendered camera, without hardware"),
-        "devices": Entry("run", "List attached cameras, thermometers and outputs"),
+        "demo": Entry("demo", "Try the whole program on a rendered camera, without hardware"),
+        "devices": Entry("run", "List the attached cameras, thermometers and outputs"),
         "session": Entry("session", "Take one measurement series, from check to report", True),
-        "run": Entry("run", "Acquire, calibrate and keep epochs until told to end"),
-        "status": Entry("run", "Say how the daemon is doing"),
-        "top": Entry("run", "Show that, always up to date"),
+        "run": Entry("run", "Acquire, calibrate and store epochs until stopped"),
+        "status": Entry("run", "Report the state of the daemon"),
+        "top": Entry("run", "Show the state of the daemon, continuously updated"),
         "dashboard": Entry("run", "Serve the daemon's web page"),
         "import": Entry("archive", "Make a recording from photographs and a logger's file"),
-        "simulate": Entry("demo", "Make a recording of a simulated camera that warms up"),
+        "simulate": Entry("demo", "Simulate a camera that warms up, and write a recording"),
     },
     "Analyse": {
-        "replay": Entry("study", "Calibrate every epoch of a recording, and say how it drifts"),
+        "replay": Entry("study", "Calibrate every epoch of a recording and report the drift"),
         "export": Entry("study", "Write one row per epoch as CSV, JSON or Parquet"),
-        "study": Entry("study", "Test how the camera changes with its temperature; report it"),
-        "discover": Entry("study", "Find which effect a model misses, name it, prove it"),
+        "study": Entry("study", "Analyse how a camera changes with its temperature"),
+        "discover": Entry("study", "Find, name and verify the effect that a thermal model lacks"),
         "fit": Entry("study", "Fit a thermal model to all series of a camera"),
         "calibrate": Entry("camera", "Calibrate a camera from photographs of a test field"),
     },
     "Use": {
-        "predict": Entry("camera", "Predict the camera at a temperature, or along a log"),
+        "predict": Entry("camera", "Predict the camera at a temperature or along a log"),
         "correct": Entry("camera", "Correct image points or images for the temperature"),
-        "measure": Entry("camera", "Measure in metres on a water surface, a plane, a staff"),
-        "camera": Entry("camera", "Convert and compare cameras; one at a temperature", True),
+        "measure": Entry("camera", "Measure in metres on a water surface, a plane or a staff"),
+        "camera": Entry("camera", "Convert and compare camera files; predict a camera", True),
     },
     "Test field": {
         "testfield": Entry("testfield", "Print, import, survey and check a test field", True)
     },
     "Many cameras": {
         "forward": Entry("server", "Send a store's rows to a server"),
-        "fleet": Entry("server", "Show all cameras of a server, and which need a look"),
+        "fleet": Entry("server", "Show all cameras of a server and which need attention"),
         "reprocess": Entry("server", "Calibrate or analyse whole archives again"),
-        "server": Entry("server", "Make a server's tables, and let stations write to them", True),
+        "server": Entry("server", "Create a server's tables and grant access to them", True),
     },
     "Look after": {
-        "doctor": Entry("run", "Say what this machine lacks, and what mends it"),
-        "check": Entry("run", "Say whether a recording, configuration or store is sound"),
+        "doctor": Entry("run", "Report what this machine lacks and how to fix it"),
+        "check": Entry("run", "Check a recording, a configuration or a store for errors"),
         "backup": Entry("archive", "Copy a store that is in use, and verify the copy"),
         "archive": Entry("archive", "Write a store's series as recordings; delete old frames"),
         "convert": Entry("archive", "Rewrite a recording's observations as Parquet or CSV"),
@@ -96,29 +96,29 @@ COMMANDS = {name: entry for panel in PANELS.values() for name, entry in panel.it
 
 
 _TYPE = re.compile(r"<(?:list\[)?(Path|path|str|int|float)(?: range)?\]?>")
-_SAID = {"Path": "path", "path": "path", "str": "text", "int": "number", "float": "number"}
+_SHOWN = {"Path": "path", "path": "path", "str": "text", "int": "number", "float": "number"}
 
 
 class Command(TyperCommand):
-    """A command whose help has its expert's options in a section of their own.
+    """A command whose help lists the advanced options in their own section.
 
     An output that cannot be written is refused before anything is computed.
     """
 
     def invoke(self, ctx: Any) -> Any:
-        """Look where the outputs go, and run the command."""
+        """Check that the outputs can be written, then run the command."""
         if not ctx.params.get("dry_run"):
             _check_outputs(ctx)
         return super().invoke(ctx)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments, options, and last the advanced ones."""
+        """Write the arguments, the options, and last the advanced options."""
         sections: dict[str, list[tuple[str, str]]] = {}
         for parameter in self.get_params(ctx):
             if (record := parameter.get_help_record(ctx)) is not None:
                 usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
                 title = getattr(parameter, "rich_help_panel", None) or usual
-                name = _TYPE.sub(lambda found: f"<{_SAID[found[1]]}>", record[0])
+                name = _TYPE.sub(lambda found: f"<{_SHOWN[found[1]]}>", record[0])
                 sections.setdefault(title, []).append((name, record[1]))
         for title in sorted(sections, key=["Arguments", "Options", ADVANCED].index):
             with formatter.section(title):
@@ -126,14 +126,14 @@ class Command(TyperCommand):
 
 
 def _check_outputs(ctx: Any) -> None:
-    """Refuse outputs that could not be written: OutputError; one for two results: UsageError."""
+    """Raise OutputError for an output that cannot be written, UsageError for one given twice."""
     command, above = ctx.info_name, ctx.parent
     while above is not None and above.parent is not None:
         command, above = f"{above.info_name} {command}", above.parent
     written: dict[str, str] = {}
     for name, given in ctx.params.items():
         kind = _OUTPUTS.get(f"{command} {name}", _OUTPUTS.get(name))
-        # `--report / --no-report` is no file
+        # `--report / --no-report` is a switch, not a file
         if kind is None or not isinstance(given, (str, Path)) or str(given) in ("", "-"):
             continue
         path, option = Path(given), f"--{name.replace('_', '-')}"
@@ -145,10 +145,10 @@ def _check_outputs(ctx: Any) -> None:
 
 
 class Group(TyperGroup):
-    """Commands listed by panels, each with its whole line."""
+    """A group whose help lists the commands by panel, each line in full."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write one section for each panel."""
+        """Write one section per panel."""
         sections: dict[str, list[tuple[str, str]]] = {}
         for name in self.list_commands(ctx):
             command = self.get_command(ctx, name)
@@ -164,34 +164,23 @@ class Group(TyperGroup):
 
 
 def add_commands(app: typer.Typer, load: Callable[[str], bool]) -> None:
-    """Add every command to an application; those that `load` does not want, by their line only."""
+    """Add every command to an application; a command for which `load` is false is only listed."""
     for panel, entries in PANELS.items():
         for name, entry in entries.items():
-            told: dict[str, Any] = {"short_help": entry.line, "rich_help_panel": panel}
-            if not entry.group:
-                function = command(name) if load(name) else _not_loaded
-                app.command(name, cls=Command, **told)(function)
-            elif load(name):
-                app.add_typer(group(name), name=name, cls=Group, help=f"{entry.line}.", **told)
+            shown: dict[str, Any] = {"short_help": entry.line, "rich_help_panel": panel}
+            if not load(name):
+                app.command(name, cls=Command, **shown)(_not_loaded)
+                continue
+            module = importlib.import_module(f"thermocald.cli.{entry.module}")
+            if entry.group:
+                app.add_typer(module.group, name=name, cls=Group, help=f"{entry.line}.", **shown)
             else:
-                app.command(name, cls=Command, **told)(_not_loaded)
-
-
-def command(name: str) -> Callable[..., Any]:
-    """Return the function of a command, by the command's name."""
-    module = importlib.import_module(f"thermocald.cli.{COMMANDS[name].module}")
-    found: Callable[..., Any] = getattr(module, "import_" if name == "import" else name)
-    return found
-
-
-def group(name: str) -> typer.Typer:
-    """Return the commands below a word."""
-    found: typer.Typer = importlib.import_module(f"thermocald.cli.{name}").group
-    return found
+                function = getattr(module, "import_" if name == "import" else name)
+                app.command(name, cls=Command, **shown)(function)
 
 
 def subcommands(**functions: Callable[..., Any]) -> typer.Typer:
-    """Return the commands below a word; a name that Python keeps for itself ends in `_`."""
+    """Return a group of commands; a trailing `_`, as in `import_`, is not part of the name."""
     app = typer.Typer(no_args_is_help=True)
     for name, function in functions.items():
         app.command(name.rstrip("_"), cls=Command)(function)

@@ -1,4 +1,4 @@
-"""What all commands share: options, where output goes, progress, and errors in one line."""
+"""Parts that the commands share: options, output, progress and log lines."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import json
 import logging
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,27 +25,31 @@ if TYPE_CHECKING:
     from thermocald import ThermalCamera
 
 JsonOption = Annotated[
-    str | None, typer.Option("--json", help="Write the result as JSON; - for standard output.")
+    str | None, typer.Option("--json", help="Write the result as JSON; - is standard output.")
 ]
 ConfigOption = Annotated[
     Path | None,
     typer.Option(
-        "--config", "-c", help="The configuration [./config.yaml, /etc/thermocald/config.yaml]."
+        "--config", "-c", help="Configuration; default: ./config.yaml, /etc/thermocald/config.yaml."
     ),
 ]
-StoreArgument = Annotated[Path | None, typer.Argument(help="The store; may be in use by a daemon.")]
+StoreConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", help="Configuration with the store and other settings."),
+]
+StoreArgument = Annotated[Path | None, typer.Argument(help="The store; a daemon may be using it.")]
 PhotosArgument = Annotated[
-    list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of them.")
+    list[Path], typer.Argument(metavar="PHOTO…", help="Photographs, or folders of photographs.")
 ]
 PixelPitchOption = Annotated[
-    float | None, typer.Option("--pixel-pitch", help="Size of a pixel in mm.", min=1e-5, max=1.0)
+    float | None, typer.Option("--pixel-pitch", help="Pixel pitch, mm.", min=1e-5, max=1.0)
 ]
-LogOption = Annotated[Path, typer.Option("--log", help="A logger's file, a recording, or a store.")]
-ModelOption = Annotated[Path, typer.Option("--model", help="The thermal model.")]
+LogOption = Annotated[Path, typer.Option("--log", help="Temperatures: log file, recording, store.")]
+ModelOption = Annotated[Path, typer.Option("--model", help="Thermal model (YAML).")]
 ExtrapolateOption = Annotated[
-    bool, expert(..., "--extrapolate", help="Allow temperatures far outside the fit.")
+    bool, expert(..., "--extrapolate", help="Allow temperatures far outside the fit's range.")
 ]
-SeedOption = Annotated[int, expert(..., "--seed", min=0, help="Seed of all random numbers.")]
+SeedOption = Annotated[int, expert(..., "--seed", min=0, help="Seed of the random numbers.")]
 TimezoneOption = Annotated[
     str | None,
     typer.Option("--timezone", help="Time zone of times without one: Europe/Berlin, UTC, +02:00."),
@@ -55,20 +59,21 @@ FreeOption = Annotated[
     expert(
         ...,
         "--free",
-        help="Interior orientation to estimate, separated by commas; the rest is held.",
+        help="Interior orientation parameters to estimate, or none; the rest is held fixed.",
     ),
 ]
 DEFAULT_FREE = "c,x0,y0,A1,A2,A3,B1,B2"
 JobsOption = Annotated[
     int,
-    expert(..., min=1, max=256, help="Number of processes; the results are the same to the bit."),
+    expert(..., min=1, max=256, help="Number of processes; the results do not depend on it."),
 ]
 ExteriorOption = Annotated[
     str,
     typer.Option(
         "--exterior",
-        help="per_epoch: every epoch has its own orientation; series: one for all epochs; mount: "
-        "one and movements of the mount, whose size is estimated; auto: what the data show.",
+        help="Exterior orientation. per_epoch: one for each epoch; series: one for all epochs; "
+        "mount: one for all epochs and random motion of the mount, whose size is estimated; auto: "
+        "chosen from the data.",
     ),
 ]
 
@@ -76,40 +81,41 @@ ExteriorOption = Annotated[
 def _log_options(
     timezone: TimezoneOption = None,
     temperature_column: list[str] | None = typer.Option(
-        None, help="Column of a temperature; the first is the reference; repeatable."
+        None, help="Name of a temperature column; repeatable, the first is the reference."
     ),
     name: list[str] | None = typer.Option(
-        None, metavar="COLUMN=LABEL", help="A label for a column of the log."
+        None, metavar="COLUMN=LABEL", help="Label for a column of the log; repeatable."
     ),
-    unit: str | None = typer.Option(
-        None, help="The log's unit where it does not say: degC, K, degF."
-    ),
-    date_order: str | None = expert(None, help="Which of 06/07/2026 is the day: dmy or mdy."),
+    unit: str | None = typer.Option(None, help="Unit, if the log states none: degC, K, degF."),
+    date_order: str | None = expert(None, help="Order of dates such as 06/07/2026: dmy or mdy."),
     time_column: list[str] | None = expert(
-        None, help="The log's column of times; twice for a date and a time."
+        None, help="Name of the log's time column; twice for a date and a time column."
     ),
-    log_timezone: str | None = expert(None, help="The logger's time zone."),
-    log_clock: str = expert("0", help="How far the logger's clock was ahead: +00:03:12."),
+    log_timezone: str | None = expert(
+        None, help="Time zone of the logger; overrides --timezone and what the log states."
+    ),
+    log_clock: str = expert("0", help="Advance of the logger's clock, such as +00:03:12."),
     ambiguous: str = expert(
         "order",
-        help="The hour that comes twice in autumn: order (of rows), earlier, later, refuse.",
+        help="The hour that occurs twice in autumn: order (of rows), earlier, later, refuse.",
     ),
-    separator: str | None = expert(None, help="Between the log's columns: ';' ',' tab."),
-    decimal: str | None = expert(None, help="The log's decimal mark: , or ."),
+    separator: str | None = expert(None, help="Column separator of the log: ';' ',' tab."),
+    decimal: str | None = expert(None, help="Decimal mark of the log: , or ."),
 ) -> Any:
-    """How a logger's file is to be read, wherever a command reads one."""
-    said = locals()
+    """Return the options for reading a logger's file, for every command that reads one."""
+    given = locals()
     from thermocald.store.logger.temperatures import log_options
 
-    return log_options(**said)
+    return log_options(**given)
 
 
-def takes(name: str, asked: Callable[..., Any]) -> Callable[[Callable[..., None]], Any]:
-    """Give a command the options that a function asks for; it receives its result as `name`.
+def takes(name: str, function: Callable[..., Any]) -> Callable[[Callable[..., None]], Any]:
+    """Return a decorator that adds a function's options to a command.
 
-    Those that its own signature names it receives by themselves too.
+    The command receives the function's result as `name`, and also every option that its own
+    signature lists.
     """
-    more = inspect.signature(asked, eval_str=True).parameters
+    more = inspect.signature(function, eval_str=True).parameters
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         own = inspect.signature(command, eval_str=True).parameters
@@ -118,8 +124,8 @@ def takes(name: str, asked: Callable[..., Any]) -> Callable[[Callable[..., None]
 
         @functools.wraps(command)
         def called(**given: Any) -> None:
-            said = {key: given[key] if key in own else given.pop(key) for key in more}
-            command(**given, **{name: asked(**said)})
+            options = {key: given[key] if key in own else given.pop(key) for key in more}
+            command(**given, **{name: function(**options)})
 
         last = kept[-1].replace(kind=inspect.Parameter.KEYWORD_ONLY)
         called.__signature__ = inspect.Signature([*kept[:-1], *added, last])  # type: ignore[attr-defined]
@@ -132,20 +138,21 @@ def takes(name: str, asked: Callable[..., Any]) -> Callable[[Callable[..., None]
 takes_log_options = takes("log_options", _log_options)
 CONFIG_PLACES = (Path("config.yaml"), Path("/etc/thermocald/config.yaml"))
 _NOTICES = ("thermocald.output.dashboard", "thermocald.store.database.file")
-_LINES = 10  # progress lines where there is no terminal
+_LINES = 10  # progress lines without a terminal
 
 
 def say(text: str) -> None:
-    """A line for a person, on standard error: standard output belongs to results.
+    """Print a line on standard error; standard output is for results.
 
-    Control characters, which a file's name may hold and a terminal would obey, are shown as codes.
+    Secrets are removed. Control characters, which a file name may contain and a terminal would
+    obey, are shown as codes.
     """
     sys.stderr.write(printable(without_secrets(text)) + "\n")
     sys.stderr.flush()
 
 
 def printable(text: str) -> str:
-    """The text with control characters but line ends and tabs written as codes."""
+    """Return the text with control characters, except line ends and tabs, written as codes."""
     return "".join(
         c if (c >= " " and not "\x7f" <= c <= "\x9f") or c in "\n\t" else f"\\x{ord(c):02x}"
         for c in text
@@ -153,16 +160,16 @@ def printable(text: str) -> str:
 
 
 def log_to_stderr(level: str = "WARNING") -> None:
-    """Let the program's log be seen."""
+    """Send the program's log to standard error."""
     logging.basicConfig(level=level, stream=sys.stderr, force=True)
     for handler in logging.getLogger().handlers:
         handler.setFormatter(_LogLine("%(levelname)s %(name)s: %(message)s"))
-    for name in _NOTICES:  # said to whoever calls the command, and no fault
+    for name in _NOTICES:  # for the user of the command; not a fault
         logging.getLogger(name).setLevel("INFO")
 
 
 class _LogLine(CleanFormatter):
-    """A notice is its sentence; what is wrong has its level and where it comes from."""
+    """A log line: a notice is its message only; a warning or error has level and origin too."""
 
     def format(self, record: logging.LogRecord) -> str:
         notice = record.levelno == logging.INFO and record.name in _NOTICES
@@ -171,7 +178,7 @@ class _LogLine(CleanFormatter):
 
 @contextmanager
 def progress(total: int | None, label: str) -> Iterator[Callable[[int], None]]:
-    """Yield a function that counts steps: a bar on a terminal, some lines otherwise."""
+    """Yield a function that counts steps, shown as a bar on a terminal, else as some lines."""
     if sys.stderr.isatty():
         from rich import progress as rich
         from rich.console import Console
@@ -196,7 +203,7 @@ def progress(total: int | None, label: str) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def warnings_said() -> Iterator[None]:
-    """Say warnings of the program as lines on standard error, each once."""
+    """Print the program's warnings as lines on standard error, each once."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
@@ -205,9 +212,9 @@ def warnings_said() -> Iterator[None]:
 
 
 def require_config(given: Path | None, instead: str) -> Path:
-    """The configuration that is named, else ./config.yaml, else the system's; UsageError for none.
+    """Return the given configuration file, else ./config.yaml, else the system's.
 
-    instead: what else may be given, for the message.
+    instead: what the message tells the user to give. Raises UsageError if there is none.
     """
     found = given or next((path for path in CONFIG_PLACES if path.exists()), None)
     if found is None:
@@ -217,23 +224,31 @@ def require_config(given: Path | None, instead: str) -> Path:
 
 
 def write_json(document: Any, destination: str | None) -> None:
-    """Write one JSON document to a file, to standard output for `-`, for None nowhere."""
+    """Write a JSON document to a file, to standard output for `-`, or not at all for None."""
     if destination is not None:
         write_text(json.dumps(jsonable(document), indent=1, allow_nan=False) + "\n", destination)
 
 
 def show(result: Any, json: str | None, *lines: object) -> None:
-    """Write a command's result where `--json` says, and print lines, by default the result itself.
+    """Write a command's result as `--json` says, and print lines, by default the result itself.
 
-    Nothing is printed where standard output is the document's.
+    Nothing is printed if the JSON document goes to standard output.
     """
     write_json(result, json)
     if json != "-":
         typer.echo("\n".join(map(str, lines or [result])))
 
 
+def session_line(one: Mapping[str, Any]) -> str:
+    """Return the line of a session's status."""
+    why = f": {one['why']}" if one["why"] else ""
+    start = f", {one['start']}" if one["start"] else ""
+    taken = f"{one['taken']} of {one['epochs']} epochs"
+    return f"{one['camera']}/{one['series']}{start}: {taken}, {one['state']}{why}"
+
+
 def warned(camera: ThermalCamera) -> ThermalCamera:
-    """Return a thermal camera; what its user must know was said."""
+    """Print a thermal camera's warning, if it has one, and return the camera."""
     if camera.warning:
         say(f"warning: {camera.warning}")
     return camera
@@ -242,16 +257,16 @@ def warned(camera: ThermalCamera) -> ThermalCamera:
 def write_text(text: str, destination: str | Path) -> None:
     """Write text to a file, whole or not at all, or to standard output for `-`.
 
-    Folders that do not exist are made.
+    Missing folders are created.
     """
     write_parts((text,), destination)
 
 
 def write_parts(parts: Iterable[str], destination: str | Path) -> None:
-    """Write a text that comes in parts, as `write_text` does."""
+    """Write a text that comes in parts, in the same way as `write_text`."""
     if str(destination) == "-":
         for part in parts:
             sys.stdout.write(part)
-            sys.stdout.flush()  # whoever reads it waits for it
+            sys.stdout.flush()  # its reader waits for each part
         return
     files.write_parts(Path(destination), parts)

@@ -1,7 +1,8 @@
 """`thermocald demo` and `simulate`: a camera that warms up, without hardware.
 
-The demo is the daemon on a virtual clock: frames of a corner field, a thermometer, 25 minutes of
-heating and cooling, an effect hidden in it; what was put in stands beside what was found.
+The demo runs the daemon on a virtual clock for 25 minutes of heating and cooling, with frames of a
+corner field and a thermometer. It compares the estimated drift with the true one, and then
+discovers a hidden effect in a second simulation.
 """
 
 from __future__ import annotations
@@ -26,33 +27,31 @@ if TYPE_CHECKING:
 
 
 def demo(
-    out: Path = typer.Option(
-        Path("thermocald-demo"), help="Folder for the store and the recording."
-    ),
+    out: Path = typer.Option(Path("thermocald-demo"), help="Folder for store and recording."),
     epochs: int = typer.Option(150, min=10, help="Number of epochs, of 10 s each."),
     seed: SeedOption = 0,
     discovery: bool = typer.Option(
-        True, "--discovery/--no-discovery", help="End with a hidden effect found."
+        True, "--discovery/--no-discovery", help="Finish with the discovery of a hidden effect."
     ),
     json: JsonOption = None,
 ) -> None:
-    """Run the main job on a camera that is rendered: 25 minutes of heating and cooling.
+    """Run the daemon on a rendered camera through 25 minutes of heating and cooling.
 
     Example: thermocald demo --out /tmp/demo
     """
-    say(f"a rendered camera (3280 × 2464) looks at a corner field for {epochs} epochs of 10 s")
+    say(f"a rendered camera (3280 × 2464 px) takes {epochs} epochs of 10 s of a corner field")
     with progress(epochs, "epochs") as advance:
         document = run_demo(out, epochs, seed, advance)
     if json != "-":
-        _tell(document)
+        _print_drift(document)
     if discovery:
         document["discovery"] = discover_hidden_effect(out, seed, say)
         if json != "-":
-            _tell_effect(document["discovery"])
+            _print_discovery(document["discovery"])
     write_json(document, json)
 
 
-def _tell(document: dict[str, Any]) -> None:
+def _print_drift(document: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -63,7 +62,7 @@ def _tell(document: dict[str, Any]) -> None:
         f"targets, {low:.1f} to {high:.1f} °C, sigma0 {document['sigma0']:.2f}"
     )
     table = Table(title="Drift from the first epoch to the hottest, px", box=None, pad_edge=False)
-    for title in ("", "put in", "found", "sd", "scatter / sd"):
+    for title in ("", "true", "estimated", "sd", "scatter / sd"):
         table.add_column(title, justify="left" if not title else "right")
     for row in document["parameters"]:
         table.add_row(
@@ -78,7 +77,7 @@ def _tell(document: dict[str, Any]) -> None:
     typer.echo(f"recording: {document['recording']}")
 
 
-def _tell_effect(document: dict[str, Any]) -> None:
+def _print_discovery(document: dict[str, Any]) -> None:
     hidden = document["hidden"]
     typer.echo(f"\nhidden:    {hidden['effect']}, tau {hidden['tau_s']:.0f} s")
     for effect in document["effects"]:
@@ -96,23 +95,21 @@ def _tell_effect(document: dict[str, Any]) -> None:
 
 def simulate(
     preset: str | None = typer.Option(None, help="A camera of the reference study; see --list."),
-    model: Path | None = typer.Option(None, help="A thermal model (YAML); replaces the preset's."),
-    camera: Path | None = typer.Option(
-        None, help="A camera file (YAML): heat, thermometers, noise."
-    ),
+    model: Path | None = typer.Option(None, help="Thermal model (YAML); replaces the preset's."),
+    camera: Path | None = typer.Option(None, help="Camera file (YAML): heat, thermometers, noise."),
     testfield: str | None = typer.Option(None, help="A testfield.csv, or markers, circles, plain."),
-    programme: Path | None = typer.Option(None, help="What is done to the camera (YAML)."),
+    programme: Path | None = typer.Option(
+        None, help="Programme (YAML): epochs, ambient temperatures, heat sources."
+    ),
     out: Path | None = typer.Option(None, help="The recording to write."),
     frames: bool = typer.Option(
-        False, "--frames", help="Render frames instead of measured image points."
+        False, "--frames", help="Render frames instead of simulating measured image points."
     ),
-    effect: list[Path] | None = expert(
-        None, help="An effect file (YAML) to add, such as a proposal."
-    ),
+    effect: list[Path] | None = expert(None, help="Effect file (YAML) to add; repeatable."),
     seed: SeedOption = 0,
-    series: str = typer.Option("M1", help="Name of the series (preset)."),
-    model_out: Path | None = expert(None, help="Also write the model that was simulated."),
-    list_: bool = typer.Option(False, "--list", help="List presets and effects."),
+    series: str = typer.Option("M1", help="Name of the series, for a preset."),
+    model_out: Path | None = expert(None, help="Also write the simulated thermal model."),
+    list_: bool = typer.Option(False, "--list", help="List the presets and effects."),
     json: JsonOption = None,
 ) -> None:
     """Simulate a camera that warms up, and write a recording of it.
@@ -136,15 +133,15 @@ def simulate(
     show(document, json, f"{out}: {made.simulation.lines()[0]}")
 
 
-_NAMES = ("c", "x0", "y0")  # the first of the interior orientation
+_NAMES = ("c", "x0", "y0")  # the first parameters of the interior orientation
 _HIDDEN = "thermal_lag"
 _TAU_S = 75.0
 
 
 def run_demo(out: Path, epochs: int, seed: int, advance: Callable[[int], None]) -> dict[str, Any]:
-    """Take epochs of a rendered camera into a store and a recording; return what `demo` writes.
+    """Take epochs of a rendered camera into a store and a recording; return the JSON document.
 
-    advance: receives how many epochs are done. Raises DataError where the folder is not empty.
+    advance: receives the number of new epochs. Raises DataError if the folder is not empty.
     """
     if out.exists() and any(out.iterdir()):
         raise DataError(f"{out}: exists and is not empty; give another folder with --out")
@@ -167,9 +164,9 @@ def run_demo(out: Path, epochs: int, seed: int, advance: Callable[[int], None]) 
 def _acquire(
     out: Path, epochs: int, seed: int, advance: Callable[[int], None]
 ) -> tuple[tc.Series, Array]:
-    """Have the daemon take the epochs on a virtual clock, then write their recording.
+    """Run the daemon on a virtual clock until it has taken the epochs, then write the recording.
 
-    Returns what was taken, and the true interior orientation (E, 10) at the frames' times.
+    Returns the series, and the true interior orientation (E, 10) at the times of the frames.
     """
     from thermocald.daemon.plan import demo_config
     from thermocald.daemon.service import Service
@@ -185,7 +182,7 @@ def _acquire(
     taken = 0
     set_up_logging("warning")
 
-    def look(station: Station) -> bool:
+    def show_progress(station: Station) -> bool:
         nonlocal taken
         run = station.cameras[0].run
         now = 0 if run is None else run.taken
@@ -193,7 +190,7 @@ def _acquire(
         taken = now
         return False
 
-    Service(config, epochs=epochs, until_finished=True, on_turn=look, clock=clock).run()
+    Service(config, epochs=epochs, until_finished=True, on_turn=show_progress, clock=clock).run()
     advance(epochs - taken)
     with Store.open(config.store.path) as store:
         archive_series(store, store.find_series(), out / "M1")
@@ -203,7 +200,10 @@ def _acquire(
 
 
 def _compare(table: tc.Epochs, truth: Array, pitch: float) -> list[dict[str, Any]]:
-    """Per kelvin and over the series: the drift put in and the drift found; pitch: of a pixel."""
+    """Compare estimated and true drift, per kelvin and from the first epoch to the hottest.
+
+    pitch: pixel pitch, mm. Returns a record for each of c, x0, y0.
+    """
     ok = table.ok & np.isfinite(table.temperature)
     t = table.temperature[ok] - table.temperature[ok].mean()
     hottest = int(np.argmax(table.temperature[ok]))
@@ -230,8 +230,11 @@ def _compare(table: tc.Epochs, truth: Array, pitch: float) -> list[dict[str, Any
 
 
 def discover_hidden_effect(out: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Simulate a hidden lag, discover it on M1, prove it on M2; return the document."""
-    say(f"hiding an effect: the camera follows the thermometer with a lag of {_TAU_S:.0f} s")
+    """Simulate a hidden lag, discover it in M1, verify it in M2; return the JSON document."""
+    say(
+        "simulating a hidden effect: the camera follows the thermometer with a lag of "
+        f"{_TAU_S:.0f} s"
+    )
     folder = out / "discovery"
     make_folder(folder)
     M1, M2 = (
@@ -241,7 +244,7 @@ def discover_hidden_effect(out: Path, seed: int, say: Callable[[str], None]) -> 
         )
         for number, name in enumerate(("M1", "M2"))
     )  # fmt: skip
-    say("discovering: where do model and measurement disagree, and why?")
+    say("discovering where simulation and measurement disagree, and why")
     found = tc.discover(M1, verify=[M2], say=say)
     document = found.as_dict()
     document["model"] = str(found.save(folder / "camera.thermal.yaml"))

@@ -1,9 +1,7 @@
 """`thermocald run`, `dashboard`, `status`, `top`, `check`, `devices` and `doctor`.
 
-The daemon, its page, and how it is doing; what is sound, what is attached, what is lacking. The
-status fits a terminal of 80 columns, or a pipe: a block for each camera, because a table of all
-that is known of one does not fit; a line for each other device. Nothing is cut off: long reasons
-are left to the terminal to wrap.
+The status is written for 80 columns: one block per camera, because a table of its values would be
+wider, and one line per other device. Long lines are wrapped, never cut off.
 """
 
 from __future__ import annotations
@@ -24,7 +22,15 @@ from typing import Annotated, Any
 import typer
 
 from thermocald.cli.commands import expert
-from thermocald.cli.common import ConfigOption, JsonOption, require_config, say, show
+from thermocald.cli.common import (
+    ConfigOption,
+    JsonOption,
+    StoreConfigOption,
+    require_config,
+    say,
+    session_line,
+    show,
+)
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import duration, with_sd
@@ -33,20 +39,18 @@ from thermocald.numbers import duration, with_sd
 def run(
     config: ConfigOption = None,
     mock: bool = typer.Option(
-        False, "--mock", help="A rendered camera that warms up, and a thermometer."
+        False, "--mock", help="Use a rendered camera that warms up, and a mock thermometer."
     ),
-    recording: Path | None = typer.Option(None, help="Play a recording instead of devices."),
+    recording: Path | None = typer.Option(None, help="Play back a recording instead of devices."),
     store: Path | None = typer.Option(None, help="The store; overrides the configuration."),
-    epochs: int = typer.Option(0, min=0, help="End after so many epochs per camera; 0: never."),
-    fast: bool = expert(
-        False, "--fast", help="Play the recording as fast as it can be calibrated."
-    ),
+    epochs: int = typer.Option(0, min=0, help="Stop after this many epochs per camera; 0: never."),
+    fast: bool = expert(False, "--fast", help="Play back as fast as epochs can be calibrated."),
     hang_after: float = expert(
-        60.0, min=0.5, help="Seconds after which a device that does not return hangs."
+        60.0, min=0.5, help="Seconds without an answer after which a device counts as hung."
     ),
-    dashboard: bool = typer.Option(False, "--dashboard", help="Show the web page too."),
+    dashboard: bool = typer.Option(False, "--dashboard", help="Serve the web page too."),
 ) -> None:
-    """Acquire, calibrate and keep epochs until told to end (Ctrl-C, SIGTERM).
+    """Acquire, calibrate and store epochs until stopped (Ctrl-C, SIGTERM).
 
     Example: thermocald run --config config.yaml
     """
@@ -90,7 +94,7 @@ def run(
     for one in faults:
         say(f"error: {one}")
     if not released:
-        # a driver that hangs in the kernel would keep the interpreter from ending
+        # a driver that hangs in the kernel would keep the interpreter from exiting
         os._exit(1 if faults else 0)
     if faults:
         raise typer.Exit(1)
@@ -98,18 +102,16 @@ def run(
 
 def dashboard(
     store: Path | None = typer.Option(None, help="The daemon's store."),
-    live: Path | None = expert(None, help="The folder of the daemon's live state."),
-    host: str = expert("127.0.0.1", help="Elsewhere than here needs --token-file."),
-    port: int = expert(8437, min=1, max=65535),
-    token_file: Path | None = expert(None, help="A file that holds the token."),
-    name: list[str] | None = expert(None, help="A further name of the page; repeatable."),
-    config: Path | None = typer.Option(
-        None, "--config", "-c", help="All of these from a configuration."
-    ),
+    live: Path | None = expert(None, help="Folder of the daemon's live state."),
+    host: str = expert("127.0.0.1", help="Address; other than loopback needs --token-file."),
+    port: int = expert(8437, min=1, max=65535, help="Port to listen on."),
+    token_file: Path | None = expert(None, help="File with the access token."),
+    name: list[str] | None = expert(None, help="Further host name of the page; repeatable."),
+    config: StoreConfigOption = None,
 ) -> None:
-    """Serve a daemon's web page, in a process of its own that only reads.
+    """Serve a daemon's web page from a separate process that only reads.
 
-    With --config it ends at once where the configuration has `dashboard: {enabled: false}`.
+    With --config, the command exits at once if the configuration has `dashboard: {enabled: false}`.
 
     Example: thermocald dashboard --store thermocald.db
     """
@@ -121,7 +123,7 @@ def dashboard(
     if config is not None:
         read = load_config(config)
         if not read.dashboard.enabled:
-            say(f"{config}: dashboard.enabled is false; there is no page")
+            say(f"{config}: dashboard.enabled is false; the page is not served")
             return
         page = read.dashboard
         store = store or read.store.path
@@ -129,7 +131,7 @@ def dashboard(
         names = [*names, *page.names]
     if store is None:
         raise UsageError("give --store FILE or --config FILE")
-    # with --config the page may be started before the daemon has made its store
+    # with --config the page may be started before the daemon has created its store
     if config is None and live is None and not store.exists():
         raise StoreError(f"{store}: does not exist; give the store that the daemon writes")
     serve(store, live or find_state(store), host, port, token_file, names)
@@ -144,10 +146,10 @@ StoreOption = Annotated[Path | None, typer.Option("--store", help="The daemon's 
 def status(
     config: _DaemonConfig = None, store: StoreOption = None, json: JsonOption = None
 ) -> None:
-    """Say how the daemon is doing: cameras, thermometers, store.
+    """Report the state of the daemon: cameras, thermometers, store.
 
-    Exit status 1 if it does not run, if its store cannot be written, or if an epoch that it took is
-    lost.
+    The exit status is 1 if the daemon does not run, if its store cannot be written, or if an epoch
+    was taken but not stored.
 
     Example: thermocald status --config /etc/thermocald/config.yaml
     """
@@ -155,9 +157,9 @@ def status(
     show(document, json, *status_lines(document))
     store_ = document["store"]
     if store_["lost"]:
-        raise DataError(f"{store_['lost']} epochs were lost, taken and not kept")
+        raise DataError(f"{store_['lost']} epochs were lost: taken but not stored")
     if store_["state"] == "out":
-        raise DataError(f"the store cannot be written, {store_['waiting']} epochs wait in memory")
+        raise DataError(f"the store cannot be written; {store_['waiting']} epochs wait in memory")
 
 
 def top(
@@ -165,7 +167,7 @@ def top(
     store: StoreOption = None,
     interval: float = typer.Option(1.0, min=0.2, help="Seconds between two updates."),
 ) -> None:
-    """Show how the daemon is doing, always up to date; q or Ctrl-C ends it.
+    """Show the state of the daemon, continuously updated; q or Ctrl-C ends it.
 
     Example: thermocald top --store thermocald.db
     """
@@ -177,7 +179,7 @@ def top(
         head, *rest = status_lines(read_status(config, store))
         return Group(Text(head, style="bold"), *(Text(line) for line in rest))
 
-    # A KeyboardInterrupt could be raised in a destructor, where Python only prints it.
+    # A KeyboardInterrupt could arrive in a destructor, where Python only prints it.
     ended = Event()
     before = signal.signal(signal.SIGINT, lambda *_: ended.set())
     console = Console()
@@ -196,9 +198,9 @@ def top(
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str]]:
-    """A function that waits for a key, s, and returns it or an empty string.
+    """Yield a function that waits for a key, at most the given s, and returns it or "".
 
-    Without a terminal to read from it only waits. The terminal is as it was before at the end.
+    If standard input is not a terminal, the function only waits. The terminal's mode is restored.
     """
     if not sys.stdin.isatty():
 
@@ -235,9 +237,9 @@ def read_status(config: Path | None, store: Path | None) -> dict[str, Any]:
 
 
 def devices(json: JsonOption = None) -> None:
-    """List attached cameras, thermometers and outputs, as they are written in config.yaml.
+    """List the attached cameras, thermometers and outputs as stanzas of config.yaml.
 
-    What is not certain (what is on a serial port, on an I2C bus) is a comment.
+    A device that cannot be identified for certain (on a serial port or I2C bus) is a comment.
 
     Example: thermocald devices >> config.yaml
     """
@@ -251,13 +253,13 @@ def devices(json: JsonOption = None) -> None:
 
 
 def doctor(
-    root: Path = expert(Path("/"), help="The machine's root folder, such as a mounted card."),
+    root: Path = expert(Path("/"), help="Root folder of the machine, such as a mounted card."),
     json: JsonOption = None,
 ) -> None:
-    """Say what this machine lacks: camera stack, groups, I2C, clock, power, disk.
+    """Report what this machine lacks: camera stack, groups, I2C, clock, power, disk.
 
-    Below each thing that is missing is the command that mends it. Nothing is changed. Exit status 1
-    where something is missing.
+    Each finding is followed by the command that fixes it. Nothing is changed. The exit status is 1
+    if something is missing.
 
     Example: thermocald doctor
     """
@@ -273,13 +275,13 @@ def doctor(
 def check(
     source: Path = typer.Argument(..., help="A recording, a config.yaml, or a store."),
     probe: bool = typer.Option(
-        False, "--probe", help="Take one frame and one reading from every device of a config."
+        False, "--probe", help="Take a frame or a reading from every device of a configuration."
     ),
     json: JsonOption = None,
 ) -> None:
-    """Read everything and say what it is; stop at the first thing that is wrong.
+    """Read a recording, a configuration or a store completely; stop at the first error.
 
-    With --probe every device is tried, whatever the others did: exit status 3 where one failed.
+    With --probe, every device is tried even if others fail; the exit status is 3 if one failed.
 
     Example: thermocald check config.yaml
     """
@@ -290,14 +292,13 @@ def check(
     if damaged := document.get("damaged"):
         raise DataError(
             f"{source}: {len(damaged)} places are damaged, the first: {damaged[0]}; restore a "
-            "backup, or read what is sound"
+            "backup, or use what can still be read"
         )
     probes = document.get("probes", [])
     failed = [probe.name for probe in probes if probe.error]
     if failed:
         raise DeviceError(
-            f"{len(failed)} of {len(probes)} devices gave nothing: {', '.join(failed)}; "
-            "see their lines"
+            f"{len(failed)} of {len(probes)} devices failed: {', '.join(failed)}; see their lines"
         )
 
 
@@ -306,12 +307,12 @@ _OLD_S = 10.0
 
 
 def status_lines(document: dict[str, Any]) -> list[str]:
-    """Lines of a `thermocald-status/1` document; the first is the headline."""
+    """Return a `thermocald-status/1` document as lines; the first is the headline."""
     lines = [_headline(document), ""]
     for name, camera in document["cameras"].items():
         lines += _camera(name, camera)
     for one in document["sessions"].values():
-        lines += _wrapped(_session(one))
+        lines += _wrapped(f"session {session_line(one)}")
     others = [
         (name, device)
         for kind in ("thermometers", "outputs")
@@ -325,7 +326,7 @@ def status_lines(document: dict[str, Any]) -> list[str]:
 
 
 def _wrapped(text: str, indent: int = 2) -> list[str]:
-    """A line in lines of 79 characters, between words; a path is never broken."""
+    """Wrap a line between words to lines of 79 characters; a path is never broken."""
     return textwrap.wrap(
         text, WIDTH, subsequent_indent=" " * indent, break_long_words=False,
         break_on_hyphens=False,
@@ -336,7 +337,7 @@ def _headline(document: dict[str, Any]) -> str:
     running = duration(max(0.0, document["utc"] - document["started"]))
     text = f"thermocald {document['version']}, pid {document['pid']}, for {running}"
     if document["age_s"] > _OLD_S:
-        text += f"; this is {duration(document['age_s'])} old: it does not answer"
+        text += f"; this status is {duration(document['age_s'])} old: the daemon does not answer"
     return text
 
 
@@ -351,8 +352,8 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
         if last.get("status") in WITH_VALUES:
             lines += _orientation(last)
             lines += _wrapped(f"  {_movement(last)}")
-            if said := (last.get("online") or {}).get("orientation"):
-                lines += _wrapped(f"  {said}")
+            if change := (last.get("online") or {}).get("orientation"):
+                lines += _wrapped(f"  {change}")
         else:
             lines += _wrapped(f"  {last.get('status', '')}: {last.get('reason', '')}")
     late = 1000 * camera["late_p99_s"]
@@ -361,7 +362,7 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
 
 
 def _orientation(last: dict[str, Any]) -> list[str]:
-    """c, x0, y0 with their standard deviations and drifts, a line each."""
+    """Return a line for each of c, x0, y0 with its standard deviation and drift."""
     lines = []
     for name in ("c", "x0", "y0"):
         value, sd = last.get(name), last.get(f"sd_{name}")
@@ -377,10 +378,10 @@ def _orientation(last: dict[str, Any]) -> list[str]:
 
 def _movement(last: dict[str, Any]) -> str:
     online = last.get("online") or {}
-    said = str(online.get("sentence") or last.get("state", ""))
+    state = str(online.get("sentence") or last.get("state", ""))
     sigma0 = last.get("sigma0")
     fit = "" if sigma0 is None or not math.isfinite(sigma0) else f"σ₀ {sigma0:.2f}"
-    return ", ".join(part for part in (fit, said) if part)
+    return ", ".join(part for part in (fit, state) if part)
 
 
 def _device(device: dict[str, Any]) -> str:
@@ -396,21 +397,14 @@ def _device(device: dict[str, Any]) -> str:
     return text + (f": {device['why']}" if device["why"] else "")
 
 
-def _session(one: dict[str, Any]) -> str:
-    why = f": {one['why']}" if one["why"] else ""
-    start = f", {one['start']}" if one["start"] else ""
-    taken = f"{one['taken']} of {one['epochs']} epochs"
-    return f"session {one['camera']}/{one['series']}{start}: {taken}, {one['state']}{why}"
-
-
 def status_warnings(document: dict[str, Any]) -> list[str]:
-    """What a person should know, a sentence each."""
+    """Return the warnings of a status document, one sentence each."""
     found = list(document["stalled"])
     store = document["store"]
     if store["state"] != "ok":
         found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
     if store["lost"]:
-        found.append(f"{store['lost']} epochs are lost, taken and not kept: {store['lost_why']}")
+        found.append(f"{store['lost']} epochs are lost, taken but not stored: {store['lost_why']}")
     if store.get("notice"):
         found.append(f"store: {store['notice']}")
     if document.get("dashboard", {}).get("why"):
@@ -420,7 +414,7 @@ def status_warnings(document: dict[str, Any]) -> list[str]:
     if not document["clock"]["trusted"]:
         found.append("the clock is not synchronised: times may be wrong")
     if not document["frames"].get("ages_known", True):
-        found.append("no frame is deleted for its age until the clock can be trusted")
+        found.append("frames are not deleted for their age until the clock is synchronised")
     for kind in ("camera", "thermometer", "output"):
         for name, device in document[f"{kind}s"].items():
             found += [f"{kind} {name}: {text}" for text in device.get("warnings", ())]

@@ -1,7 +1,6 @@
-"""`thermocald server`, `forward` and `fleet`: the series of many cameras on a PostgreSQL server.
+"""`thermocald server`, `forward`, `fleet`: the series of many cameras on a PostgreSQL server.
 
-And `reprocess`: whole archives calibrated again, on many cores or machines. A task is one series
-analysed on its own, wherever that is.
+`reprocess` calibrates or analyses whole archives again, on many cores or machines.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from thermocald.cli.common import (
     JobsOption,
     JsonOption,
     StoreArgument,
+    StoreConfigOption,
     log_to_stderr,
     progress,
     say,
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 
 _Address = Annotated[
-    str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, an owner's.")
+    str, typer.Argument(metavar="ADDRESS", help="postgresql://OWNER@HOST/DATABASE, by its owner.")
 ]
 
 
 def init(address: _Address) -> None:
-    """Make the tables, or bring older ones up to date.
+    """Create the tables, or bring older ones up to date.
 
     Example: thermocald server init postgresql://owner@db.example/thermocald
     """
@@ -52,17 +52,17 @@ def init(address: _Address) -> None:
 
     parsed = ServerAddress.parse(address)
     create_tables(parsed)
-    say(f"{parsed}: the tables are as this program needs them")
+    say(f"{parsed}: the tables are up to date")
 
 
 def grant(
     address: _Address,
-    role: str = typer.Argument(..., help="A role that exists."),
+    role: str = typer.Argument(..., help="An existing role."),
     forward: bool = typer.Option(
-        False, "--forward/--read", help="It may only insert; or only read."
+        False, "--forward/--read", help="Allow the role to insert only, or to read only."
     ),
 ) -> None:
-    """Let a role forward (insert and nothing else) or read.
+    """Allow a role to forward (insert only) or to read.
 
     Example: thermocald server grant postgresql://owner@db.example/thermocald gauge7 --forward
     """
@@ -74,11 +74,9 @@ def grant(
 
 
 def dashboard(
-    output: str = typer.Option(
-        "-", "-o", "--output", help="The file to write; - for standard output."
-    ),
+    output: str = typer.Option("-", "-o", "--output", help="File to write; - is standard output."),
 ) -> None:
-    """Write a dashboard for Grafana (import it; its source is the server, PostgreSQL).
+    """Write a dashboard to import into Grafana; its data source is the PostgreSQL server.
 
     Example: thermocald server dashboard -o fleet.json
     """
@@ -94,19 +92,17 @@ def forward(
     to: str | None = typer.Option(
         None, metavar="ADDRESS", help="postgresql://USER@HOST/DATABASE?…"
     ),
-    config: Path | None = typer.Option(
-        None, "--config", "-c", help="Store and `forward:` of this file."
-    ),
-    station: str | None = expert(None, help="This station's name; default: the host's."),
+    config: StoreConfigOption = None,
+    station: str | None = expert(None, help="Name of this station; default: the host's name."),
     once: bool = typer.Option(
-        False, "--once", help="Send what waits, then end; else run until stopped."
+        False, "--once", help="Send the waiting rows and exit; default: run until stopped."
     ),
-    cursor: Path | None = expert(None, help="The file that says how far it has sent."),
+    cursor: Path | None = expert(None, help="File that records which rows have been sent."),
     json: JsonOption = None,
 ) -> None:
-    """Send epochs, events, readings and chosen frames to a PostgreSQL server, each of them once.
+    """Send epochs, events, readings and chosen frames to a PostgreSQL server, each exactly once.
 
-    The store is only read. Without a network rows wait in it, for as long as it takes.
+    The store is only read. While there is no network, the rows wait in it.
 
     Example: thermocald forward thermocald.db --to postgresql://pi@db.example/thermocald --once
     """
@@ -147,10 +143,10 @@ def fleet(
     servers: list[str] = typer.Argument(
         ..., metavar="ADDRESS…", help="postgresql://USER@HOST/DATABASE?station=…"
     ),
-    report: Path | None = typer.Option(None, help="Write a page, one HTML file."),
+    report: Path | None = typer.Option(None, help="Write a page to an HTML file."),
     json: JsonOption = None,
 ) -> None:
-    """Show late and dead stations, sensors and clocks, odd cameras, and what needs calibration.
+    """Show late or dead stations, sensors and clocks, unusual cameras, and calibrations due.
 
     Example: thermocald fleet postgresql://reader@db.example/thermocald --report fleet.html
     """
@@ -166,21 +162,21 @@ ANALYSES = ("discover", "study")
 
 
 def find_series_tasks(sources: list[Path], out: Path, analysis: str) -> list[tuple[Path, Path]]:
-    """Every series that is not analysed yet: a recording's folder or an address, and its JSON file.
+    """Return each series that is not analysed yet, as (folder or address, its JSON file).
 
-    sources: folders and addresses. Raises DataError where there is no series, UsageError for an
+    sources: folders and addresses. Raises DataError if there is no series, UsageError for an
     unknown analysis.
     """
     from thermocald.fleet.reprocess import find_series
 
     if analysis not in ANALYSES:
-        raise UsageError(f"--do {analysis}: there are calibrate, {', '.join(ANALYSES)}")
+        raise UsageError(f"--do {analysis}: must be one of calibrate, {', '.join(ANALYSES)}")
     tasks = [(place, out / f"{name}.json") for name, place in sorted(find_series(sources).items())]
     return [task for task in tasks if not task[1].exists()]
 
 
 def analyse(analysis: str, sets: int, task: tuple[Path, Path]) -> Outcome:
-    """Analyse one series and write its file, whole or not at all; sets: of a study."""
+    """Analyse one series and write its JSON file, whole or not at all; sets: draws of a study."""
     from thermocald.fleet.reprocess import Outcome
 
     source, target = task
@@ -196,21 +192,20 @@ def reprocess(
     archives: list[str] = typer.Argument(
         ..., metavar="ARCHIVE…", help="Folders that hold recordings, or postgresql://…"
     ),
-    out: Path = typer.Option(..., help="Where the files are written."),
-    do: str = typer.Option(
-        "calibrate", help="calibrate every epoch, or discover, study every series."
-    ),
+    out: Path = typer.Option(..., help="Folder for the results."),
+    do: str = typer.Option("calibrate", help="calibrate epochs, or discover or study series."),
     engine: str = expert("local", help="local, or a Dask scheduler: tcp://HOST:8786."),
     jobs: JobsOption = 1,
     free: FreeOption = DEFAULT_FREE,
-    sets: int = expert(100_000, min=100, max=10_000_000, help="Draws of a study's Monte-Carlo."),
+    sets: int = expert(100_000, min=100, max=10_000_000, help="Draws of a study's simulation."),
     json: JsonOption = None,
 ) -> None:
-    """Calibrate every epoch of every recording again, or analyse every series on its own.
+    """Calibrate every epoch of every recording again, or analyse every series separately.
 
-    What is done already is not done twice. Calibrations are Parquet files, one a block of epochs,
-    which DuckDB, pandas or R read as they stand; discover and study write one JSON file a series.
-    Every engine gives the same bits. Exit status 1 where a part failed; the others are there.
+    Existing results are not computed again. Calibrations are Parquet files, one per block of
+    epochs, which DuckDB, pandas and R can read; discover and study write one JSON file per series.
+    Results do not depend on the engine. The exit status is 1 if a part failed; the others are
+    written.
 
     Example: thermocald reprocess archive --out again --jobs 2
     """
@@ -239,15 +234,15 @@ def reprocess(
         calibrated = sum(o.calibrated for o in outcomes)
         document = {"blocks": count, "epochs": epochs, "calibrated": calibrated}
         places = [{"recording": o.task.recording, "first": o.task.first} for o in failed]
-        said = f"{calibrated} of {epochs} epochs calibrated in {count - len(failed)} blocks"
+        summary = f"{calibrated} of {epochs} epochs calibrated in {count - len(failed)} blocks"
     else:
         document = {"series": count}
         places = [{"source": source_name(o.task[0])} for o in failed]
-        said = f"{count - len(failed)} of {count} series done"
+        summary = f"{count - len(failed)} of {count} series analysed"
     errors = [{**place, "error": o.error} for place, o in zip(places, failed, strict=True)]
     write_json({**document, "failed": errors}, json)
     if json != "-":
-        say(f"{out}: {said}")
+        say(f"{out}: {summary}")
     if not failed:
         return
     first = failed[0]

@@ -1,4 +1,4 @@
-"""`thermocald session`: from a plugged-in camera to epochs, a recording and the report."""
+"""`thermocald session`: take a measurement series, up to its recording and report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ import typer
 
 import thermocald as tc
 from thermocald.cli.commands import expert, subcommands
-from thermocald.cli.common import ConfigOption, JsonOption, require_config, say, write_json
+from thermocald.cli.common import (
+    ConfigOption,
+    JsonOption,
+    require_config,
+    say,
+    session_line,
+    show,
+)
 from thermocald.errors import DataError, UsageError
 from thermocald.files import make_folder
 
@@ -20,41 +27,41 @@ if TYPE_CHECKING:
     from thermocald.daemon.session import Session
 
 CameraOption = Annotated[
-    str | None, typer.Option("--camera", help="Which of the configuration's cameras.")
+    str | None, typer.Option("--camera", help="Camera, if the configuration has several.")
 ]
 
 
 def start(
     camera: CameraOption = None,
-    series: str = typer.Option("M1", help="Name of the series; resumes it."),
+    series: str = typer.Option("M1", help="Name of the series; an unfinished one is resumed."),
     condition: str = typer.Option("", "--start", help="Start condition, such as cold or warm."),
-    epochs: int = typer.Option(150, min=1, help="How many epochs."),
+    epochs: int = typer.Option(150, min=1, help="Number of epochs."),
     config: ConfigOption = None,
-    mock: bool = typer.Option(False, "--mock", help="A rendered camera, without hardware."),
-    programme: Path | None = typer.Option(None, help="Steps of a heating output: YAML list."),
+    mock: bool = typer.Option(False, "--mock", help="Use a rendered camera, without hardware."),
+    programme: Path | None = typer.Option(None, help="Programme of the heating output (YAML)."),
     output: Path = typer.Option(Path(), "--output", "-o", help="Folder for recording and report."),
     check: bool = typer.Option(
-        True, "--check/--no-check", help="Look at light, focus, geometry first."
+        True, "--check/--no-check", help="Check light, focus and geometry first."
     ),
-    report: bool = typer.Option(True, "--report/--no-report", help="End with the study's report."),
+    report: bool = typer.Option(True, "--report/--no-report", help="Finish with a study's report."),
     wait: bool = typer.Option(
-        True, "--wait/--no-wait", help="Wait for a daemon to take all epochs."
+        True, "--wait/--no-wait", help="Wait until a running daemon has taken all epochs."
     ),
     until_separated: str | None = typer.Option(
-        None, metavar="A,B", help="Heat so that two effects separate, and stop when they are."
+        None, metavar="A,B", help="Plan the heating to separate two effects; stop once they are."
     ),
-    evidence: Path | None = expert(None, help="A recording that could not separate them."),
+    evidence: Path | None = expert(None, help="A recording that could not separate A and B."),
     max_temperature: float | None = expert(
-        None, help="Highest °C of a planned programme [the output's]."
+        None, help="Highest temperature of a planned programme, °C; default: the output's limit."
     ),
     max_rate: float = expert(3.0, min=0.1, max=60.0, help="Fastest planned rise, K/min."),
-    max_duty: float = expert(0.8, min=0.05, max=1.0, help="Share of time with heat."),
-    dry_run: bool = expert(False, "--dry-run", help="Print the planned programme and end."),
+    max_duty: float = expert(0.8, min=0.05, max=1.0, help="Largest share of time with heating."),
+    dry_run: bool = expert(False, "--dry-run", help="Print the planned programme and exit."),
 ) -> None:
-    """Take a series of epochs with progress, then write its recording and its report.
+    """Take a series of epochs, showing progress, then write its recording and its report.
 
-    A daemon that runs with this configuration takes them; where none runs, this command does.
-    Interrupted, the same command goes on where it stopped.
+    A daemon that runs with this configuration takes the epochs; if none runs, this command does.
+    If it was interrupted, the same command continues the series.
 
     Example: thermocald session start --camera phone-1 --series M1 --start cold --epochs 150
     """
@@ -93,33 +100,25 @@ def start(
 
 
 def status(config: ConfigOption = None, json: JsonOption = None) -> None:
-    """Show the sessions of a running daemon: under way, or the last that ended.
+    """Show the sessions of a running daemon, in progress or last finished.
 
     Example: thermocald session status --config /etc/thermocald/config.yaml
     """
     sessions = _ask(config, "session status")["sessions"]
-    write_json({"format": "thermocald-sessions/1", "sessions": sessions}, json)
-    if json == "-":
-        return
-    for name, one in sessions.items():
-        why = f": {one['why']}" if one["why"] else ""
-        start = f" ({one['start']})" if one["start"] else ""
-        taken = f"{one['taken']} of {one['epochs']}"
-        say(f"{name}/{one['series']}{start}: {taken}, {one['state']}{why}")
-    if not sessions:
-        say("no sessions")
+    lines = map(session_line, sessions.values()) if sessions else ["no sessions"]
+    show({"format": "thermocald-sessions/1", "sessions": sessions}, json, *lines)
 
 
 def stop(camera: CameraOption = None, config: ConfigOption = None) -> None:
-    """End a session of a running daemon before its time; what was taken stays.
+    """Stop a session of a running daemon early; the epochs taken so far stay in the store.
 
     Example: thermocald session stop --camera phone-1
     """
     from thermocald.daemon.desk import only_camera
 
     name = camera or only_camera(_configuration(config, False))
-    told = _ask(config, "session stop", camera=name)["session"]
-    say(f"{name}/{told['series']}: {told['taken']} of {told['epochs']} epochs, stopped")
+    one = _ask(config, "session stop", camera=name)["session"]
+    say(f"{name}/{one['series']}: {one['taken']} of {one['epochs']} epochs, stopped")
 
 
 def _configuration(config: Path | None, mock: bool) -> Config:
@@ -140,10 +139,10 @@ def _ask(config: Path | None, do: str, **values: Any) -> dict[str, Any]:
     from thermocald.daemon.live_state import find_state
 
     read = _configuration(config, False)
-    told = ask(find_state(read.store.path), do, **values)
-    if told is None:
-        raise DataError(f"no daemon listens for {read.store.path}; is it running?")
-    return told
+    answer = ask(find_state(read.store.path), do, **values)
+    if answer is None:
+        raise DataError(f"no daemon runs for {read.store.path}; start it with `thermocald run`")
+    return answer
 
 
 def _finish(config: Config, session: Session, path: Path, report: bool) -> None:

@@ -1,8 +1,4 @@
-"""`thermocald replay`, `export`, `study`, `discover`, `fit`: what measured series say of a camera.
-
-A recording calibrated, a series as a table; statistics, significance and Monte-Carlo; where
-simulation and measurement disagree, why, and the proof; one thermal model from all series.
-"""
+"""`thermocald replay`, `export`, `study`, `discover`, `fit`: calibrate and analyse series."""
 
 from __future__ import annotations
 
@@ -39,32 +35,30 @@ if TYPE_CHECKING:
 def replay(
     recording: Path = typer.Argument(..., help="The recording's folder."),
     store: Path | None = typer.Option(
-        None, help="Keep all in this store; an interrupted replay goes on."
+        None, help="Store the epochs in this file; an interrupted replay is continued."
     ),
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE,
     jobs: JobsOption = 1,
     model: Path | None = typer.Option(
-        None, help="Of photographs of a scene: the camera's thermal model."
+        None, help="Thermal model (YAML) of the camera, for photographs of a scene."
     ),
     log: Path | None = typer.Option(
-        None, help="With --model: a logger's file, a recording, or a store."
+        None, help="With --model: log of temperatures, a logger's file, a recording or a store."
     ),
-    times: str = expert(
-        "exif", "--times", help="With --model, when each was taken: exif, name, or file."
-    ),
+    times: str = expert("exif", "--times", help="With --model: as for `import --times`."),
     recording_out: Path | None = typer.Option(
         None,
         "--recording-out",
-        help="With --model: a folder for what does not move, a recording for `discover`.",
+        help="With --model: folder for a recording of the static points, for `discover`.",
     ),
     timezone: TimezoneOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Calibrate every epoch of a recording, and say what the series is worth.
+    """Calibrate every epoch of a recording and report the drift of the series.
 
-    With --model, RECORDING is a folder of photographs of a scene without a test field: what does
-    not move in it is compared with what the thermal model predicts.
+    With --model, RECORDING is a folder of photographs of a scene without a test field: the motion
+    of its static points in the image is compared with the prediction of the thermal model.
 
     Example: thermocald replay rpi-heating-M1 --store thermocald.db
 
@@ -75,9 +69,7 @@ def replay(
     if (model is None) != (log is None):
         raise UsageError("--model and --log go together")
     if recording_out is not None and model is None:
-        raise UsageError(
-            "--recording-out goes with --model: it keeps what does not move in a scene"
-        )
+        raise UsageError("--recording-out needs --model: it stores the static points of a scene")
     if model is not None and log is not None:
         from thermocald.store.logger.photographs import find_photographs
 
@@ -110,27 +102,27 @@ def export(
     output: str = typer.Option("-", "--output", "-o", help="File; - is standard output."),
     exterior: str = typer.Option(
         "",
-        help="stored: a store's epochs as they were stored; the others adjust the series "
-        "again: auto (of a recording), per_epoch, series, mount.",
+        help="stored: a store's epochs as they were stored; auto, per_epoch, series, mount: adjust "
+        "the series again. Default: stored for a store, auto for a recording.",
     ),
     free: FreeOption = DEFAULT_FREE,
-    series: str | None = typer.Option(None, help="Which of a store: CAMERA/SERIES or SERIES."),
-    units: str = typer.Option("", help="px, um, deg instead of mm and rad; named in the columns."),
-    time_: str = typer.Option("seconds", "--time", help="seconds since 1970 UTC, or iso."),
-    separator: str = typer.Option(",", help="Between the columns: , ; | tab"),
-    decimal: str = typer.Option(".", help="The decimal mark: . or ,"),
+    series: str | None = typer.Option(None, help="Series of a store: CAMERA/SERIES or SERIES."),
+    units: str = typer.Option("", help="px, um, deg instead of mm and rad; columns name them."),
+    time_: str = typer.Option("seconds", "--time", help="Times: seconds (since 1970, UTC) or iso."),
+    separator: str = typer.Option(",", help="Column separator: , ; | tab"),
+    decimal: str = typer.Option(".", help="Decimal mark: . or ,"),
     extra: bool = expert(
         False,
         "--extra",
-        help="All thermometers and all else that is stored of an epoch: camera_… settings as "
-        "the camera reported them, light, blur, the online filter.",
+        help="Add all thermometers and everything else stored for an epoch: the settings that the "
+        "camera reported (camera_…), light, blur, the online filter.",
     ),
     jobs: JobsOption = 1,
 ) -> None:
     """Write one row per epoch: parameters, standard deviations, sigma0, status.
 
-    With one of --units, --time, --separator, --decimal, --extra, and as Parquet, the temperatures
-    of all thermometers follow.
+    The temperatures of all thermometers are added with any of --units, --time, --separator,
+    --decimal, --extra, and always in Parquet.
 
     Example: thermocald export rpi-heating-M1 --format csv > M1.csv
 
@@ -142,7 +134,7 @@ def export(
     folder = source.is_dir()
     exterior = exterior or ("auto" if folder else "stored")
     if format_ not in ("csv", "json", "parquet"):
-        raise UsageError(f"--format {format_}: csv, json and parquet are written")
+        raise UsageError(f"--format {format_}: must be one of csv, json, parquet")
     style = series_export.style_of(units, time_, separator, decimal)
     if format_ == "parquet" and output == "-":
         raise UsageError("--format parquet needs a file: -o FILE")
@@ -170,34 +162,34 @@ def study(
     inputs: list[str] | None = typer.Argument(
         None,
         metavar="[LABEL=]RECORDING_OR_STORE…",
-        help="Recordings (folders) and stores (files). Series with one label are one camera; "
-        "the label is the camera's name unless given.",
+        help="Recordings (folders) and stores (files). Series with the same label belong to one "
+        "camera; default label: the camera's name.",
     ),
     json: JsonOption = None,
-    report: Path | None = typer.Option(None, help="Write the report, one HTML file."),
-    figures: Path | None = typer.Option(None, help="Write all figures as SVG and PNG here."),
-    window: int = expert(31, min=3, help="Epochs in the F-test's window, odd."),
-    alpha: float = expert(0.05, min=1e-6, max=0.5, help="Level of the F-test."),
-    sets: int = expert(50_000, min=2, help="Interior orientations drawn (Monte-Carlo)."),
+    report: Path | None = typer.Option(None, help="Write the report to an HTML file."),
+    figures: Path | None = typer.Option(None, help="Write all figures here, as SVG and PNG."),
+    window: int = expert(31, min=3, help="Number of epochs in the window of the F-test; odd."),
+    alpha: float = expert(0.05, min=1e-6, max=0.5, help="Significance level of the F-test."),
+    sets: int = expert(50_000, min=2, help="Number of draws of the Monte-Carlo simulation."),
     seed: SeedOption = 0,
     distance: float = expert(10.0, min=0.01, help="Distance of the object plane, m."),
     grid: int = expert(3, "--grid", min=2, max=9, help="Image points per row and column."),
     focus: float = expert(1.0, min=0.01, help="Focus distance for the depth of field, m."),
     f_number: float = expert(2.0, min=0.1, help="f-number of the lens."),
     confusion: float | None = expert(
-        None, min=1e-6, help="Circle of confusion, mm [diagonal/2000]."
+        None, min=1e-6, help="Circle of confusion, mm; default: image diagonal/2000."
     ),
     thermometer_sd: float | None = expert(
-        None, min=0.0, help="Noise of the thermometers, K [estimated]."
+        None, min=0.0, help="Standard deviation of a reading, K; default: estimated."
     ),
     exterior: ExteriorOption = "auto",
     free: FreeOption = DEFAULT_FREE,
     jobs: JobsOption = 1,
     reference: bool = expert(
-        False, "--reference", help="Study the presets instead, next to the reference study."
+        False, "--reference", help="Study the presets, and compare them with the reference study."
     ),
 ) -> None:
-    """Study how a camera changes with its temperature, whether that is significant, what it costs.
+    """Analyse how a camera changes with its temperature: drift, significance, effect on the object.
 
     Example: thermocald study M1 M2 --report study.html --json study.json
     """
@@ -231,7 +223,7 @@ def _study(inputs: list[str], settings: dict[str, Any], exterior: str, free: str
     series: list[tc.Series] = []
     for text in inputs:
         label, equals, rest = text.partition("=")
-        # A path may hold "="; what exists as it stands is a path.
+        # A path may contain "=": a text that exists as a path is one.
         if not equals or Path(text).exists() or is_server(text):
             label, rest = "", text
         found = tc.open_all(rest)
@@ -246,27 +238,27 @@ def _study(inputs: list[str], settings: dict[str, Any], exterior: str, free: str
 
 def discover(
     recording: Path | None = typer.Argument(
-        None, metavar="M1", help="What to explain: a recording, a store, postgresql://…"
+        None, metavar="M1", help="The series to explain: a recording, a store, postgresql://…"
     ),
     verify: list[Path] | None = typer.Option(
-        None, help="M2: another recording of this camera, to prove it on; repeatable."
+        None, help="M2: another series of this camera, to verify the effect; repeatable."
     ),
-    model: Path | None = typer.Option(None, help="The model so far (YAML) [base model]."),
+    model: Path | None = typer.Option(None, help="Model so far (YAML); default: the base model."),
     json: JsonOption = None,
-    model_out: Path | None = typer.Option(None, help="Write the model with what was found."),
-    effect_out: Path | None = expert(None, help="Write what was found as an effect file (YAML)."),
-    report: Path | None = typer.Option(None, help="Write a report, one HTML file."),
+    model_out: Path | None = typer.Option(None, help="Write the model with the effects found."),
+    effect_out: Path | None = expert(None, help="Write the effects found to a file (YAML)."),
+    report: Path | None = typer.Option(None, help="Write a report to an HTML file."),
     jobs: JobsOption = 1,
     plan: bool = typer.Option(
-        False, "--plan", help="Which effects a set-up would show, before heating anything."
+        False, "--plan", help="Predict which effects a set-up would reveal, before any heating."
     ),
     preset: str | None = typer.Option(None, help="With --plan: a camera of the reference study."),
     testfield: str | None = typer.Option(None, help="With --plan: a testfield.csv."),
-    programme: Path | None = typer.Option(None, help="With --plan: what is done to the camera."),
+    programme: Path | None = typer.Option(None, help="With --plan: the programme (YAML)."),
     strength: float = expert(0.1, min=0.001, help="With --plan: size of an effect, px."),
-    seeds: int = expert(2, min=1, max=50, help="With --plan: repetitions."),
+    seeds: int = expert(2, min=1, max=50, help="With --plan: number of repetitions."),
 ) -> None:
-    """Find where simulation and measurement disagree, name the missing effect, prove it.
+    """Find where simulation and measurement disagree, name the missing effect and verify it.
 
     Example: thermocald discover M1 --verify M2 --model-out camera.yaml --report discovery.html
     """
@@ -287,7 +279,7 @@ def discover(
     if model_out is not None:
         document["model"] = str(found.save(model_out))
     if effect_out is not None and found.save_effects(effect_out) is None:
-        say(f"{effect_out} is not written: nothing was found that another recording would show too")
+        say(f"{effect_out}: not written: no effect was found that another recording would show")
     if report is not None:
         found.report(report)
     show(document, json, found)
@@ -298,30 +290,30 @@ def fit(
     inputs: list[str] = typer.Argument(
         ...,
         metavar="RECORDING_OR_STORE…",
-        help="Recordings and stores; or JSON files of `calibrate`, each with its °C: "
+        help="Recordings and stores; or JSON files of `calibrate`, each with its temperature, °C: "
         "21.5=cold.json.",
     ),
     output: Path = typer.Option(..., "-o", "--output", help="The model file to write."),
     effect: list[str] | None = typer.Option(
-        None, help="NAME[:PARAMETER=VALUE,…] to fit alongside the base model; repeatable."
+        None, help="NAME[:PARAMETER=VALUE,…]: an effect to add to the base model; repeatable."
     ),
     model: Path | None = typer.Option(
-        None, help="Fit the effects of this model, such as discovery wrote it."
+        None, help="Fit the effects of this thermal model (YAML), such as one from `discover`."
     ),
     reference_temperature: float | None = expert(
-        None, "--t0", help="Reference temperature °C; default: the mean."
+        None, "--t0", help="Reference temperature, °C; default: the mean."
     ),
     type_name: str | None = typer.Option(
         None,
         "--type",
         metavar="NAME|MODEL",
-        help="Several cameras: fit each, write the type NAME. One: its type's MODEL file helps "
-        "where it was measured at few temperatures.",
+        help="NAME: fit several cameras and write the model of their type. MODEL: the model file "
+        "of a camera's type, which supports its fit if it was measured at few temperatures.",
     ),
-    code: Path | None = expert(None, help="Write the model as FILE.h (C, C++) and FILE.py too."),
-    report: Path | None = typer.Option(None, help="Write the model's certificate, one HTML file."),
+    code: Path | None = expert(None, help="Also write the model as FILE.h (C, C++) and FILE.py."),
+    report: Path | None = typer.Option(None, help="Write the model's certificate to an HTML file."),
     log: Path | None = typer.Option(
-        None, help="Temperatures of calibrations, at their photographs' times."
+        None, help="For calibrations: log of temperatures at the times of their photographs."
     ),
     temperature_sd: float = expert(
         0.1, min=0.0, help="Standard deviation of a calibration's temperature, K."
@@ -334,7 +326,7 @@ def fit(
 ) -> None:
     """Fit a thermal model to all series of a camera, in one adjustment over all image points.
 
-    Photographs that were calibrated at two temperatures or more do instead of recordings.
+    Instead of series, calibrations at two or more temperatures can be given.
 
     Example: thermocald fit M1 M2 -o camera.thermal.yaml --effect thermal_lag
 
@@ -375,14 +367,17 @@ def fit(
 
 
 def _temperatures(inputs: list[str]) -> dict[str, float | None]:
-    """{file: °C} of calibrations, where the inputs are some; UsageError for no temperature."""
+    """Return {file: °C or None} of calibrations, {} if the inputs are series.
+
+    Raises UsageError for a mixture of both, or for a label that is not a temperature.
+    """
     found: dict[str, float | None] = {}
     for text in inputs:
         label, equals, rest = text.partition("=")
         name = rest if equals and not Path(text).exists() else text
         if Path(name).suffix != ".json":
             if found:
-                raise UsageError(f"{text}: is no calibration; fit series and calibrations apart")
+                raise UsageError(f"{text}: is not a calibration; fit series and calibrations apart")
             return {}
         try:
             found[name] = float(label) if name == rest else None

@@ -1,4 +1,4 @@
-"""`thermocald testfield print | import | survey | check`: make, take, measure, assess a field."""
+"""`thermocald testfield print | import | survey | check`: make, survey and assess a test field."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Flat = Annotated[
     bool,
     typer.Option(
         "--flat/--corner",
-        help="One flat sheet instead of the three of a corner. A fixed camera cannot be calibrated "
+        help="One flat sheet instead of a corner of three. A fixed camera cannot be calibrated "
         "from one flat sheet.",
     ),
 ]
@@ -35,25 +35,26 @@ Landscape = Annotated[
 ]
 Diameter = Annotated[
     float | None,
-    typer.Option("--diameter", help="Diameter of the discs, mm; default by paper size."),
+    typer.Option("--diameter", help="Diameter of the targets, mm; default: by paper size."),
 ]
 Point = tuple[float, float, float]
 
 
 def _board(
-    charuco: str | None = typer.Option(None, help="A ChArUco board: 11x8 squares."),
-    chessboard: str | None = typer.Option(None, help="A chessboard: 9x6 inner corners."),
-    aprilgrid: str | None = typer.Option(None, help="Kalibr's AprilGrid: 6x6 tags."),
-    square: float | None = typer.Option(None, min=0.1, help="Side of a board's square, mm."),
-    marker: float | None = typer.Option(None, min=0.1, help="Side of a board's marker or tag, mm."),
-    spacing: float = expert(0.3, help="Gap between an AprilGrid's tags, over a tag's side."),
+    charuco: str | None = typer.Option(None, help="A ChArUco board, such as 11x8 squares."),
+    chessboard: str | None = typer.Option(None, help="A chessboard, such as 9x6 inner corners."),
+    aprilgrid: str | None = typer.Option(None, help="An AprilGrid of Kalibr, such as 6x6 tags."),
+    square: float | None = typer.Option(None, min=0.1, help="Side of a square, mm."),
+    marker: float | None = typer.Option(None, min=0.1, help="Side of a marker or tag, mm."),
+    spacing: float = expert(0.3, help="Gap between AprilGrid tags, relative to a tag's side."),
     dictionary: str = expert(
-        "DICT_5X5_1000", help="A ChArUco board's dictionary, by OpenCV's name."
+        "DICT_5X5_1000", help="Dictionary of a ChArUco board, by its OpenCV name."
     ),
-    legacy: bool = expert(False, "--legacy", help="ChArUco as OpenCV drew it before 4.6."),
+    legacy: bool = expert(False, "--legacy", help="ChArUco as drawn by OpenCV before 4.6."),
 ) -> Any:
-    """The board that these options describe, None where none does; its sizes are 0 where they are
-    not given. UsageError for two boards, or counts that are none.
+    """Return the board that these options describe, or None; a size that is not given is 0.
+
+    Raises UsageError for two boards, or for counts that cannot be read.
     """
     from thermocald.output.testfield.print import KINDS, Board, counts_of
 
@@ -77,25 +78,25 @@ def print_(
     flat: Flat = False,
     landscape: Landscape = None,
     diameter: Diameter = None,
-    bits: int | None = expert(None, help="Bits of the ring codes: 12, 14, or 0 for none."),
-    plain: bool = expert(True, "--plain/--no-plain", help="Plain circles between the coded ones."),
-    markers: str | None = expert(None, help="Markers too, of a dictionary: DICT_APRILTAG_36h11."),
+    bits: int | None = expert(None, help="Bits of the ring codes: 12, 14, or 0 for no codes."),
+    plain: bool = expert(True, "--plain/--no-plain", help="Plain circles between coded targets."),
+    markers: str | None = expert(None, help="Add markers of a dictionary: DICT_APRILTAG_36h11."),
     light: bool = expert(False, "--light", help="White targets on black."),
-    first_code: int = expert(0, min=0, help="Skip so many codes: for a second field."),
-    pitch: float | None = expert(None, help="Distance of the coded targets, mm."),
+    first_code: int = expert(0, min=0, help="Skip this many codes, for a second field."),
+    pitch: float | None = expert(None, help="Spacing of the coded targets, mm."),
     force: bool = typer.Option(
-        False, "--force", help="Replace a test field that was printed before."
+        False, "--force", help="Replace a test field printed earlier into this folder."
     ),
     board: Any = None,
     json: JsonOption = None,
 ) -> None:
-    """Draw a test field: a PDF, an SVG per sheet, and the testfield.csv that belongs to it.
+    """Draw a test field: a PDF, one SVG per sheet, and the testfield.csv with its coordinates.
 
-    By default it is a corner of three sheets; the last page of the PDF shows how to put it up.
-    Print without scaling ("actual size"), measure the rulers, then survey what you have built.
+    The default is a corner of three sheets; the last page of the PDF shows how to mount it.
+    Print without scaling ("actual size"), measure the rulers, then survey the mounted field.
 
-    With --charuco, --chessboard or --aprilgrid it is one board of that kind, as large as the paper
-    allows unless sizes are given.
+    With --charuco, --chessboard or --aprilgrid, one board of that kind is drawn, as large as the
+    paper allows unless its sizes are given.
 
     Example: thermocald testfield print --paper A3 --out field
 
@@ -104,7 +105,7 @@ def print_(
     from thermocald.output.testfield import print as sheets
     from thermocald.output.testfield.layout import PAPERS, paper_size
 
-    if board is not None:  # the page lies as the board does unless it is said how
+    if board is not None:  # by default the page has the orientation of the board
         wide = board.columns > board.rows and paper.strip().upper() in PAPERS
         page = paper_size(paper, landscape=wide if landscape is None else landscape)
         printed = sheets.print_board(board.filled(page), page, out, replace_printed=force)
@@ -125,24 +126,25 @@ def import_(
     source: Path | None = typer.Argument(
         None,
         metavar="[FILE]",
-        help="Kalibr's target.yaml, OpenCV's parameters, a file of calib.io's, or a list.",
+        help="Kalibr's target.yaml, OpenCV's board parameters, a calib.io file, or a target list.",
     ),
     out: Path = typer.Option(
         Path("testfield.csv"), "--out", "-o", help="The testfield.csv to write."
     ),
     rings: int | None = expert(None, help="FILE lists targets with ring codes of 12 or 14 bits."),
-    diameter: float | None = typer.Option(None, min=0.1, help="Diameter of ring-coded discs, mm."),
+    diameter: float | None = typer.Option(None, min=0.1, help="Diameter of the coded targets, mm."),
     sigma: float | None = typer.Option(
-        None, min=1e-4, help="Standard deviation of a coordinate, mm, if measured."
+        None, min=1e-4, help="Standard deviation of a coordinate, mm, if the board was measured."
     ),
     force: bool = typer.Option(False, "--force", help="Replace an existing file."),
     board: Any = None,
     json: JsonOption = None,
 ) -> None:
-    """Make a testfield.csv of a board that you own: ChArUco, chessboard, AprilGrid, coded rings.
+    """Make a testfield.csv for a board that you own: ChArUco, chessboard, AprilGrid, coded rings.
 
-    One flat board calibrates a camera from several poses (`thermocald calibrate`); for a series of
-    a camera that stands still put several boards at an angle and survey them together.
+    One flat board suffices to calibrate a camera from several poses (`thermocald calibrate`). For a
+    series with a fixed camera, mount several boards at an angle to each other and survey them
+    together.
 
     Example: thermocald testfield import april_6x6.yaml --out aprilgrid.csv
 
@@ -157,31 +159,31 @@ def import_(
             "give a file, or one of --charuco, --chessboard, --aprilgrid with its sizes"
         )
     if out.exists() and not force:
-        raise UsageError(f"{out}: exists already: give another name, or --force to replace it")
+        raise UsageError(f"{out}: exists already; give another name, or --force to replace it")
     if source is not None and rings is not None:
         if diameter is None:
-            raise UsageError("--rings needs the --diameter of the discs, mm")
+            raise UsageError("--rings needs the --diameter of the targets, mm")
         if rings not in (12, 14):
-            raise UsageError(f"--rings {rings}: there are codes of 12 and of 14 bits")
-        field, said = read_rings(source, rings, diameter, sigma), f"rings of {rings} bits"
+            raise UsageError(f"--rings {rings}: must be 12 or 14 bits")
+        field, kind = read_rings(source, rings, diameter, sigma), f"rings of {rings} bits"
     elif source is not None:
-        field, said = read_board(source, sigma)
+        field, kind = read_board(source, sigma)
     else:
         for option, size, needless in (
             ("--square", board.square, "aprilgrid"), ("--marker", board.marker, "chessboard"),
         ):  # fmt: skip
             if not size and board.kind != needless:
                 raise UsageError(f"{option} is missing (mm)")
-        field, said = board.field(sigma), board.name
+        field, kind = board.field(sigma), board.name
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     write_testfield(out, field)
     extent = [float(v) for v in field.points.max(axis=0) - field.points.min(axis=0)]
     document = {
-        "format": "thermocald-testfield-import/1", "testfield": out, "what": said,
+        "format": "thermocald-testfield-import/1", "testfield": out, "what": kind,
         "targets": len(field), "extent": extent,
     }  # fmt: skip
     show(
-        document, json, f"{out}: {said}, {len(field)} targets, {extent[0]:.1f} × {extent[1]:.1f} mm"
+        document, json, f"{out}: {kind}, {len(field)} targets, {extent[0]:.1f} × {extent[1]:.1f} mm"
     )
 
 
@@ -189,27 +191,27 @@ def survey(
     photos: PhotosArgument,
     out: Path = typer.Option(..., "--out", "-o", help="The testfield.csv to write."),
     scale: tuple[str, str, float] | None = typer.Option(
-        None, metavar="A B MM", help="Two targets and their measured distance."
+        None, metavar="A B MM", help="Two targets and their measured distance, mm."
     ),
     scale_sd: float = expert(0.1, min=1e-6, help="Standard deviation of the --scale distance, mm."),
     distances: Path | None = expert(
-        None, help="More measured distances, a CSV: a, b, length, sigma in mm."
+        None, help="CSV of further measured distances: a, b, length, sigma in mm."
     ),
     field: Path | None = typer.Option(
-        None, help="The nominal testfield.csv, as printed; for plain circles."
+        None, help="The nominal testfield.csv, as printed; needed for plain circles."
     ),
     camera: CameraFile = None,
     hold_camera: bool = expert(
-        False, "--hold-camera", help="Trust --camera and do not calibrate it again."
+        False, "--hold-camera", help="Hold the interior orientation of --camera fixed."
     ),
     pixel_pitch: PixelPitchOption = None,
-    camera_out: Path | None = typer.Option(None, help="Write the camera that was found (JSON)."),
+    camera_out: Path | None = typer.Option(None, help="Write the estimated camera (JSON)."),
     json: JsonOption = None,
 ) -> None:
-    """Measure a test field from photographs of it: coordinates and their standard deviations.
+    """Survey a test field from photographs: coordinates and their standard deviations.
 
-    Take 8 to 12 photographs with one camera, focus and zoom untouched, from all sides, the camera
-    turned by 90° in some. Do not let a program rotate or crop them afterwards.
+    Take 8 to 12 photographs from all sides with one camera, without touching focus or zoom; in some
+    of them the camera is rotated by 90°. Do not rotate or crop the photographs afterwards.
 
     Example: thermocald testfield survey photos/ --field field/testfield.csv --scale R65 R89 340.12
     --out surveyed.csv
@@ -224,7 +226,7 @@ def survey(
 
 def check(
     field: Path | None = typer.Argument(
-        None, metavar="[FIELD]", help="A testfield.csv; without it what `print` would draw."
+        None, metavar="[FIELD]", help="A testfield.csv; default: the field that `print` would draw."
     ),
     paper: Paper = "A3",
     flat: Flat = False,
@@ -233,21 +235,23 @@ def check(
     camera: CameraFile = None,
     pixel_pitch: PixelPitchOption = None,
     place: Point | None = typer.Option(
-        None, "--from", metavar="X Y Z", help="Where the camera stands, mm."
+        None, "--from", metavar="X Y Z", help="Position of the camera, mm."
     ),
     at: Point | None = expert(
-        None, metavar="X Y Z", help="What it looks at; default the field's middle."
+        None,
+        metavar="X Y Z",
+        help="Point that the camera looks at, mm; default: the field's centre.",
     ),
-    roll: float = expert(0.0, help="Rotation about its axis, degrees."),
+    roll: float = expert(0.0, help="Rotation of the camera about its optical axis, degrees."),
     sigma: float = expert(0.03, min=1e-4, help="Standard deviation of an image coordinate, px."),
-    report: Path | None = typer.Option(None, help="Write a report, one HTML file."),
+    report: Path | None = typer.Option(None, help="Write a report to an HTML file."),
     json: JsonOption = None,
 ) -> None:
     """Assess a test field: what a camera sees of it, how well it would be calibrated, what to add.
 
-    Without FIELD it is the field that `testfield print` would draw with the same --paper, --flat,
-    --landscape and --diameter, so that you know before you print. Without --from the camera stands
-    where the field just fills its image; without --camera it is a Raspberry Pi camera v2.1.
+    Without FIELD, assess the field that `testfield print` would draw with the same --paper, --flat,
+    --landscape and --diameter: do this before you print. Without --from, the camera is placed where
+    the field just fills its image. Without --camera, a Raspberry Pi camera v2.1 is assumed.
 
     Example: thermocald testfield check --paper A4
 
@@ -275,13 +279,13 @@ def check(
 
 
 def _design(paper: str, flat: bool, landscape: bool | None, diameter: float | None) -> Design:
-    """The print that these options describe; UsageError for paper that there is not."""
+    """Return the print that these options describe; UsageError for an unknown paper size."""
     from thermocald.output.testfield.layout import Design, paper_size
     from thermocald.output.testfield.print import default_diameter
 
     page = paper_size(paper, landscape=not flat if landscape is None else landscape)
     if landscape is None and "x" in paper.lower().replace("×", "x"):
-        page = paper_size(paper)  # a size in mm says itself how it lies
+        page = paper_size(paper)  # a size in mm includes the orientation
     return Design(
         page, diameter if diameter is not None else default_diameter(page), sheets=1 if flat else 3
     )

@@ -1,1 +1,1 @@
-"""What users take home: reports, figures, exports, the dashboard."""
+"""Reports, figures, exports, printed test fields and the dashboard."""

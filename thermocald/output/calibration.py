@@ -1,8 +1,8 @@
-"""The report of a calibration from photographs: what was found, and what its residuals show.
+"""The report of a calibration from photographs, and the report of a test field's check.
 
-Residuals and coverage show what a standard deviation does not: distortion that the model leaves,
-and parts of the image in which no target was seen. The report of a test field's check: what a
-camera would get out of it, and what to add.
+Residuals and coverage show what a standard deviation does not: distortion that the model does not
+describe, and parts of the image in which no target was seen. The check of a test field predicts the
+precision of a calibration and advises what to add.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _CELLS = (12, 9)
 _MOST_ARROWS = 3000
 _RINGS = 10
 _LITTLE_COVERED = 0.6
-_FIELD_DOMINATES = 2.0  # times what the image alone would give
-_FEW_NAMES = 3  # that a legend has room for
+_FIELD_DOMINATES = 2.0  # times the standard deviation from the image points alone
+_FEW_NAMES = 3  # for which a legend has room
 
 
 def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
@@ -53,7 +53,7 @@ def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
 
 
 def coverage(points: Array, sensor: Sensor) -> float:
-    """Fraction of the cells of a grid over the image in which a target was seen."""
+    """Return the fraction of the cells of a grid over the image in which a target was seen."""
     x = np.clip((points[:, 0] + 0.5) / sensor.width * _CELLS[0], 0, _CELLS[0] - 1).astype(int)
     y = np.clip((points[:, 1] + 0.5) / sensor.height * _CELLS[1], 0, _CELLS[1] - 1).astype(int)
     return len(set(zip(x.tolist(), y.tolist(), strict=True))) / (_CELLS[0] * _CELLS[1])
@@ -73,10 +73,10 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     rms = float(np.sqrt(np.mean(residuals**2)))
     covered = coverage(points, sensor)
     if result.estimated:
-        sentence = f"{_found(result, sensor)}."
+        sentence = f"{_estimates(result, sensor)}."
         fit = f"; σ₀ {result.sigma0:.2f}, redundancy {result.redundancy}"
     else:
-        sentence = f"The interior orientation is held, not estimated: {result.reason}."
+        sentence = f"The interior orientation was held fixed, not estimated: {result.reason}."
         fit = ""
     more = (
         (
@@ -86,22 +86,22 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
         ),
     )
     if covered < _LITTLE_COVERED:
-        steps.append("Take photographs with the field in the parts of the image still empty.")
+        steps.append("Take photographs with the field in the parts of the image that are empty.")
     if result.estimated:
         steps.append("Write the camera with --camera-out and use it in every later command.")
     return Answer(
         sentence, proof, more, tuple(steps),
         (
             ("Temperatures other than that of the photographs: a series with a thermometer shows "
-            "how the camera follows."),
+            "how the camera changes."),
             "Parts of the image without targets: there the distortion is extrapolated.",
-            "Errors of the camera model, which the standard deviations do not hold.",
+            "Errors of the camera model, which the standard deviations do not include.",
         ),
     )  # fmt: skip
 
 
-def _found(result: Photographs, sensor: Sensor) -> str:
-    """c, x0 and y0 with their standard deviations, mm and px."""
+def _estimates(result: Photographs, sensor: Sensor) -> str:
+    """Return c, x0 and y0 with their standard deviations, in mm and px."""
     assert result.interior is not None
     sds = np.sqrt(np.diag(result.covariance)[:3])
     found = zip(IOP_NAMES[:3], result.interior.as_array()[:3], sds, strict=True)
@@ -116,7 +116,7 @@ def _found(result: Photographs, sensor: Sensor) -> str:
 
 
 def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
-    """Measured minus adjusted image points of all photographs, as arrows; there may be none."""
+    """Draw measured minus adjusted image points of all photographs as arrows; may be empty."""
     points, residuals = _used(result.photographs)
     lengths = np.linalg.norm(residuals, axis=1)
     rows = spread_rows(len(points), _MOST_ARROWS)
@@ -127,21 +127,21 @@ def residual_figure(result: Photographs, sensor: Sensor) -> Figure:
     return Figure(
         "residuals", "Residuals",
         "Measured minus adjusted image points of all photographs. Without pattern they are noise; "
-        "neighbours that point the same way are distortion that the model leaves, or targets that "
-        "are not where the test field says.",
+        "neighbours that point the same way show distortion that the model does not describe, or "
+        "wrong coordinates of the test field.",
         (image_panel("Residuals", arrows=arrows),),
     )  # fmt: skip
 
 
 def _used(photographs: Sequence[PhotographResult]) -> tuple[Array, Array]:
-    """Image points (n, 2) that the adjustment used, and their residuals, px."""
+    """Return the image points (n, 2) that the adjustment used, and their residuals, px."""
     found = [np.hstack([p.points, p.residuals])[p.used] for p in photographs if len(p.points)]
     points, residuals = np.hsplit(np.concatenate([np.empty((0, 4)), *found]), 2)
     return points, residuals
 
 
 def _figures(posed: Sequence[PhotographResult], sensor: Sensor) -> tuple[Figure, ...]:
-    """Where targets were seen, and what the residuals show."""
+    """Return the figures of the coverage and of the residuals."""
     points, residuals = _used(posed)
     w, h = float(sensor.width), float(sensor.height)
     seen = [Curve("", np.array([0, w, w, 0, 0]), np.array([0, 0, h, h, 0]), "line", "#888888")]
@@ -153,13 +153,13 @@ def _figures(posed: Sequence[PhotographResult], sensor: Sensor) -> tuple[Figure,
     return (
         Figure(
             "coverage", "Coverage",
-            "Where targets were seen, a colour per photograph, and the image's frame.",
+            "The targets seen, one colour per photograph, and the frame of the image.",
             (image_panel("Coverage", *seen),),
         ),
         _by_radius(points, residuals, sensor),
         Figure(
             "scatter", "Residuals in x and y",
-            "The same residuals against each other: a round cloud without outliers.",
+            "The same residuals, x against y: they should form a round cloud without outliers.",
             (image_panel("Residuals in x and y", cloud),),
         ),
     )  # fmt: skip
@@ -187,14 +187,15 @@ def _by_radius(points: Array, residuals: Array, sensor: Sensor) -> Figure:
     )  # fmt: skip
     return Figure(
         "outwards", panel.title,
-        "The residuals' component away from the image centre, and its mean in rings of as many "
-        "points. A band that leaves zero is radial distortion that the model leaves.",
+        "The residuals' component away from the image centre, and its mean in rings with equal "
+        "numbers of points. A band that excludes zero shows radial distortion that the model does "
+        "not describe.",
         (panel,),
     )  # fmt: skip
 
 
 def _interior(result: Photographs, sensor: Sensor) -> Table:
-    """Values with their standard deviations, the same in px for what has one."""
+    """Return the values with their standard deviations, c, x0 and y0 in px too."""
     values = () if result.interior is None else result.interior.as_array()
     sds = np.sqrt(np.diag(result.covariance)[:10])
 
@@ -211,13 +212,13 @@ def _interior(result: Photographs, sensor: Sensor) -> Table:
         "Values",
         ("parameter", "value ± sd", "in px"),
         tuple(rows),
-        "The standard deviations hold the noise of the image points and the errors of the test "
-        "field's coordinates; errors of the camera model they do not hold.",
+        "The standard deviations include the noise of the image points and the errors of the test "
+        "field's coordinates, but not the errors of the camera model.",
     )
 
 
 def _correlations(result: Photographs) -> Table:
-    """Pairs that correlate by more than 0.5, the strongest first."""
+    """Return the pairs whose correlation exceeds ±0.5, the strongest first."""
     sd = np.sqrt(np.diag(result.covariance)[:10])
     free = np.flatnonzero(sd > 0)
     found = [
@@ -263,11 +264,11 @@ def render_field_check(result: FieldCheck) -> str:
     field, model = result.field, result.camera
     pitch = model.sensor.pixel_pitch
     sds = result.sds_px
-    said = ", ".join(f"{parameter_label(n)} to ± {_sd(one)}" for n, (one, *_) in sds.items())
+    expected = ", ".join(f"{parameter_label(n)} to ± {_sd(one)}" for n, (one, *_) in sds.items())
     if result.weak:
-        sentence = f"Not enough for a result from there: {'; '.join(result.weak)}."
+        sentence = f"Not enough for a result from this position: {'; '.join(result.weak)}."
     else:
-        sentence = f"One image gives {said}, for image points of ± {result.sigma_px:g} px."
+        sentence = f"One image gives {expected}, for image points of ± {result.sigma_px:g} px."
     X, Y, Z = result.station.centre
     more = (
         f"{len(result.visible)} of {len(field)} targets are visible from ({X:.0f}, {Y:.0f}, "
@@ -279,7 +280,7 @@ def render_field_check(result: FieldCheck) -> str:
         stated = ", ".join(
             f"{parameter_label(n)} to ± {_sd(field)}" for n, (*_, field) in sds.items()
         )
-        more += f" With the errors of the targets' places as they are stated it gives {stated}."
+        more += f" With the stated errors of the targets' coordinates it gives {stated}."
     rows = tuple((parameter_label(n), *(_sd(value) for value in row)) for n, row in sds.items())
     reasons = list(result.hidden.values())
     return Chapter(
@@ -289,10 +290,10 @@ def render_field_check(result: FieldCheck) -> str:
             _seen(result, field, model),
             (more,),
             tuple(map(as_sentence, result.advice))
-            or ("Nothing would help by a seventh: put it up.",),
+            or ("No addition would improve it by a seventh: mount it.",),
             (
                 "Blur, shadow, glare and paper that is not flat: look at the first frames.",
-                "Errors of the camera model, which no field shows beforehand.",
+                "Errors of the camera model, which cannot be predicted from a test field.",
             ),
         ),
         (
@@ -303,8 +304,7 @@ def render_field_check(result: FieldCheck) -> str:
                         "Standard deviations",
                         ("parameter", "one image", "in a series", "with the field's own errors"),
                         rows,
-                        "In a series: one epoch relative to the others, of a camera that stands "
-                        "still.",
+                        "In a series: one epoch relative to the others, for a fixed camera.",
                     ),
                 ),
             ),
@@ -319,11 +319,11 @@ def render_field_check(result: FieldCheck) -> str:
 
 
 def _sd(value: float) -> str:
-    return f"{plain(value, 'px', 2)}" if value < 1e300 else "nothing"
+    return f"{plain(value, 'px', 2)}" if value < 1e300 else "undetermined"
 
 
 def _seen(result: FieldCheck, field: TestField, model: CameraModel) -> Figure:
-    """The visible targets in the image, with the parts that ought to be filled."""
+    """Draw the visible targets in the image, and the parts of it that should all hold some."""
     w, h = float(model.sensor.width), float(model.sensor.height)
     upright = [((x, x), (0.0, h)) for x in np.linspace(0, w, CELLS[0] + 1)]
     level = [((0.0, w), (y, y)) for y in np.linspace(0, h, CELLS[1] + 1)]
@@ -339,6 +339,6 @@ def _seen(result: FieldCheck, field: TestField, model: CameraModel) -> Figure:
     return Figure(
         "seen", "What the camera sees",
         f"The visible targets in the image, in {CELLS[0]} × {CELLS[1]} parts, {empty} of them "
-        "empty. Distortion is only known where there are targets.",
+        "empty. The distortion is determined only where there are targets.",
         (image_panel("Targets in the image", *lines, targets),),
     )  # fmt: skip

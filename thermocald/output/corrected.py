@@ -1,4 +1,4 @@
-"""Points and images as a camera without thermal drift had seen them, from file to file."""
+"""Correct the points or images of a file for thermal drift, into a new file or folder."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 _ADDED = ("dx", "dy", "sd_x", "sd_y", "temperature", "extrapolated_K")
-_SAID = 20  # rows that are named
+_MOST_NAMED = 20  # refused rows that are reported by line
 
 
 @dataclass
 class Correction:
-    """What is corrected with which model and log, and what came of it.
+    """A correction with a thermal model and a log, and its result.
 
-    path: the CSV, `-` is standard input; of_images: whether it names images, not points; to: °C to
-    correct to, None for the model's T₀; temperature_sd K, of a reading of the log; say: is told of
-    each row that cannot be corrected.
+    path: the CSV, `-` is standard input; of_images: whether it lists images, not points; to: °C to
+    correct to, None for the model's T₀; temperature_sd K, of a reading of the log; say: receives a
+    line for each row that cannot be corrected.
     """
 
     path: Path
@@ -61,7 +61,7 @@ class Correction:
     _left_over: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """The result as `--json` has it."""
+        """Return the result as the document that `--json` writes."""
         head = {
             "format": "thermocald-correction/1",
             "corrected_to": self.corrected_to,
@@ -84,23 +84,23 @@ class Correction:
             most = max(d["largest_correction_px"] for d in self.images)
             images = "1 image" if len(self.images) == 1 else f"{len(self.images)} images"
             return (
-                f"{images} corrected by up to {most:.3f} px; left over ± {worst:.3f} px at most "
-                "(RMS)"
+                f"{images} corrected by up to {most:.3f} px; remaining error ± {worst:.3f} px at "
+                "most (RMS)"
             )
         return (
-            f"{self.points} points corrected by {self._rms(self._moved):.3f} px (RMS); left over ± "
-            f"{self._rms(self._left_over):.3f} px"
+            f"{self.points} points corrected by {self._rms(self._moved):.3f} px (RMS); remaining "
+            f"error ± {self._rms(self._left_over):.3f} px"
         )
 
     @property
     def corrected_to(self) -> float:
-        """°C."""
+        """The temperature that is corrected to, °C."""
         return self.thermal.model.T0 if self.to is None else self.to
 
     def write(self, out: Path | str, advance: Callable[[int], None] | None = None) -> None:
         """Write the corrected CSV, or the corrected images into a folder.
 
-        advance: receives how many images are done.
+        advance: receives the number of images done.
         """
         if self.of_images:
             self._write_images(Path(out), advance or (lambda _: None))
@@ -110,18 +110,18 @@ class Correction:
     def lines(self) -> Iterator[str]:
         """Yield the corrected CSV of points, a block of rows at a time.
 
-        `-` is standard input: rows are corrected as they come in. Rows that cannot be corrected are
-        kept in `refused`. Raises DataError where none can.
+        Rows of standard input are corrected as they arrive. Rows that cannot be corrected are added
+        to `refused`. Raises DataError if no row can be corrected.
         """
         for block in row_blocks(self.path, ("x", "y"), self.clock):
             yield self._corrected(self._possible(block))
         self._require_any(self.points)
 
     def _write_images(self, out: Path, advance: Callable[[int], None]) -> None:
-        """Correct the images that a CSV of time and image names, into a folder.
+        """Correct the images that a CSV of time and image lists, into a folder; EXIF is preserved.
 
-        EXIF is kept. Images that cannot be corrected are kept in `refused`. Raises DataError where
-        none can, UsageError where one would be overwritten.
+        Images that cannot be corrected are added to `refused`. Raises DataError if no image can be
+        corrected, UsageError if one would be overwritten.
         """
         make_folder(out)
         for block in row_blocks(self.path, (), self.clock):
@@ -146,18 +146,18 @@ class Correction:
         self._require_any(len(self.images))
 
     def require_all(self) -> None:
-        """Raise DataError where a row was refused."""
+        """Raise DataError if a row was refused."""
         if self.refused:
             count = len(self.refused) + self.points + len(self.images)
-            lines = ", ".join(str(r["line"]) for r in self.refused[:_SAID])
+            lines = ", ".join(str(r["line"]) for r in self.refused[:_MOST_NAMED])
             raise DataError(
                 f"{self.path}: {len(self.refused)} of {count} rows were not corrected: line"
                 f"{'s' if len(self.refused) > 1 else ''} {lines}"
-                + (", …" if len(self.refused) > _SAID else "")
+                + (", …" if len(self.refused) > _MOST_NAMED else "")
             )
 
     def _possible(self, block: RowBlock) -> RowBlock:
-        """The rows that lie in the image and in the time of the log; the others are said."""
+        """Return the rows within the image and the time span of the log; refuse the others."""
         log = self.log.times
         step = float(np.median(np.diff(log))) if len(log) > 1 else 0.0
         within = (block.times >= log[0] - step) & (block.times <= log[-1] + step)
@@ -168,8 +168,8 @@ class Correction:
             sensor = self.thermal.model.sensor
             possible = possible.kept(
                 sensor.contains(possible.values),
-                f"lies outside the model's {sensor.width}×{sensor.height} px; of another camera, "
-                "or binned (--size)?",
+                f"lies outside the model's {sensor.width}×{sensor.height} px; is it of another "
+                "camera, or binned (--size)?",
             )
         for line, reason in possible.refused:
             self._refuse(line, reason)
@@ -186,7 +186,7 @@ class Correction:
         except ThermocaldError as cause:
             if self.path != STANDARD_INPUT:
                 raise
-            # of what comes in one row must not stop the others
+            # on standard input one bad row must not stop the others
             if len(block.times) == 1:
                 self._refuse(block.lines[0], str(cause))
                 return ""
@@ -211,7 +211,7 @@ class Correction:
 
     def _refuse(self, line: int, reason: str) -> None:
         self.refused.append({"line": line, "reason": reason})
-        if len(self.refused) <= _SAID:
+        if len(self.refused) <= _MOST_NAMED:
             self.say(f"{self.path}, line {line}: not corrected: {reason}")
 
     def _require_any(self, count: int) -> None:
@@ -235,7 +235,7 @@ def _write_corrected(source: Path, written: Path, c: ImageCorrection) -> None:
     if image.shape[:2] != (height, width):
         raise ImageError(
             f"{source}: has {image.shape[1]}×{image.shape[0]} px, the model's camera "
-            f"{width}×{height}; say --size where it is binned"
+            f"{width}×{height}; give --size if it is binned"
         )
     corrected = c.maps.resample(image, c.values)
     encoded, data = cv2.imencode(written.suffix, corrected)

@@ -1,4 +1,4 @@
-"""The report of a discovery: what was found, the plot that proves it, and why the others lost."""
+"""The report of a discovery: the effects found, the evidence, and why others were rejected."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 _BASE, _FOUND = PALETTE[1], PALETTE[0]
-_AT_NOISE = 1.1  # times the noise: what an effect leaves counts as noise
+_AT_NOISE = 1.1  # times the noise: a misfit up to this counts as noise
 
 
 def report_html(discovery: Discovery, title: str) -> str:
-    """Return the whole page."""
+    """Return the report as HTML text."""
     return Chapter(
         f"Discovery: {title}",
         _answer(discovery),
@@ -74,23 +74,24 @@ def _answer(d: Discovery) -> Answer:
     else:
         sentence = (
             f"The model reproduces the recording within its noise of {_noise_px(d, 0):.3f} px"
-            f"{temperatures}: nothing is missing that this recording could show."
+            f"{temperatures}: it lacks no effect that this recording could show."
         )
     more = []
     if d.effects:
         gaps = zip(_names(d), before.gaps, after.gaps, strict=True)
-        said = [f"{a.rms_px:.3f} to {b.rms_px:.3f} px RMS on {name}" for name, a, b in gaps]
+        changes = [f"{a.rms_px:.3f} to {b.rms_px:.3f} px RMS on {name}" for name, a, b in gaps]
         more += [f"Also found: {_statement(e)}." for e in closing[1:]]
-        it = "it" if len(closing) == 1 else "all of it"
+        it = "it" if len(closing) == 1 else "all of them"
         more.append(
-            f"With {it} the gap between model and measurement goes from {' and from '.join(said)}"
-            f"{temperatures}; the noise of an image coordinate is {_noise_px(d, 0):.3f} px."
+            f"With {it} the gap between model and measurement falls from "
+            f"{' and from '.join(changes)}{temperatures}; the noise of an image coordinate is "
+            f"{_noise_px(d, 0):.3f} px."
         )
     return Answer(sentence, _trajectory(d), tuple(more), _next_steps(d), _not_covered(d))
 
 
 def _statement(effect: EffectFound) -> str:
-    """What an effect states, without its stop; amplitudes are called as what they are of."""
+    """Return an effect's statement without the full stop; an amplitude a_c is written as c."""
     return re.sub(r"\ba_(?=[A-Zcxy])", "", effect.statement).rstrip(".")
 
 
@@ -102,32 +103,32 @@ def _temperatures(d: Discovery) -> str:
 
 def _next_steps(d: Discovery) -> tuple[str, ...]:
     steps = [
-        f"To tell {e.effect} from {a['effect']}: {a['experiment']}."
+        f"To distinguish {e.effect} from {a['effect']}: {a['experiment']}."
         for e in d.effects
         for a in e.alternatives
         if not a.get("resembles") and a.get("experiment")
     ]
     if d.stages[0].verify is None:
-        steps.append("Record a second series (M2) and give it with --verify: that is the proof.")
+        steps.append("Record a second series (M2) and give it with --verify, as the proof.")
     if d.verdict == "effects_found":
         steps.append("Write the model with --model-out and correct measurements with it.")
     if d.verdict == "adequate":
-        steps.append("See with thermocald discover --plan which effects this set-up would show.")
+        steps.append("See which effects this set-up would reveal: thermocald discover --plan.")
     if d.verdict == "unexplained":
-        steps.append("Record what may be the cause (light, current, a second temperature) too.")
+        steps.append("Also record possible causes (light, current, a second temperature).")
     return tuple(steps)
 
 
 def _not_covered(d: Discovery) -> tuple[str, ...]:
-    said = [f"Temperatures other than{_temperatures(d)}, and faster changes than were measured."]
+    limits = [f"Temperatures other than{_temperatures(d)}, and changes faster than those measured."]
     if d.stages[0].verify is None:
-        said.append("Whether the constants hold on another day: no M2 was given.")
-    said.append("Effects that move the image by less than its noise; they would go unseen.")
-    return tuple(said)
+        limits.append("Whether the constants hold on another day: no M2 was given.")
+    limits.append("Effects that move the image by less than its noise: they are not detected.")
+    return tuple(limits)
 
 
 def _names(d: Discovery) -> list[str]:
-    """M1, M2, … with the recordings' names."""
+    """Return M1, M2, … with the recordings' names."""
     return [
         f"M{k}" if (e.source.series or f"M{k}") == f"M{k}" else f"M{k} ({e.source.series})"
         for k, e in enumerate(d.examination.fitter.series, start=1)
@@ -148,15 +149,15 @@ def _origin(d: Discovery) -> list[str]:
 
 def _sections(d: Discovery) -> list[Section]:
     tested = d.verdict == "effects_found" and bool(d.examination.surrogates)
-    left = "Before and after" if d.effects else "What the model leaves"
+    left = "Before and after" if d.effects else "Misfit of the model"
     return [
         Section(left, figures=(_movement(d), gap_figure(d)), tables=(_gap_table(d),)),
         *(_effect(e) for e in d.effects),
         *([_noise_test(d)] if tested else []),
         _candidates(d),
         Section(
-            "What the base model leaves, in numbers",
-            ("What it leaves of M1, against everything that was recorded.",),
+            "Misfit of the base model, in numbers",
+            ("The misfit on M1, against everything that was recorded.",),
             (_misfit_matrix(d),),
             (_misfit_table(d),),
             folded=True,
@@ -164,11 +165,11 @@ def _sections(d: Discovery) -> list[Section]:
     ]
 
 
-# what was measured, and what the models leave of it
+# measured and modelled movement
 
 
 def _without_level(e: ReducedSeries, values: Array) -> Array:
-    """Parameters (E, P) less their level in the metric of the image points."""
+    """Subtract from parameters (E, P) their mean, weighted as the image points determine them."""
     right = np.einsum("epq,eq->p", e.N, values)
     return np.asarray(values - np.linalg.lstsq(e.N.sum(axis=0), right, rcond=1e-12)[0])
 
@@ -179,13 +180,13 @@ def _model(fit: Fit, series: int) -> Array:
 
 
 def _noise_px(d: Discovery, series: int) -> float:
-    """Standard deviation of an image coordinate, px: what no model can go below."""
+    """Return the standard deviation of an image coordinate, px: the least misfit of any model."""
     weights = d.examination.fitter.series[series].weights[..., :2]
     return float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
 
 
 def _trajectory(d: Discovery) -> Figure:
-    """Measured image movement against both models over time and temperature, residuals below."""
+    """Draw measured and modelled image movement over time and temperature, residuals below."""
     e = d.examination.fitter.series[0]
     base, final = (_model(fit, 0) for fit in (d.base_fit, d.final_fit))
     rests = [_without_level(e, e.values - m) for m in (base, final)]
@@ -218,21 +219,21 @@ def _trajectory(d: Discovery) -> Figure:
             curves.append(Curve(label, x, measured - after, "line", _FOUND))
             left.append(Curve("", x, after, "points", _FOUND))
         above.append(Panel("Movement", of, "image movement in px", tuple(curves)))
-        below.append(Panel("Left over", of, "left over in px", tuple(left)))
+        below.append(Panel("Residual", of, "residual in px", tuple(left)))
     return Figure(
         "trajectory",
         "Measured and modelled",
-        "Movement of the image in the pattern in which "
-        + (f"{name} shows" if found else "the model leaves most")
-        + ", root-mean-square over the targets of M1: measured, and as the models have it. Below: "
-        "what each leaves; grey: 95 % of the noise of an epoch.",
+        "Movement of the image in the pattern of "
+        + (name if found else "the largest misfit")
+        + ", root mean square over the targets of M1, as measured and as modelled. Below: the "
+        "residuals of each model; grey: 95 % of the noise of an epoch.",
         (*above, *below),
         columns=2,
     )
 
 
 def _movement(d: Discovery) -> Figure:
-    """What each model leaves of the targets' movement, as vectors of one scale."""
+    """Draw the targets' movement that each model does not explain, as vectors of one scale."""
     e = d.examination.fitter.series[0]
     seen = e.weights[..., 0].any(axis=0)
     places = e.at.predicted[seen]
@@ -247,11 +248,11 @@ def _movement(d: Discovery) -> Figure:
         pattern = U[:, keep] @ (v[0][keep] / np.sqrt(size[keep])) * s[0] / np.sqrt(len(r))
         misfit = np.sqrt(np.mean(np.einsum("tij,ej->eti", e.columns[seen], r) ** 2))
         drawn.append((float(misfit), np.einsum("tij,j->ti", e.columns[seen], pattern)))
-    # what is less than the noise shall not look large
+    # a movement below the noise must not look large
     longest = max(float(np.linalg.norm(drawn[0][1], axis=1).max()), _noise_px(d, 0))
     frame = (e.source.sensor.width, e.source.sensor.height)
     targets = Curve("", places[:, 0], places[:, 1], "points", PALE)
-    titles = ("Before", "After") if len(drawn) > 1 else ("Left",)
+    titles = ("Before", "After") if len(drawn) > 1 else ("Misfit",)
     panels = tuple(
         image_panel(
             f"{title}: {misfit:.3f} px", targets,
@@ -261,12 +262,12 @@ def _movement(d: Discovery) -> Figure:
     )  # fmt: skip
     return Figure(
         "movement",
-        "Image movement that the model leaves",
-        "Each target of M1 with the strongest pattern of what is measured minus what the model says"
+        "Image movement that the model does not explain",
+        "The strongest pattern of measured minus modelled movement, at each target of M1"
         + (
-            ", before and after what was found, with its root-mean-square; one scale for both."
+            ", before and after the effects found, with the root mean square; one scale for both."
             if len(drawn) > 1
-            else "; nothing was found that another recording would show too."
+            else "; no effect was found that another recording would show."
         ),
         panels,
         columns=2,
@@ -274,7 +275,7 @@ def _movement(d: Discovery) -> Figure:
 
 
 def _bars(groups: list[tuple[float, list[tuple[str, float, str]]]], label: str) -> Any:
-    """Draw bars (name, px, colour) in groups, each against its noise, px."""
+    """Draw bars (name, px, colour) in groups, each group with its noise, px."""
     bars = [bar for _, group in groups for bar in group]
     with drawing_style():
         drawing = new_drawing(5.0, 0.9 + 0.4 * len(bars) + 0.1 * len(groups))
@@ -301,7 +302,7 @@ def _bars(groups: list[tuple[float, list[tuple[str, float, str]]]], label: str) 
 
 
 def gap_figure(d: Discovery) -> Figure:
-    """The gap of every stage on every recording as bars against the noise."""
+    """Draw the gap of every stage on every recording as bars, with the noise."""
     groups = [
         (
             _noise_px(d, k),
@@ -315,8 +316,8 @@ def gap_figure(d: Discovery) -> Figure:
     return Figure(
         "gaps",
         "The gap",
-        "Measured minus simulated image points, with and without what was found, against the noise "
-        "of an image coordinate (dotted). The constants are those of M1 throughout.",
+        "Measured minus simulated image points, without and with the effects found, and the noise "
+        "of an image coordinate (dotted). All constants are those of M1.",
         drawing=_bars(groups, "gap between model and measurement in px RMS"),
     )
 
@@ -332,11 +333,11 @@ def _gap_table(d: Discovery) -> Table:
         for name, gap in zip(_names(d), stage.gaps, strict=True)
     ]
     outside, inside = d.cross_validation
-    note = "1 is the floor of reduced χ²."
+    note = "With noise alone, reduced χ² is 1."
     if math.isfinite(outside):
         note += (
             " On blocks of M1 left out of the fit, χ² of the parameters per degree of freedom is "
-            f"{outside:.3f}; fitted with them {inside:.3f}."
+            f"{outside:.3f}; with these blocks in the fit it is {inside:.3f}."
         )
     if d.stages[0].verify is None:
         note += " No M2 was given: the constants are not verified."
@@ -353,7 +354,7 @@ def _gap_table(d: Discovery) -> Table:
     )
 
 
-# what was found
+# effects
 
 
 def _effect(effect: EffectFound) -> Section:
@@ -362,18 +363,18 @@ def _effect(effect: EffectFound) -> Section:
     if proposal := effect.evidence.get("proposal"):
         test = proposal["surrogates"]
         text.append(
-            f"Formula {proposal['formula']}: constants of M1 alone explain "
+            f"Formula {proposal['formula']}: with constants of M1 alone it explains "
             f"{proposal['closed_on_verify_by_fit']:.0%} of the misfit of M2. Formulas on a grid of "
-            f"constants explain {test['explained']:.0%} of the misfit, of {test['count']} "
+            f"constants explain {test['explained']:.0%} of the misfit, but of {test['count']} "
             "surrogates whose cause was not recorded at most "
             f"{test['largest_of_surrogates']:.0%}: probability of a false formula "
             f"{_p(proposal['false_alarm_probability'], test['count'])}."
         )
     excluded = [a for a in effect.alternatives if not a.get("resembles")]
     if excluded:
-        text.append("These data cannot exclude the following instead.")
+        text.append("These data cannot exclude the following alternatives.")
     items = [
-        (a["effect"], (f"scores {a['score_difference']:.1f} worse. To separate them: "
+        (a["effect"], (f"its score is {a['score_difference']:.1f} worse. To separate them: "
          f"{a['experiment']}."))
         for a in excluded
     ]  # fmt: skip
@@ -381,15 +382,15 @@ def _effect(effect: EffectFound) -> Section:
         text.append(
             f"Effects that merely resemble it: {', '.join(alike)}. They do not pass the absolute "
             "test."
-            + ("" if effect.term else " The smooth bridge in M1 does not transfer to another "
+            + ("" if effect.term else " The smooth term fitted to M1 does not apply to another "
                "series.")
         )  # fmt: skip
-    table = Table("What was estimated", ("parameter", "value ± sd"), tuple(rows))
-    return Section(f"What was found: {effect.effect}", tuple(text), (), (table,), tuple(items))
+    table = Table("Estimates", ("parameter", "value ± sd"), tuple(rows))
+    return Section(f"Effect found: {effect.effect}", tuple(text), (), (table,), tuple(items))
 
 
 def _parameter(name: str) -> str:
-    """How a parameter of an effect is called: a_c is the amplitude of c."""
+    """Return the label of an effect's parameter: a_c is the amplitude of c."""
     return f"amplitude of {parameter_label(name[2:])}" if name.startswith("a_") else (
         name.replace("_", " ")
     )  # fmt: skip
@@ -404,7 +405,7 @@ def _value(estimate: dict[str, Any]) -> str:
 
 
 def _p(p: float, count: int) -> str:
-    """A probability out of so many surrogates: none can show less than one in count + 1."""
+    """Return a probability as text; `count` surrogates cannot resolve less than 1/(count + 1)."""
     return f"≤ 1/{count + 1}" if p <= 1.000001 / (count + 1) else f"{p:.2g}"
 
 
@@ -421,9 +422,9 @@ def _noise_test(d: Discovery) -> Section:
     figure = Figure(
         "surrogates",
         "Surrogates",
-        f"{text}. Grey: what the same search gains on surrogates, which are the recording's own "
-        "noise moved in time against the temperatures. A name needs a gain that none of them "
-        "reaches.",
+        f"{text}. Grey: the gain of the same search on surrogates, in which the recording's own "
+        "noise is shifted in time against the temperatures. An effect is named only if its gain "
+        "exceeds that of every surrogate.",
         drawing=drawing,
     )
     return Section("Could noise do this?", (), (figure,))
@@ -449,7 +450,7 @@ def _draw_surrogates(axis: Any, name: str, test: SurrogateTest) -> None:
 
 
 def _candidates(d: Discovery) -> Section:
-    """What every candidate leaves when it is alone, and why it is not the one."""
+    """Compare the misfit of every candidate alone, and state why it was named or rejected."""
     x = d.examination
     singles: dict[str, Solution] = {}
     for s in sorted(x.ranking, key=lambda s: s.score):
@@ -463,17 +464,17 @@ def _candidates(d: Discovery) -> Section:
         bars.insert(0, (" + ".join(best), _left_px(d, x.best.fit), _FOUND))
     if not bars:
         return Section(
-            "The candidates", ("No effect of the catalogue explains more than noise would.",)
+            "Candidates", ("No effect of the catalogue explains more than noise would.",)
         )
     figure = Figure(
         "candidates",
-        "The candidates, each alone",
-        f"What the base model with one effect more leaves of M1. {'Blue: named. ' if best else ''}"
-        "The dotted line is the noise, below which nothing can be explained.",
-        drawing=_bars([(noise, bars)], "left on M1 in px RMS"),
+        "Candidates, each alone",
+        f"Misfit on M1 of the base model with one more effect. {'Blue: named. ' if best else ''}"
+        "Dotted: the noise, the least misfit of any model.",
+        drawing=_bars([(noise, bars)], "misfit on M1 in px RMS"),
     )
     items = tuple((name, _why(d, name, s, left, noise)) for name, s, left in rows)
-    return Section("The candidates, and why each lost", (), (figure,), (), items)
+    return Section("Candidates, and why they were named or rejected", (), (figure,), (), items)
 
 
 def _candidate_name(s: Solution) -> str:
@@ -482,7 +483,7 @@ def _candidate_name(s: Solution) -> str:
 
 
 def _left_px(d: Discovery, fit: Fit) -> float:
-    """RMS of what a fit leaves of M1's image points, px, as the gap counts it."""
+    """Return the RMS misfit of a fit to M1's image points, px, computed as the gap is."""
     e = d.examination.fitter.series[0]
     within = float(np.sum(e.weights[..., :2] * np.nan_to_num(e.residuals) ** 2))
     chi2 = within + e.correlation * image_chi2(e, fit, 0)
@@ -493,22 +494,22 @@ def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str
     x = d.examination
     best = x.best.names[len(x.base.terms) :]
     worse = s.score - x.best.score
-    score = f"−2 log L and penalty together are {worse:,.0f} worse"
+    score = f"(−2 log L plus penalty) is {worse:,.0f} worse"
     if x.adequate and name.split(" ")[0] in best:
         if len(best) > 1:
             return f"named, together with {' and '.join(n for n in best if n != name)}."
-        return f"named: it leaves {left:.3f} px, which is the noise."
+        return f"named: its misfit of {left:.3f} px is the noise."
     if any(name.split(" ")[0] in r.names for r in x.rivals):
-        return f"cannot be excluded: {score} only."
+        return f"cannot be excluded: its score {score} only."
     if left > _AT_NOISE * noise:
-        text = f"leaves {left:.3f} px, {left / noise:.1f} times the noise"
+        text = f"misfit {left:.3f} px, {left / noise:.1f} times the noise"
         if "omega" in s.terms[-1].parameters:
-            text += "; a mount that moves shifts near targets more than far ones, as these do not"
+            text += "; a moving mount shifts near targets more than far ones, which is not observed"
         return f"{text}."
-    return f"leaves no more than noise on M1, but over all recordings {score}: excluded."
+    return f"misfit at the noise on M1, but over all recordings its score {score}: excluded."
 
 
-# where the base model fails
+# misfit of the base model
 
 
 def _misfit_table(d: Discovery) -> Table:
@@ -530,7 +531,7 @@ def _misfit_table(d: Discovery) -> Table:
 
 
 def _misfit_matrix(d: Discovery) -> Figure:
-    """Where the base model fails: slow trajectories by parameter combination, in sigma."""
+    """Draw the misfit of the base model, in σ: slow trajectories by parameter combination."""
     a = d.examination.base_adequacy[0]
     scores = np.maximum(np.abs(a.scores[:, ::-1]), 1e-3)
     with drawing_style():
@@ -546,7 +547,7 @@ def _misfit_matrix(d: Discovery) -> Figure:
     return Figure(
         "misfit-matrix",
         "Misfit of the base model",
-        f"Slow trajectories that the base model leaves: {plain(float(scores.max()), digits=3)} σ "
-        "at most.",
+        "Slow trajectories that the base model does not explain: at most "
+        f"{plain(float(scores.max()), digits=3)} σ.",
         drawing=drawing,
     )

@@ -1,14 +1,14 @@
-"""What other programs take: a series as a table, and pyorc's camera configuration renewed.
+"""Files for other programs: a series as a table, and an updated camera configuration of pyorc.
 
-A series is CSV or Parquet with units, times, separators and all thermometers as people want them.
-The columns of CONVENTIONS §4 with other units have them in their names (`c_px`, `X0_um`,
-`omega_deg`), so that nobody reads one for the other. The temperatures of all thermometers follow.
+A series is written as CSV or Parquet with a choice of units, times, separators and thermometers.
+Columns of CONVENTIONS §4 with another unit have it in their names (`c_px`, `X0_um`, `omega_deg`),
+so that units are not confused. The temperatures of all thermometers follow.
 
-In pyorc's configuration a warm camera's geometry is for velocities and levels. The camera is that
-of the video's temperature, the pose the one that the control points give with it, seen where they
-were clicked, or measured in a frame of the video. All else that the configuration holds stays as it
-is, but for the control points' image points: pyorc solves for the pose whenever it reads the file,
-without weights, and so they are written as the new camera sees them.
+The configuration of pyorc gets the geometry of the warm camera, for velocities and water levels:
+the camera at the temperature of the video, and the pose that it gives with the control points, as
+they were clicked or as measured in a frame of the video. Everything else stays unchanged, except
+for the image points of the control points: pyorc solves for the pose whenever it reads the file,
+without weights, and therefore they are written as the new camera projects them.
 
 Source: pyopenrivercam 0.9, `pyorc.CameraConfig`; OpenCV's pose x_camera = R X + t, in metres.
 """
@@ -49,7 +49,10 @@ _PLACE = ("X0", "Y0", "Z0")
 
 @dataclass(frozen=True, slots=True)
 class ExportStyle:
-    """units: of UNITS, others stay mm and rad; time: `seconds` or `iso`; separator and decimal."""
+    """The style of an exported table.
+
+    units: a choice of UNITS, otherwise mm and rad; time: `seconds` or `iso`; separator and decimal.
+    """
 
     units: frozenset[str] = frozenset()
     time: str = "seconds"
@@ -58,16 +61,16 @@ class ExportStyle:
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is the form that other programs of ours read."""
+        """Whether it is the default style, which other commands read."""
         return self == ExportStyle()
 
 
 def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle:
-    """The style that options describe; UsageError for what there is not."""
+    """Return the style that options describe; UsageError for unknown values."""
     wanted = [u.strip() for u in units.split(",") if u.strip()]
     for unit in wanted:
         if unit not in UNITS:
-            raise UsageError(f"--units {unit}: there are {', '.join(UNITS)}, separated by commas")
+            raise UsageError(f"--units {unit}: must be of {', '.join(UNITS)}, separated by commas")
     if time not in ("seconds", "iso"):
         raise UsageError(f"--time {time}: must be seconds or iso")
     mark = {"tab": "\t", "\\t": "\t"}.get(separator, separator)
@@ -83,9 +86,9 @@ def style_of(units: str, time: str, separator: str, decimal: str) -> ExportStyle
 def column_parts(
     table: Epochs, style: ExportStyle, pixel_pitch: float, others: Columns | None = None
 ) -> Iterator[Columns]:
-    """Yield the columns of a series in some style, then the others, as they are.
+    """Yield the columns of a series in a style, then the other columns unchanged.
 
-    Some thousand rows at a time: a year has to fit. pixel_pitch: mm.
+    They come some thousand rows at a time, because of the memory for a year. pixel_pitch: mm.
     """
     done = 0
     for part in table.parts():
@@ -103,7 +106,7 @@ def column_parts(
 
 
 def _unit(name: str, style: ExportStyle, pixel_pitch: float) -> tuple[str, float]:
-    """The ending of a parameter's name, and the factor from mm or rad."""
+    """Return the suffix of a parameter's column, and the factor from mm or rad to its unit."""
     if name in _IN_IMAGE and "px" in style.units:
         return "_px", 1.0 / pixel_pitch
     if name in (*_IN_IMAGE, *_PLACE) and "um" in style.units:
@@ -119,28 +122,28 @@ def _iso(seconds: float) -> str:
 
 
 def as_csv(parts: Iterable[Columns], style: ExportStyle) -> Iterator[str]:
-    """Yield the columns as text; numbers keep every digit, what is not known stays empty."""
+    """Yield the columns as CSV; numbers have all digits, unknown values are empty."""
     return csv_text(parts, style.separator, style.decimal)
 
 
 def as_json(parts: Iterable[Columns]) -> Iterator[str]:
-    """Yield the columns as one JSON list with a row per epoch; what is not known is null."""
+    """Yield the columns as one JSON list with a row per epoch; unknown values are null."""
     start = "[\n"
     for columns in parts:
         lists = [c.tolist() if isinstance(c, np.ndarray) else c for c in columns.values()]
         for row in zip(*lists, strict=True):
-            said = json.dumps(jsonable(dict(zip(columns, row, strict=True))), indent=1)
-            yield start + " " + said.replace("\n", "\n ")
+            text = json.dumps(jsonable(dict(zip(columns, row, strict=True))), indent=1)
+            yield start + " " + text.replace("\n", "\n ")
             start = ",\n"
     yield "\n]\n" if start != "[\n" else "[]\n"
 
 
-_AXES = np.diag([1.0, -1.0, -1.0])  # ours: y up, looking along -Z
+_AXES = np.diag([1.0, -1.0, -1.0])  # from our camera frame: y up, looking along −Z
 
 
 @dataclass(frozen=True, eq=False)
 class RenewedConfiguration:
-    """pyorc's document, and its camera: as known beforehand, and as the control points have it."""
+    """An updated configuration of pyorc: document, camera, control points, and estimated pose."""
 
     document: dict[str, Any]
     camera: Camera
@@ -148,7 +151,7 @@ class RenewedConfiguration:
     pose: Adjustment
 
     def write(self, path: Path) -> str:
-        """Write the document; returns in words what the pose is worth."""
+        """Write the document, and return the precision of the pose in words."""
         write_text(path, json.dumps(self.document, indent=4) + "\n")
         sd = self.pose.sd[EOP]
         rejected = ", ".join(self.control.field.names[row] for row in self.pose.rejected)
@@ -160,44 +163,44 @@ class RenewedConfiguration:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return width and height px of a configuration's images."""
+    """Return the width and height, px, of a configuration's images."""
     document = _document(path)
     try:
         return int(document["width"]), int(document["height"])
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path}: holds no width and height: {error}") from error
+        raise DataError(f"{path}: has no width and height: {error}") from error
 
 
 def renew_configuration(
     path: Path, camera: Camera, reference: Path | None = None, frame: Path | None = None
 ) -> RenewedConfiguration:
-    """Renew pyorc's configuration with a camera and the pose that its control points give.
+    """Update a configuration of pyorc with a camera and the pose that its control points give.
 
-    reference: the frame that was clicked in; frame: one of the video, in which the points are
-    measured. Raises DataError where they give no pose.
+    reference: the frame in which the points were clicked; frame: a frame of the video in which to
+    measure them. Raises DataError if they give no pose.
     """
     document = _document(path)
     control = ControlPoints.read(path, "m")
     if (frame is None) != (reference is None):
-        raise UsageError("--reference (clicked) and --frame (measured) go together")
+        raise UsageError("give both --reference (clicked) and --frame (to measure in), or neither")
     if reference is not None and frame is not None:
         templates = Templates.read(reference, control.field, control.seen)
         found = templates.measure(decode_grey(frame))
         if not found.status.ok:
             raise DataError(f"{frame}: {found.status.reason}")
         control = replace(control, seen=found.observations)
-    # sigmas that nobody stated cannot tell a gross error; sigma0 then says what they are worth
+    # no snooping with assumed standard deviations: sigma0 then shows how good they are
     try:
         pose = control.pose(camera, 0.0 if control.assumed else 0.001)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
     assert pose.exterior is not None
-    # pose and camera are correlated: the pose goes with the camera that it was estimated with
+    # pose and camera are correlated: write the camera that was estimated together with the pose
     now = replace(camera, values=pose.values[IOP], covariance=pose.covariance[IOP, IOP])
     K, distortion = _opencv(now)
     rvec, tvec = opencv_pose(pose.exterior, control.origin)
-    # pyorc solves for the pose again when it reads the file: from where this camera sees the points
-    # it finds this pose
+    # pyorc solves for the pose again when it reads the file: with the points as this camera
+    # projects them it obtains this pose
     six = pose.exterior.as_array()
     document["gcps"]["src"] = now.project(control.field.points, six).tolist()
     document |= {
@@ -211,8 +214,8 @@ def renew_configuration(
 
 
 def _opencv(camera: Camera) -> tuple[Array, Array]:
-    """OpenCV's matrix and distortion; in closed form where that is exact, also where a distortion
-    of few terms folds back in the corners of the image.
+    """Return OpenCV's matrix and distortion, in closed form if that is exact, which also works if
+    a distortion of few terms folds back in the corners of the image.
     """
     terms = opencv_terms(camera.sensor, camera.values, camera.covariance)
     if not terms["exact"]:
@@ -224,7 +227,7 @@ def _opencv(camera: Camera) -> tuple[Array, Array]:
 
 
 def opencv_pose(pose: ExteriorOrientation, origin: Array) -> tuple[Array, Array]:
-    """Return OpenCV's rotation vector and translation (m) for coordinates that count from zero."""
+    """Return OpenCV's rotation vector and translation (m); origin: of the pose, mm."""
     import cv2
 
     R = _AXES @ pose.rotation.T
@@ -239,5 +242,5 @@ def _document(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as JSON: {error}") from error
     if not isinstance(document, dict) or not isinstance(document.get("gcps"), dict):
-        raise DataError(f"{path}: is not a camera configuration of pyorc: it has no gcps")
+        raise DataError(f"{path}: is not a camera configuration of pyorc; it has no gcps")
     return document

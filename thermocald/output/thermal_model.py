@@ -1,9 +1,9 @@
-"""A thermal model to take home: its certificate, and code in C and in Python without dependencies.
+"""The certificate of a thermal model, and its code in C and in Python without dependencies.
 
-The certificate says how the camera follows its temperature, and how far. The code evaluates the
-camera that has long been at a temperature T: the ten parameters as polynomials in T, OpenCV's
-camera matrix and distortion coefficients, and the projection itself, which holds also where C1 or
-C2 are not zero and OpenCV has no place for them.
+The certificate states how the camera changes with its temperature, and over which range. The code
+evaluates the camera at a steady temperature T: the ten parameters as polynomials in T, OpenCV's
+camera matrix and distortion coefficients, and the projection itself, which is also valid if C1 or
+C2 are not zero, for which OpenCV has no parameters.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ def render_certificate(camera: ThermalCamera) -> str:
         Answer(
             _sentence(document, camera.model.sensor.pixel_pitch, low, high),
             _drift(T, values, sds, missing),
-            tuple(_judged(document)),
-            ("Find what is missing: thermocald discover.",) if missing
+            tuple(_assess_misfit(document)),
+            ("Find the missing effect: thermocald discover.",) if missing
             else ("Correct measurements with: thermocald correct.",),
             (
                 f"Temperatures below {low:g} and above {high:g} °C.",
-                "Focus or lens moved since: calibrate again.",
-                "Errors of the camera model itself, which no standard deviation here holds.",
+                "A change of focus or lens after the series: calibrate again.",
+                "Errors of the camera model itself, which no standard deviation here includes.",
             ),
         ),
         (
             _section("The model", _values(document), _effects(document)),
-            _section("What it rests on", *_evidence(document)),
+            _section("Evidence", *_evidence(document)),
         ),
         about=(_about(camera, document),),
         notes=tuple(as_sentence(line) for line in doubt_lines(document.get("doubts", ()))),
@@ -76,10 +76,10 @@ def _about(camera: ThermalCamera, document: Mapping[str, Any]) -> str:
 
 
 def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float) -> str:
-    """The largest of the rates with its sd, the range, and what that is on a plane."""
+    """State the largest rate with its sd, the range, and the effect of both on a plane at 10 m."""
     rates = {n: (r["value"], r.get("sd", float("nan"))) for n, r in document["rates"].items()}
     if not rates:
-        return f"The camera does not follow the temperature between {low:.0f} and {high:.0f} °C."
+        return f"The camera does not change with temperature between {low:.0f} and {high:.0f} °C."
     name = max(rates, key=lambda n: abs(rates[n][0]))
     rate, sd = rates[name]
     text = (
@@ -93,15 +93,15 @@ def _sentence(document: Mapping[str, Any], pitch: float, low: float, high: float
     return f"{text}."
 
 
-def _judged(document: Mapping[str, Any]) -> list[str]:
+def _assess_misfit(document: Mapping[str, Any]) -> list[str]:
     if why := document.get("not_examined"):
         return [f"Whether an effect is missing was not examined: {why}."]
     if document.get("effect_missing"):
         left = document.get("misfit_px")
         size = "" if left is None else f" of {left:.3f} px"
-        return [(f"An effect is missing: the model leaves smooth trajectories{size}. The standard "
-                "deviations are widened by that, and no 95 % band is stated.")]  # fmt: skip
-    return ["The model leaves no more than noise."]
+        return [(f"An effect is missing: the residuals have smooth trajectories{size}. They are "
+                "included in the standard deviations, and no 95 % band is given.")]  # fmt: skip
+    return ["The residuals are no larger than the noise."]
 
 
 def _drift(T: Array, values: Array, sds: Array, missing: bool) -> Figure:
@@ -113,11 +113,11 @@ def _drift(T: Array, values: Array, sds: Array, missing: bool) -> Figure:
         curve = Curve("", T, y, half=None if missing else half)
         label = parameter_label(name)
         panels.append(Panel(label, "temperature in °C", f"Δ{label} in µm", (curve,)))
-    band = "no band is stated" if missing else "bands hold 95 %, the level's uncertainty included"
+    band = "no band is given" if missing else "bands: 95 %, with the uncertainty of the level"
     return Figure(
-        "drift", "How the camera follows its temperature",
-        f"Each parameter less its value in the middle of the range, of a camera that has long been "
-        f"at a temperature; {band}.",
+        "drift", "Change of the camera with its temperature",
+        "Each parameter minus its value in the middle of the range, at steady temperatures; "
+        f"{band}.",
         tuple(panels),
     )  # fmt: skip
 
@@ -167,7 +167,7 @@ def _evidence(document: Mapping[str, Any]) -> list[Table]:
             {
                 "series": lambda s: str(s["name"]),
                 "epochs": lambda s: str(s["epochs"]),
-                "left over px RMS": lambda s: f"{s['rms_px']:.4f}",
+                "residual px RMS": lambda s: f"{s['rms_px']:.4f}",
                 "noise px": lambda s: f"{s['noise_px']:.4f}",
                 "thermometer ± K": lambda s: f"{s['thermometer_sd']:.3f}",
             },
@@ -187,7 +187,7 @@ def _evidence(document: Mapping[str, Any]) -> list[Table]:
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _FOLLOW_C = """\
-    /* the lens keeps its rays' angles: distortion follows c */
+    /* the lens preserves the angles of its rays: the distortion scales with c */
     double s = {c0} / p[0];
     p[3] *= s * s;
     p[4] *= s * s * s * s;
@@ -197,13 +197,13 @@ _FOLLOW_C = """\
 """
 
 _FOLLOW_PYTHON = """\
-    s = {c0} / p[0]  # the lens keeps its rays' angles: distortion follows c
+    s = {c0} / p[0]  # the lens preserves the angles of its rays: the distortion scales with c
     p[3:8] = p[3] * s**2, p[4] * s**4, p[5] * s**6, p[6] * s, p[7] * s
 """
 
 
 def write_code(camera: ThermalCamera, path: Path) -> tuple[Path, Path]:
-    """Write PATH.h and PATH.py; OutputError where they cannot be written."""
+    """Write PATH.h and PATH.py and return their paths; OutputError if they cannot be written."""
     header, module = path.with_suffix(".h"), path.with_suffix(".py")
     texts = [code_of(camera, path.stem, kind) for kind in ("h", "py")]
     for file, text in zip((header, module), texts, strict=True):
@@ -214,7 +214,7 @@ def write_code(camera: ThermalCamera, path: Path) -> tuple[Path, Path]:
 def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
     """Return the model as a C header or a Python module.
 
-    Raises UsageError where it needs more than one thermometer.
+    Raises UsageError for a model that needs more than one thermometer.
     """
     model = camera.model
     sensor = model.sensor
@@ -229,7 +229,7 @@ def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
     reference, limits = next(iter(model.validity.items()), ("the thermometer", (-273.0, 1000.0)))
     affine = any(any(row[8:]) for row in p) or any(any(k[9:]) for k in camera.steady_knees())
     c0 = repr(float(model.interior.c))
-    exact = "C1 or C2 are not zero: OpenCV's parameters are then not exact, the projection is."
+    exact = "C1 or C2 are not zero: the projection is exact, OpenCV's parameters are not."
     fields = {
         "name": _plain(model.name or model.camera), "id": identifier,
         "guard": f"THERMOCALD_{identifier.upper()}_H", "reference": _plain(reference),
@@ -245,7 +245,7 @@ def code_of(camera: ThermalCamera, name: str, kind: Literal["h", "py"]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text that neither a comment of C nor a docstring ends at."""
+    """Replace characters that could end a comment in C or a docstring."""
     return re.sub(r"[^\w .:()+-]", "?", text, flags=re.ASCII)
 
 

@@ -1,7 +1,7 @@
-"""The web page of a daemon: read-only, live, in a process of its own.
+"""The live, read-only web page of a daemon, served by a separate process.
 
-It reads what the daemon leaves (its live folder and its store) and never talks to it: if the page
-dies, acquisition does not notice.
+It reads the daemon's live folder and store and never connects to the daemon, so that a failure of
+the page cannot affect acquisition.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ def serve(
     token_file: Path | None = None,
     names: Sequence[str] = (),
 ) -> None:
-    """Serve until ended.
+    """Serve the page until stopped.
 
-    names: further names by which the page may be asked for. Raises ConfigurationError, also where
-    the port is in use; DriverMissing without the extra `dashboard`.
+    names: further host names under which the page may be opened. Raises ConfigurationError, also
+    if the port is in use; DriverMissing without the extra `dashboard`.
     """
     token = _read_token(token_file)
     if not is_loopback(host) and token is None:
-        raise ConfigurationError(f"host {host} is open to others; give --token-file too")
+        raise ConfigurationError(f"host {host} is open to other machines; give --token-file too")
     try:
         from thermocald.output.dashboard.application import build_application
         from thermocald.output.dashboard.server import bind, run_server
@@ -63,7 +63,9 @@ def _read_token(path: Path | None) -> str | None:
         why = getattr(error, "strerror", None) or error
         raise ConfigurationError(f"{path}: the token cannot be read: {why}") from error
     if mode & (stat.S_IROTH | stat.S_IWOTH):
-        raise ConfigurationError(f"{path}: everybody may read the token; chmod o-rw {path}")
+        raise ConfigurationError(
+            f"{path}: everybody may read or change the token; run: chmod o-rw {path}"
+        )
     if len(token) < _SHORTEST_TOKEN:
         raise ConfigurationError(
             f"{path}: the token has {len(token)} characters; at least {_SHORTEST_TOKEN} are needed"

@@ -1,6 +1,6 @@
-"""The routes: pages, JSON, a stream of events; only GET, and only what is named here.
+"""The routes of the page: HTML, JSON, a stream of events, and metrics; all of them only read.
 
-`/metrics` is the daemon's status as Prometheus reads it.
+`/metrics` is the daemon's status in the format of Prometheus.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ if TYPE_CHECKING:
 
 _CAMERA = {
     "ticks": "Ticks of the camera's schedule.",
-    "skipped": "Ticks skipped because they came too late.",
+    "skipped": "Ticks skipped because they were too late.",
     "late_p99_s": "Lateness of ticks, 99th percentile of the last 1000, s.",
     "lost": "Ticks in which the camera gave no frame.",
-    "waiting": "Epochs on their way to the store.",
+    "waiting": "Epochs not yet in the store.",
     "deferred": "Epochs whose calibration was deferred.",
-    "caught_up": "Epochs that were calibrated later.",
+    "caught_up": "Deferred epochs calibrated since.",
     "stored": "Epochs stored by this process.",
 }
 _EPOCH = {
     "epoch": "Number of the last epoch.",
     "temperature": "Reference temperature, degrees Celsius.",
     "c": "Principal distance, mm.",
-    "sd_c": "Its standard deviation, mm.",
+    "sd_c": "Standard deviation of c, mm.",
     "x0": "Principal point x, mm.",
-    "sd_x0": "Its standard deviation, mm.",
+    "sd_x0": "Standard deviation of x0, mm.",
     "y0": "Principal point y, mm.",
-    "sd_y0": "Its standard deviation, mm.",
+    "sd_y0": "Standard deviation of y0, mm.",
     "sigma0": "Standard deviation of unit weight.",
     "n_observations": "Targets measured.",
     "n_rejected": "Targets rejected.",
@@ -69,7 +69,7 @@ _ONLINE = {
 
 @dataclass(frozen=True)
 class _StatusCollector:
-    """A daemon's status as metrics; an empty one says that none runs."""
+    """A daemon's status as metrics; it is empty if no daemon runs."""
 
     status: Mapping[str, Any]
 
@@ -81,16 +81,17 @@ class _StatusCollector:
             single += [
                 ("status_age_s", "Age of the daemon's status, s.", status["age_s"]),
                 ("stalled", "Devices or pipelines that hang.", len(status["stalled"])),
-                ("store_ok", "Whether the store takes everything.", store["state"] == "ok"),
+                ("store_ok", "Whether the store can be written.", store["state"] == "ok"),
                 ("store_waiting", "Epochs waiting in memory.", store["waiting"]),
-                ("store_lost", "Epochs taken and not kept.", store["lost"]),
-                ("clock_trusted", "Whether UTC is known.", status["clock"]["trusted"]),
+                ("store_lost", "Epochs taken but not stored.", store["lost"]),
+                ("clock_trusted", "Whether UTC is synchronised.", status["clock"]["trusted"]),
             ]
         for name, about, value in single:
             yield GaugeMetricFamily(f"thermocald_{name}", about, value=float(value))
         if not status:
             return
-        up = GaugeMetricFamily("thermocald_device_up", "Open and working.", labels=["kind", "name"])
+        labels = ["kind", "name"]
+        up = GaugeMetricFamily("thermocald_device_up", "Whether a device is open.", labels=labels)
         for kind in ("cameras", "thermometers", "outputs"):
             for name, device in status[kind].items():
                 up.add_metric([kind[:-1], name], float(device["device"] == "open"))
@@ -108,7 +109,7 @@ class _StatusCollector:
 
 
 def _metrics(request: Request) -> Response:
-    """The status in the text format of Prometheus."""
+    """Return the status in the text format of Prometheus."""
     text = generate_latest(_StatusCollector(_view(request).status()))
     return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
@@ -137,7 +138,10 @@ _NAME_LENGTH = 64
 def build_application(
     store: Path, live: Path, token: str | None, host: str, names: Sequence[str] = ()
 ) -> Starlette:
-    """The application; token: None if whoever reaches it may look; names: further ones of ours."""
+    """Return the application.
+
+    token: None to let every client read; names: further host names of the page.
+    """
     application = Starlette(
         routes=[
             Route("/", _page),
@@ -161,9 +165,9 @@ def build_application(
 
 
 class _Guard:
-    """Refuses foreign host names (DNS rebinding) and, where there is one, requests without token.
+    """A guard that refuses unknown host names (DNS rebinding) or, if set, requests without token.
 
-    The token comes as `Authorization: Bearer …`, or once as `?token=…`, which sets a cookie.
+    The token is sent as `Authorization: Bearer …`, or once as `?token=…`, which sets a cookie.
     """
 
     def __init__(self, app: ASGIApp, token: str | None, names: HostNames) -> None:
@@ -181,7 +185,7 @@ class _Guard:
         if scope["method"] not in ("GET", "HEAD"):
             response = JSONResponse({"error": "this page only reads"}, 405)
         elif self._is_foreign(request):
-            response = JSONResponse({"error": "another site's page asks for this"}, 403)
+            response = JSONResponse({"error": "requests from other sites are refused"}, 403)
         elif self._token is None:
             if not self._names.allow_host(",".join(request.headers.getlist("host"))):
                 response = JSONResponse({"error": "unknown host name"}, 400)
@@ -199,7 +203,7 @@ class _Guard:
         await (response or self._app)(scope, receive, send_with_headers)
 
     def _is_foreign(self, request: Request) -> bool:
-        """Whether a browser says that a page of another site asks."""
+        """Return whether the browser reports that the request comes from another site."""
         origin = request.headers.get("origin")
         if origin is not None:
             own = request.headers.get("host", "")
@@ -232,7 +236,7 @@ def _same(a: str, b: str) -> bool:
 
 
 def _digest(token: str) -> str:
-    """What the cookie holds: a header cannot hold every token, and nobody need read it there."""
+    """Return a token's hash for the cookie: a header cannot hold every token, nor should it."""
     return hashlib.sha256(token.encode(errors="replace")).hexdigest()
 
 
@@ -258,7 +262,7 @@ def _static(request: Request) -> Response:
 
 @cache
 def _plotly_script() -> bytes:
-    # read from its package without importing that: 30 MB of memory
+    # read from its package without importing it, which would take 30 MB of memory
     found = find_spec("plotly")
     if found is None or found.origin is None:
         raise DataError("the page's charts need plotly: pip install 'thermocald[dashboard]'")
@@ -282,7 +286,7 @@ async def _stream(request: Request) -> Response:
     async def events() -> AsyncIterator[str]:
         seen, silent, ends = -1.0, 0, False
         while not (ends or await request.is_disconnected()):
-            # once more when the server ends, which is how the page hears that the daemon has
+            # once more when the server stops, so that the page shows that the daemon has stopped
             ends = request.app.state.ends()
             changed = view.changed()
             silent += 1
@@ -307,7 +311,7 @@ def _columns(view: View, request: Request) -> dict[str, Any]:
     return view.columns(camera, series, since, until, int(points or 1000))
 
 
-# path → what is answered, and as what if not as JSON
+# path → function that answers, and the media type if it is not JSON
 _ANSWERS: dict[str, tuple[Callable[[View, Request], Any], str]] = {
     "/api/status": (lambda view, _: view.shown(), ""),
     "/api/series": (lambda view, _: view.series(), ""),
@@ -324,8 +328,8 @@ _ANSWERS: dict[str, tuple[Callable[[View, Request], Any], str]] = {
 }  # fmt: skip
 
 
-def _answer(said: Callable[[View, Request], Any], media_type: str, request: Request) -> Response:
-    found = said(_view(request), request)
+def _answer(read: Callable[[View, Request], Any], media_type: str, request: Request) -> Response:
+    found = read(_view(request), request)
     return Response(found, media_type=media_type) if media_type else JSONResponse(found)
 
 
@@ -353,7 +357,7 @@ def _camera_and_series(request: Request) -> tuple[str, str]:
     for key in ("camera", "series"):
         value = request.query_params.get(key, "")
         if not value or len(value) > _NAME_LENGTH or not value.isprintable():
-            raise UsageError(f"{key}: give the name of one, at most {_NAME_LENGTH} characters")
+            raise UsageError(f"{key}: give a name of at most {_NAME_LENGTH} characters")
         found.append(value)
     return found[0], found[1]
 
@@ -363,7 +367,7 @@ def _number(request: Request, key: str, low: float, high: float) -> float | None
     if text is None:
         return None
     try:
-        # float() also takes 1_0 and digits of any script
+        # float() also accepts 1_0 and the digits of every script
         value = float(text[:40]) if text.isascii() and "_" not in text else math.nan
     except ValueError:
         value = math.nan

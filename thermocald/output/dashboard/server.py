@@ -1,7 +1,7 @@
-"""The page's server: it binds first, and neither silent nor slow clients hold it up or fill memory.
+"""The page's server, which silent or slow clients can neither block nor exhaust.
 
-A connection that sends no whole request, or takes up nothing of its answer for so many seconds, is
-ended; beyond a number of connections, and of costly requests at once, the answer is 503.
+A connection that sends no complete request, or reads nothing of its answer, is closed after some
+seconds. Beyond a number of connections or of simultaneous costly requests, the answer is 503.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ log = logging.getLogger(__name__)
 _CONNECTIONS = 100
 _LOOK_EVERY_S = 2.0
 _REQUEST_S = 10.0  # for a request's head to arrive
-_END_S = 1.0  # for answers to come to their end
-_STUCK_S = 20.0  # for a client to take up 64 kB
-_SEND_BUFFER_BYTES = 131_072  # what the kernel holds of an answer, else up to 4 MB a connection
-# path → (requests served at once, requests that may wait for that)
+_END_S = 1.0  # for answers to be completed when the server stops
+_STUCK_S = 20.0  # for a client to read 64 kB
+_SEND_BUFFER_BYTES = 131_072  # of an answer in the kernel, otherwise up to 4 MB per connection
+# path → (requests served at once, requests that may wait)
 _COSTLY = {
     "/api/series.csv": (4, 0),
     "/api/columns": (2, 20),
@@ -41,13 +41,13 @@ _COSTLY = {
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening socket; raises ConfigurationError where the address cannot be had."""
+    """Return a listening socket; ConfigurationError if the address cannot be used."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listening = socket.socket(family, socket.SOCK_STREAM)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
-        # the kernel's own limit for who takes up nothing: inherited by every connection
+        # the kernel's limit for a client that reads nothing; every connection inherits it
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * _STUCK_S))
         listening.bind((host, port))
     except OSError as error:
@@ -56,12 +56,12 @@ def bind(host: str, port: int) -> socket.socket:
             why = "it is in use by another program; choose another dashboard.port"
         else:
             why = error.strerror or str(error)
-        raise ConfigurationError(f"the page cannot be at {host}, port {port}: {why}") from error
+        raise ConfigurationError(f"the page cannot use {host}, port {port}: {why}") from error
     return listening
 
 
 def run_server(application: Starlette, listening: socket.socket) -> None:
-    """Serve until ended by a signal; what is being answered has a second to come to its end."""
+    """Serve until a signal stops it; answers under way have a second to be completed."""
     config = uvicorn.Config(
         application, http=_Connection, ws="none", log_level="warning", access_log=False,
         lifespan="off", server_header=False, backlog=64, limit_concurrency=_CONNECTIONS,
@@ -73,9 +73,9 @@ def run_server(application: Starlette, listening: socket.socket) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Hangs up on whoever still has not taken up an answer, rather than cancel it half-way.
+    """A server that, when it stops, closes the connections of clients still reading an answer.
 
-    A request that is cancelled is a traceback in the journal.
+    Cancelling their requests instead would put a traceback into the journal.
     """
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
@@ -89,7 +89,7 @@ class _Server(uvicorn.Server):
 
 
 class _Connection(H11Protocol):
-    """A connection that is ended when its client neither asks nor takes up what it asked for."""
+    """A connection that is closed if its client neither sends a request nor reads the answer."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
@@ -116,7 +116,7 @@ class _Connection(H11Protocol):
 
 
 class Limits:
-    """Serves so many costly requests at once; some wait, the rest are answered with 503."""
+    """A limit on simultaneous costly requests: some wait, the rest are answered with 503."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -131,7 +131,7 @@ class Limits:
         slot = self._slots[path]
         if slot.locked() and self._waiting[path] >= _COSTLY[path][1]:
             busy = JSONResponse(
-                {"error": "too many ask for this at once; ask again"}, 503, {"retry-after": "5"}
+                {"error": "too many requests at once; try again"}, 503, {"retry-after": "5"}
             )
             await busy(scope, receive, send)
             return
@@ -145,7 +145,7 @@ class Limits:
         except RuntimeError as error:
             if not isinstance(error.__cause__, ThermocaldError):
                 raise
-            # half of the answer is sent: all that can be done is to end it there
+            # part of the answer is sent already: it can only be cut off
             log.warning("%s: %s", path, error.__cause__)
         finally:
             slot.release()

@@ -1,4 +1,4 @@
-"""What the page shows, read from the live folder and the store; nothing is written."""
+"""The data of the page, read from the live folder and the store; nothing is written."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ _SHOWN = ("c", "x0", "y0")
 _MOST_POINTS = 2000
 _ROWS_AT_ONCE = 500
 _OLD_S = 30.0
-_LOST_S = 3600.0  # for so long after an epoch was lost the daemon is not well
+_LOST_S = 3600.0  # the daemon is unhealthy for this long after an epoch was lost
 
 
 class View:
-    """A store and a live folder, looked at; threads may share it: every call opens for itself."""
+    """A view of a store and a live folder, which every call opens anew: threads may share it."""
 
     def __init__(self, store: Path, live: Path) -> None:
         self._store = store
         self._live = live
 
     def status(self) -> dict[str, Any]:
-        """status.json with its age in s; empty if no daemon runs."""
+        """Return status.json with its age in s; empty if no daemon runs."""
         written = self.changed()
         document = read_json(self._live / "status.json") if written else {}
         return document and {**document, "age_s": max(0.0, time.time() - written)}
 
     def shown(self) -> dict[str, Any]:
-        """The status; without a daemon only `stopped`, when the last one ended, where known."""
+        """Return the status; if no daemon runs, only `stopped`, the time the last one stopped."""
         if status := self.status():
             return status
         try:
@@ -61,7 +61,7 @@ class View:
         return {"stopped": ends[-1]} if ends else {}
 
     def healthy(self) -> tuple[bool, str]:
-        """(whether the daemon runs and nothing hangs, why not)."""
+        """Return whether the daemon runs without a fault, and if not, why."""
         status = self.status()
         if not status:
             return False, "no daemon runs"
@@ -77,30 +77,30 @@ class View:
         return True, ""
 
     def changed(self) -> float:
-        """When status.json was last written, s; 0 if there is none."""
+        """Return the time at which status.json was last written, s; 0 if there is none."""
         try:
             return (self._live / "status.json").stat().st_mtime
         except OSError:
             return 0.0
 
     def last_epoch(self, camera: str) -> dict[str, Any]:
-        """The last epoch's row, targets and residuals; DataError if there is none."""
+        """Return the row, targets and residuals of the last epoch; DataError if there is none."""
         document = read_json(self._path(camera, "json"))
         if not document:
-            raise DataError(f"camera {camera!r} has given nothing yet")
+            raise DataError(f"camera {camera!r} has no epoch yet")
         return document
 
     def current_camera(self, name: str | None) -> dict[str, Any]:
-        """The camera of now in OpenCV's terms, with its pose where there is one; name: None for the
-        only one. DataError where there is none, or its last epoch has no result.
+        """Return the present camera in OpenCV's terms, and its pose if it is known.
+
+        name: None for the only camera. Raises DataError for an unknown camera, or if its last epoch
+        has no result.
         """
-        there = list(self.status().get("cameras", {}))
+        names = list(self.status().get("cameras", {}))
         if name is None:
-            if len(there) != 1:
-                raise DataError(
-                    f"say which with ?camera=…; there are: {', '.join(there) or 'none'}"
-                )
-            name = there[0]
+            if len(names) != 1:
+                raise DataError(f"give ?camera=NAME; the cameras are: {', '.join(names) or 'none'}")
+            name = names[0]
         row = self.last_epoch(name).get("row", {})
         if not row.get("opencv"):
             raise DataError(
@@ -118,27 +118,27 @@ class View:
         }  # fmt: skip
 
     def camera_info(self, name: str | None) -> str:
-        """The camera of now as ROS' camera_info YAML; errors as `current_camera`."""
+        """Return the present camera as YAML of ROS' camera_info; errors as `current_camera`."""
         now = self.current_camera(name)
         sensor = Sensor(int(now["width"]), int(now["height"]), float(now["pixel_pitch_mm"]))
         interior = InteriorOrientation.from_array([now["interior"][n] or 0.0 for n in IOP_NAMES])
         about = f"{now['status']}, epoch {now['epoch']}"
         if now["temperature"] is not None:
             about += f", {now['temperature']:.2f} degC"
-        # imported where they are used: few ask, and the page's process is small
+        # imported here: few clients request it, and the page's process is to stay small
         from thermocald.photogrammetry.camera_files import encode
 
         return encode(CameraModel(sensor, interior), "ros", None, about, now["camera"])[0]
 
     def last_frame(self, camera: str) -> bytes:
-        """The last frame as JPEG; DataError if there is none."""
+        """Return the last frame as JPEG; DataError if there is none."""
         try:
             return self._path(camera, "jpg").read_bytes()
         except OSError as error:
-            raise DataError(f"camera {camera!r} has given nothing yet") from error
+            raise DataError(f"camera {camera!r} has no frame yet") from error
 
     def series(self) -> list[dict[str, Any]]:
-        """All series of the store, oldest first."""
+        """Return all series of the store, oldest first."""
         with Store.open(self._store) as store:
             return [
                 {
@@ -157,16 +157,18 @@ class View:
     def columns(
         self, camera: str, series: str, since_s: float | None, until: float | None, points: int
     ) -> dict[str, Any]:
-        """Columns for the charts: means over at most `points` bins of equal numbers of epochs.
+        """Return columns for the charts: means over at most `points` bins with equal numbers of
+        epochs.
 
-        since_s: the last so many s before `until` (UTC s, default: the last epoch); None: all.
-        Standard deviations are means too: a bin's mean is better than they say.
+        until: UTC, s, by default the last epoch; since_s: only this many s before `until`, None:
+        all. A standard deviation is the mean of those of the bin's epochs, hence larger than that
+        of the bin's mean.
         """
         names = ["sigma0", *_SHOWN, *(f"sd_{n}" for n in _SHOWN)]
         with Store.open(self._store) as store:
             found = store.find_series(camera, series)
             channels = list(found.head.channels)
-            # one column at a time: a year of them would not fit into the page's memory
+            # one column at a time: all columns of a year would not fit into the page's memory
             times = store.series_columns(found, ["frame_time"])["frame_time"]
             chosen = np.ones(len(times), dtype=bool)
             if until is not None:
@@ -178,7 +180,7 @@ class View:
             bins = np.array_split(rows, min(points, len(rows))) if len(rows) else []
             averaged = {"frame_time": _means(times, bins)}
             for name in (*names, *channels):
-                # an epoch that came meanwhile is not among the times
+                # epochs stored in the meantime are not among the times
                 column = store.series_columns(found, [name])[name][: len(times)]
                 averaged[name] = _means(column, bins)
         return {
@@ -189,14 +191,14 @@ class View:
         }
 
     def events(self, since: float) -> list[dict[str, Any]]:
-        """What happened since a UTC time, newest first, at most 200."""
+        """Return the events since a UTC time, s, newest first, at most 200."""
         with Store.open(self._store) as store:
             found = store.events(since_utc=since)[-200:]
         shown = ("utc", "kind", "text", "epoch")
         return [{name: getattr(event, name) for name in shown} for event in reversed(found)]
 
     def csv(self, camera: str, series: str) -> Iterator[str]:
-        """A series as CSV: epoch, times, temperatures as read, parameters with sds, status."""
+        """Yield a series as CSV: epoch, times, temperatures, parameters with sds, status."""
         with Store.open(self._store) as store:
             found = store.find_series(camera, series)
             names = _csv_names(found)
@@ -211,7 +213,7 @@ class View:
             store.find_series(camera, series)
 
     def _path(self, camera: str, suffix: str) -> Path:
-        # the name is looked up, never joined as it came
+        # a name from a request is checked before it becomes part of a path
         if camera not in self.status().get("cameras", {}):
             raise DataError(f"there is no camera {camera!r}")
         return self._live / f"{camera}.{suffix}"

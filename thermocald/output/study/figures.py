@@ -1,7 +1,7 @@
-"""The figures of a study: each with a caption that says in words what it shows for this camera.
+"""The figures of a study, each with a caption that states what it shows for this camera.
 
-Numbered as in the report; the reference's figures (Elias et al. 2020) that they correspond to are
-named in docs/explanation/study.md.
+Figure numbers in parentheses are those of the reference (Elias et al. 2020); the correspondence is
+listed in docs/explanation/study.md.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 _DRAWN = 400  # points of a cloud
-_ALIKE = 0.005  # correlations that differ by less do not differ when written
+_ALIKE = 0.005  # correlations that differ by less are printed alike
 _CLUSTERS = ("#1b7837", "#7fbf7b", "#e6a800", "#d6278a", "#7b3294", "#000000")
 
 
 def study_figures(camera: CameraStudy) -> dict[str, Figure]:
-    """Return every figure of a camera's study by name; none of what the data do not support."""
+    """Return the figures of a camera's study by name, without those the data do not support."""
     moving = any(len(study.series) > 1 for study in camera.series)
     made = (
         deviation_figure(camera) if moving else None,
@@ -50,12 +50,12 @@ def _coloured(camera: CameraStudy) -> Iterator[tuple[SeriesStudy, str]]:
 
 
 def _free_parameters(camera: CameraStudy) -> list[str]:
-    """IOP that are free in any series."""
+    """Return the parameters of the interior orientation that are free in any series."""
     return [n for n in IOP_NAMES if any(n in study.series.free for study in camera.series)]
 
 
 def _readable(camera: CameraStudy, name: str) -> tuple[float, str]:
-    """A factor that makes an IOP's changes easy to read, and how the axis is labelled."""
+    """Return a factor that makes the changes of a parameter easy to read, and the axis label."""
     unit, k = UNITS[name], IOP_NAMES.index(name)
     if unit == "mm":
         return 1000.0, f"Δ{parameter_label(name)} in µm"
@@ -68,7 +68,7 @@ def _readable(camera: CameraStudy, name: str) -> tuple[float, str]:
 
 
 def deviation_figure(camera: CameraStudy) -> Figure:
-    """Every parameter minus its first value over time (the reference's Figures 3 and 5)."""
+    """Draw every parameter minus its first value over time (Figures 3 and 5)."""
     panels, ratios, words = [], [], []
     temperatures: dict[str, list[Curve]] = {}
     for name in _free_parameters(camera):
@@ -99,15 +99,15 @@ def deviation_figure(camera: CameraStudy) -> Figure:
     ]
     return Figure(
         "deviations", "Deviations from the first epoch",
-        "Each parameter minus its value in the first epoch. The bands are 95 % of what one epoch's "
-        "adjustment leaves uncertain; a line that leaves its band has moved."
+        "Each parameter minus its value in the first epoch. The bands are the 95 % uncertainty of "
+        "one epoch's adjustment; a line that leaves its band shows a change."
         + (f" The principal point has moved {' and '.join(words)}." if words else ""),
         tuple(panels),
     )  # fmt: skip
 
 
 def principal_point_figure(camera: CameraStudy) -> Figure | None:
-    """The path of the principal point on the sensor (the reference's Figures 4 and 6)."""
+    """Draw the path of the principal point on the sensor (Figures 4 and 6)."""
     if not {"x0", "y0"} <= set(_free_parameters(camera)):
         return None
     curves, words = [], []
@@ -120,21 +120,20 @@ def principal_point_figure(camera: CameraStudy) -> Figure | None:
         words.append(f"{s.name}: {_direction(float(x[-1]), float(y[-1]))}")
         farthest = float(np.max(np.hypot(x, y)))
         if farthest > 1.5 * np.hypot(x[-1], y[-1]):
-            words[-1] += f" in the end, {plain(farthest, 'px', 3)} away at most"
+            words[-1] += f" at the end, at most {plain(farthest, 'px', 3)} away"
     panel = Panel(
         "Path of the principal point", "Δx₀ in px, right", "Δy₀ in px, up", tuple(curves),
         equal=True,
     )  # fmt: skip
     return Figure(
         "principal-point", "Principal point",
-        f"Where the principal point has gone from its first position (black dot). "
-        f"{'; '.join(words)}.",
+        f"The path of the principal point from its first position (black dot). {'; '.join(words)}.",
         (panel,),
     )  # fmt: skip
 
 
 def _direction(x: float, y: float) -> str:
-    """`16.2 px to the lower right` of a movement in px, y up."""
+    """Describe a movement in px, y up, such as `16.2 px to the lower right`."""
     length = float(np.hypot(x, y))
     vertical = "upper" if y > 0.38 * length else "lower" if y < -0.38 * length else ""
     horizontal = "right" if x > 0.38 * length else "left" if x < -0.38 * length else ""
@@ -144,7 +143,7 @@ def _direction(x: float, y: float) -> str:
 
 
 def _movement_figure(camera: CameraStudy) -> Figure | None:
-    """Directional zoom: how the image of a still scene moves (Figures 4 and 6)."""
+    """Draw the directional zoom: the movement of the image of a static scene (Figures 4 and 6)."""
     moved = [
         (study.series, colour, study.grid, study.displacement)
         for study, colour in _coloured(camera)
@@ -161,16 +160,16 @@ def _movement_figure(camera: CameraStudy) -> Figure | None:
         words.append(f"{plain(length, 'px', 3)} in {s.name}")
     return Figure(
         "movement", "Movement of the image",
-        "How points of a scene that stands still move in the image from the first to the last "
-        "epoch, because the interior orientation changes. The largest "
-        f"movement is {' and '.join(words)}. Equal arrows are a shift of the principal point; "
-        "arrows that point outwards are a longer principal distance.",
+        "Movement of the points of a static scene in the image from the first to the last epoch, "
+        "caused by the change of the interior orientation. The largest "
+        f"movement is {' and '.join(words)}. Equal arrows show a shift of the principal point; "
+        "arrows that point outwards show a longer principal distance.",
         tuple(panels), columns=2,
     )  # fmt: skip
 
 
 def _significance_figure(camera: CameraStudy) -> Figure | None:
-    """Moving variance over moving mean squared sd, with the limit of the F-test."""
+    """Draw the moving variance over the moving mean of the squared sd, and the F-test's limit."""
     panels, always, rarely = [], [], []
     for name in _free_parameters(camera):
         tested = [
@@ -209,7 +208,7 @@ def _significance_figure(camera: CameraStudy) -> Figure | None:
 
 
 def dependence_figure(camera: CameraStudy, only: Sequence[str] = ()) -> Figure | None:
-    """Parameters over the reference temperature with the fitted lines (Figure 7).
+    """Draw the parameters over the reference temperature with the fitted lines (Figure 7).
 
     only: parameters to show, by default all.
     """
@@ -239,14 +238,14 @@ def dependence_figure(camera: CameraStudy, only: Sequence[str] = ()) -> Figure |
     )
     return Figure(
         "temperature-dependence", "Dependence on the temperature",
-        "Each parameter against the reference temperature, with the straight line that counts the "
-        f"noise of both. {follow}",
+        "Each parameter against the reference temperature, with a straight line whose fit takes "
+        f"the noise of both into account. {follow}",
         tuple(panels),
     )  # fmt: skip
 
 
 def _fitted(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Curve]:
-    """A parameter's changes over the temperature, and their straight line."""
+    """Return the curves of a parameter's changes over the temperature and of their line."""
     s = study.series
     value = s.sigma0
     if name != "sigma0":
@@ -264,8 +263,8 @@ def _fitted(study: SeriesStudy, name: str, scale: float, colour: str) -> list[Cu
 
 
 def _object_space(camera: CameraStudy) -> Iterator[Figure]:
-    """Error clouds on the object plane, one panel per grid point; mean and largest error of each,
-    and the mean of the largest (Figures 10 and 11).
+    """Draw the error clouds on the object plane, one panel per grid point, and the mean and largest
+    errors of the points with the mean of the largest (Figures 10 and 11).
     """
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
@@ -290,11 +289,11 @@ def _object_space(camera: CameraStudy) -> Iterator[Figure]:
     worst = int(np.argmax(mc.largest))
     yield Figure(
         "object-space-errors", f"Errors on a plane at {mc.distance_mm / 1000:g} m",
-        f"Where {mc.sets:,} drawn interior orientations put each image point on a plane at "
-        f"{mc.distance_mm / 1000:g} m, relative to where it belongs ({min(_DRAWN, mc.sets)} are "
-        f"drawn). {percent(float(mc.fractions[0]))} of all errors are below {limits[0] / 10:g} cm, "
+        f"Errors of each image point on a plane at {mc.distance_mm / 1000:g} m for {mc.sets:,} "
+        f"drawn interior orientations ({min(_DRAWN, mc.sets)} are shown). "
+        f"{percent(float(mc.fractions[0]))} of all errors are below {limits[0] / 10:g} cm, "
         f"the mean is {mc.overall_mean / 10:.2f} cm; the largest, {mc.largest[worst] / 10:.1f} cm, "
-        f"arises at the {_place(worst, size)}.",
+        f"occurs at the {_place(worst, size)}.",
         tuple(panels), columns=size,
     )  # fmt: skip
     number = np.arange(1.0, len(mc.image_points) + 1)
@@ -313,10 +312,9 @@ def _object_space(camera: CameraStudy) -> Iterator[Figure]:
     yield Figure(
         "errors-by-point", "Errors by image point",
         f"Mean and largest error of each image point, and the mean of the largest, "
-        f"{mc.mean_largest / 10:.1f} cm. The largest error is least at the "
-        f"{_place(least, size)}. A "
-        "shifting principal point moves all points alike, a changing principal distance those "
-        "at the image's edges most.",
+        f"{mc.mean_largest / 10:.1f} cm. The largest error is smallest at the "
+        f"{_place(least, size)}. A shift of the principal point moves all points alike, a change "
+        "of the principal distance moves those at the edges of the image most.",
         (panel,),
     )  # fmt: skip
 
@@ -329,7 +327,7 @@ def cluster_names(limits: Sequence[float]) -> list[str]:
 
 
 def _place(k: int, size: int) -> str:
-    """Name of a grid point."""
+    """Return the name of a grid point."""
     if size != 3:
         return f"row {k // size + 1}, column {k % size + 1}"
     vertical, horizontal = ("top", "", "bottom")[k // 3], ("left", "", "right")[k % 3]
@@ -338,7 +336,7 @@ def _place(k: int, size: int) -> str:
 
 
 def _ellipse(covariance: Array, centre: Array) -> tuple[Array, Array]:
-    """Outline of the 95 % ellipse."""
+    """Return the outline of the 95 % ellipse."""
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0, 2 * np.pi, 73)
     scale = np.sqrt(5.991 * np.maximum(values, 0))  # chi-square with 2 degrees of freedom
@@ -347,7 +345,7 @@ def _ellipse(covariance: Array, centre: Array) -> tuple[Array, Array]:
 
 
 def _matrices(camera: CameraStudy) -> Iterator[Figure]:
-    """Correlations over the epochs of each series, and within the adjustments."""
+    """Draw the correlations over the epochs of each series, and those within the adjustments."""
     for study in camera.series:
         if len(study.series) > 2:
             names = [parameter_label(n) for n in study.columns]
@@ -367,7 +365,7 @@ def _matrices(camera: CameraStudy) -> Iterator[Figure]:
         yield Figure(
             "iop-correlations", "Correlations within the adjustments",
             "Correlation of the estimated parameters within an epoch's adjustment: median over "
-            f"{camera.correlations.epochs} epochs, which {scatter}. High values belong to the "
+            f"{camera.correlations.epochs} epochs, which {scatter}. High values are due to the "
             "geometry of the calibration, not to the temperature.",
             drawing=draw_matrix(
                 camera.correlations.median[free][:, free], names, "Within the adjustments"
@@ -376,5 +374,5 @@ def _matrices(camera: CameraStudy) -> Iterator[Figure]:
 
 
 def file_name(label: str) -> str:
-    """A label with nothing in it that a file name cannot hold."""
+    """Return a label as a file name: other characters than letters, digits, -_. are replaced."""
     return "".join(c if c.isalnum() or c in "-_." else "-" for c in label).strip(".") or "camera"

@@ -1,6 +1,6 @@
-"""The report of a study: how the camera follows its temperature, and what that does.
+"""The report of a study: the change of a camera with its temperature, and its effects.
 
-`save_figures` writes the drawings of the page for a paper.
+`save_figures` writes the figures of the report for a publication.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def render_study(study: Study, title: str = "Thermal study of a camera") -> str:
 
 
 def save_figures(study: Study, folder: Path) -> list[Path]:
-    """Write every figure as SVG and PNG in `folder`, which is made; return the files."""
+    """Write every figure as SVG and PNG to `folder`, which is created; return the files."""
     make_folder(folder)
     paths = []
     for camera in study.cameras:
@@ -71,19 +71,19 @@ def save_figures(study: Study, folder: Path) -> list[Path]:
 
 
 def _answer(camera: CameraStudy) -> Answer:
-    sentences = answer_sentences(camera) or ["Nothing can be said about change."]
+    sentences = answer_sentences(camera) or ["The data do not show whether the camera changes."]
     proof = dependence_figure(camera, ("c", "x0", "y0"))
     if proof is None and any(len(study.series) > 1 for study in camera.series):
         proof = principal_point_figure(camera)
     if any(c.dependences for study in camera.series for c in study.channels):
         steps = [
-            "Fit a thermal model to correct measurements with: thermocald fit.",
-            "See what a straight line leaves, and why: thermocald discover.",
+            "Fit a thermal model, with which to correct measurements: thermocald fit.",
+            "Find what a straight line does not explain, and why: thermocald discover.",
         ]
     else:
         steps = ["Record a temperature with the frames; without one nothing can be corrected."]
     if len(camera.series) < 2:
-        steps.append("Measure a second series on another day: only that shows what repeats.")
+        steps.append("Measure a second series on another day, to see which changes repeat.")
     return Answer(
         sentences[0],
         None if proof is None else replace(proof, name="proof"),
@@ -91,14 +91,14 @@ def _answer(camera: CameraStudy) -> Answer:
         tuple(steps),
         (
             "Temperatures other than those measured, and changes faster than the epochs.",
-            "Errors of the camera model itself, and focus or lens moved by hand.",
-            "How another specimen of this camera behaves: that is measured with it.",
+            "Errors of the camera model itself, and changes of focus or lens by hand.",
+            "The behaviour of another specimen of this camera, which needs its own series.",
         ),
     )
 
 
 def _device(camera: CameraStudy) -> str:
-    """The camera, its sensor, and when each series was measured."""
+    """Describe the camera, its sensor, and when each series was measured."""
     series = [study.series for study in camera.series]
     sensor = series[0].sensor
     names = ", ".join(dict.fromkeys(s.camera for s in series))
@@ -148,7 +148,7 @@ def _sections(camera: CameraStudy, settings: StudySettings) -> list[Section]:
 
 
 def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
-    """What follows from values that nobody measured: said, not given as a result."""
+    """State what would follow from values that were not measured, instead of giving a result."""
     changes = [
         f"{plain(study.focus.change, 'mm', 2)} in {study.series.name}"
         for study in camera.series
@@ -162,7 +162,7 @@ def _assumed(camera: CameraStudy, settings: StudySettings) -> tuple[str, ...]:
 
 
 def _clips(camera: CameraStudy) -> list[Figure]:
-    """First and last image around one target, side by side, for every series that has frames."""
+    """Show the first and last image around one target for every series that has frames."""
     made = []
     for i, study in enumerate(camera.series):
         clip = study.series.clip
@@ -177,7 +177,7 @@ def _clips(camera: CameraStudy) -> list[Figure]:
                 f"clips-{i}",
                 f"Image around target {clip.target}",
                 f"The same {_CLIP_PX} × {_CLIP_PX} px of the first and the last frame; the cross "
-                "is where the target was in the first.",
+                "marks the position of the target in the first.",
                 images=images,
             )
         )
@@ -185,9 +185,9 @@ def _clips(camera: CameraStudy) -> list[Figure]:
 
 
 def cut_clip(path: Path, centre: tuple[float, float], size: int) -> NDArray[np.uint8]:
-    """Return a square of `size` px about `centre` (px), grey; black beyond the image's edge.
+    """Return a grey square of `size` px about `centre` (px), black beyond the image's edge.
 
-    Raises ImageError for what is not an image.
+    Raises ImageError for a file that is not an image.
     """
     image = decode_grey(path)
     image = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
@@ -217,7 +217,7 @@ def clip_png(clip: NDArray[np.uint8]) -> bytes:
 
 
 def _notes(camera: CameraStudy) -> list[str]:
-    """Notes of all series, each once, with the series that it holds for."""
+    """Return the notes of all series, each once, with the series to which it applies."""
     holders: dict[str, list[str]] = {}
     for study in camera.series:
         for note in study.notes:

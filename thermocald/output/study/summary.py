@@ -1,6 +1,6 @@
-"""The outcome of a study in a few sentences for readers who stop there, and as a JSON document.
+"""The results of a study in a few sentences, and as a JSON document.
 
-The document is that of CONVENTIONS §4: units of the model, `sd_<name>` with a value.
+The document follows CONVENTIONS §4: units of the model, `sd_<name>` beside a value.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _FIXED = {
 
 
 def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[str]:
-    """Return what `thermocald study` prints; comparisons: with the reference study, instead."""
+    """Return the lines that `thermocald study` prints, or those of the comparisons if given."""
     if comparisons:
         rows = [f"{'camera':17}{'quantity':43}{'reference':>12}{'ours':>9}  met"]
         for c in comparisons:
@@ -69,9 +69,7 @@ def study_lines(study: Study, comparisons: Sequence[Comparison] = ()) -> list[st
 
 
 def answer_sentences(camera: CameraStudy) -> list[str]:
-    """Return what the camera does and what follows from it, the rates first; nothing that the data
-    do not support.
-    """
+    """Return the results in sentences, the rates first, without those the data do not support."""
     mc = camera.montecarlo
     distance = mc.distance_mm if mc is not None else _DISTANCE_MM
     sentences = [s for study in camera.series if (s := rates(study, distance))]
@@ -80,7 +78,7 @@ def answer_sentences(camera: CameraStudy) -> list[str]:
         sentences.append(
             f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn from "
             "independent normal distributions about the series' mean (the reference's procedure) "
-            f"make errors of {mc.overall_mean / 10:.2f} cm on average and up to "
+            f"cause errors of {mc.overall_mean / 10:.2f} cm on average and up to "
             f"{mc.mean_largest / 10:.1f} cm (mean of the largest of {mc.sets:,} draws); "
             f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
         )
@@ -89,16 +87,16 @@ def answer_sentences(camera: CameraStudy) -> list[str]:
 
 
 def detail_sentences(camera: CameraStudy) -> list[str]:
-    """Return what depends on the temperature, and where the noise is not the stated one."""
+    """Return sentences on the dependence on temperature, and on noise other than the stated."""
     sentences = [s for study in camera.series if (s := _dependence(study))]
     return sentences + [s for study in camera.series if (s := _noise(study))]
 
 
 def rates(study: SeriesStudy, distance_mm: float) -> str:
-    """Return how fast c, x0 and y0 follow the reference temperature; empty where none does.
+    """State the significant rates of c, x0 and y0 with the reference temperature; "" if none is.
 
-    In px/K and µm/K with their standard deviations, and in mm/K on a plane at a distance: of x0
-    and y0 everywhere, of c at the image's left and right edge.
+    The rates are in px/K and µm/K with their standard deviations, and in mm/K on a plane at a
+    distance: for x0 and y0 everywhere, for c at the image's left and right edge.
     """
     channel = next((c for c in study.channels if c.dependences), None)
     if channel is None:
@@ -124,7 +122,7 @@ def rates(study: SeriesStudy, distance_mm: float) -> str:
     T = channel.thermometer.values
     low, high = float(np.nanmin(T)), float(np.nanmax(T))
     joined = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-    rough = " (so short a series gives these standard deviations only roughly)"
+    rough = " (standard deviations are rough, because the series is short)"
     where = parameter_label(channel.thermometer.name)
     return (
         f"{study.series.name}: between {low:.0f} and {high:.0f} °C "
@@ -136,7 +134,7 @@ def rates(study: SeriesStudy, distance_mm: float) -> str:
 def rate_in_px_and_mm(
     study: SeriesStudy, name: str, rate: float, distance_mm: float
 ) -> tuple[float, float]:
-    """Return a rate of c, x0 or y0 in mm/K as px/K and as mm/K on a plane at a distance."""
+    """Convert a rate of c, x0 or y0 from mm/K to px/K, and to mm/K on a plane at a distance."""
     s = study.series
     c = float(np.mean(s.values[:, 0]))
     lever = 0.5 * s.sensor.width * s.sensor.pixel_pitch / c if name == "c" else 1.0
@@ -144,7 +142,7 @@ def rate_in_px_and_mm(
 
 
 def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
-    """The camera's own path alongside the draws, and what the draws leave out."""
+    """Compare the camera's own path with the draws, and state the correlations these ignore."""
     if not camera.trajectories:
         return []
     parts = [
@@ -166,8 +164,8 @@ def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
     if strong and camera.correlations is not None:
         drawn = coefficient(float(camera.correlations.median[1, 2]))
         text += (
-            f" Over time its parameters move together (r of {', '.join(strong)}), which the draws "
-            f"leave out (r of x₀ and y₀ in the draws: {drawn})."
+            f" Over time its parameters change together (r of {', '.join(strong)}), which the "
+            f"draws ignore (r of x₀ and y₀ in the draws: {drawn})."
         )
     return [text]
 
@@ -200,7 +198,7 @@ def _change(study: SeriesStudy) -> str:
 
 
 def _distance(c: Deviation) -> str:
-    """What the principal distance did."""
+    """Describe the change of the principal distance."""
     if c.returned:
         grew = "grew" if c.largest > 0 else "shrank"
         ended = "where it started" if abs(c.change) < 3 * c.sd_change else (
@@ -220,7 +218,7 @@ def _distance(c: Deviation) -> str:
 
 
 def _warmed(study: SeriesStudy) -> str:
-    """What the reference temperature did meanwhile."""
+    """Describe the change of the reference temperature during the series."""
     reference = study.series.reference
     if reference is None or reference.name not in study.deviations:
         return ""
@@ -237,7 +235,7 @@ def _warmed(study: SeriesStudy) -> str:
 
 
 def _noise(study: SeriesStudy) -> str:
-    """Where the noise found is another than the stated one."""
+    """State the noise if it differs from the stated standard deviations, else ""."""
     ratio = study.noise_ratio
     if not np.isfinite(ratio) or 1 / _NOISE_AGREES <= ratio <= _NOISE_AGREES:
         return ""
@@ -266,7 +264,7 @@ def _dependence(study: SeriesStudy) -> str:
 
 
 def study_document(study: Study) -> dict[str, Any]:
-    """Everything the study computed; null where something could not be, `notes` says why."""
+    """Return all results; those that could not be computed are null, and `notes` states why."""
     s = study.settings
     document: dict[str, Any] = jsonable(
         {

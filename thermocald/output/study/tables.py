@@ -1,4 +1,4 @@
-"""The tables of a study's report: headings and cells as text, ready to be copied."""
+"""The tables of a study's report: headings and cells as text, ready to copy."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FIXED = {"first": "first epoch", "mean": "mean", "last": "last epoch"}
 
 
 def overview_table(camera: CameraStudy) -> Table:
-    """What was measured."""
+    """Return the table of the measured series."""
 
     def temperatures(study: SeriesStudy) -> str:
         reference = study.series.reference
@@ -75,7 +75,7 @@ def overview_table(camera: CameraStudy) -> Table:
 
 
 def deviation_table(camera: CameraStudy) -> Table:
-    """Last minus first (Table 2)."""
+    """Return the table of last minus first epoch (Table 2)."""
     names = dict.fromkeys(n for study in camera.series for n in study.deviations)
     rows = [
         (name, study, study.deviations[name])
@@ -116,18 +116,18 @@ def deviation_table(camera: CameraStudy) -> Table:
 
 
 def _small_unit(unit: str) -> tuple[float, str]:
-    """The factor to the unit in which changes are told, and that unit."""
+    """Return the factor to the unit in which changes are given, and that unit."""
     return (1000.0, "µm") if unit == "mm" else (1.0, unit)
 
 
 def _in_pixels(study: SeriesStudy, name: str, value: float, sd: float) -> str:
-    """A change of c, x0 or y0 in px, nothing for the others."""
+    """Return a change of c, x0 or y0 in px, "" for other parameters."""
     pitch = study.series.sensor.pixel_pitch
     return with_sd(value / pitch, sd / pitch) if name in ("c", "x0", "y0") else ""
 
 
 def significance_table(camera: CameraStudy, settings: StudySettings) -> Table:
-    """Success ratios of the F-test and the p-value of the whole series (Tables 4 and 5)."""
+    """Return the success ratios of the F-test and the p-values of the series (Tables 4 and 5)."""
     rows = [
         (name, study.series.name, study.significance[name], study.significance[name].drift)
         for name in IOP_NAMES
@@ -154,18 +154,18 @@ def significance_table(camera: CameraStudy, settings: StudySettings) -> Table:
         f"F-test at each epoch: variance of {settings.window} consecutive epochs against the "
         f"mean of their squared standard deviations, one-sided at α = {settings.alpha:g}. "
         f"Neighbouring windows have {settings.window - 1} of {settings.window} epochs in common, "
-        "so the success ratio is not a probability; of a parameter that does not drift, about α of "
-        "the epochs succeed by chance, and more where its noise exceeds the stated standard "
-        "deviations or has a memory. The p-values are for the whole series and corrected for the "
-        "number of parameters (Holm). No drift: the slow changes are noise, of whatever size and "
-        "memory. Within sds: all variation is noise of the stated standard deviations, whatever "
-        "its memory. Noise / stated: scatter between neighbouring epochs over the stated standard "
-        "deviation, 1 where they agree.",
+        "so the success ratio is not a probability. For a parameter without drift, about α of the "
+        "epochs succeed by chance, and more if its noise exceeds the stated standard deviations or "
+        "is correlated in time. The p-values are for the whole series and corrected for the number "
+        "of parameters (Holm). Hypothesis of no drift: the slow changes are noise of any size and "
+        "correlation in time. Within sds: all variation is noise of the stated standard "
+        "deviations, with any correlation in time. Noise / stated: scatter between neighbouring "
+        "epochs over the stated standard deviation, 1 if they agree.",
     )
 
 
 def dependence_tables(camera: CameraStudy) -> list[Table]:
-    """Correlation and slope on each thermometer (the reference's section 4.3)."""
+    """Return the tables of correlation and slope on each thermometer (reference, section 4.3)."""
     return [
         _dependence_table(study, channel)
         for study in camera.series
@@ -194,17 +194,17 @@ def _dependence_table(study: SeriesStudy, channel: ChannelStudy) -> Table:
             "px/K": lambda r: _in_pixels(study, r[0], r[1].slope, r[1].sd_slope),
             "scatter / noise": lambda r: f"{r[1].misfit:.1f}",
         },
-        f"r: Pearson's correlation. p naive counts every epoch as independent; p holds whatever "
-        "the memory of the noise; both are corrected for the number of parameters (Holm). n "
-        "effective: independent epochs that the series is worth. The slope counts the "
-        f"thermometer's noise of {plain(t.sd, 'K', 2)}, its sd the memory of the noise. "
-        "Scatter / noise above 1: the straight line does not explain all.",
+        "r: Pearson's correlation. p naive treats every epoch as independent; p is valid for noise "
+        "correlated in time; both are corrected for the number of parameters (Holm). n effective: "
+        "number of independent epochs with the same information. The slope takes the thermometer's "
+        f"noise of {plain(t.sd, 'K', 2)} into account, its sd the correlation of the noise. "
+        "Scatter / noise above 1: the straight line does not explain all changes.",
     )
 
 
 def object_space_tables(camera: CameraStudy) -> list[Table]:
-    """Fractions of the errors, means, maxima (Table 7), and of the camera's own path; errors per
-    grid point (Figure 11).
+    """Return the table of fractions, means and maxima of the errors (Table 7), also along the
+    camera's own path, and the table of errors per grid point (Figure 11).
     """
     mc, first = camera.montecarlo, camera.first_order
     if mc is None or first is None:
@@ -230,8 +230,8 @@ def object_space_tables(camera: CameraStudy) -> list[Table]:
         "points. First order is the analytic propagation of the same covariance: where it differs "
         "from the simulation, linear error propagation fails. The mean of maxima depends on the "
         "number of sets and, by some per cent, on the seed. The draws are normal about the series' "
-        "mean, with the correlations of the adjustments; the own path is that of the measured "
-        "epochs, against one interior orientation that is held fixed.",
+        "mean, with the correlations of the adjustments. Own path: the measured epochs against one "
+        "interior orientation that is held fixed.",
     )
     values, vectors = np.linalg.eigh(mc.covariance)  # the longer axis is the last
     axes = np.sqrt(np.maximum(values, 0.0)) / 10
@@ -249,7 +249,7 @@ def object_space_tables(camera: CameraStudy) -> list[Table]:
             "direction": lambda k: f"{direction[k]:.0f}°",
             "bias mm": lambda k: f"{np.linalg.norm(mc.mean_error[k]):.2f}",
         },
-        "Direction of the longer axis, from X (right) towards Y (up) as the camera looks. "
-        "Bias is what the mean error vector keeps: an effect of second order.",
+        "Direction: of the longer axis, from X (right) towards Y (up) as the camera sees them. "
+        "Bias: length of the mean error vector, an effect of second order.",
     )
     return [clusters, points]

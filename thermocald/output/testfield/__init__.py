@@ -1,1 +1,1 @@
-"""Test fields laid out, drawn, and printed."""
+"""The layout, drawing and printing of test fields."""

@@ -1,10 +1,10 @@
-"""The drawing of a test field's sheets, in mm: PDF and SVG, all of it vectors; needs matplotlib.
+"""Draw a test field's sheets in mm, as PDF and SVG of vectors only; needs matplotlib.
 
 One list of paths serves both formats; circles are Bézier curves of eight segments, exact to
 4·10⁻⁶ of their radius. The sheet's lower left trimmed corner is the origin, x right, y up.
 
-The last page of a corner's PDF is its plan: which sheet goes where, how to fix it, what error of
-its angles is allowed. It shows the corner as somebody sees it who looks into it.
+The last page of a corner's PDF is its plan: where each sheet goes, how to fix it, and the tolerance
+of its angles. It shows the corner as seen when looking into it.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _POINTS_PER_MM = 72 / _MM_PER_INCH
 _RULER = 100.0
 _LEGEND_HEIGHT = 2.1
 GREY = "0.62"
-"""What is read by people only: light enough never to be mistaken for a target."""
+"""The colour of text for people: too light to be mistaken for a target."""
 
 
 class Pen:
-    """A figure of one page that is drawn on in mm from the lower left trimmed corner."""
+    """A figure of one page, with drawing in mm from the lower left trimmed corner."""
 
     def __init__(self, page: tuple[float, float], light: bool) -> None:
         self.figure = Figure(figsize=(page[0] / _MM_PER_INCH, page[1] / _MM_PER_INCH))
@@ -72,23 +72,23 @@ class Pen:
 
 
 def rectangle(x: float, y: float, width: float, height: float) -> Any:
-    """A rectangle by its lower left corner and its sides, mm."""
+    """Return a rectangle from its lower left corner and its sides, mm."""
     x1, y1 = x + width, y + height
     return Curve([(x, y), (x1, y), (x1, y1), (x, y1), (x, y)], closed=True)
 
 
 def square(x: float, y: float, side: float) -> Any:
-    """A square by its centre and side, mm."""
+    """Return a square from its centre and side, mm."""
     return rectangle(x - side / 2, y - side / 2, side, side)
 
 
 def draw_marker(
     pen: Pen, centre: tuple[float, float], side: float, cells: NDArray[np.bool_]
 ) -> None:
-    """A marker with its border: cells (n, n), True where black, the first row on top; mm.
+    """Draw a marker with its border, mm; cells (n, n): True where black, the first row on top.
 
-    The white cells are drawn on the black square, each row's runs in one piece. Every run reaches a
-    hair into a white row below it, so that no renderer leaves a dark seam.
+    The white cells are drawn on the black square, each run of a row in one piece. A run extends
+    slightly into a white row below it, so that no renderer leaves a dark seam.
     """
     pen.fill(square(*centre, side), "black")
     white = ~cells
@@ -104,7 +104,7 @@ def draw_marker(
 
 
 def crop_marks(pen: Pen, size: tuple[float, float]) -> None:
-    """Where to cut: short lines outside of the four corners."""
+    """Draw the crop marks, short lines outside the four corners."""
     w, h = size
     for x, sx in ((0.0, -1.0), (w, 1.0)):
         for y, sy in ((0.0, -1.0), (h, 1.0)):
@@ -113,7 +113,7 @@ def crop_marks(pen: Pen, size: tuple[float, float]) -> None:
 
 
 def rulers(pen: Pen, size: tuple[float, float]) -> None:
-    """A ruler per direction: printers scale the two differently."""
+    """Draw a ruler in each direction, because printers scale the two differently."""
     for along, length in enumerate(size):
         total = min(_RULER, 10 * int((length - STRIP - 10) / 10))
 
@@ -124,7 +124,7 @@ def rulers(pen: Pen, size: tuple[float, float]) -> None:
         for mm in range(int(total) + 1):
             tick = 3.0 if mm % 10 == 0 else 2.0 if mm % 5 == 0 else 1.2
             pen.line([at(mm, 4), at(mm, 4 + tick)], pen.colour, 0.1)
-        words = f"0 to {total:g} mm: measure it; if it is not {total:g}.0 mm, the printer scaled"
+        words = f"0 to {total:g} mm: measure it; if not {total:g}.0 mm, the printer has scaled it"
         x, y = at(0, 1.2)
         if along == 0:
             pen.text(x, y, words, 1.9)
@@ -133,28 +133,28 @@ def rulers(pen: Pen, size: tuple[float, float]) -> None:
 
 
 ALLOWED_ANGLE_DEG = 0.4
-"""A wall that is off by this angle moves its far edge by the 3 mm that testfield.csv allows for."""
+"""The error of a wall's angle that moves its far edge by 3 mm, the sd in testfield.csv."""
 
 _TEXT = f"""
 Print all pages at "actual size" on matt paper of at least 160 g/m². Measure both rulers of each
-sheet; if they are not 100.0 mm the printer scaled, and the survey will find it.
+sheet; if they are not 100.0 mm, the printer has scaled the sheet, which the survey will show.
 
 Cut along the crop marks. Sheet 1 may be smaller than its paper.
 
-Glue each sheet without bubbles to a board that stays flat: aluminium composite, MDF from 8 mm, or
-glass. Spray glue is best.
+Glue each sheet without bubbles to a board that stays flat: aluminium composite, MDF of at least
+8 mm, or glass. Spray glue is best.
 
-Put the boards up so that edges with the same letter meet: A with A, B with B, C with C. Sheet 1
-lies, sheet 2 stands on the left, sheet 3 on the right. Gaps of a few mm do no harm.
+Mount the boards so that edges with the same letter meet: A with A, B with B, C with C. Sheet 1
+lies flat, sheet 2 stands on the left, sheet 3 on the right. Gaps of a few mm do no harm.
 
-Fix every edge with two brackets screwed to both boards, and the whole to something heavy. From the
-survey on nothing may move by more than 0.02 mm: do not lift it or lean on it.
+Fix every edge with two brackets screwed to both boards, and the corner to something heavy. After
+the survey nothing may move by more than 0.02 mm: do not lift the corner or lean on it.
 
-Angles: if you survey the corner (you should) they may be off by 5°, since the survey measures them.
-If you use testfield.csv as it is, by {ALLOWED_ANGLE_DEG:g}° at most, which is 3 mm at the far edge
-of a sheet; c, x0 and y0 are then good to some tens of pixels only.
+Angles: if you survey the corner (recommended), they may be off by 5°, since the survey measures
+them. If you use testfield.csv as it is, they may be off by {ALLOWED_ANGLE_DEG:g}° at most, which is
+3 mm at the far edge of a sheet; c, x0 and y0 are then accurate to some tens of pixels only.
 
-Matt surroundings and even light: no lamp, window or reflection in the picture.
+Use matt surroundings and even light: no lamp, window or reflection in the image.
 
 testfield.csv, written with these pages, belongs to this corner. Next: thermocald testfield survey
 photos/ --field testfield.csv --scale …
@@ -163,12 +163,12 @@ STEPS = tuple(" ".join(step.split()) for step in _TEXT.strip().split("\n\n"))
 
 
 def draw_plan(sheets: Sequence[Sheet]) -> Any:
-    """The plan as a matplotlib Figure of the sheets' page size."""
+    """Draw the plan as a matplotlib Figure of the sheets' page size."""
     width, height = sheets[0].design.page
-    figure = Figure(figsize=(width / 25.4, height / 25.4))
+    figure = Figure(figsize=(width / _MM_PER_INCH, height / _MM_PER_INCH))
     portrait = height > width
     size = min(width, height) / 297 * 13  # points
-    figure.text(0.08, 0.95, "How to put up this corner", fontsize=1.6 * size, va="top")
+    figure.text(0.08, 0.95, "How to mount this corner", fontsize=1.6 * size, va="top")
     box = (0.08, 0.52, 0.84, 0.38) if portrait else (0.03, 0.1, 0.45, 0.75)
     _draw_corner(figure, box, sheets, size)
     x, y = (0.08, 0.49) if portrait else (0.5, 0.86)
@@ -213,7 +213,7 @@ def _draw_corner(
 
 
 def _seen(points: Array) -> Array:
-    """Places in the drawing (n, 2) of points (n, 3): seen from (1, 1, 0.8), Z up, X to the left."""
+    """Project points (n, 3) into the drawing (n, 2), seen from (1, 1, 0.8), Z up, X to the left."""
     towards = np.array([1.0, 1.0, 0.8])
     towards /= np.linalg.norm(towards)
     right = np.cross([0.0, 0.0, 1.0], towards)
@@ -227,7 +227,7 @@ _TARGET_NAME = 0.7
 
 
 def draw(sheet: Sheet) -> Any:
-    """The sheet as a matplotlib Figure of the page's size."""
+    """Draw a sheet as a matplotlib Figure of the page's size."""
     pen = Pen(sheet.design.page, sheet.design.light)
     if sheet.design.light:
         pen.fill(rectangle(0.0, 0.0, *sheet.size), "black")
@@ -239,7 +239,7 @@ def draw(sheet: Sheet) -> Any:
             pen.fill(_ring_segment((x, y), r, begin, end), pen.colour)
         _label(pen, x, y - (outline.RING_OUTER if code else 1.0) * r, field.names[row], r)
     for name, (x, y), side, cells in markers_of(field):
-        if sheet.design.light:  # a marker is black on white, whatever the circles are
+        if sheet.design.light:  # a marker is always black on white
             pen.fill(square(x, y, side * (1 + 2 / len(cells))), "white")
         draw_marker(pen, (x, y), side, cells)
         _label(pen, x, y - side / 2, name, r)
@@ -251,7 +251,7 @@ def draw(sheet: Sheet) -> Any:
 
 
 def _edge_letters(pen: Pen, sheet: Sheet) -> None:
-    """At each edge that meets another sheet's the letter that both have."""
+    """Write the common letter at each edge that meets another sheet."""
     (w, h), size = sheet.size, 3.0
     places = {
         "left": (1.5, 0.75 * h),
@@ -263,13 +263,13 @@ def _edge_letters(pen: Pen, sheet: Sheet) -> None:
 
 
 def _label(pen: Pen, x: float, below: float, name: str, r: float) -> None:
-    """A target's name, grey and small enough never to look like a target."""
+    """Write a target's name, grey and too small to be mistaken for a target."""
     height = min(_TARGET_NAME * r, 3.0)
     pen.text(x, below - 0.35 * r - height, name, height, ha="center", color=GREY)
 
 
 def _ring_segment(centre: tuple[float, float], r: float, begin: float, end: float) -> Any:
-    """An arc of the ring; codes run clockwise as seen, the sheet's y is up: angles are negated."""
+    """Return an arc of the ring; codes run clockwise but y is up: angles are negated."""
     arc = Curve.arc(-360 * end, -360 * begin, n=max(2, int(np.ceil(16 * (end - begin)))))
     unit = np.asarray(arc.vertices, dtype=float)
     outer, inner = unit * outline.RING_OUTER * r, unit[::-1] * outline.RING_INNER * r
@@ -317,13 +317,13 @@ def draw_board(board: Board, page: tuple[float, float]) -> Any:
 
 
 def draw_sheets(sheets: Sequence[Sheet]) -> list[Any]:
-    """Draw sheets as Figures; those of a corner with the plan to put it up as the last one."""
+    """Draw sheets as Figures; for a corner, its plan is the last one."""
     pages = [draw(sheet) for sheet in sheets]
     return [*pages, draw_plan(sheets)] if len(sheets) == 3 else pages
 
 
 def write_pdf(pages: Sequence[Any], path: Path) -> None:
-    """Figures as the pages of one PDF."""
+    """Write Figures as the pages of one PDF."""
     about = {"Title": "thermocald test field", "Creator": "thermocald", "CreationDate": None}
     with rc_context({"pdf.fonttype": 42}), PdfPages(path, metadata=about) as document:
         for page in pages:
@@ -331,7 +331,7 @@ def write_pdf(pages: Sequence[Any], path: Path) -> None:
 
 
 def write_svg(page: Any, path: Path) -> None:
-    """One Figure as SVG."""
+    """Write a Figure as SVG."""
     about = {"Title": "thermocald test field", "Creator": "thermocald", "Date": None}
     with rc_context({"svg.hashsalt": "thermocald"}):
         page.savefig(path, format="svg", metadata=about)

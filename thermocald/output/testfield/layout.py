@@ -1,13 +1,12 @@
-"""Where the targets of a printed test field lie: on a sheet, and the sheets in space.
+"""The layout of a printed test field: targets on sheets, and sheets in space.
 
 A sheet is a square grid of coded targets with a plain circle in the middle of each mesh; markers of
-OpenCV's dictionaries may take some of the grid's places. Sheet coordinates are mm from the lower
+OpenCV's dictionaries may replace some of the coded targets. Sheet coordinates are mm from the lower
 left corner of the trimmed sheet, x right, y up, as a viewer sees it.
 
 Three sheets form a corner: the floor (XY, seen from +Z), the left wall (XZ, seen from +Y) and the
-right wall (YZ, seen from +X), left and right as somebody sees them who looks into the corner with Z
-up. Trimmed edges meet at the axes; the floor is cut to a square where it would stand out from under
-the walls.
+right wall (YZ, seen from +X); left and right as seen when looking into the corner with Z up.
+Trimmed edges meet at the axes; the floor is cut to a square if it would extend beyond the walls.
 """
 
 from __future__ import annotations
@@ -42,21 +41,20 @@ PAPERS = {
     "A4": (210.0, 297.0),
 }
 TRIM = 8.0
-"""Width of the edge outside the crop marks, mm; most printers leave 5 mm of it white."""
+"""Width of the margin outside the crop marks, mm; most printers leave 5 mm of it white."""
 STRIP = 14.0
 """Width of the strips at the left and lower edge that hold the rulers and the legend, mm."""
 _PITCH = 8.5
-"""Grid pitch in radii of a disc: the rings' white surround and a plain circle fit in between."""
+"""Grid pitch in radii of a disc: leaves room for the rings' white surround and a plain circle."""
 _MAX_SIDE = 5000.0
 _MARKER_EVERY = 5
-"""Every so many places of the grid one is a marker's."""
+"""One in this many places of the grid holds a marker."""
 _CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))
-"""Of a marker in OpenCV's order: right and up of its centre."""
+"""Corners of a marker in OpenCV's order, as signs right and up of its centre."""
 _MARKER_SIDE = 6.0
 """Side of a marker in radii of a disc; its white surround then still fits into the pitch."""
-# What a print is worth before it has been surveyed (1 sigma): the printer's own raggedness, its
-# scale error over the distance from the sheet's centre, paper that is not flat, sheets that are
-# put up by hand.
+# Standard deviations of a print before its survey, mm: the printer's irregularity, its scale error
+# (per mm from the sheet's centre), paper that is not flat, sheets that are mounted by hand.
 _SIGMA_PRINT, _SIGMA_SCALE, _SIGMA_FLAT, _SIGMA_MOUNT = 0.1, 0.003, 1.0, 3.0
 
 
@@ -70,12 +68,12 @@ _EDGES = {
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """What is asked of a print.
+    """The options of a print.
 
-    page: size (width, height) mm; diameter of the discs mm; bits of the ring codes (12 or 14, 0 for
-    none, None for the fewest that suffice), from the `first_code`-th on; whether plain circles
-    stand in between; a dictionary of markers, every fifth place being one of them; light
-    targets on black; 1 sheet or the 3 of a corner; pitch of the grid mm, None for the least.
+    page: width, height mm; diameter: of the discs, mm; bits: of the ring codes, 12 or 14, 0 for no
+    codes, None for the fewest that suffice; plain: whether there are plain circles in between;
+    dictionary: of markers at every fifth place; light: white targets on black; sheets: 1, or the 3
+    of a corner; first_code: codes to skip; pitch: of the grid, mm, None for the smallest.
     """
 
     page: tuple[float, float]
@@ -91,7 +89,7 @@ class Design:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """One sheet: its title, trimmed size (width, height) mm, and what is on it: x, y mm, z = 0."""
+    """One sheet: title, design, trimmed size (width, height) mm, and targets: x, y mm, z = 0."""
 
     title: str
     design: Design
@@ -100,12 +98,12 @@ class Sheet:
 
     @property
     def edges(self) -> dict[str, str]:
-        """The letters of the edges that meet other sheets', by side: left, right, lower."""
+        """The letters of the edges that meet another sheet, by side: left, right, lower."""
         return _EDGES.get(self.title, {})
 
     @property
     def scale_bar(self) -> tuple[int, int] | None:
-        """The rows of the two coded circles to measure between: the ends of the lowest row."""
+        """The rows of the two coded circles to measure between, the ends of the lowest row."""
         circles = np.flatnonzero(self.field.circles).tolist()
         coded = [i for i in circles if self.field.codes[i]] or circles
         if len(coded) < 2:
@@ -119,7 +117,7 @@ class Sheet:
 
 
 def paper_size(text: str, *, landscape: bool = False) -> tuple[float, float]:
-    """`A3` or `300x400` (width × height, mm) → page size in mm; UsageError for anything else."""
+    """Return the size in mm of `A3` or `300x400` (width × height, mm); UsageError for others."""
     name = text.strip().upper()
     if name in PAPERS:
         w, h = PAPERS[name]
@@ -137,11 +135,11 @@ def paper_size(text: str, *, landscape: bool = False) -> tuple[float, float]:
 
 
 def lay_out(design: Design) -> tuple[Sheet, ...]:
-    """The sheets of a design; UsageError where it does not fit, or runs out of codes."""
+    """Return the sheets of a design; UsageError if it does not fit, or codes are too few."""
     if design.bits is None:
         try:
             return lay_out(replace(design, bits=12))
-        except UsageError:  # where it is not the codes, it fails again
+        except UsageError:  # if the reason is not the number of codes, this fails too
             return lay_out(replace(design, bits=14))
     _check(design)
     width, height = (side - 2 * TRIM for side in design.page)
@@ -184,7 +182,7 @@ def lay_out(design: Design) -> tuple[Sheet, ...]:
 
 
 def _grid(design: Design, size: tuple[float, float]) -> tuple[Array, Array]:
-    """The coordinates of columns and rows on a sheet, mm."""
+    """Return the coordinates of the columns and rows on a sheet, mm."""
     r = design.diameter / 2
     pitch = design.pitch if design.pitch is not None else _PITCH * r
     reach = 4 * r if design.bits or design.dictionary else 2 * r
@@ -193,7 +191,7 @@ def _grid(design: Design, size: tuple[float, float]) -> tuple[Array, Array]:
     if min(counts) < 2:
         raise UsageError(
             f"discs of {design.diameter:g} mm on {design.page[0]:g} × {design.page[1]:g} mm paper "
-            f"leave room for {counts[0]} × {counts[1]} targets: take smaller discs or larger paper"
+            f"leave room for {counts[0]} × {counts[1]} targets; use smaller discs or larger paper"
         )
     x, y = (
         np.asarray(low + (side - low - reach - (n - 1) * pitch) / 2 + pitch * np.arange(n), float)
@@ -204,20 +202,20 @@ def _grid(design: Design, size: tuple[float, float]) -> tuple[Array, Array]:
 
 def _check(design: Design) -> None:
     if not 2 <= design.diameter <= 200:
-        raise UsageError(f"disc diameter {design.diameter:g} mm: between 2 and 200 mm are possible")
+        raise UsageError(f"disc diameter {design.diameter:g} mm: must be between 2 and 200 mm")
     if design.bits not in (0, *ring_code.BITS):
-        raise UsageError(f"ring codes of {design.bits} bits: there are 12 and 14, and 0 for none")
+        raise UsageError(f"ring codes of {design.bits} bits: must be 12 or 14, or 0 for no codes")
     if not design.bits and design.dictionary is None:
         raise UsageError(
-            "plain circles alone cannot be identified: add ring codes (--bits 12) or markers "
+            "plain circles alone cannot be identified; add ring codes (--bits 12) or markers "
             "(--markers DICT_APRILTAG_36h11)"
         )
     if design.sheets not in (1, 3):
-        raise UsageError(f"{design.sheets} sheets: one, or the three of a corner")
+        raise UsageError(f"{design.sheets} sheets: must be one, or the three of a corner")
     least = _PITCH * design.diameter / 2
     if design.pitch is not None and design.pitch < least - 1e-9:
         raise UsageError(
-            f"pitch {design.pitch:g} mm: discs of {design.diameter:g} mm need {least:g} mm"
+            f"pitch {design.pitch:g} mm: discs of {design.diameter:g} mm need at least {least:g} mm"
         )
 
 
@@ -228,8 +226,8 @@ def _codes(design: Design) -> Iterator[str]:
             yield ring_code.write(design.bits, number)
         raise UsageError(
             f"the field needs more than the {len(available) - design.first_code} ring codes of "
-            f"{design.bits} bits that are left: "
-            + ("take --bits 14, or " if design.bits == 12 else "take ")
+            f"{design.bits} bits that are left; "
+            + ("use --bits 14, or " if design.bits == 12 else "use ")
             + "larger discs, smaller paper, or markers in between"
         )
 
@@ -239,14 +237,14 @@ def _marker_codes(design: Design) -> Iterator[str]:
     if name is not None:
         known = marker_dictionaries()
         if name not in known:
-            raise UsageError(f"no marker dictionary {name!r}: {', '.join(known)}")
+            raise UsageError(f"no marker dictionary {name!r}; there are {', '.join(known)}")
         available = len(dictionary(name).bytesList)
         yield from (f"{name}:{i}" for i in range(available))
         raise UsageError(f"the field needs more than the {available} markers of {name}")
 
 
 def _placement(sheets: Sequence[Sheet], k: int) -> tuple[Array, Array]:
-    """Where a sheet lies: its origin (3,) mm, and the space directions of its x and y (2, 3)."""
+    """Return a sheet's origin (3,) mm, and the directions of its x and y axes in space (2, 3)."""
     if len(sheets) == 1 or k == 0:
         return np.zeros(3), np.eye(3)[:2]
     if k == 1:
@@ -255,7 +253,7 @@ def _placement(sheets: Sequence[Sheet], k: int) -> tuple[Array, Array]:
 
 
 def field_of(sheets: Sequence[Sheet]) -> TestField:
-    """The nominal test field of the sheets, with the standard deviations of an unsurveyed print."""
+    """Return the sheets' nominal test field with the standard deviations of an unsurveyed print."""
     points, sigmas = [], []
     mount = _SIGMA_MOUNT if len(sheets) > 1 else 0.0
     for k, sheet in enumerate(sheets):
@@ -280,14 +278,14 @@ def markers_of(
 ) -> Iterator[tuple[str, tuple[float, float], float, NDArray[np.bool_]]]:
     """Yield the markers of a flat field: name, centre and side mm, cells (n, n).
 
-    border: of black cells; a cell is True where black, the first row on top.
+    border: width of the black border in cells; a cell is True where black, the first row on top.
     """
     rows = [r for r, kind in enumerate(field.kinds) if kind == "marker_corner"]
     for first in range(0, len(rows), 4):
         quad = field.points[rows[first : first + 4], :2]
         name, number, _ = field.codes[rows[first]].split(":")
         cells = marker_cells(name, int(number), border)
-        # corner 0 is where the cells' first one is; turns of 90° bring it there
+        # corner 0 is at the first cell: turn the cells by multiples of 90° until it is
         x, y = quad.mean(axis=0).tolist()
         turns = {(False, True): 0, (False, False): 1, (True, False): 2, (True, True): 3}
         turned = np.rot90(cells, turns[bool(quad[0, 0] > x), bool(quad[0, 1] > y)])

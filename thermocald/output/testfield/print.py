@@ -1,8 +1,7 @@
-"""`thermocald testfield print`: a folder with the sheets to print and the test field they are.
+"""`thermocald testfield print`: write the sheets to print and their test field to a folder.
 
-Boards of other programs (ChArUco, chessboard, Kalibr's AprilGrid): the field is that of
-`targets.boards`, the same that `testfield import` writes for a board that was bought; the drawing
-follows OpenCV's and Kalibr's.
+The field of another program's board (ChArUco, chessboard, Kalibr's AprilGrid) is that of
+`targets.boards`, which `testfield import` writes too; the drawing follows OpenCV and Kalibr.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ if TYPE_CHECKING:
 
 KINDS = ("charuco", "chessboard", "aprilgrid")
 _APRIL_BORDER = 2
-_MARKER_SHARE = 0.75  # of a ChArUco square, where no size is given
-_QUIET = 0.5  # of a square, white about the board
+_MARKER_SHARE = 0.75  # side of a ChArUco marker over its square's, if no size is given
+_QUIET = 0.5  # white margin of a board over a square's side
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +50,8 @@ class Board:
     """A board of columns × rows: squares of a ChArUco board, inner corners of a chessboard, tags.
 
     square mm: side of a square (not of an AprilGrid); marker mm: side of a marker or tag with its
-    black border; spacing: between tags, over their side; dictionary: OpenCV's name, of a ChArUco
-    board; legacy: ChArUco as OpenCV drew it before 4.6.
+    black border; spacing: gap between tags over their side; dictionary: of a ChArUco board, by its
+    OpenCV name; legacy: ChArUco as drawn by OpenCV before 4.6.
     """
 
     kind: str
@@ -69,7 +68,7 @@ class Board:
         return self.kind == "aprilgrid"
 
     def field(self, sigma: float | None = None) -> TestField:
-        """The test field, origin at the board's lower left; sigma: mm, None for a print."""
+        """Return the test field, origin at the board's lower left; sigma: mm, None for a print."""
         if self.kind == "charuco":
             return boards.charuco(
                 self.columns, self.rows, self.square, self.marker, self.dictionary,
@@ -81,7 +80,7 @@ class Board:
 
     @property
     def name(self) -> str:
-        """What it is, in words."""
+        """The kind and size of the board, in words."""
         kind, unit = {
             "charuco": ("a ChArUco board", "squares"),
             "chessboard": ("a chessboard", "inner corners"),
@@ -91,7 +90,7 @@ class Board:
 
     @property
     def measures(self) -> str:
-        """Its sizes, in words."""
+        """The dimensions of squares, markers or tags, in words."""
         if self.kind == "charuco":
             return (
                 f"squares {self.square:g} mm, markers {self.marker:g} mm of {self.dictionary}"
@@ -102,7 +101,7 @@ class Board:
         return f"tags {self.marker:g} mm, {self._gap:g} mm apart"
 
     def filled(self, page: tuple[float, float]) -> Board:
-        """With the largest sizes that fit on a page (mm) in place of those that are 0."""
+        """Return the board with the largest sizes that fit on a page (mm) in place of zeros."""
         side = self.marker if self._tags else self.square
         if side == 0:
             unit = replace(self, square=1.0, marker=1.0)._extent()
@@ -110,24 +109,24 @@ class Board:
             side = min(room[0] / unit[0], room[1] / unit[1])
             side = np.floor(side) if side >= 5 else np.floor(10 * side) / 10
             if side <= 0:
-                raise UsageError(f"{self.name} has no place on {page[0]:g} × {page[1]:g} mm")
+                raise UsageError(f"{self.name} does not fit on {page[0]:g} × {page[1]:g} mm")
         if self._tags:
             return replace(self, marker=float(side))
         marker = self.marker or round(_MARKER_SHARE * side, 1)
         return replace(self, square=float(side), marker=marker)
 
     def check_fits(self, page: tuple[float, float]) -> None:
-        """UsageError, with what would fit, where the board is larger than the page (mm)."""
+        """Raise UsageError, with what would fit, if the board is larger than the page (mm)."""
         (w, h), room = self._extent(), _room(page)
         if w > room[0] + 1e-6 or h > room[1] + 1e-6:
             raise UsageError(
                 f"{self.name} ({self.measures}) needs {w:.0f} × {h:.0f} mm with its white margin; "
-                f"{page[0]:g} × {page[1]:g} mm paper has room for {room[0]:.0f} × {room[1]:.0f}: "
-                "take smaller squares, or larger paper"
+                f"{page[0]:g} × {page[1]:g} mm paper has room for {room[0]:.0f} × {room[1]:.0f}; "
+                "use smaller squares or larger paper"
             )
 
     def place(self, page: tuple[float, float]) -> tuple[float, float]:
-        """Where its origin lies so that it is in the middle of a page (mm)."""
+        """Return the position of the origin that centres the board on a page (mm)."""
         room, (width, height) = _room(page), self._black()
         low = -self._gap if self._tags else 0.0
         return STRIP + (room[0] - width) / 2 - low, STRIP + (room[1] - height) / 2 - low
@@ -137,7 +136,7 @@ class Board:
         return self.spacing * self.marker
 
     def _black(self) -> tuple[float, float]:
-        """Width and height of what is black, mm."""
+        """Return the width and height of the black area, mm."""
         if self._tags:
             step = self.marker + self._gap
             return self.columns * step + self._gap, self.rows * step + self._gap
@@ -145,13 +144,13 @@ class Board:
         return (self.columns + more) * self.square, (self.rows + more) * self.square
 
     def _extent(self) -> tuple[float, float]:
-        """Width and height with the white margin, mm."""
+        """Return the width and height with the white margin, mm."""
         quiet = 2 * (self._gap if self._tags else _QUIET * self.square)
         width, height = self._black()
         return width + quiet, height + quiet
 
     def squares(self) -> Iterator[tuple[float, float, float]]:
-        """The black squares that are no markers: lower left x, y and side, mm."""
+        """Yield the black squares that are not markers: lower left x, y and side, mm."""
         s = self.square
         if self._tags:
             step = self.marker + self._gap
@@ -168,35 +167,35 @@ class Board:
                     yield i * s, j * s, s
 
     def markers(self) -> Iterator[tuple[str, tuple[float, float], float, NDArray[np.bool_]]]:
-        """Its markers, as `markers_of`."""
+        """Yield the markers, as `markers_of` does."""
         return markers_of(self.field(), _APRIL_BORDER if self._tags else 1)
 
 
 def counts_of(option: str, text: str) -> tuple[int, int]:
-    """Return columns and rows of 9x6; UsageError that names the option."""
+    """Return the columns and rows of text such as 9x6; UsageError that names the option."""
     columns, _, rows = text.lower().replace("×", "x").partition("x")
     if not (columns.isascii() and columns.isdigit() and rows.isascii() and rows.isdigit()):
         raise UsageError(f"{option} {text}: write COLUMNSxROWS, such as 9x6")
     if not 0 < int(columns[:6]) <= 1000 or not 0 < int(rows[:6]) <= 1000:
-        raise UsageError(f"{option} {text}: counts up to 1000 are possible")
+        raise UsageError(f"{option} {text}: counts must be from 1 to 1000")
     return int(columns), int(rows)
 
 
 def _room(page: tuple[float, float]) -> tuple[float, float]:
-    """What a page (mm) leaves beside the rulers' strips."""
+    """Return the room on a page (mm) beside the strips with the rulers."""
     return page[0] - 2 * TRIM - STRIP, page[1] - 2 * TRIM - STRIP
 
 
 ONE_PLANE = (
-    "one flat sheet calibrates a camera from photographs in several poses (thermocald calibrate); "
-    "a camera that stands still before it gets no result: for series print the corner, or put up "
-    "two or three sheets at an angle and survey them"
+    "one flat sheet calibrates a camera from photographs in several poses (thermocald calibrate), "
+    "but not a fixed camera: for a series print the corner, or mount two or three sheets at an "
+    "angle and survey them"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Printed:
-    """What was written: the files, the sheets (none of a board), the nominal field, the board.
+    """A printed test field: the files, sheets (none for a board), nominal field, and board.
 
     page: width, height mm.
     """
@@ -210,7 +209,7 @@ class Printed:
 
     @property
     def is_flat(self) -> bool:
-        """Whether it is one sheet."""
+        """Whether the test field is a single sheet."""
         return len(self.sheets) <= 1
 
     def as_dict(self) -> dict[str, Any]:
@@ -254,7 +253,7 @@ class Printed:
                 )
             ]
         found = self.as_dict()
-        sheets = "1 sheet" if self.is_flat else "3 sheets of a corner (and how to put it up)"
+        sheets = "1 sheet" if self.is_flat else "3 sheets of a corner (and how to mount it)"
         return [
             (
                 f"{self.folder}: {sheets} of {size}, {found['coded']} coded and {found['plain']} "
@@ -271,15 +270,15 @@ class Printed:
 
 
 def default_diameter(page: tuple[float, float]) -> float:
-    """A disc diameter for a page size (mm): about a hundred targets on a sheet, mm."""
+    """Return a disc diameter, mm, that puts about a hundred targets on a page of this size (mm)."""
     return max(3.0, round(min(page) / 34))
 
 
 def print_testfield(design: Design, folder: Path, *, replace_printed: bool = False) -> Printed:
     """Write `testfield.pdf`, one SVG per sheet, and `testfield.csv` into a folder.
 
-    All files appear, or none. UsageError where the folder holds a `testfield.csv` already: what
-    hangs on a wall would no longer have its coordinates; `replace_printed` replaces it.
+    Either all files are written or none. Raises UsageError if the folder holds a `testfield.csv`
+    already, because a mounted field would lose its coordinates; `replace_printed` replaces it.
     """
     sheets = lay_out(design)
     field = field_of(sheets)
@@ -292,7 +291,7 @@ def print_board(
 ) -> Printed:
     """Write a board's `testfield.pdf`, `testfield.svg` and `testfield.csv`, as `print_testfield`.
 
-    page: width, height mm. UsageError where the board does not fit on it.
+    page: width, height mm. Raises UsageError if the board does not fit on it.
     """
     board.check_fits(page)
     field = board.field()
@@ -301,7 +300,7 @@ def print_board(
 
 
 def _drawing() -> ModuleType:
-    """The module that draws; DriverMissing, with what mends it, where there is no matplotlib."""
+    """Return the drawing module; DriverMissing, with the command to run, without matplotlib."""
     if importlib.util.find_spec("matplotlib") is None:
         raise DriverMissing(
             "drawing a test field needs matplotlib: pip install 'thermocald[report]'"
@@ -312,10 +311,10 @@ def _drawing() -> ModuleType:
 def _publish(
     pages: Sequence[Any], sheets: int, field: TestField, folder: Path, replace_printed: bool
 ) -> tuple[Path, ...]:
-    """All pages as one PDF, the first `sheets` of them as SVG, and the field."""
+    """Write all pages to one PDF, the first `sheets` of them as SVG, and the field; return all."""
     if not replace_printed and (folder / "testfield.csv").exists():
         raise UsageError(
-            f"{folder}: holds a printed test field already, whose coordinates would be lost: give "
+            f"{folder}: holds a printed test field already, whose coordinates would be lost; give "
             "another folder with --out, or --force to replace it"
         )
     drawings = (
@@ -325,7 +324,7 @@ def _publish(
     with ExitStack() as opened:
         partial = {name: opened.enter_context(new_file(folder / name)) for name in names}
         _drawing().write_pdf(pages, partial["testfield.pdf"])
-        for page, name in zip(pages, drawings, strict=False):  # the plan is in the PDF alone
+        for page, name in zip(pages, drawings, strict=False):  # the plan is only in the PDF
             _drawing().write_svg(page, partial[name])
         partial["testfield.csv"].write_text(testfield_csv(field), encoding="utf-8")
     return tuple(folder / name for name in names)

@@ -1,8 +1,8 @@
-// The page: the daemon's status as a stream, the last epoch of one camera, its course from the store.
+// The page: the daemon's status as a stream, the last epoch of one camera, its time series from the store.
 "use strict";
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
-// As in the reports: colours that everybody can tell apart, bands of 95 %.
+// As in the reports: colours for every kind of colour vision, bands of 95 %.
 const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00"], BAND = 1.96;
 const COURSE_EVERY_MS = 10000, RESIDUAL_SCALE = 400;
 let status = {}, series = [], shownEpoch = null, courseAt = 0, eventsAt = 0, courses = 0, lastUtc = 0;
@@ -51,7 +51,7 @@ function show(document_) {
   const old = status.age_s > 10;
   $("connection").textContent = !status.pid ? ended() :
     old ? `the daemon has not answered for ${fixed(status.age_s, 0)} s` : "live";
-  if (!status.pid) $("state").textContent = `${ended()}; what was stored is below`;
+  if (!status.pid) $("state").textContent = `${ended()}; stored data are shown below`;
   showCamera((status.cameras || {})[chosen()]);
   showDevices();
   showWarnings();
@@ -65,10 +65,10 @@ function show(document_) {
 
 function ended() {
   const since = status.stopped || lastUtc;
-  return since ? `acquisition has ended: no daemon runs since ${time(since)} UTC` : "no daemon runs";
+  return since ? `acquisition has stopped: no daemon has run since ${time(since)} UTC` : "no daemon runs";
 }
 
-// The camera whose figures, frame and curves are shown: what else arrives is thrown away.
+// The camera whose figures, frame and curves are shown; data of other cameras are discarded.
 function chosen() { return $("camera").value; }
 
 function fillCameras() {
@@ -138,7 +138,7 @@ async function showFrame(name) {
   frame.onload = () => URL.revokeObjectURL(url);
   frame.src = url;
   frame.hidden = false;
-  frame.alt = `the last frame that was shown of camera ${name}`;
+  frame.alt = `the last frame of camera ${name}`;
 }
 
 function showDevices() {
@@ -151,7 +151,7 @@ function showDevices() {
         (device.since ? ` since ${time(device.since)} UTC` : "") + (device.why ? `: ${device.why}` : ""));
       const rhythm = kind === "cameras" ?
         `every ${device.period_s} s, 99 % at most ${fixed(1000 * device.late_p99_s, 0)} ms late, ` +
-        `${device.skipped} skipped, ${device.lost} lost, ${device.deferred - device.caught_up} to catch up` : "";
+        `${device.skipped} skipped, ${device.lost} lost, ${device.deferred - device.caught_up} to calibrate later` : "";
       const first = element("th", name);
       first.scope = "row";
       row.append(first, state, element("td", rhythm));
@@ -163,7 +163,10 @@ function showDevices() {
 
 function showWarnings() {
   const found = [...(status.stalled || [])];
-  if (status.store && status.store.state !== "ok") found.push(`store: ${status.store.state} ${status.store.why}`);
+  const store = status.store || { state: "ok" };
+  if (store.state !== "ok") found.push(`store: ${store.state}: ${store.why}`);
+  if (store.lost) found.push(`${counted(store.lost, "epoch")} lost, taken but not stored: ${store.lost_why}`);
+  if (store.notice) found.push(`store: ${store.notice}`);
   if (status.frames && status.frames.paused) found.push(status.frames.paused);
   if (status.clock && !status.clock.trusted) found.push("the clock is not synchronised: times may be wrong");
   const text = found.join("\n");
@@ -179,7 +182,7 @@ async function refreshEvents() {
       row.append(element("td", time(event.utc)), element("td", event.text));
       return row;
     }));
-  } catch { /* the store is not there yet; asked again soon */ }
+  } catch { /* there is no store yet; tried again soon */ }
 }
 
 async function refreshCourse() {
@@ -191,7 +194,7 @@ async function refreshCourse() {
     fillCameras();
     options($("series"), series.filter((s) => s.camera === chosen()).map((s) => s.series).reverse());
     if (!$("series").value) {
-      $("course-note").textContent = "nothing is stored of this camera yet";
+      $("course-note").textContent = "no epoch of this camera is stored yet";
       Plotly.purge("course");
       return;
     }
@@ -235,8 +238,8 @@ function draw(columns, name) {
   });
   Plotly.react("course", traces, layout, { responsive: true, displaylogo: false });
   $("course-note").textContent = `${name}: ${columns.epochs} epochs` +
-    (columns.per_point > 1 ? `, up to ${columns.per_point} averaged in a point` : "") +
-    "; bands hold 95 % of what a single epoch leaves uncertain";
+    (columns.per_point > 1 ? `, up to ${columns.per_point} averaged per point` : "") +
+    "; bands: 95 % uncertainty of a single epoch";
 }
 
 function listen() {
@@ -244,7 +247,7 @@ function listen() {
   stream.onmessage = (message) => show(JSON.parse(message.data));
   stream.onerror = () => {
     $("connection").textContent = status.pid ? "the page's server does not answer; trying again" :
-      `${ended()}; this page's server has ended too`;
+      `${ended()}; the page's server has stopped too`;
   };
 }
 
@@ -258,7 +261,7 @@ $("camera").addEventListener("change", () => {
 });
 $("series").addEventListener("change", refreshCourse);
 $("range").addEventListener("change", refreshCourse);
-// paper has a width of its own: A4 less margins, in px of CSS
+// for printing: A4 less margins, in px of CSS
 addEventListener("beforeprint", () => { if ($("course").data) Plotly.relayout("course", { width: 670, height: 430, "font.size": 9 }); });
 addEventListener("afterprint", () => { if ($("course").data) refreshCourse(); });
 for (const look of ["(prefers-color-scheme: dark)", "(max-width: 600px)"]) {

@@ -1,11 +1,12 @@
-"""An epoch's adjustment against OpenCV's, and a batch of epochs against one by one (one thread).
+"""Compare an epoch's adjustment with OpenCV's, and a batch of epochs with single ones (one thread).
 
-Run: python benchmarks/adjustment.py
-Bounds: warm epoch with full covariance ≤ 0.4 × cv2.calibrateCameraExtended on the same points;
-a batch of 1,000 epochs ≤ 0.14 × per epoch (0.06 before a series said how noisy its outer targets
-are and what a held affinity does to its level; from run to run 0.10 to 0.13). The adjustment with
-its covariance stands beside all that `adjust` does: data snooping, redundancy numbers, a look at
-the geometry. OpenCV does neither.
+Run: python -m benchmarks.adjustment
+Bounds: an epoch with good initial values and full covariance ≤ 0.4 × cv2.calibrateCameraExtended
+on the same points; an epoch in a batch of 1,000 ≤ 0.14 × a single one (runs vary from 0.10 to 0.13;
+it was 0.06 before a series estimated the noise of its outer targets and the effect of a fixed
+affinity on its level). The first row is the adjustment with its covariance alone, the second all
+that `adjust` does: also data snooping, redundancy numbers and checks of the geometry, which OpenCV
+does not do.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from thermocald.photogrammetry.series.result import SeriesSettings
 SENSOR = Sensor(3280, 2464, 0.00112)
 INTERIOR = InteriorOrientation(3.04, 0.02, -0.03, -5e-3, 4e-4, -1e-5, 3e-4, -2e-4)
 SIGMA_PX = 0.04
-_EPOCHS = 40  # timed one by one: some need a round of data snooping, some do not
+_EPOCHS = 40  # timed singly; only some need a round of data snooping
 
 
 def corner_field() -> TestField:
-    """150 targets on three mutually perpendicular planes."""
+    """Return 150 targets on three mutually perpendicular planes."""
     a, b = (g.ravel() for g in np.meshgrid(np.linspace(60, 600, 7), np.linspace(60, 600, 7)))
     z = np.zeros_like(a)
     planes = [np.c_[a, b, z], np.c_[a, z, b], np.c_[z, a, b], [[0, 0, 0], [330, 0, 0], [0, 330, 0]]]
@@ -50,7 +51,7 @@ def corner_field() -> TestField:
 
 
 def looking_at(centre: list[float], target: list[float]) -> ExteriorOrientation:
-    """A camera at one place that looks at another, upright."""
+    """Return the exterior orientation of an upright camera at `centre` that looks at `target`."""
     backward = np.array(centre, dtype=float) - np.array(target, dtype=float)
     backward /= np.linalg.norm(backward)
     right = np.cross([0, 0, 1], backward)
@@ -63,16 +64,17 @@ EXTERIOR = looking_at([950, 900, 800], [150, 180, 160])
 
 
 def observe(field: TestField, rng: np.random.Generator) -> Observations:
-    """All targets with their noise."""
+    """Draw noisy observations of all targets."""
     points = project(SENSOR, INTERIOR.as_array(), EXTERIOR.as_array(), field.points)
     points += rng.normal(0, SIGMA_PX, points.shape)
     return Observations(np.arange(len(field)), points, np.full(points.shape, SIGMA_PX))
 
 
 def least_seconds(functions: Sequence[Callable[[], object]], rounds: int) -> list[float]:
-    """Least processor time of each call, taken in turn: what the machine does beside is left out.
+    """Return the least processor time of each function, s.
 
-    Each is called five times in a row, or the caches would be filled by the other.
+    The functions take turns, and the least time excludes disturbances by other programs. Each is
+    called five times in a row, because the others have evicted its data from the caches.
     """
     best = [float("inf")] * len(functions)
     for _ in range(rounds):
@@ -85,7 +87,7 @@ def least_seconds(functions: Sequence[Callable[[], object]], rounds: int) -> lis
 
 
 def opencv(field: TestField, observations: Observations) -> Callable[[], object]:
-    """The same points and the same eight IOP through OpenCV."""
+    """Return a call that calibrates the same eight IOP from the same points with OpenCV."""
     f = INTERIOR.c / SENSOR.pixel_pitch
     K = np.array([[f, 0, SENSOR.centre[0]], [0, f, SENSOR.centre[1]], [0, 0, 1]])
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO
@@ -110,7 +112,7 @@ def main() -> int:
     def warm(epoch: Observations) -> Callable[[], object]:
         return lambda: adjust(SENSOR, field, epoch, INTERIOR, EXTERIOR)
 
-    # Nothing shared: in every epoch other sigmas, and other targets hidden
+    # The epochs share nothing: each has its own sigmas and hidden targets
     unlike = [
         Observations(e.targets[seen], e.points[seen], e.sigmas[seen] * rng.uniform(0.9, 1.1))
         for e in epochs
@@ -144,14 +146,14 @@ def main() -> int:
     bare, ours, peer = triples.mean(axis=0)
     per_epoch, each_its_own = (s / len(epochs) for s in least_seconds([batch, unlike_batch], 6))
     rows = [
-        ("adjustment and covariance / OpenCV's", bare / peer, 0.4),
-        ("all that adjust does / OpenCV's", ours / peer, 0.4),
-        ("batch of 1,000, per epoch / adjust", per_epoch / ours, 0.14),
+        ("adjustment with covariance / OpenCV", bare / peer, 0.4),
+        ("complete adjust() / OpenCV", ours / peer, 0.4),
+        ("epoch in a batch of 1,000 / adjust()", per_epoch / ours, 0.14),
     ]
     print(f"{'':45} ratio   bound")
     for name, ratio, bound in rows:
         print(f"{name:45} {ratio:5.3f}  {bound:5.3f}  {'ok' if ratio <= bound else 'MISSED'}")
-    print(f"{'the same, every epoch its own weights':45} {each_its_own / ours:5.3f}")
+    print(f"{'the same, with other weights in each epoch':45} {each_its_own / ours:5.3f}")
     print(
         f"(epoch {ours * 1e3:.3f} ms, OpenCV {peer * 1e3:.3f} ms, batch {per_epoch * 1e6:.1f} µs)"
     )

@@ -1,13 +1,13 @@
-"""Every printed standard deviation against the scatter of what it belongs to, and every level.
+"""Compare every printed standard deviation with the scatter of its quantity, and every level.
 
 Run: python -m benchmarks.audit [SECTION …] [--draws N] [--seed S] [--page FILE]
-Prints every row of which docs/reference/standard-deviations.md shows the range: error over stated
-standard deviation (root mean square over the draws; 1 where the statement is true) or the fraction
-of false alarms. Exit
-status 1 where a ratio lies outside 0.9 to 1.1 by more than three of its own sds, or a level is
-exceeded by as much; rows that are known to be cautious have a lower bound of their own. With
---page the tables of that page are written again.
-Array-level. Seeds are drawn anew each time and printed; the same seed prints the same rows.
+Prints the rows whose range docs/reference/standard-deviations.md shows: error over stated standard
+deviation (root mean square over the draws; 1 if the statement is true) or the share of false
+alarms. Exit status 1 if a ratio is outside 0.9 to 1.1, or above its level, by more than three of
+its own sds; rows that are known to be cautious have a lower bound of their own. --page rewrites
+the tables of that page.
+No images are rendered. A new seed is drawn for each run and printed; the same seed prints the same
+rows.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ SECTIONS: dict[str, Callable[[int, np.random.Generator], list[Row]]] = {
 
 
 def with_rows(page: str, section: str, rows: list[Row]) -> str:
-    """The page with the lines of one section written again."""
+    """Return the page with the rows of one section replaced."""
     old = rf"(^\| {section} \|.*\n)+"
     return re.sub(old, lambda _: table(section, rows) + "\n", page, flags=re.M)
 
@@ -64,12 +64,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=", ".join(SECTIONS))
     parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--seed", type=int, help="drawn anew without; the page is of seed 1")
-    parser.add_argument("--page", type=Path, help="a page whose tables are written again")
+    parser.add_argument("--seed", type=int, help="default: a new one; the page has seed 1")
+    parser.add_argument("--page", type=Path, help="a page whose tables are rewritten")
     given = parser.parse_args()
     unknown = set(given.sections) - set(SECTIONS)
     if unknown:
-        parser.error(f"{min(unknown)}: there are {', '.join(SECTIONS)}")
+        parser.error(f"{min(unknown)}: not a section; choose from {', '.join(SECTIONS)}")
     seed = given.seed or int(np.random.SeedSequence().generate_state(1)[0])
     missed = 0
     for name in given.sections or SECTIONS:
@@ -81,7 +81,7 @@ def main() -> int:
         if given.page is not None:
             page = given.page.read_text(encoding="utf-8")
             given.page.write_text(with_rows(page, name, rows), encoding="utf-8")
-        print(f"{name}: {time.process_time() - begin:.0f} s of processor", file=sys.stderr)
+        print(f"{name}: {time.process_time() - begin:.0f} s of processor time", file=sys.stderr)
     return 1 if missed else 0
 
 

@@ -1,4 +1,4 @@
-"""Audit of what adjusts image points: an epoch, a series, a mount, photographs, the filter."""
+"""Audit of the adjustments of image points: epoch, series, mount, photographs, online filter."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NOISE_PX = 0.04
 
 
 class Scene:
-    """A camera before a corner of 48 targets whose coordinates err as stated."""
+    """A camera before a corner of 48 targets whose coordinates have errors of the stated size."""
 
     def __init__(
         self, rng: np.random.Generator, sigma_mm: float, noise_px: float = NOISE_PX,
@@ -73,7 +73,7 @@ CAMERAS = {
     '1/4", 100°': (2592, 1944, 0.0014, 100.0, -0.03),
     '1/2.3", 120°': (4000, 3000, 0.00155, 120.0, -0.02),
 }
-"""Width, height, pixel in mm, horizontal angle of view, k1 of OpenCV; C1, C2."""
+"""Width and height px, pixel pitch mm, horizontal angle of view °, k1 of OpenCV; C1, C2."""
 
 DEPTHS = ("corner", "sheet", "wall", "room")
 
@@ -81,7 +81,7 @@ DEPTHS = ("corner", "sheet", "wall", "room")
 def _camera(
     width: int, height: int, pitch: float, angle: float, k1: float, C1: float = 0.0, C2: float = 0.0
 ) -> tuple[Sensor, Array]:
-    """A camera by its angle of view, its principal point a little beside the middle."""
+    """Return a camera with this angle of view, its principal point slightly off the centre."""
     sensor = Sensor(width, height, pitch)
     c = 0.5 * width * pitch / np.tan(np.radians(0.5 * angle))
     return sensor, InteriorOrientation(
@@ -91,8 +91,9 @@ def _camera(
 
 
 def _filled(sensor: Sensor, iop: Array, eop: Array, depth: str, rng: np.random.Generator) -> Array:
-    """48 targets (48, 3) mm that fill the image, 1 m away and more: three walls that meet, a bent
-    sheet, one oblique wall, or anywhere in a room.
+    """Return 48 targets (48, 3) mm that fill the image, at least 1 m away.
+
+    They are on three walls that meet, on a bent sheet or an oblique wall, or anywhere in a room.
     """
     u, v = (
         a.ravel() for a in np.meshgrid(np.linspace(-0.88, 0.88, 8), np.linspace(-0.85, 0.85, 6))
@@ -113,7 +114,7 @@ def _filled(sensor: Sensor, iop: Array, eop: Array, depth: str, rng: np.random.G
 
 
 def cameras(draws: int, rng: np.random.Generator) -> list[Row]:
-    """Cameras from 62° to 120° before four fields each, in series of 3 to 1,000 epochs."""
+    """Audit cameras of 62° to 120° before four fields each, in series of 3 to 1,000 epochs."""
     rows = []
     for camera in CAMERAS:
         off, change, level, refused, long = [], [], [], [], []
@@ -131,9 +132,8 @@ def cameras(draws: int, rng: np.random.Generator) -> list[Row]:
                     refused.append(depth)
                 found, truth = _series(scene, (3, 10, 30, 100)[k % 4], 0.0, "series")
                 change.append(_change(found, truth))
-                error = (found.values - truth)[:, :3]
-                level.append(error.mean(axis=0) / np.sqrt(np.diag(found.level_covariance)[:3]))
-        print(f"({camera}: {len(refused)} epochs refused before {set(refused)})", file=sys.stderr)
+                level.append(_level(found, truth))
+        print(f"({camera}: {len(refused)} epochs refused, field {set(refused)})", file=sys.stderr)
         rows += [
             ratio("`replay`, daemon: an epoch", f"sd of c, x0, y0, X0, Y0, Z0; {camera}",
                   "noise, the field's coordinates", np.array(off)),
@@ -147,15 +147,21 @@ def cameras(draws: int, rng: np.random.Generator) -> list[Row]:
     return rows
 
 
-def _change(found: SeriesAdjustment, truth: Array) -> Array:
-    """Error over sd (3,) of the change of c, x0, y0 from the first epoch to the last."""
+def _change(found: SeriesAdjustment, truth: Array, first: int = 0, last: int = -1) -> Array:
+    """Return error over sd (3,) of the change of c, x0, y0 between two epochs."""
     error = (found.values - truth)[:, :3]
     sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
-    return np.asarray((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
+    return np.asarray((error[last] - error[first]) / np.hypot(sd[first], sd[last]))
+
+
+def _level(found: SeriesAdjustment, truth: Array) -> Array:
+    """Return error over sd (3,) of the level of c, x0, y0."""
+    error = (found.values - truth)[:, :3]
+    return np.asarray(error.mean(axis=0) / np.sqrt(np.diag(found.level_covariance)[:3]))
 
 
 def epoch(draws: int, rng: np.random.Generator) -> list[Row]:
-    """One epoch's adjustment."""
+    """Audit the adjustment of one epoch."""
     rows = []
     cases = (
         ("field 0.01 mm", 0.01, 0.0, 1.0),
@@ -174,7 +180,7 @@ def epoch(draws: int, rng: np.random.Generator) -> list[Row]:
         rows.append(ratio("`replay`, daemon: an epoch", f"sd of c, x0, y0, X0, Y0, Z0; {what}",
                           "noise, the field's coordinates", np.array(off)))  # fmt: skip
         if factor != 1.0:
-            print(f"(σ₀: {np.mean(sigma0):.2f}, against the stated sigmas)", file=sys.stderr)
+            print(f"(sigma0 with the stated sigmas: {np.mean(sigma0):.2f})", file=sys.stderr)
     return rows
 
 
@@ -193,14 +199,13 @@ def _series(scene: Scene, epochs: int, tremble_px: float, exterior: Exterior, dr
 
 
 def series(draws: int, rng: np.random.Generator) -> list[Row]:
-    """A series that stands still: differences between epochs, and what all have in common."""
+    """Audit a series with a still mount: differences between epochs, and their common level."""
     change, level = [], []
     for _ in range(draws):
         scene = Scene(rng, 0.01)
         found, truth = _series(scene, 24, 0.0, "series")
         change.append(_change(found, truth))
-        error = (found.values - truth)[:, :3]
-        level.append(error.mean(axis=0) / np.sqrt(np.diag(found.level_covariance)[:3]))
+        level.append(_level(found, truth))
     strong = []
     for _ in range(max(draws // 10, 4)):
         scene = Scene(rng, 0.0, 0.5 * NOISE_PX)
@@ -216,16 +221,13 @@ def series(draws: int, rng: np.random.Generator) -> list[Row]:
 
 
 def mount(draws: int, rng: np.random.Generator) -> list[Row]:
-    """A mount that trembles."""
+    """Audit a trembling mount."""
     rows = []
     for tremble in (0.02, 0.1):
         off = []
         for _ in range(draws):
             scene = Scene(rng, 0.0)
-            found, truth = _series(scene, 40, tremble, "mount")
-            error = (found.values - truth)[:, :3]
-            sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3])
-            off.append((error[30] - error[10]) / np.hypot(sd[10], sd[30]))
+            off.append(_change(*_series(scene, 40, tremble, "mount"), 10, 30))
         rows.append(ratio("`--exterior mount`", f"sd of a difference; c, x0, y0; {tremble} px",
                           "noise and movements of the mount", np.array(off)))  # fmt: skip
     return rows
@@ -234,7 +236,7 @@ def mount(draws: int, rng: np.random.Generator) -> list[Row]:
 def _noisy(
     scene: Scene, targets: int, factor: float, edge: float, epochs: int
 ) -> list[Observations]:
-    """Epochs of some targets; noise `factor` times as stated, and `edge` times at the corners."""
+    """Draw epochs of some targets with `factor` times the stated noise, at corners `edge` times."""
     kept = scene.rng.choice(len(scene.field), targets, replace=False)
     half = 0.5 * np.array([scene.sensor.width - 1, scene.sensor.height - 1])
     out = []
@@ -248,7 +250,7 @@ def _noisy(
 
 
 def noise(draws: int, rng: np.random.Generator) -> list[Row]:
-    """Few targets, noise or a field that are not as stated: epochs by themselves, and series."""
+    """Audit single epochs and series of few targets, with false statements of noise or field."""
     rows = []
     for what, targets, factor, edge, worse in (
         ("12 targets", 12, 1.0, 1.0, 1.0),
@@ -272,9 +274,8 @@ def noise(draws: int, rng: np.random.Generator) -> list[Row]:
                 ExteriorOrientation.from_array(scene.eop), SeriesSettings(exterior="series"),
             )  # fmt: skip
             if found.ok.all():
-                error, sd = (found.values - truth)[:, :3], found.sd[:, :3]
-                change.append((error[-1] - error[0]) / np.hypot(sd[0], sd[-1]))
-                level.append(error.mean(axis=0) / found.level_sd[:3])
+                change.append(_change(found, truth))
+                level.append(_level(found, truth))
                 factors.append(found.field_ratio)
         field = f"field × {np.median(factors):.1f}"
         print(f"({what}: {refused} of {draws // 2} refused, {field})", file=sys.stderr)
@@ -288,7 +289,7 @@ def noise(draws: int, rng: np.random.Generator) -> list[Row]:
 
 
 def calibrate(draws: int, rng: np.random.Generator) -> list[Row]:
-    """Four photographs before one field."""
+    """Audit the calibration from four photographs of one field."""
     rows = []
     for what, sigma, few, gross_px in (
         ("field 0.0 mm", 0.0, 48, 0.0), ("field 0.05 mm", 0.05, 48, 0.0),
@@ -318,7 +319,7 @@ def calibrate(draws: int, rng: np.random.Generator) -> list[Row]:
 
 
 def photographs(scene: Scene, few: int, gross_px: float) -> list[Observations]:
-    """Four stations' image points of some targets, 8 % of them grossly wrong by so many px."""
+    """Draw image points of some targets at four stations, 8 % with gross errors (sd `gross_px`)."""
     kept = np.sort(scene.rng.choice(len(scene.field), few, replace=False))
     seen = []
     for turn in (0.0, 0.05, -0.05, 0.1):
@@ -330,7 +331,7 @@ def photographs(scene: Scene, few: int, gross_px: float) -> list[Observations]:
 
 
 def online(draws: int, rng: np.random.Generator) -> list[Row]:
-    """The filter in the daemon: its estimate, its innovations, its drift."""
+    """Audit the daemon's online filter: its estimate, its innovations, its drift."""
     rows = []
     for what, sigma, factor in (
         ("field 0.01 mm", 0.01, 1.0), ("field 0.05 mm", 0.05, 1.0),

@@ -1,4 +1,4 @@
-"""Audit of `testfield survey`: the coordinates and the camera of a free network."""
+"""Audit of `testfield survey`: coordinates and camera from a free network."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ TAPE_MM = 0.05
 
 
 def _sheet() -> Array:
-    """A bent sheet of 30 targets, (30, 3) mm."""
+    """Return a bent sheet of 30 targets, (30, 3) mm."""
     x, y = np.meshgrid(np.linspace(0, 800, 6), np.linspace(0, 560, 5))
     u = x / 800 - 0.5
     return np.column_stack([x.ravel(), y.ravel(), 6 * (1 - 4 * u.ravel() ** 2)])
 
 
 def _stations(field: Array) -> list[ExteriorOrientation]:
-    """Convergent stations on a ring, the camera turned by 90° at every second."""
+    """Return convergent stations on a ring; the camera is rolled by 90° at every other one."""
     centre = field.mean(axis=0)
     found = []
     for k in range(STATIONS):
@@ -55,7 +55,7 @@ def _stations(field: Array) -> list[ExteriorOrientation]:
 
 
 def survey(draws: int, rng: np.random.Generator) -> list[Row]:
-    """`testfield survey`: coordinates, the scale of a measured distance, the camera."""
+    """Audit the coordinates, scaled by one measured distance, and the camera."""
     field, stations = _sheet(), _stations(_sheet())
     nominal = TestField.build([f"t{k}" for k in range(len(field))], field)
     length = float(np.linalg.norm(field[-1] - field[0]))

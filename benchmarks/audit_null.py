@@ -1,4 +1,4 @@
-"""Audit of false alarms: series and recordings in which nothing happens, in odd kinds of noise."""
+"""Audit of false alarms: series and recordings without an effect, in unusual kinds of noise."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NOISE_PX = 0.04
 
 
 def _coloured(phi: float, part: float = 1.0) -> Noise:
-    """First-order autoregressive noise, a part of the variance, and white noise."""
+    """Return noise that is autoregressive (first order) in a part of its variance, else white."""
     from scipy.signal import lfilter
 
     def draw(rng: np.random.Generator, n: int, columns: int) -> Array:
@@ -42,7 +42,10 @@ def _coloured(phi: float, part: float = 1.0) -> Noise:
 
 
 def _flicker(exponent: float, part: float = 1.0) -> Noise:
-    """Noise of spectrum 1/f^exponent, an eighth of a longer series, and white noise."""
+    """Return noise of spectrum 1/f^exponent in a part of its variance, else white.
+
+    Each draw is the first eighth of a longer series.
+    """
 
     def draw(rng: np.random.Generator, n: int, columns: int) -> Array:
         shape = np.zeros((4 * n + 1, 1))
@@ -112,7 +115,7 @@ KINDS: dict[str, Noise] = {
 
 
 def null(draws: int, rng: np.random.Generator) -> list[Row]:
-    """Drift and dependence claimed at 1 % of three parameters of a camera at rest, by kind."""
+    """Count drifts and dependences found at 1 % in three stable parameters, by kind of noise."""
     rows = []
     for kind, noise in KINDS.items():
         drifting, dependent = [], []
@@ -130,7 +133,7 @@ def null(draws: int, rng: np.random.Generator) -> list[Row]:
 
 
 def named(draws: int, rng: np.random.Generator) -> list[Row]:
-    """Names that `discover` gives to recordings of a camera that follows its temperature alone."""
+    """Count the effects that `discover` finds where a camera only follows its temperature."""
     found, others = [], Counter[str]()
     for k in range(max(draws // 2, 2)):
         kind = list(KINDS)[k % len(KINDS)]

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 HEADER = "| section | printed by | error / sd, or share of false alarms |\n|---|---|---|"
-_FAR = 0.1  # from 1: the case is named
+_FAR = 0.1  # ratios farther from 1 are named
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class Row:
     def text(self, seed: int) -> str:
         return (
             f"{self.shown}  {self.printed_by}: {self.what} "
-            f"(holds {self.holds or 'no more'}; {self.draws} draws, seed {seed})"
+            f"(includes {self.holds or 'nothing else'}; {self.draws} draws, seed {seed})"
         )
 
 
 def table(section: str, rows: list[Row]) -> str:
-    """Return the lines of a section as the page has them: one per command, from least to most."""
+    """Return a section's lines of the page: one per command, with its least and largest value."""
     lines = []
     for kind in dict.fromkeys((row.printed_by, row.level is None) for row in rows):
         alike = (r for r in rows if (r.printed_by, r.level is None) == kind)
@@ -63,7 +63,7 @@ def table(section: str, rows: list[Row]) -> str:
 
 
 def ratio(printed_by: str, what: str, holds: str, standardised: Array, low: float = 0.9) -> Row:
-    """A row from errors over sds (draws,) or (draws, k), whose k are taken together."""
+    """Return a row from errors over sds (draws,) or (draws, k), all pooled."""
     off = np.asarray(standardised, dtype=float)
     draws = len(off)
     value = float(np.sqrt(np.mean(off**2)))
@@ -71,7 +71,7 @@ def ratio(printed_by: str, what: str, holds: str, standardised: Array, low: floa
 
 
 def share(printed_by: str, what: str, holds: str, alarms: list[bool], level: float = 0.05) -> Row:
-    """A row of false alarms; its sd is that of a share as large as the level."""
+    """Return a row of false alarms; its sd is that of a share as large as the level."""
     n = len(alarms)
     sd = np.sqrt(level * (1 - level) / n)
     return Row(printed_by, what, holds, float(np.mean(alarms)), sd, n, level=level)

@@ -1,4 +1,4 @@
-"""Audit of the study's statistics: false alarms, and the standard deviations of its slopes."""
+"""Audit of the study's statistics: false alarms, and standard deviations of slopes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _noise(rng: np.random.Generator, coloured: float, phi: float, n: int = 150) 
 
 
 def significance(draws: int, rng: np.random.Generator) -> list[Row]:
-    """False alarms of the study's tests at 5 %, and the standard deviations beside them."""
+    """Audit the false alarms of the study's tests at 5 %, and the standard deviations it states."""
     rows = []
     ones, redundancy = np.ones(150), np.full(150, 280.0)
     course = 1 - np.exp(-np.arange(150) / 30)

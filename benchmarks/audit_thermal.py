@@ -1,4 +1,4 @@
-"""Audit of the thermal model: `fit`, `predict`, `correct`, and what `discover` writes."""
+"""Audit of the thermal model: `fit`, `predict`, `correct`, and the model that `discover` writes."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ NAMES = ("c", "x0", "y0")
 TAU = 70.0
 LAG = ModelEffect("thermal_lag", {"tau": TAU})
 FIELD_MM = 0.02
-NEAR = 35.0  # °C at which `predict` is asked
+NEAR = 35.0  # °C, for `predict`
 
 
 def simulated(
     seed: int, effects: tuple[ModelEffect, ...] = (LAG,), epochs: int = 120, power: float = 9.0,
     until: float = 500.0, series: str = "M1", begin: float = 80.0,
 ) -> Any:  # fmt: skip
-    """The camera of the preset, heated between two seconds, with effects of our choice."""
+    """Return a simulation with these effects, heated from `begin` to `until` s."""
     s = preset_simulation("rpi-v2.1-heating", seed=seed, series=series)
     lamp = Course.steps([0, begin, until, 1e5], [0.0, power, 0.0])
     programme = replace(s.programme, epochs=epochs, sources={"housing": lamp})
@@ -54,7 +54,7 @@ def simulated(
 
 
 def seen(s: Any, rng: np.random.Generator | None = None) -> SeriesInput:
-    """What was recorded; with rng before a field whose stated coordinates err by 0.02 mm."""
+    """Return the recorded series; with `rng`, the field's coordinates have errors of 0.02 mm."""
     field = s.field
     if rng is not None:
         points = field.points + rng.normal(0, FIELD_MM, field.points.shape)
@@ -63,12 +63,12 @@ def seen(s: Any, rng: np.random.Generator | None = None) -> SeriesInput:
 
 
 def fitted(source: SeriesInput, *effects: ModelEffect) -> ThermalCamera:
-    """The series reduced as `fit` does it, and fitted."""
+    """Return the model fitted to the series, which is reduced as `fit` does it."""
     return fit_thermal_model([reduce_series(source, strict=False)], effects)
 
 
 def before(scene: Scene, s: Any) -> SeriesInput:
-    """What another camera records before its field, heated alike; C1 and C2 are not stated."""
+    """Return the series of another camera, heated alike before its field, without C1 and C2."""
     model = replace(
         s.model, sensor=scene.sensor, interior=InteriorOrientation.from_array(scene.iop),
         exterior=ExteriorOrientation.from_array(scene.eop),
@@ -79,7 +79,7 @@ def before(scene: Scene, s: Any) -> SeriesInput:
 
 
 def other_cameras(draws: int, rng: np.random.Generator) -> list[Row]:
-    """`fit` of cameras from 62° to 120° before four fields; what it doubts itself is left out."""
+    """Audit `fit` of cameras of 62° to 120° before four fields, without doubtful fits."""
     rows = []
     for camera in CAMERAS:
         off, doubted = [], []
@@ -90,16 +90,15 @@ def other_cameras(draws: int, rng: np.random.Generator) -> list[Row]:
                 if "rates_hang_on_c" in f.fitted:
                     doubted.append(depth)
                     continue
-                off.append([(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}")
-                            for n in NAMES])  # fmt: skip
-        print(f"({camera}: {len(doubted)} fits doubted before {set(doubted)})", file=sys.stderr)
+                off.append(_rate_errors(f, s))
+        print(f"({camera}: {len(doubted)} doubtful fits, field {set(doubted)})", file=sys.stderr)
         rows.append(ratio("`fit`", f"sd of the rates of c, x0, y0; {camera}, field 0.01 mm",
                           "noise of image and thermometer", np.array(off)))  # fmt: skip
     return rows
 
 
 def seen_by_opencv(s: Any, noise_px: float = 0.04) -> SeriesInput:
-    """What a camera that keeps its angles records, rendered by OpenCV's model with changing f."""
+    """Return the series that OpenCV's model gives with changing f: distortion follows the angle."""
     import cv2
 
     source, m = seen(s), s.model
@@ -107,10 +106,9 @@ def seen_by_opencv(s: Any, noise_px: float = 0.04) -> SeriesInput:
     c0, A, B = start[0], start[3:6], start[6:8]
     k = np.array([A[0] * c0**2, A[1] * c0**4, -B[1] * c0, B[0] * c0, A[2] * c0**6])
     x = np.eye(3)
-    # object axes to OpenCV's camera: x right, y down, z forward
-    angles = zip(np.eye(3), eop[:3], strict=True)
-    for axis, angle in angles:
+    for axis, angle in zip(np.eye(3), eop[:3], strict=True):
         x = x @ cv2.Rodrigues(axis * angle)[0]
+    # object axes to OpenCV's camera: x right, y down, z forward
     turn = np.diag([1.0, -1.0, -1.0]) @ x.T
     points = np.empty(source.grid.points.shape)
     centre = np.array([sensor.width - 1, sensor.height - 1]) / 2.0
@@ -125,25 +123,23 @@ def seen_by_opencv(s: Any, noise_px: float = 0.04) -> SeriesInput:
 
 
 def distortion(draws: int, rng: np.random.Generator) -> list[Row]:
-    """A camera that keeps its angles while c changes, rendered by OpenCV."""
+    """Audit a camera whose distortion follows the angle while c changes, computed by OpenCV."""
     rates, wrong = [], []
     for seed in _seeds(rng, draws):
         s = simulated(seed, ())
         f = fitted(seen_by_opencv(s))
-        rates.append(
-            [(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
-        )
+        rates.append(_rate_errors(f, s))
         wrong.append(f.model.distortion != "angle")
     return [
         ratio("`fit`", "sd of the rates of c, x0, y0; rendered by OpenCV with changing f",
               "noise of image and thermometer", np.array(rates)),
-        share("`fit`", "distortion said to keep its place in the image; it follows the angle",
+        share("`fit`", "distortion reported as fixed in the image; it follows the angle",
               "3 sd", wrong),
     ]  # fmt: skip
 
 
 def read_apart(s: Any, late: float, interval: float = 15.0, noise_k: float = 0.05) -> SeriesInput:
-    """What was recorded, with a thermometer that is read between the frames; late: s, its clock."""
+    """Return the series with a thermometer read between the frames, its clock `late` s ahead."""
     source, true = seen(s), s.true_history
     rng = np.random.default_rng([s.seed, 8])
     times = np.arange(rng.uniform(0, interval), s.frame_times[-1], interval)
@@ -157,13 +153,13 @@ def read_apart(s: Any, late: float, interval: float = 15.0, noise_k: float = 0.0
 
 
 def switched(seed: int) -> Any:
-    """The camera without effects, its lamp switched at instants that no frame knows."""
+    """Simulate a camera without effects whose lamp is switched at any instant between frames."""
     begin, until = np.random.default_rng([seed, 9]).uniform(0.0, 10.0, 2)
     return simulated(seed, (), begin=80.0 + begin, until=500.0 + until)
 
 
 def delay(draws: int, rng: np.random.Generator) -> list[Row]:
-    """A logger whose clock is wrong by up to 90 s, read between the frames, every 10 to 60 s."""
+    """Audit a logger, its clock wrong by up to 90 s, read between frames every 10 to 60 s."""
     shifts, rates = [], []
     for interval in (10.0, 15.0, 30.0, 60.0):
         shift, rate = [], []
@@ -175,12 +171,10 @@ def delay(draws: int, rng: np.random.Generator) -> list[Row]:
             if "read_seldom" in f.fitted:
                 continue
             shift.append((f.model.effects[0].values["d"] + late) / f.model.sd("time_offset.d"))
-            rate.append(
-                [(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
-            )
+            rate.append(_rate_errors(f, s))
         what = f"readings of {interval:g} s, ± 0.05 K"
         if len(shift) <= draws // 4:
-            print(f"({what}: {len(shift)} of {draws} fits not doubted)", file=sys.stderr)
+            print(f"({what}: {len(shift)} of {draws} fits not doubtful)", file=sys.stderr)
             continue
         shifts.append(ratio("`fit`", f"sd of a clock's shift, ± 90 s; {what}",
                             "noise of image and thermometer", np.array(shift)))  # fmt: skip
@@ -189,21 +183,25 @@ def delay(draws: int, rng: np.random.Generator) -> list[Row]:
     return shifts + rates
 
 
+def _rate_errors(fit: ThermalCamera, s: Any) -> list[float]:
+    """Return error over sd of the rates of c, x0, y0."""
+    model, true = fit.model, s.model.rates
+    return [(model.rates[n] - true[n]) / model.sd(f"rates.{n}") for n in NAMES]
+
+
 def _seeds(rng: np.random.Generator, draws: int) -> list[int]:
     return [int(seed) for seed in rng.integers(0, 2**31, draws)]
 
 
 def thermal(draws: int, rng: np.random.Generator) -> list[Row]:
-    """`fit`: rates, the time of a lag, the level; `predict` and `correct` with the fitted model."""
+    """Audit `fit` (rates, a lag's time, level), and `predict` and `correct` with its model."""
     rates, tau, level, predicted, corrected = [], [], [], [], []
     for seed in _seeds(rng, draws):
         s = simulated(seed)
         truth = s.model
         f = fitted(seen(s, rng), ModelEffect("thermal_lag", {"tau": 10.0}))
         tau.append((f.model.effects[0].values["tau"] - TAU) / f.model.sd("thermal_lag.tau"))
-        rates.append(
-            [(f.model.rates[n] - truth.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
-        )
+        rates.append(_rate_errors(f, s))
         start = truth.interior.as_array() + (f.model.T0 - truth.T0) * truth.rate_vector
         off = f.model.interior.as_array() - start
         level.append([off[IOP_NAMES.index(n)] / f.model.sd(f"interior.{n}") for n in NAMES])
@@ -230,7 +228,7 @@ NOISY_K = 0.15
 
 
 def thermometer(draws: int, rng: np.random.Generator) -> list[Row]:
-    """A thermometer with 0.15 K of noise: `correct` and `predict --log` with its own log."""
+    """Audit `correct` and `predict --log` with the log of a thermometer of 0.15 K noise."""
     moved, predicted = [], []
     for seed in _seeds(rng, draws):
         s = simulated(seed, ())
@@ -261,7 +259,7 @@ def thermometer(draws: int, rng: np.random.Generator) -> list[Row]:
 
 
 def _corrected(s: Any, camera: ThermalCamera) -> list[float]:
-    """Error over sd of points seen at 40 °C, corrected to 25 °C: a log that stands still."""
+    """Return error over sd of points seen at a constant 40 °C and corrected to 25 °C."""
     truth = s.model
     start = truth.interior.as_array()
     warm, cool = (
@@ -289,11 +287,12 @@ UNKNOWN = (
     ("softening", {"T_k": 34.0}, {"c": 2e-5, "x0": 6e-5, "y0": -4e-5}),
     ("thermal_gradient", {}, {"c": 2e-3, "x0": 6e-3, "y0": -4e-3}),
 )
-"""Effects that a fit is not told of: times as they are, the others times a size drawn anew."""
+"""Effects that a fit does not include, with their times and sizes; the sizes, or else the times,
+are multiplied by a factor drawn for each case."""
 
 
 def outside(draws: int, rng: np.random.Generator) -> list[Row]:
-    """Cameras whose effect `fit` is not told of: a band that does not hold is a false alarm."""
+    """Count the prediction bands that do not hold where the model lacks the camera's effect."""
     found = []
     for seed in _seeds(rng, draws):
         name, times, sizes = UNKNOWN[int(rng.integers(len(UNKNOWN)))]
@@ -305,12 +304,12 @@ def outside(draws: int, rng: np.random.Generator) -> list[Row]:
         reduced = reduce_series(seen(second), strict=False)
         error = predicted_error(first.model, reduced, first.fitted["series"][0].thermometer_sd)
         found.append(bool(error.coverage < 0.9))
-    return [share("`predict --test`", "a band that holds less than 90 %; an effect that `fit` "
-                  "is not told of", "no band where an effect is missing", found)]  # fmt: skip
+    return [share("`predict --test`", "a band that holds less than 90 %; an effect not given "
+                  "to `fit`", "no band where an effect is missing", found)]  # fmt: skip
 
 
 def discovery(draws: int, rng: np.random.Generator) -> list[Row]:
-    """`discover`: the estimate of what was found, and the model it writes."""
+    """Audit the estimates of effects that `discover` finds, and the model it writes."""
     tau, level, rates = [], [], []
     for seed in _seeds(rng, draws):
         s = simulated(seed, epochs=60)

@@ -1,10 +1,12 @@
-"""The daemon's rhythm and what an epoch costs: python benchmarks/daemon.py [--ticks 600]
+"""Measure the daemon's punctuality and the cost of an epoch.
 
-Rhythm: absolute deadlines beside a plain `sleep` loop, 50 ms ticks while two other threads
-calculate and render; then a day of 10 s ticks in virtual time. Cost: one 8 MP epoch from frame to
-store in CPU time, beside a tenth of a 10 s period at one tenth of this machine's speed.
+Run: python -m benchmarks.daemon [--ticks 600] [--epochs 40]
 
-On a machine that is busy with other programs, run it as the service runs: nice -n -10.
+Punctuality: absolute deadlines beside a plain `sleep` loop, with ticks of 50 ms, both idle and
+beside two busy threads; then a day of 10 s ticks in virtual time. Cost: the CPU time of one 8 MP
+epoch from frame to store, against a tenth of a 10 s period on a machine ten times slower.
+
+On a machine that is busy with other programs, run it at the service's priority: nice -n -10.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ def percentile(values: list[float], p: float) -> float:
 
 
 def load(stop: threading.Event) -> None:
-    """What the calibrating and keeping threads do: arrays, and Python between them."""
+    """Work like the calibrating and storing threads: array operations, and Python between them."""
     rng = np.random.default_rng(0)
     a, image = rng.normal(size=(300, 16)), rng.integers(0, 255, (600, 800)).astype(np.uint8)
     while not stop.is_set():
@@ -47,7 +49,7 @@ def load(stop: threading.Event) -> None:
 
 
 def scheduled(ticks: int, work_s: float) -> tuple[list[float], float, int]:
-    """(lateness s, drift s, skipped) of the daemon's schedule."""
+    """Return (lateness s, drift s, skipped ticks) of the daemon's schedule."""
     schedule = Schedule(SystemClock(), PERIOD_S)
     late, last = [], None
     for _ in range(ticks):
@@ -61,7 +63,7 @@ def scheduled(ticks: int, work_s: float) -> tuple[list[float], float, int]:
 
 
 def sleeping(ticks: int, work_s: float) -> tuple[list[float], float, int]:
-    """The same of `while True: work(); sleep(period)`: lateness against the ideal instants."""
+    """Return the same for `while True: work(); sleep(period)`, late against the ideal instants."""
     begin = time.monotonic()
     late = []
     for k in range(ticks):
@@ -73,7 +75,7 @@ def sleeping(ticks: int, work_s: float) -> tuple[list[float], float, int]:
 
 def rhythm(ticks: int) -> None:
     sys.setswitchinterval(0.0005)  # as the daemon does
-    print(f"rhythm: {ticks} ticks of {PERIOD_S * 1000:.0f} ms, 10 ms of work each")
+    print(f"punctuality: {ticks} ticks of {PERIOD_S * 1000:.0f} ms, 10 ms of work each")
     print(f"{'':28}{'late p50':>10}{'p99':>10}{'max':>10}{'drift':>12}{'skipped':>9}")
     for loaded in (False, True):
         stop = threading.Event()
@@ -102,14 +104,13 @@ def virtual_day() -> None:
         late.append(clock.monotonic() - schedule.due(tick))
         clock.advance(float(rng.uniform(0.0, 9.0)))
     print(
-        f"virtual day: 8640 ticks of 10 s with up to 9 s of work: late max {max(late):g} s, drift "
-        f"{schedule.due(tick) - 8639 * 10.0:g} s, "
-        f"skipped {schedule.stats()['skipped']}"
+        f"virtual day: 8640 ticks of 10 s, up to 9 s of work each: at most {max(late):g} s late, "
+        f"drift {schedule.due(tick) - 8639 * 10.0:g} s, {schedule.stats()['skipped']} skipped"
     )
 
 
 def epoch_cost(epochs: int) -> None:
-    """Frame to store, 8 MP, one thread."""
+    """Measure the steps from an 8 MP frame to the store, on one thread."""
     from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.daemon.epoch_keeper import EpochKeeper
     from thermocald.daemon.plan import mock_config, plan_cameras, running_series
@@ -140,7 +141,9 @@ def epoch_cost(epochs: int) -> None:
                 epoch = Epoch(k + 1, frame.utc, utc, temperatures)
                 jpeg = cv2.imencode(".jpg", frame.image)[1].tobytes()
                 z = time.thread_time()
-                decode_grey(jpeg)  # what a phone's frame costs more; the mock's has grey values
+                decode_grey(
+                    jpeg
+                )  # only a phone's frame is a JPEG; the mock camera gives grey values
                 a = time.thread_time()
                 calibrated = calibrator.calibrate(epoch, frame.image)
                 b = time.thread_time()
@@ -155,23 +158,23 @@ def epoch_cost(epochs: int) -> None:
                 keeper.keep(item)
                 d = time.thread_time()
                 skew.append(epoch.temperature_time - epoch.frame_time)
-                if k:  # the first frame is searched as a whole
+                if k:  # the whole first frame is searched
                     parts = (a - z, b - a, c - b, e - c, d - e)
                     for name, seconds in zip(spent, parts, strict=True):
                         spent[name].append(seconds)
         guard.close()
     total = sum(statistics.median(s) for s in spent.values())
     least = sum(min(s) for s in spent.values())
-    print(f"one 8 MP epoch, CPU time, {len(plan.testfield)} targets, {epochs - 1} epochs:")
+    print(f"CPU time of an 8 MP epoch, {len(plan.testfield)} targets, {epochs - 1} epochs:")
     print(f"  {'':20}{'median':>11}{'least':>11}")
     for name, seconds in spent.items():
         print(f"  {name:20}{1e3 * statistics.median(seconds):8.1f} ms{1e3 * min(seconds):8.1f} ms")
     print(
-        f"  total {1e3 * total:.1f} ms, least {1e3 * least:.1f} ms; at a tenth of this speed "
-        f"{10 * total:.2f} s = {100 * total:.1f} % of a 10 s period (bound 10 %), least "
+        f"  total: median {1e3 * total:.1f} ms, least {1e3 * least:.1f} ms; on a machine ten times "
+        f"slower {10 * total:.2f} s = {100 * total:.1f} % of a 10 s period (bound 10 %), at least "
         f"{100 * least:.1f} %"
     )
-    print(f"  temperature minus frame: median {1e3 * statistics.median(skew):.0f} ms")
+    print(f"  temperature time minus frame time: median {1e3 * statistics.median(skew):.0f} ms")
 
 
 def main() -> None:

@@ -1,11 +1,11 @@
-"""Discovery beside its peers on the same blind recordings: names, false alarms, gap on M2, time.
+"""Compare `discover` with peers on blind recordings: names, false alarms, gap on M2, time.
 
-    python benchmarks/discovery.py [--seeds 1] [--px 0.1] [--long]
+    python -m benchmarks.discovery [--seeds 1] [--px 0.1] [--long]
 
-Peers get generous help: the free camera of each epoch whitened by its normal equations, the
-smoothed temperature, and a library of every catalogue trajectory (non-linear parameters at the
-truth's order of magnitude on a grid). They need `pip install pysindy scikit-learn`; a peer that is
-not installed is left out and said so.
+The peers get generous help: the free camera of each epoch whitened by its normal equations, the
+smoothed temperature, and a library of all catalogue trajectories (non-linear parameters on a grid
+around the true order of magnitude). They need `pip install pysindy scikit-learn`; a peer that is
+not installed is reported and left out.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import argparse
 import os
 import time
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -27,9 +27,9 @@ from thermocald.discovery.result import discover_series
 from thermocald.discovery.search import list_candidates
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.reduce import reduce_series
-from thermocald.thermal.series import COLUMNS
+from thermocald.thermal.series import COLUMNS, ReducedSeries
 
-# what a trajectory in the parameter series can show: image space is not offered to the peers
+# The peers see parameter series only, which do not show effects in image space
 COURSES = [e for e in SINGLE if e not in ("defocus", "target_displacement")]
 
 
@@ -39,15 +39,12 @@ class Score:
     cases: int = 0
     alarms: int = 0
     quiet: int = 0
-    closed: list[float] | None = None
-    seconds: list[float] | None = None
-
-    def __post_init__(self) -> None:
-        self.closed, self.seconds = [], []
+    closed: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
 
 
 def library(fitter: HypothesisFitter, series: int) -> tuple[list[str], np.ndarray]:
-    """Named, normalised columns (E · D, K): each effect on each parameter it acts on."""
+    """Return names and whitened columns (E · D, K): each effect in each parameter it acts on."""
     e = fitter.series[series]
     names, columns = [], []
     base = fitter.drive_trajectory([], series)
@@ -71,25 +68,26 @@ def library(fitter: HypothesisFitter, series: int) -> tuple[list[str], np.ndarra
     for parameter in ("c", "x0", "y0"):
         names.append("base")
         columns.append((T, parameter))
-    size, U = np.linalg.eigh(e.N.mean(axis=0))
-    keep = size > 1e-4 * np.median(size)
-    root = U[:, keep] * np.sqrt(size[keep])
+    root = whitening_root(e)
     X = np.stack([np.outer(c, root[COLUMNS.index(p)]).ravel() for c, p in columns], axis=1)
     return names, X
 
 
-def whitened(fitter: HypothesisFitter, series: int) -> np.ndarray:
-    e = fitter.series[series]
-    size, U = np.linalg.eigh(e.N.mean(axis=0))
+def whitening_root(series: ReducedSeries) -> np.ndarray:
+    """Return a root (P, D) of the mean normal equations, without their weak directions."""
+    size, U = np.linalg.eigh(series.N.mean(axis=0))
     keep = size > 1e-4 * np.median(size)
-    z = (e.values - e.values.mean(axis=0)) @ (U[:, keep] * np.sqrt(size[keep]))
-    return z.ravel()
+    return U[:, keep] * np.sqrt(size[keep])
+
+
+def whitened(series: ReducedSeries) -> np.ndarray:
+    return ((series.values - series.values.mean(axis=0)) @ whitening_root(series)).ravel()
 
 
 def peer_sindy(X: np.ndarray, y: np.ndarray) -> np.ndarray:
     import pysindy
 
-    # columns of unit length: a term has to explain a sixth of the misfit's amplitude
+    # With columns of unit length, a term must explain a sixth of the misfit's amplitude
     optimizer = pysindy.STLSQ(
         threshold=float(np.linalg.norm(y)) / 6, alpha=1e-2, normalize_columns=True
     )
@@ -109,10 +107,10 @@ def peer_lasso(X: np.ndarray, y: np.ndarray) -> np.ndarray:
     return model.coef_ / scale
 
 
-def names_said(
+def named_effects(
     names: list[str], X: np.ndarray, coefficients: np.ndarray, y: np.ndarray
 ) -> set[str]:
-    """Effects whose columns explain a twentieth of the largest one's share, and more than noise."""
+    """Return the effects that explain more than noise, and a twentieth of the largest share."""
     power = {}
     for effect in set(names) - {"base"}:
         rows = [i for i, n in enumerate(names) if n == effect]
@@ -123,7 +121,7 @@ def names_said(
 
 
 def gaussian_process(fitter: HypothesisFitter) -> float:
-    """Share of M2's misfit that a discrepancy in (T, dT/dt) learnt on M1 explains."""
+    """Return the share of M2's misfit that a discrepancy in (T, dT/dt) learnt on M1 explains."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, WhiteKernel
 
@@ -147,7 +145,7 @@ def gaussian_process(fitter: HypothesisFitter) -> float:
 
 
 def long_series() -> float:
-    """CPU seconds for a day at 10 s with a lag in it."""
+    """Return the CPU time, s, for a day of 10 s epochs with a lag."""
     series, _ = generate(Case(("thermal_lag",), 0.1, 77, epochs=8640, with_m2=False))
     source = series_input(series[0])
     begin = time.process_time()
@@ -160,7 +158,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--px", type=float, default=0.1)
-    parser.add_argument("--long", action="store_true", help="a day of 8,640 epochs instead")
+    parser.add_argument(
+        "--long", action="store_true", help="only the time for a day of 8,640 epochs"
+    )
     a = parser.parse_args()
     if a.long:
         print(f"8640 epochs: {long_series():.1f} CPU s")
@@ -174,7 +174,7 @@ def main() -> None:
             __import__(module)
             peers[name] = function
         except ImportError:
-            print(f"{name}: not installed, left out")
+            print(f"{name}: left out; {module} is not installed")
     scores = {name: Score() for name in ("thermocald discover", *peers)}
     gp = []
     cases = [Case((e,), a.px, 500 + s) for s in range(a.seeds) for e in COURSES]
@@ -192,30 +192,30 @@ def main() -> None:
         if closed is not None:
             own.closed.append(closed)
         fitter = HypothesisFitter([first, second])
-        prepared = [(library(fitter, s), whitened(fitter, s)) for s in (0, 1)]
+        prepared = [(library(fitter, s), whitened(fitter.series[s])) for s in (0, 1)]
         (names, X), y = prepared[0]
         for name, peer in peers.items():
             begin = time.process_time()
             coefficients = peer(*_without_base(names, X, y))
             scores[name].seconds.append(time.process_time() - begin)
             rest, _ = _without_base(names, X, y)
-            _count(scores[name], names_said(names, rest, coefficients, y), case)
+            _count(scores[name], named_effects(names, rest, coefficients, y), case)
             if case.effects:
                 scores[name].closed.append(_closed(prepared[1], coefficients, names))
         if case.effects and "LassoLarsIC" in peers:
             gp.append(gaussian_process(fitter))
-    print("| method | names right | false alarms | gap on M2 closed (median) | median CPU s |")
+    print("| method | correct names | false alarms | gap on M2 closed (median) | median CPU s |")
     print("|---|---|---|---|---|")
     for name, s in scores.items():
         closed = f"{np.median(s.closed):.0%}" if s.closed else ""
         print(f"| {name} | {s.right} of {s.cases} | {s.alarms} of {s.quiet} | {closed} | "
               f"{np.median(s.seconds):.2f} |")  # fmt: skip
     if gp:
-        print(f"| Gaussian process in (T, dT/dt) | gives no names | | {np.median(gp):.0%} | |")
+        print(f"| Gaussian process in (T, dT/dt) | names no effect | | {np.median(gp):.0%} | |")
 
 
 def _without_base(names: list[str], X: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Library and misfit with the base model's own terms projected out, as a kindness."""
+    """Return library and misfit without the base model's terms, which helps the peers."""
     base = [i for i, n in enumerate(names) if n == "base"]
     Q, _ = np.linalg.qr(X[:, base])
     rest = X - Q @ (Q.T @ X)
@@ -226,7 +226,7 @@ def _without_base(names: list[str], X: np.ndarray, y: np.ndarray) -> tuple[np.nd
 
 
 def _closed(prepared: tuple, coefficients: np.ndarray, names: list[str]) -> float:
-    """Share of M2's excess over the base model that the coefficients of M1 explain."""
+    """Return the share of M2's excess over the base model that the coefficients of M1 explain."""
     (own, X), y = prepared
     if own != names:
         return 0.0
@@ -235,18 +235,17 @@ def _closed(prepared: tuple, coefficients: np.ndarray, names: list[str]) -> floa
     before = y - B @ np.linalg.lstsq(B, y, rcond=None)[0]
     after = y - X @ coefficients
     after = after - B @ np.linalg.lstsq(B, after, rcond=None)[0]
-    floor = 1.0
-    start = float(np.mean(before**2)) - floor
-    return 1.0 - (float(np.mean(after**2)) - floor) / max(start, 1e-9)
+    start = float(np.mean(before**2)) - 1.0
+    return 1.0 - (float(np.mean(after**2)) - 1.0) / max(start, 1e-9)
 
 
-def _count(score: Score, said: set[str], case: Case) -> None:
+def _count(score: Score, names: set[str], case: Case) -> None:
     if case.effects:
         score.cases += 1
-        score.right += said == set(case.effects)
+        score.right += names == set(case.effects)
     else:
         score.quiet += 1
-        score.alarms += bool(said)
+        score.alarms += bool(names)
 
 
 if __name__ == "__main__":

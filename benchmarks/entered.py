@@ -1,13 +1,12 @@
-"""How much of the house a command walks through: functions entered, and modules they stand in.
+"""Count the functions that a command enters, and the modules it imports.
 
     python -m benchmarks.entered [--list discover] [--check]
 
 Counts with `sys.setprofile` the functions of thermocald and its drivers that `discover`, `replay`
-and `run --recording` enter on one simulated recording, each in a process of its own: all code that
-is called (with comprehensions and lambdas, as the marks count) in all modules that are imported,
-and the functions with a name of these. What a dataclass makes by itself does not count. --list
-prints the names by module; with --check the exit status is 1 where a command enters more than its
-mark (`MARKS`).
+and `run --recording` enter on one simulated recording, each in its own process: all functions with
+comprehensions and lambdas (which the marks include), those of them that have a name, and all
+imported modules. Methods that a dataclass generates do not count. --list prints the names by
+module. With --check, the exit status is 1 if a command exceeds its mark (`MARKS`).
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).parents[1]
 PACKAGES = (str(ROOT / "thermocald"), str(ROOT / "drivers" / "thermocald_drivers"))
 MARKS = {"discover": (400, 70), "replay": (300, 45), "run": (450, 60)}
-"""The most functions and modules of each command (a goal, not yet a bound)."""
+"""Most functions and modules per command (a goal, not yet a bound)."""
 
 
 def entered(*command: str) -> set[CodeType]:
-    """The code of ours that a command enters."""
+    """Return thermocald's code that a command enters."""
     seen: set[CodeType] = set()
 
     def note(frame: FrameType, event: str, _: object) -> None:
@@ -55,7 +54,7 @@ def entered(*command: str) -> set[CodeType]:
 
 
 def count(codes: set[CodeType]) -> dict[str, object]:
-    """How many functions, how many with a name, in how many modules; names by module."""
+    """Return the numbers of functions, of named ones and of modules, and the names by module."""
     functions = [c for c in codes if c.co_name != "<module>" and c.co_flags & inspect.CO_OPTIMIZED]
     names = collections.defaultdict(list)
     for code in functions:
@@ -93,8 +92,8 @@ def main() -> None:
             found = json.loads(run("benchmarks.entered", "--of", *command).splitlines()[-1])
             most, widest = MARKS[name]
             print(
-                f"{name}: {found['functions']} functions ({found['named']} with a name) in "
-                f"{found['modules']} modules; mark {most} in {widest}"
+                f"{name}: {found['functions']} functions ({found['named']} named) in "
+                f"{found['modules']} modules; mark: {most} functions in {widest} modules"
             )
             if a.list:
                 for module, names in found["names"].items():
@@ -102,11 +101,11 @@ def main() -> None:
             if found["functions"] > most or found["modules"] > widest:
                 missed.append(name)
     if a.check and missed:
-        raise SystemExit(f"more than the mark: {', '.join(missed)}")
+        raise SystemExit(f"above the mark: {', '.join(missed)}")
 
 
 def run(module: str, *arguments: str) -> str:
-    """What a module prints."""
+    """Run a module; return what it prints."""
     command = [sys.executable, "-m", module, *arguments]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if ended.returncode:

@@ -1,12 +1,12 @@
-"""The first epochs of the shipped configuration: python -m benchmarks.first_epochs [--starts 200]
+"""Audit the first epochs of config.yaml: python -m benchmarks.first_epochs [--starts 200]
 
-Each start is config.yaml's mock camera with another seed. Frames of one in so many are rendered and
-measured, as the daemon would take them; the corners of the others are drawn: where they are in
-truth, and the errors that each marker's corners had in one of the frames that were rendered first.
-Of every epoch, pooled over the starts: the median sigma0, errors of c, x0 and y0 over their
-standard deviations, and how many targets were rejected, none of which is wrong. Exit status 1 where
-a bound is broken: sigma0 0.85 to 1.15, errors 0.9 to 1.1 times what is stated (or what so few
-starts allow), one target in 1,000.
+Each start is config.yaml's mock camera with another seed. The frames of the first starts are
+rendered and measured as in the daemon. Later starts draw their corners: true positions, plus the
+errors that each marker's corners had in one of the rendered frames. For each epoch number, pooled
+over the starts, it prints the median sigma0, the errors of c, x0 and y0 over their standard
+deviations, and the share of rejected targets, all of which are good. Exit status 1 if a bound is
+missed: sigma0 0.85 to 1.15, errors 0.9 to 1.1 standard deviations (more for few starts), one
+rejected target in 1,000.
 """
 
 from __future__ import annotations
@@ -30,22 +30,20 @@ from thermocald.photogrammetry.field.testfield import Observations
 
 
 def corners(camera: Any, frame: Any) -> np.ndarray:
-    """Where the corners of a frame are in truth, (T, 2) px."""
+    """Return the true corners of a frame, (T, 2) px."""
     truth = camera.truth(frame.monotonic)
     return project(camera.scene.sensor, truth.iop[0], truth.eop[0], camera.field.points)
 
 
 @dataclass(eq=False)
 class Pool:
-    """Errors (F, T, 2) px of the corners in frames that were rendered, NaN where one was not seen,
-    and what is stated of them (T, 2) px.
-    """
+    """Corner errors (F, T, 2) px of rendered frames, NaN if not seen, and their sds (T, 2) px."""
 
     errors: np.ndarray
     sigmas: np.ndarray
 
     def observations(self, true: np.ndarray, groups: np.ndarray, seed: list[int]) -> Observations:
-        """Draw a frame's corners (T, 2) px: the errors of each marker are those of one frame."""
+        """Draw a frame's corners; each marker has the errors it had in one rendered frame."""
         of = np.random.default_rng(seed).integers(0, len(self.errors), groups.max() + 1)[groups]
         points = true + self.errors[of, np.arange(len(true))]
         seen = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -53,7 +51,10 @@ class Pool:
 
 
 def start(seed: int, epochs: int, pool: Pool | None) -> tuple[np.ndarray, Pool]:
-    """Rows (epochs, 6): sigma0, three normed errors, rejected, offered; the corners' errors."""
+    """Run one start; return rows (epochs, 6) and the corners' errors.
+
+    A row is sigma0, the errors of c, x0, y0 over their sds, targets rejected and targets offered.
+    """
     clock = VirtualClock()
     config = load_config(Path(__file__).parents[1] / "config.yaml")
     camera = config.cameras[0]
@@ -67,7 +68,7 @@ def start(seed: int, epochs: int, pool: Pool | None) -> tuple[np.ndarray, Pool]:
     assert one.testfield is not None
     mock: Any = one.camera
     if pool is not None:
-        mock._picture = lambda _: np.zeros((1, 1), np.uint8)  # nobody looks at it
+        mock._picture = lambda _: np.zeros((1, 1), np.uint8)  # not measured
     thermometer = open_device("thermometer", "mock", {"seed": seed}, clock)
     rows, errors = [], np.full((epochs, len(one.testfield), 2), np.nan)
     sigmas = np.full((len(one.testfield), 2), np.nan)
@@ -95,21 +96,22 @@ def start(seed: int, epochs: int, pool: Pool | None) -> tuple[np.ndarray, Pool]:
 
 
 def report(every: np.ndarray) -> bool:
-    """Print what starts (S, E, 6) show; whether the bounds hold."""
+    """Print the statistics of the starts (S, E, 6); return whether the bounds hold."""
     starts, epochs = every.shape[:2]
     sigma0 = np.median(every[..., 0], axis=0)
     errors = np.sqrt(np.mean(every[..., 1:4] ** 2, axis=0))
     rejected = every[..., 4].sum(axis=0) / every[..., 5].sum(axis=0)
     for k in range(epochs):
         print(
-            f"epoch {k + 1:3}: sigma0 {sigma0[k]:.3f}, errors of c, x0, y0 "
+            f"epoch {k + 1:3}: sigma0 {sigma0[k]:.3f}; errors of c, x0, y0 "
             + ", ".join(f"{e:.2f}" for e in errors[k])
-            + f" of their sd, {1e3 * rejected[k]:.2f} of 1,000 rejected"
+            + f" sd; {1e3 * rejected[k]:.2f} of 1,000 targets rejected"
         )
     spread = max(0.1, 3.0 / np.sqrt(2 * starts))
     whole = every[..., 4].sum() / every[..., 5].sum()
     pooled = np.sqrt(np.mean(every[..., 1:4] ** 2, axis=(0, 1)))
-    print("all: errors", ", ".join(f"{e:.3f}" for e in pooled), f"; {1e3 * whole:.2f} of 1,000")
+    pooled_text = ", ".join(f"{e:.3f}" for e in pooled)
+    print(f"all: errors {pooled_text} sd; {1e3 * whole:.2f} of 1,000 targets rejected")
     holds = (np.abs(sigma0 - 1) <= 0.15).all() and (np.abs(errors - 1) <= spread).all()
     return bool(holds and whole <= 1e-3)
 
@@ -117,10 +119,12 @@ def report(every: np.ndarray) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--rendered", type=int, default=10, help="How many of them are rendered.")
+    parser.add_argument("--rendered", type=int, default=10, help="starts that are rendered")
     parser.add_argument("--epochs", type=int, default=30)
     parser.add_argument("--seed", type=int, default=1000)
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="Begin none after it.")
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="begin no start after this time"
+    )
     given = parser.parse_args()
     until = time.monotonic() + 60.0 * given.minutes
     every: list[np.ndarray] = []

@@ -1,13 +1,13 @@
-"""A fleet: what a server costs and how fast it answers; what a second worker brings.
+"""Measure a fleet: a server's size and response times, forwarding, and a second Dask worker.
 
     python -m benchmarks.fleet server [--full]             # 5 million epochs; --full: 50 million
     python -m benchmarks.fleet workers [--full]            # 400 frames on Dask; --full: 1,200
-    python -m benchmarks.fleet forward                     # rows a second, bytes an epoch
+    python -m benchmarks.fleet forward                     # rows per second, bytes per epoch
 
-`server` needs PostgreSQL (a cluster of its own is made, and removed) and about 0.6 kB of disk an
-epoch: the rows are generated without covariances and observations, which the
-overview and columns do not read; the year that is studied, an epoch an hour, has them. Measure on a
-quiet machine with a core for each worker. Exit status 1 where a bound is missed.
+`server` needs PostgreSQL (it makes and removes a cluster of its own) and about 0.6 kB of disk per
+epoch. The rows are generated without covariances and observations, which overview and columns do
+not read; the studied year, with an epoch per hour, has them. Measure on a quiet machine with a core
+for each worker. Exit status 1 if a bound is missed.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ from thermocald.store.server.reader import ServerStore
 
 CAMERAS = 50
 COLUMNS = 100_000  # epochs whose columns are read
-STUDIED = 8760  # epochs of the year that is studied: one an hour
-FRAMES = 20  # of a recording that workers measure again
+STUDIED = 8760  # epochs of the studied year: one per hour
+FRAMES = 20  # per recording that the workers measure again
 YEAR_S = 365 * 86400.0
 NAMES = ["epoch", "frame_time", "c", "x0", "y0", "sd_c", "sigma0", "temperature"]
 
@@ -62,7 +62,7 @@ def timed(call):
 
 
 def server(full: bool) -> dict[str, float]:
-    """Overview of a fleet, and one camera's year, at the server and from a store."""
+    """Time the overview of a fleet, and one camera's columns and year from server and store."""
     epochs = 1_000_000 if full else 100_000
     found: dict[str, float] = {"epochs": CAMERAS * epochs}
     with new_cluster() as cluster, tempfile.TemporaryDirectory() as folder:
@@ -70,9 +70,7 @@ def server(full: bool) -> dict[str, float]:
             for setting in ("checkpoint_timeout = '1h'", "max_wal_size = '8GB'"):
                 connection.execute(f"ALTER SYSTEM SET {setting}")
             connection.execute("SELECT pg_reload_conf()")
-            connection.execute("CREATE DATABASE thermocald")
-        address = ServerAddress.parse(cluster.address(name="thermocald"))
-        create_tables(address)
+        address = _create_database(cluster)
         base = GeneratedCamera("", epochs=epochs, interval=YEAR_S / epochs, end=time.time() - 30)
         rng = np.random.default_rng(1)
         begin = time.perf_counter()
@@ -82,10 +80,7 @@ def server(full: bool) -> dict[str, float]:
                 add_camera(connection, replace(base, station=f"gauge{i:02d}", rates=rates))
             found["generated_s"] = time.perf_counter() - begin
             connection.execute("VACUUM (ANALYZE) epoch")
-            found["bytes_an_epoch"] = connection.execute(
-                "SELECT sum(pg_total_relation_size(inhrelid))::float8 FROM pg_inherits "
-                "WHERE inhparent = 'epoch'::regclass"
-            ).fetchone()[0] / found["epochs"]  # fmt: skip
+            found["bytes_an_epoch"] = _table_bytes(connection) / found["epochs"]
         whole = Path(cluster.address(name="thermocald"))
         found["overview_s"], document = timed(lambda: fleet_document([whole]))
         found["overview_again_s"], _ = timed(lambda: fleet_document([whole]))
@@ -117,8 +112,22 @@ def server(full: bool) -> dict[str, float]:
     return found
 
 
+def _create_database(cluster) -> ServerAddress:
+    with psycopg.connect(cluster.address(), autocommit=True) as connection:
+        connection.execute("CREATE DATABASE thermocald")
+    address = ServerAddress.parse(cluster.address(name="thermocald"))
+    create_tables(address)
+    return address
+
+
+def _table_bytes(connection: psycopg.Connection) -> float:
+    """Return the size of the epochs' tables with their indexes, bytes."""
+    size = "SELECT sum(pg_total_relation_size(inhrelid))::float8 FROM pg_inherits"
+    return connection.execute(f"{size} WHERE inhparent = 'epoch'::regclass").fetchone()[0]
+
+
 def _copy_to_store(address: Path, path: Path) -> None:
-    """One camera's series from the server in a store: its rows, without covariances."""
+    """Copy the rows of one camera's series, without covariances, from the server into a store."""
     with ServerStore.open(address) as there, Store.open(path, "append", durable=False) as store:
         found = there.find_series()
         series = store.create_series(found.head, found.testfield, identity={}, created_utc=1.0)
@@ -127,7 +136,7 @@ def _copy_to_store(address: Path, path: Path) -> None:
 
 
 def _write_year(path: Path) -> None:
-    """A year of one camera with all details: 150 simulated epochs, calibrated, again and again."""
+    """Write a year of one camera with all details: 150 calibrated epochs, repeated."""
     simulation = preset_simulation("rpi-v2.1-heating", 1)
     with tempfile.TemporaryDirectory() as name:
         simulation.write(Path(name) / "M1")
@@ -146,12 +155,12 @@ def _write_year(path: Path) -> None:
 
 
 def workers(full: bool) -> dict[str, float]:
-    """Frames measured again, here and with one and two Dask workers: time, and processor time.
+    """Measure frames again in this process and with one and two Dask workers.
 
-    The ratio of times needs free cores; processor time of client, scheduler and worker against
-    that of one process tells the scheduler's cost on a machine that is busy, too. A processor's
-    speed wanders by more than that cost, so the three take turns, and medians of their ratios are
-    stated with the standard error of that.
+    The ratio of elapsed times needs free cores. The processor time of client, scheduler and workers
+    over that of one process gives the scheduler's cost on a busy machine too. A processor's speed
+    varies by more than that cost, so the three take turns, and the medians of their ratios are
+    reported with standard errors.
     """
     rounds: list[list[float]] = []
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
@@ -162,7 +171,7 @@ def workers(full: bool) -> dict[str, float]:
             return find_blocks([folder / "archive"], folder / out, tuple(DEFAULT_FREE), FRAMES)
 
         def measured(out, cluster):
-            """s, processor time and time that all blocks take."""
+            """Return processor time and elapsed time for all blocks, s."""
             todo = blocks(out)
             started = [cluster.scheduler, *cluster.workers] if cluster else []
             processes = [Process(p.pid) for p in started]
@@ -177,7 +186,7 @@ def workers(full: bool) -> dict[str, float]:
             (folder / f"dask{count}").mkdir()
             clusters.append(stack.enter_context(DaskCluster(folder / f"dask{count}", count)))
         time.sleep(5)
-        for count, cluster in enumerate(clusters):  # all is imported
+        for count, cluster in enumerate(clusters):  # so that everything is imported
             warm = blocks(f"warm{count}")[: 2 * max(count, 1)]
             run_tasks(calibrate_block, warm, cluster.address if cluster else "local")
         for number in range(6 if full else 2):
@@ -201,19 +210,16 @@ def workers(full: bool) -> dict[str, float]:
 
 
 def _processor_time(processes):
-    """s, of these processes and of this one."""
+    """Return the processor time of these processes and this one, s."""
     each = [process.cpu_times() for process in processes]
     return time.process_time() + sum(times.user + times.system for times in each)
 
 
 def forward() -> dict[str, float]:
-    """Rows a second of one forwarder, and bytes of an epoch with 147 targets: sent and stored."""
+    """Measure one forwarder's rows per second, and the bytes of an epoch with 147 targets."""
     found: dict[str, float] = {}
     with new_cluster() as cluster, tempfile.TemporaryDirectory() as name:
-        with psycopg.connect(cluster.address(), autocommit=True) as connection:
-            connection.execute("CREATE DATABASE thermocald")
-        address = ServerAddress.parse(cluster.address(name="thermocald"))
-        create_tables(address)
+        address = _create_database(cluster)
         simulation = preset_simulation("rpi-v2.1-heating", 1)
         rng = np.random.default_rng(1)
         path = Path(name) / "k.db"
@@ -233,10 +239,7 @@ def forward() -> dict[str, float]:
         found["rows_a_second"] = progress.rows / seconds
         with psycopg.connect(cluster.address(name="thermocald"), autocommit=True) as connection:
             connection.execute("VACUUM (ANALYZE) epoch")
-            found["bytes_at_server"] = connection.execute(
-                "SELECT sum(pg_total_relation_size(inhrelid))::float8 FROM pg_inherits "
-                "WHERE inhparent = 'epoch'::regclass"
-            ).fetchone()[0] / count  # fmt: skip
+            found["bytes_at_server"] = _table_bytes(connection) / count
     return found
 
 
@@ -246,7 +249,7 @@ BOUNDS = {
     "second_worker": (1.7, np.inf),
     "overhead_per_frame": (-np.inf, 0.05),
 }
-"""What is asked of each figure: at least, at most."""
+"""Least and largest permitted value of each figure."""
 
 
 def main() -> int:
@@ -255,7 +258,7 @@ def main() -> int:
     parser.add_argument(
         "--full",
         action="store_true",
-        help="50 million epochs in place of 5, 1,200 frames in place of 400",
+        help="50 million epochs instead of 5, 1,200 frames instead of 400",
     )
     given = parser.parse_args()
     calls = {

@@ -1,12 +1,13 @@
-"""Frame to parameters, 8 MP grey JPEG in memory, one thread, in multiples of decoding that JPEG.
+"""Measure the time from an 8 MP grey JPEG in memory to parameters, in multiples of its decoding.
 
-Run: python -m benchmarks.frame        (exit status 1 where a bound is missed)
-A tracked epoch is decoding, ~150 centres, and the adjustment with covariance; a second table says
-what each of the three takes. Nine tenths of a JPEG's decoding is reading its bits in order, which
-only restart markers shorten: without them the rows below the last target are all that can be left
-out, so the goal of 1.10 would leave the centres a third of the time in which their weights and grey
-values come from cold memory. From nothing: no prior but the sensor and the lens's nominal principal
-distance. OpenCV's routes give no covariance of the parameters and no identification.
+Run: python -m benchmarks.frame        (exit status 1 if a bound is missed)
+All on one thread. A tracked epoch is decoding, about 150 centres, and the adjustment with
+covariance; a last line gives the shares of the three. Nine tenths of decoding a JPEG is reading its
+bits in order, which only restart markers shorten: without them, only the rows below the last target
+can be left out. The goal of 1.10 would leave the centres a third of the time that fetching their
+weights and grey values from cold memory takes. "From nothing" has no prior but the sensor and the
+lens's nominal principal distance. OpenCV's routes give no covariance of the parameters and do not
+identify targets.
 """
 
 from __future__ import annotations
@@ -39,29 +40,29 @@ if TYPE_CHECKING:
 
 ROUNDS = 40
 QUALITY = 90
-RESTART = {"a row of blocks": 410, "a fifth of a row": 41}  # units between two restart markers
+RESTART = {"row of blocks": 410, "fifth of a row": 41}  # units between two restart markers
 GOALS = {
     "tracked epoch": 1.1,
     **{f"tracked epoch, restart markers every {name}": 1.0 for name in RESTART},
     "tracked epoch, luminance plane (YU12) of a camera": 0.4,
     "from nothing": 3.0,
 }
-# Where a goal is missed: the bound instead, above what runs of a day scatter (1.19 to 1.24, 1.12 to
-# 1.21, 3.38 to 3.78), and why
+# For a missed goal: the bound instead, above the scatter of a day's runs (1.19 to 1.24, 1.12 to
+# 1.21, 3.38 to 3.78), and the reason
 MISSED = {
     "tracked epoch": (1.3, "nearly all bits have to be read"),
-    "tracked epoch, restart markers every a row of blocks": (1.25, "each row holds a target"),
-    "from nothing": (4.0, "a third of it are the fits of the discs, 110,000 pixels"),
+    "tracked epoch, restart markers every row of blocks": (1.25, "each row holds a target"),
+    "from nothing": (4.0, "a third of it is the fits of the discs, 110,000 pixels"),
 }
 
 
 class TimedImage(EncodedImage):
-    """An encoded image that keeps how long its parts took to decode, s."""
+    """An encoded image that sums the time to decode its parts, s."""
 
     seconds = 0.0
 
     def around(self, boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
-        """As `EncodedImage.around`."""
+        """Decode like `EncodedImage.around`."""
         begin = time.thread_time()
         parts = super().around(boxes, shape)
         self.seconds += time.thread_time() - begin
@@ -92,7 +93,7 @@ def main() -> int:
     def tracked_epoch(
         images: Callable[[int], np.ndarray | EncodedImage], staged: bool = False
     ) -> Callable[[], object]:
-        """One epoch after the other, of frames by number; staged: its parts are measured too."""
+        """Return a call that calibrates the next frame; with `staged` it times the three stages."""
         tracker = Tracker(field, CameraSpec("", PI_SENSOR, 3.04))
         start = tracker.measure(images(0))
         assert start.orientation is not None
@@ -107,7 +108,7 @@ def main() -> int:
             measured = tracker.measure(image)
             found = time.thread_time()
             assert not measured.searched, measured.searched
-            # As in a series: the last epoch is the start of the next.
+            # As in a series, the last epoch gives the initial values of the next
             assert last.interior is not None
             assert last.exterior is not None
             last = adjust(PI_SENSOR, field, measured.observations, last.interior, last.exterior)
@@ -190,7 +191,7 @@ def main() -> int:
         ("decode + detectMarkers + SimpleBlobDetector + calibrateCameraExtended",
          markers_and_blobs, 10),
     ]  # fmt: skip
-    # In turns, so that all meet the machine in the same moods; the least processor time counts.
+    # They take turns, so that all meet the same disturbances; the least processor time counts
     times = {name: np.inf for name, _, _ in routes}
     for k in range(ROUNDS):
         for name, work, every in routes:
@@ -214,16 +215,16 @@ def main() -> int:
                 line += f"  {why}" if seconds <= bound * unit else "  MISSED"
         print(line)
     print(
-        "of a tracked epoch: "
+        "tracked epoch, × decode: "
         + ", ".join(f"{name} {seconds / unit:.2f}" for name, seconds in stages.items())
     )
     result = from_nothing()
     assert result.interior is not None
     error = (result.values - np.r_[PI_CAMERA.interior.as_array(), exterior.as_array()])[:3]
     print(
-        f"from nothing: sigma0 {result.sigma0:.2f}, c, x0, y0 off by "
+        f"from nothing: sigma0 {result.sigma0:.2f}, errors of c, x0, y0 "
         f"{', '.join(f'{e / s:+.1f} sd' for e, s in zip(error, result.sd[:3], strict=True))}; "
-        f"RMS of OpenCV's: {threshold_and_ellipses():.3f} px (fitEllipse), "
+        f"RMS with OpenCV {threshold_and_ellipses():.3f} px (fitEllipse), "
         f"{markers_and_blobs():.3f} px (blobs)"
     )
     return int(failed)

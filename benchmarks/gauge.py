@@ -1,13 +1,13 @@
-"""The daemon at a gauge: what a tick with twelve control points costs, and the memory it takes.
+"""Measure the daemon at a gauge: processor time of a tick with twelve control points, and memory.
 
-Run: python -m benchmarks.gauge [--ticks 200] [--size 3280]     (exit status 1 beyond a bound)
-A tick is decoding an 8 MP grey JPEG, matching twelve crosses, the prediction, and the resection;
-beside it a tracked frame of a test field of some 150 targets with its adjustment, of a JPEG of
-about the same size: 1.2 times its processor time is the goal. Without decoding, of grey values
-as a camera's driver may have them, a cross costs more than a target: it is searched anew in every
-frame, and its patch may turn and stretch. Memory is that of `thermocald run` as the service starts
-it, with twelve crosses, a store and a log: at most 90 MB resident between two frames, the median of
-two seconds after two hundred ticks; an 8 MP frame takes 10 MB more for the 40 ms that it is read.
+Run: python -m benchmarks.gauge [--ticks 200] [--size 3280]     (exit status 1 if a bound is missed)
+A tick decodes an 8 MP grey JPEG, matches twelve crosses, predicts the camera, and computes the
+resection. The goal is 1.2 times the processor time of a tracked frame, with adjustment, of a test
+field of about 150 targets in a JPEG of similar size. Without decoding (some camera drivers give
+grey values) a cross costs more than a target: it is searched anew in each frame, and its patch may
+rotate and stretch. Memory is that of `thermocald run` with the service's settings, twelve crosses,
+a store and a log: at most 90 MB resident between two frames, the median of two seconds after 200
+ticks; an 8 MP frame takes 10 MB more for the 40 ms of its measurement.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import CameraSpec, Channel, write_recording
 
 GOAL = 1.2
-# 1.14 to 1.18 were measured on a busy machine; grey values: see above
-TICK_BOUND = {True: GOAL, False: 4.0}  # encoded, and not
+# Measured 1.14 to 1.18 on a busy machine; for grey values see above
+TICK_BOUND = {True: GOAL, False: 4.0}  # JPEG, grey values
 MEMORY_BOUND_MB = 90.0
 ROUNDS = 30
 PERIOD_S = 0.25
@@ -52,7 +52,7 @@ CROSSES = 12
 
 
 def render(world: World, T: float, width: int, rng: np.random.Generator) -> bytes:
-    """A JPEG of banks with a white cross on a dark board at each control point."""
+    """Render a JPEG of river banks with a white cross on a dark board at each control point."""
     scale = width / SIZE[0]
     height = round(SIZE[1] * scale)
     fine = cv2.GaussianBlur(rng.normal(0, 1, (height, width)).astype(np.float32), (0, 0), 5)
@@ -69,7 +69,7 @@ def render(world: World, T: float, width: int, rng: np.random.Generator) -> byte
 
 
 class Site:
-    """A folder with the model, the control points, their clicks, a few frames, and a recording."""
+    """A folder with a thermal model, clicked control points, a few frames, and a recording."""
 
     def __init__(self, folder: Path, width: int, ticks: int) -> None:
         self.folder, rng = folder, np.random.default_rng(12)
@@ -102,10 +102,8 @@ class Site:
                         self.frames[i])  # fmt: skip
 
     def calibrator(self):
-        folder = self.folder
-        return plan_gauge(
-            self.thermal, folder / "gcp.csv", "mm", self.frames[0], None, 0.001
-        )[0]  # fmt: skip
+        points = self.folder / "gcp.csv"
+        return plan_gauge(self.thermal, points, "mm", self.frames[0], None, 0.001)[0]
 
     def configuration(self) -> Path:
         folder = self.folder
@@ -127,7 +125,7 @@ class Site:
 
 
 def tick_is_cheap(site: Site) -> bool:
-    """Whether a tick costs little more than a tracked frame, in least processor times."""
+    """Return whether a tick's least processor time is within its bound of a tracked frame's."""
     cv2.setNumThreads(1)
     field, normals = corner_field()
     clean, rng = draw(field, normals).render(PI_CAMERA, station()), np.random.default_rng(3)
@@ -162,8 +160,8 @@ def tick_is_cheap(site: Site) -> bool:
         if encoded:
             what = f"JPEGs of {len(fields[0]) / 1e6:.2f} and {len(banks[0]) / 1e6:.2f} MB"
         print(
-            f"{what}: tracked frame of {len(seen)} targets {1e3 * tracked:.1f} ms; tick with "
-            f"{CROSSES} control points {1e3 * tick:.1f} ms: {tick / tracked:.2f} × "
+            f"{what}: tracked frame of {len(seen)} targets {1e3 * tracked:.1f} ms, tick with "
+            f"{CROSSES} control points {1e3 * tick:.1f} ms, ratio {tick / tracked:.2f} "
             f"(goal {GOAL}, bound {TICK_BOUND[encoded]})",
             flush=True,
         )
@@ -172,7 +170,7 @@ def tick_is_cheap(site: Site) -> bool:
 
 
 def memory(site: Site, ticks: int) -> dict[str, float]:
-    """MB of a daemon after so many ticks: resident, its highest, and its own share."""
+    """Return a daemon's memory after `ticks` ticks, MB: resident, its peak, proportional share."""
     log = site.folder / "log.jsonl"
     environment = {**os.environ, "MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "131072",
                    "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # fmt: skip
@@ -203,8 +201,8 @@ def memory(site: Site, ticks: int) -> dict[str, float]:
         daemon.terminate()
         daemon.wait(30)
     print(f"after {ticks} ticks ({', '.join(sorted(words))}): resident {found['VmRSS']:.1f} MB "
-          f"(bound {MEMORY_BOUND_MB:g}), at most {found['VmHWM']:.1f}, its share "
-          f"{found['Pss']:.1f}")  # fmt: skip
+          f"(bound {MEMORY_BOUND_MB:g}), peak {found['VmHWM']:.1f} MB, "
+          f"proportional share {found['Pss']:.1f} MB")  # fmt: skip
     return found
 
 

@@ -1,7 +1,7 @@
 """Recordings of any length for benchmarks: drawn, not rendered, a million epochs in minutes.
 
-A camera with linear rates, optionally behind a lag, before a corner of targets; the temperature has
-days and a year, and noise. Written as Parquet in blocks, so that memory does not grow.
+A camera with linear rates, optionally with a lag, looks at a corner of targets; the temperature has
+daily and annual cycles, and noise. The Parquet file is written in blocks, so memory does not grow.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _START = 1.7e9
 
 
 def field_of(targets: int) -> TestField:
-    """So many targets of the benchmarks' corner, spread over its planes."""
+    """Return some targets of the benchmarks' corner, spread over its planes."""
     field = whole_field()
     return field.subset(np.unique(np.linspace(0, len(field) - 1, targets).astype(np.int64)))
 
 
 def outdoor_temperature(seconds: Array) -> Array:
-    """°C: a year, days, and weather of some days."""
+    """Return temperatures, °C, with an annual cycle, daily cycles, and weather of several days."""
     day, year = 86_400.0, 365.25 * 86_400.0
     weather = np.sin(seconds / (5.3 * day)) + np.sin(seconds / (2.1 * day) + 1.0)
     cycle = 5.0 * np.sin(2 * np.pi * seconds / day)
@@ -59,7 +59,7 @@ def write_long_recording(
     temperature: Callable[[Array], Array] = outdoor_temperature,
     seed: int = 1,
 ) -> None:
-    """Write a recording of so many epochs."""
+    """Write a recording."""
     rng = np.random.default_rng(seed)
     field = field_of(targets)
     camera = CameraSpec("rpi", SENSOR, INTERIOR.c)
@@ -98,7 +98,7 @@ def write_long_recording(
 
 
 def _lagged(T: Array, lag_s: float, state: float | None) -> tuple[Array, float]:
-    """The temperature behind a first-order lag, and its last value."""
+    """Return the temperature after a first-order lag, and its last value."""
     if lag_s <= 0:
         return T, float(T[-1])
     from scipy.signal import lfilter

@@ -1,14 +1,14 @@
-"""What correcting leaves in object space: the presets of the reference study on a plane at 10 m.
+"""Measure the errors that correction leaves in object space, for the reference study's presets.
 
-Run: python -m benchmarks.object_space   (exit status 1 where a bound is missed)
-Bound: mean error after correction ≤ 1/10 of the mean error without.
+Run: python -m benchmarks.object_space   (exit status 1 if the bound is missed)
+Bound: mean error after correction ≤ 1/10 of the mean error without it.
 
-A thermal model is fitted to M1 and applied to the *readings of the thermometer* of M2, another
-series with other noise. Nine image points are seen on the plane with the true interior orientation
-of each epoch, and with another one: that of the start (uncorrected: a camera calibrated once),
-that of the series' mean (which is how the reference counts), and the model's, whose level is that
-of a calibration at the start. "Base" is the model with rates alone, "with effects" also has the
-effects that the preset contains, such as discovery names; their parameters are estimated.
+A thermal model is fitted to M1 and applied to the *thermometer's readings* of M2, another series
+with other noise. Nine image points are projected onto a plane at 10 m with the true interior
+orientation of each epoch, and with another one: that of the start (uncorrected: a camera calibrated
+once), the mean of the series (the reference study's way), and the model's, whose level is that of a
+calibration at the start. "Base" is the model with rates only; "with effects" also contains the
+preset's effects, which discovery would name; their parameters are estimated.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ HEADER = """\
 
 @dataclass(frozen=True)
 class Row:
-    """Mean distances mm: about the mean, uncorrected, by the base model, with effects."""
+    """A preset's mean distances, mm: from the mean, uncorrected, base model, with effects."""
 
     preset: str
     about_mean: float
@@ -62,7 +62,7 @@ class Row:
 
 
 def measure(preset: str, seed: int = 1) -> Row:
-    """Both series of a preset, simulated; the model fitted to the first, applied to the second."""
+    """Simulate both series of a preset; fit the model to the first and apply it to the second."""
     first = preset_simulation(preset, seed, "M1")
     second = preset_simulation(preset, seed + 1, "M2")
     listed = [
@@ -82,7 +82,7 @@ def measure(preset: str, seed: int = 1) -> Row:
 def _errors(
     series: ReducedSeries, listed: list[ModelEffect], second: Simulation
 ) -> tuple[float, float, float]:
-    """Mean distances mm of M2: about its mean, from its begin, and with the model."""
+    """Return M2's mean distances, mm: from its mean, from its start, and with the model."""
     model = fit_thermal_model([series], listed).model
     camera = ThermalCamera(model)
     along = camera.along(
@@ -107,7 +107,7 @@ def main() -> int:
         rows.append(measure(preset))
         print(rows[-1].markdown(), flush=True)
     worst = max(row.ratio for row in rows)
-    print(f"\nworst ratio {worst:.3f}, bound {BOUND:g}")
+    print(f"\nlargest ratio {worst:.3f} (bound {BOUND:g})")
     return 0 if worst <= BOUND else 1
 
 

@@ -1,9 +1,9 @@
-"""Prediction error of M2's image points by a model of M1, per effect of the catalogue.
+"""Measure the errors of M2's image points as predicted by a model of M1, per catalogue effect.
 
 Run: python -m benchmarks.prediction [--seeds 3] [--first 100] [--px 0.3] [--discover]
-Blind recordings (tests/blind), the commands `fit` and `predict --test`. The floor is the
-generator's noise. Bounds: ratio ≤ 1.1, coverage of the stated 95 % bands 93 to 97 %, both pooled.
---discover: with the effects that `discover` finds in M1 instead of the true ones.
+Uses blind recordings (tests/blind) and the commands `fit` and `predict --test`. The noise floor is
+the generator's noise. Bounds, over all cases: RMS ≤ 1.1 × floor, coverage of the stated 95 % bands
+93 to 97 %. --discover fits the effects that `discover` finds in M1 instead of the true ones.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def main() -> int:
     parser.add_argument("--discover", action="store_true")
     a = parser.parse_args()
     every = []
-    print("| hidden effect | RMS on M2 px | over the noise floor | worst | inside 95 % bands |")
+    print("| hidden effect | RMS on M2, px | RMS / noise floor | worst | inside 95 % bands |")
     print("|---|---|---|---|---|")
     for name in a.effect or ("none", *SINGLE):
         cases = []

@@ -1,10 +1,10 @@
-"""Rendered rivers: the water line's error over its sd, and the check of a model by the scene.
+"""Audit rendered rivers: the water line's error over its sd, and the check of a model by the scene.
 
 Run: python -m benchmarks.river [--scenes 56] [--days 100] [--first 100]
-Bounds: error/sd 0.9 to 1.1 pooled, with control points in the frame and in the first frame alone,
-where no movement was flagged; what temperature does at least 10 times smaller with the model; every
-knock and no other scene is a movement; at most 2 % false alarms. --days: of a model that holds, and
-as many of models that lack an effect.
+Bounds: pooled error/sd 0.9 to 1.1, with control points in the frame and, unless movement was
+flagged, in the first frame only; thermal drift at least 10 times smaller with the model; movement
+reported for every knock and in no other scene; at most 2 % false alarms. --days: days with a
+correct model, and as many with models that lack an effect.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def rms(values: list[float]) -> float:
 def water_lines(count: int, first: int, folder: Path) -> bool:
     scenes = [play(first + k, KINDS[k % len(KINDS)], folder) for k in range(count)]
     columns = (
-        "scene", "n", "statuses of the last frame", "error/sd, posed", "error/sd, first pose",
-        "drift before mm", "after mm", "moved", "flagged",
+        "scene", "n", "status of the last frame", "error/sd, own pose", "error/sd, first pose",
+        "drift without model mm", "with model mm", "moved", "flagged",
     )  # fmt: skip
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
 
@@ -55,7 +55,7 @@ def water_lines(count: int, first: int, folder: Path) -> bool:
 
 
 def checks(count: int, first: int, folder: Path) -> bool:
-    print("\n| the model lacks | days | found |\n|---|---|---|")
+    print("\n| the model lacks | days | reported |\n|---|---|---|")
     found = {}
     for i, lacks in enumerate(LACKING):
         days = count if not lacks else count // (len(LACKING) - 1)
@@ -66,9 +66,9 @@ def checks(count: int, first: int, folder: Path) -> bool:
 
 
 def powers(draws: int) -> None:
-    """How often an effect is found, by its largest change of c over a frame's sd."""
+    """Print how often an effect is found, by its largest change of c over a frame's sd."""
     sizes = (1.0, 2.0, 4.0, 8.0, 16.0)
-    print(f"\n| found of {draws} drawn days, effect over noise | {' | '.join(map(str, sizes))} |")
+    print(f"\n| share found of {draws} days, by effect / noise | {' | '.join(map(str, sizes))} |")
     print("|---" * (len(sizes) + 1) + "|")
     for lacks in filter(None, LACKING):
         rng, found = np.random.default_rng(1), []

@@ -1,10 +1,10 @@
-"""What a command costs over a series of 10³ to 3 × 10⁶ epochs: processor time, memory, growth.
+"""Measure the processor time and memory of commands for series of 10³ to 3 × 10⁶ epochs.
 
 Run: python -m benchmarks.scale [--full] [--commands replay,fit] [--epochs 1000,10000]
-Recordings are drawn as Parquet (`long_recording`), the dashboard's store is filled with columns.
-Each command is a process of its own. Printed are seconds of processor time and MB resident at most,
-and the exponent of growth of the last decade, start-up (that of the shortest series) taken off.
-Bounds: exponent ≤ 1.05, 2000 MB. Exit status 1 where one is missed. Default: up to 10⁵ epochs.
+Recordings are drawn as Parquet (`long_recording`); the dashboard's store is filled with columns.
+Each command runs in its own process. Prints processor time, peak resident memory, and the exponent
+of growth over the last decade, from which start-up (the time of the shortest series) is subtracted.
+Bounds: exponent ≤ 1.05, 2000 MB; exit status 1 if one is missed. Default: up to 10⁵ epochs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 MOST_MB = 2000.0
 MOST_EXPONENT = 1.05
-NOISE_S = 3.0  # below, what else the machine does decides the exponent
+NOISE_S = 3.0  # shorter times give no reliable exponent on a busy machine
 SHORT = (1_000, 10_000, 100_000)
 FULL = (*SHORT, 1_000_000, 3_153_600)
 
@@ -51,14 +51,14 @@ assert len(found["c"]) <= 1000
 
 @dataclass(frozen=True)
 class Cost:
-    """Seconds of processor time and MB resident at most."""
+    """Processor time, s, and peak resident memory, MB."""
 
     seconds: float
     megabytes: float
 
 
 def arguments(command: str, folder: Path, recording: Path, store: Path) -> list[str]:
-    """The process of a command."""
+    """Return the command line of a command."""
     python, tool = sys.executable, str(Path(sys.executable).with_name("thermocald"))
     return {
         "replay": [tool, "replay", str(recording)],
@@ -75,9 +75,8 @@ COMMANDS = ("replay", "series", "study", "fit", "discover", "export", "dashboard
 
 
 def cost(process: list[str]) -> Cost:
-    """Run it to its end."""
+    """Run a process to its end; exit if it fails."""
     with tempfile.TemporaryFile() as errors:
-        # a session of its own has no terminal: progress as lines
         child = subprocess.Popen(process, stdout=subprocess.DEVNULL, stderr=errors)
         _, status, used = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
@@ -88,7 +87,7 @@ def cost(process: list[str]) -> Cost:
 
 
 def exponent(epochs: list[int], costs: list[Cost]) -> float:
-    """Of the last two lengths, start-up taken off; NaN where too little was measured."""
+    """Return the exponent between the last two lengths without start-up; NaN if times are short."""
     if len(costs) < 3 or costs[-2].seconds - costs[0].seconds < NOISE_S:
         return float("nan")
     last, before = costs[-1].seconds - costs[0].seconds, costs[-2].seconds - costs[0].seconds
@@ -97,7 +96,7 @@ def exponent(epochs: list[int], costs: list[Cost]) -> float:
 
 
 def row(command: str, epochs: list[int], costs: list[Cost]) -> tuple[str, bool]:
-    """A line of the table, and whether its bounds are kept."""
+    """Return a line of the table, and whether its bounds hold."""
     growth = exponent(epochs, costs)
     cells = [f"{c.seconds:.1f} s, {c.megabytes:.0f} MB" for c in costs]
     shown = "" if np.isnan(growth) else f"{growth:.2f}"
@@ -110,11 +109,13 @@ def main() -> int:
     from benchmarks.store import fill_columns
 
     parser = argparse.ArgumentParser()
-    parser.add_argument("--full", action="store_true", help="to a year at 10 s")
-    parser.add_argument("--epochs", help="lengths, with commas")
+    parser.add_argument("--full", action="store_true", help="lengths up to a year of 10 s epochs")
+    parser.add_argument("--epochs", help="lengths, comma-separated")
     parser.add_argument("--commands", default=",".join(COMMANDS))
     parser.add_argument("--targets", type=int, default=21)
-    parser.add_argument("--folder", type=Path, help="keep recordings and stores there")
+    parser.add_argument(
+        "--folder", type=Path, help="folder for recordings and stores, which stay there"
+    )
     options = parser.parse_args()
     lengths = list(FULL if options.full else SHORT)
     if options.epochs:

@@ -1,9 +1,9 @@
-"""The simulation's speed: a rendered frame against encoding it, a day of observations, an effect.
+"""Measure the simulation's speed: a rendered frame, a day of observations, the effects.
 
-Run: python -m benchmarks.simulation   (exit status 1 where a bound is missed)
+Run: python -m benchmarks.simulation   (exit status 1 if a bound is missed)
 Bounds: an 8 MP frame of 147 targets (blur, noise, vignetting) ≤ 4 × OpenCV's JPEG encoder at its
-usual quality (95) on the same frame; simplejpeg at its usual quality (85, which throws the noise
-away) stands beside it. 8,640 epochs × 147 targets ≤ 10 s, the CSV recording included.
+default quality (95) on the same frame; simplejpeg at its default quality (85, which discards the
+noise) is printed too. 8,640 epochs × 147 targets ≤ 10 s, including the CSV recording.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def frames() -> bool:
         encoded = best(partial(cv2.imencode, ".jpg", image))
         simple = best(partial(simplejpeg.encode_jpeg, pixels, colorspace="GRAY"))
         print(
-            f"frame of {len(field)} targets ({kind}): {rendered * 1e3:.0f} ms, "
-            f"{rendered / encoded:.2f} × cv2.imencode, {rendered / simple:.2f} × simplejpeg"
+            f"frame of {len(field)} targets ({kind}): {rendered * 1e3:.0f} ms = "
+            f"{rendered / encoded:.2f} × cv2.imencode = {rendered / simple:.2f} × simplejpeg"
         )
         if kind == "plain":
             passed = rendered / encoded <= FRAME_BOUND
@@ -77,16 +77,16 @@ def day() -> bool:
         begin = time.perf_counter()
         s.write(Path(folder) / "day")
         took = time.perf_counter() - begin
-    print(f"a day at 10 s, {len(s.field)} targets, written: {took:.1f} s")
+    print(f"a day of 10 s epochs, {len(s.field)} targets, written in {took:.1f} s")
     return took <= DAY_BOUND_S
 
 
 def courses() -> None:
-    print("an effect's time course, and its matrix of sensitivity (180 and 8,640 epochs), ms")
+    print("ms per effect: time course and sensitivity matrix of 180 epochs, then of 8,640 epochs")
     for name in catalogue.names():
         effect = catalogue.get(name)
         if effect.kind == "image":
-            continue  # nothing of it is a course
+            continue  # it has no time course
         values = {k: p.default for k, p in effect.nonlinear.items() if not p.text}
         values.pop("phase", None)
         row = []

@@ -1,10 +1,10 @@
-"""The store: bytes per epoch, columns against np.load, a replay end to end against its adjustments.
+"""Measure the store: bytes per epoch, reading columns, and a whole replay against its adjustments.
 
 Run: python -m benchmarks.store [--epochs 1000000]
-Bounds: file ≤ 1.4 × payload (raw observations of 18 bytes, parameters, covariance as float64);
-columns of a million epochs × 9 into NumPy ≤ 2 × np.load and zlib.crc32 of the same, since the store
-verifies all that it reads (np.load alone takes less than half of that); read + adjust + store ≤ 4 ×
-the adjustments alone. Exit status 1 where a bound is missed.
+Bounds: file ≤ 1.4 × payload (observations of 18 bytes, parameters, covariance as float64); reading
+9 columns of a million epochs into NumPy ≤ 2 × np.load and zlib.crc32 of the same data (the store
+verifies all that it reads; np.load alone takes less than half of that time); read + adjust + store
+≤ 4 × the adjustments alone. Exit status 1 if a bound is missed.
 """
 
 from __future__ import annotations
@@ -79,16 +79,14 @@ def result_of(rng: np.random.Generator) -> EpochResult:
 
 
 def size_ratio(folder: Path, targets: int, epochs: int) -> float:
-    """Bytes on disk, everything included, over the payload."""
+    """Return the bytes on disk, everything included, over the payload."""
     rng = np.random.default_rng(2)
     path = folder / f"size{targets}.db"
     with Store.open(path, "append", durable=False) as store:
         series = store.create_series(HEAD, field_of(targets))
         for i in range(epochs):
-            points, sigmas = (
-                rng.uniform(0, 2400, (targets, 2)),
-                rng.uniform(0.01, 0.1, (targets, 2)),
-            )
+            points = rng.uniform(0, 2400, (targets, 2))
+            sigmas = rng.uniform(0.01, 0.1, (targets, 2))
             seen = Observations(np.arange(targets), points, sigmas)
             temperatures = {"temperature": 20 + 0.0625 * (i % 400), "board": 40.0}
             epoch = Epoch(i, 1.6e9 + 10 * i, 1.6e9 + 10 * i + 0.7, temperatures, observations=seen)
@@ -98,10 +96,10 @@ def size_ratio(folder: Path, targets: int, epochs: int) -> float:
 
 
 def fill_columns(path: Path, epochs: int) -> None:
-    """Epochs without observations; in one transaction, since only reading is measured.
+    """Fill a store with epochs without observations, in one transaction: only reading is measured.
 
-    The first chunk and the last epochs are rows as a series writes them, what is between is chunks
-    like the first: a million rows would take minutes, and nothing here reads them.
+    The first chunk and the last epochs are written as a series writes its rows. The chunks between
+    are permutations of the first: a million rows would take minutes, and nothing here reads them.
     """
     rng = np.random.default_rng(3)
     size = MERGED * CHUNK
@@ -136,7 +134,7 @@ def _insert_row(store: Store, series: int, number: int, rng: np.random.Generator
 
 
 def columns_ratio(folder: Path, epochs: int) -> tuple[float, float, float]:
-    """(ratio, our time s, that of np.load and CRC-32, s): best of several, after a first one."""
+    """Return (ratio, our time s, time of np.load and CRC-32 s), the least of several runs."""
     fill_columns(folder / "columns.db", epochs)
     with Store.open(folder / "columns.db") as store:
         series = store.find_series()
@@ -145,14 +143,14 @@ def columns_ratio(folder: Path, epochs: int) -> tuple[float, float, float]:
         np.save(folder / "columns.npy", np.stack(list(columns.values())))
         del columns
         ours = theirs = float("inf")
-        for _ in range(15):  # in turn, so that what else the machine does meets both
+        for _ in range(15):  # in turn, so that both meet the same disturbances
             ours = min(ours, best(lambda: store.series_columns(series, COLUMNS), 2))
             theirs = min(theirs, best(lambda: zlib.crc32(np.load(folder / "columns.npy")), 2))
     return ours / theirs, ours, theirs
 
 
 def end_to_end(folder: Path, epochs: int) -> tuple[float, dict[str, float]]:
-    """Ratio of read + adjust + store to the adjustments alone, and ms per epoch of each."""
+    """Return read + adjust + store over the adjustments alone, and the ms per epoch of each."""
     from benchmarks.adjustment import EXTERIOR, INTERIOR, SENSOR, corner_field, observe
     from thermocald.photogrammetry.epoch.adjustment import adjust
 
@@ -201,7 +199,7 @@ def end_to_end(folder: Path, epochs: int) -> tuple[float, dict[str, float]]:
 
 
 def best(work: Callable[[], object], rounds: int = 7) -> float:
-    """Least processor time, s: what waits for its turn beside other programs does not count."""
+    """Return the least processor time of some runs, s."""
     times = []
     for _ in range(rounds):
         begin = time.process_time()
@@ -212,7 +210,9 @@ def best(work: Callable[[], object], rounds: int = 7) -> float:
 
 def main() -> int:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--epochs", type=int, default=1_000_000, help="for the columns")
+    parser.add_argument(
+        "--epochs", type=int, default=1_000_000, help="number of epochs whose columns are read"
+    )
     options = parser.parse_args()
     missed = []
 
@@ -225,13 +225,13 @@ def main() -> int:
         folder = Path(name)
         for targets in (50, 150, 400):
             ratio = size_ratio(folder, targets, 6000)
-            report("size", f"file over payload, {targets} targets", ratio)
+            report("size", f"file / payload, {targets} targets", ratio)
         ratio, times = end_to_end(folder, 300)
-        report("end to end", "read + adjust + store over adjust, 150 targets", ratio)
+        report("end to end", "read + adjust + store / adjust, 150 targets", ratio)
         print("   ms per epoch: " + ", ".join(f"{n} {t:.3f}" for n, t in times.items()))
         ratio, ours, theirs = columns_ratio(folder, options.epochs)
-        report("columns", f"{options.epochs} epochs × 9 columns over np.load and CRC-32", ratio)
-        print(f"   ours {1e3 * ours:.1f} ms, np.load and CRC-32 {1e3 * theirs:.1f} ms")
+        report("columns", f"{options.epochs} epochs × 9 columns / np.load and CRC-32", ratio)
+        print(f"   store {1e3 * ours:.1f} ms, np.load and CRC-32 {1e3 * theirs:.1f} ms")
     return 1 if missed else 0
 
 

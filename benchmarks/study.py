@@ -1,7 +1,7 @@
-"""A year at 10 s, 3.15 million epochs, studied and reported: time, memory, size of the report.
+"""Measure the study and report of a year of 10 s epochs (3.15 million): time, memory, size.
 
-Run: python benchmarks/study.py [EPOCHS]
-Bounds: < 60 s and < 1.5 GB for the study; the report < 10 MB.
+Run: python -m benchmarks.study [EPOCHS]   (exit status 1 if a bound is missed)
+Bounds: < 60 s and < 1.5 GB for the study; < 10 MB for the report.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SDS = np.array([6e-5, 6e-6, 6e-6, 3e-5, 1.5e-5, 2e-6, 1.5e-6, 2e-6, np.nan, np.n
 
 
 def year(epochs: int) -> MeasuredSeries:
-    """Days and seasons; built column by column, as a store is read."""
+    """Return a series with days and seasons, built column by column, as it is read from a store."""
     rng = np.random.default_rng(0)
     time_s = np.arange(epochs) * 10.0
     true = 5 * np.sin(2 * np.pi * time_s / 86_400) + 10 * np.sin(2 * np.pi * time_s / 31_557_600)
@@ -58,7 +58,7 @@ def year(epochs: int) -> MeasuredSeries:
 
 
 def peak_mb() -> float:
-    """Largest resident size so far, MB."""
+    """Return the peak resident size so far, MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
@@ -70,11 +70,11 @@ def main() -> int:
     result = study([series])
     seconds, cpu_seconds = time.perf_counter() - begin, time.process_time() - cpu
     memory = peak_mb()
-    print(f"studied in {seconds:.1f} s ({cpu_seconds:.1f} s of processor)   < 60 s")
-    print(f"{memory:.0f} MB   < 1500 MB")
+    print(f"study in {seconds:.1f} s, processor time {cpu_seconds:.1f} s (bound 60 s)")
+    print(f"peak memory {memory:.0f} MB (bound 1500 MB)")
     begin = time.perf_counter()
     size = len(render_study(result).encode()) / 1e6
-    print(f"report of {size:.1f} MB in {time.perf_counter() - begin:.1f} s   < 10 MB")
+    print(f"report of {size:.1f} MB in {time.perf_counter() - begin:.1f} s (bound 10 MB)")
     return 0 if cpu_seconds < 60 and memory < 1500 and size < 10 else 1
 
 

@@ -1,10 +1,10 @@
-"""The thermal model's speed: `at`, undistorting a million points, fitting 20 series.
+"""Measure the thermal model's speed: `at`, undistorting a million points, fitting 20 series.
 
-Run: python -m benchmarks.thermal_model   (exit status 1 where a bound is missed)
-Bounds: `at` ≤ 50 µs; 1 M points ≤ 2 × cv2.undistortPoints, which stops at a coarser answer (both
-beside each other, one thread); 20 series of 1,000 epochs and 147 targets, reduced and fitted with
-an effect of memory (permanent_set) and two drifts of the distortion, ≤ 20 s and < 1 GB.
-Times are those of the one thread that works, so that a busy machine does not count.
+Run: python -m benchmarks.thermal_model   (exit status 1 if a bound is missed)
+Bounds: `at` ≤ 50 µs; undistorting 1 M points ≤ 2 × cv2.undistortPoints, which stops at a coarser
+answer (one thread each); reducing 20 series of 1,000 epochs × 147 targets and fitting them with an
+effect that has a memory (permanent_set) and two drifts of the distortion ≤ 20 s and < 1 GB.
+Times are thread times, so that a busy machine does not count.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def fitted() -> tuple[ThermalCamera, bool]:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
         f"{SERIES} series × {EPOCHS} epochs: reduced in {reducing:.1f} s, fitted in "
-        f"{fitting:.1f} s, peak {peak:.0f} MB"
+        f"{fitting:.1f} s (bound 20 s in all), peak memory {peak:.0f} MB (bound 1000 MB)"
     )
     return model, reducing + fitting <= 20.0 and peak < 1000
 
@@ -71,13 +71,14 @@ def use(camera: ThermalCamera) -> bool:
         took.append((time.thread_time() - begin) / 100)
     ratio = undistorting(state)
     print(
-        f"at: {min(took) * 1e6:.0f} µs; undistorting 1 M points: {ratio:.2f} × cv2.undistortPoints"
+        f"at(): {min(took) * 1e6:.0f} µs (bound 50 µs); undistorting 1 M points: {ratio:.2f} × "
+        "cv2.undistortPoints (bound 2)"
     )
     return min(took) <= 50e-6 and ratio <= 2.0
 
 
 def undistorting(state: Camera) -> float:
-    """Time to undistort a million points over cv2.undistortPoints's, which stops earlier."""
+    """Return the time to undistort a million points over that of cv2.undistortPoints."""
     points = np.random.default_rng(0).uniform([0, 0], [3279, 2463], (1_000_000, 2))
     i, p = state.interior, state.sensor.pixel_pitch
     K = np.array([[i.c / p, 0, 3279 / 2 + i.x0 / p], [0, i.c / p, 2463 / 2 - i.y0 / p], [0, 0, 1]])

@@ -90,7 +90,7 @@ def other_cameras(draws: int, rng: np.random.Generator) -> list[Row]:
                 if "rates_hang_on_c" in f.fitted:
                     doubted.append(depth)
                     continue
-                off.append(_rate_errors(f, s))
+                off.append(rate_errors(f, s))
         print(f"({camera}: {len(doubted)} doubtful fits, field {set(doubted)})", file=sys.stderr)
         rows.append(ratio("`fit`", f"sd of the rates of c, x0, y0; {camera}, field 0.01 mm",
                           "noise of image and thermometer", np.array(off)))  # fmt: skip
@@ -128,7 +128,7 @@ def distortion(draws: int, rng: np.random.Generator) -> list[Row]:
     for seed in _seeds(rng, draws):
         s = simulated(seed, ())
         f = fitted(seen_by_opencv(s))
-        rates.append(_rate_errors(f, s))
+        rates.append(rate_errors(f, s))
         wrong.append(f.model.distortion != "angle")
     return [
         ratio("`fit`", "sd of the rates of c, x0, y0; rendered by OpenCV with changing f",
@@ -171,7 +171,7 @@ def delay(draws: int, rng: np.random.Generator) -> list[Row]:
             if "read_seldom" in f.fitted:
                 continue
             shift.append((f.model.effects[0].values["d"] + late) / f.model.sd("time_offset.d"))
-            rate.append(_rate_errors(f, s))
+            rate.append(rate_errors(f, s))
         what = f"readings of {interval:g} s, ± 0.05 K"
         if len(shift) <= draws // 4:
             print(f"({what}: {len(shift)} of {draws} fits not doubtful)", file=sys.stderr)
@@ -183,7 +183,7 @@ def delay(draws: int, rng: np.random.Generator) -> list[Row]:
     return shifts + rates
 
 
-def _rate_errors(fit: ThermalCamera, s: Any) -> list[float]:
+def rate_errors(fit: ThermalCamera, s: Any) -> list[float]:
     """Return error over sd of the rates of c, x0, y0."""
     model, true = fit.model, s.model.rates
     return [(model.rates[n] - true[n]) / model.sd(f"rates.{n}") for n in NAMES]
@@ -201,7 +201,7 @@ def thermal(draws: int, rng: np.random.Generator) -> list[Row]:
         truth = s.model
         f = fitted(seen(s, rng), ModelEffect("thermal_lag", {"tau": 10.0}))
         tau.append((f.model.effects[0].values["tau"] - TAU) / f.model.sd("thermal_lag.tau"))
-        rates.append(_rate_errors(f, s))
+        rates.append(rate_errors(f, s))
         start = truth.interior.as_array() + (f.model.T0 - truth.T0) * truth.rate_vector
         off = f.model.interior.as_array() - start
         level.append([off[IOP_NAMES.index(n)] / f.model.sd(f"interior.{n}") for n in NAMES])

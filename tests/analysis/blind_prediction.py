@@ -1,9 +1,9 @@
-"""Trained on M1, tested on M2: blind recordings through the commands a user calls.
+"""Blind recordings, fitted on M1 and tested on M2 with the user's commands.
 
-The noise floor is the generator's own noise, not the fit's idea of it: 0.04 px (grown where the
-case is `defocus`), and a reading's 0.04 K and steps of 0.0625 K carried through the model. What
-readings of 10 s leave open (a lamp switched between two of them, a temperature needed after the
-last one) is part of the floor of `thermal_gradient` and `time_offset`.
+The noise floor is from the generator's noise, not from the fit's estimate: 0.04 px (more with
+`defocus`), and a reading's 0.04 K and steps of 0.0625 K propagated through the model. What readings
+every 10 s leave unknown (a lamp switched between two of them, a temperature after the last one) is
+part of the floor of `thermal_gradient` and `time_offset`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ READING_SD = float(np.hypot(0.04, 0.0625 / np.sqrt(12.0)))
 
 @dataclass(frozen=True)
 class Tested:
-    """One case: RMS over the true floor on M2, and the share inside the stated 95 % bands."""
+    """A tested case: RMS on M2 over the true floor, and the share inside the stated 95 % bands."""
 
     effect: str
     seed: int
@@ -46,7 +46,7 @@ class Tested:
 
 
 def effect_option(name: str, truth: dict) -> list[str]:
-    """The option that names the effect as a user would who knows what it is."""
+    """Return the option with which a user who knows the effect would give it."""
     if name == "second_heat_source":
         return ["--effect", f"{name}:channel=board_temperature"]
     if name == "target_displacement":
@@ -60,27 +60,29 @@ def effect_option(name: str, truth: dict) -> list[str]:
 def predict_case(
     name: str, seed: int, folder: Path, px: float = 0.3, discover: bool = False
 ) -> Tested:
-    """Fit M1, test on M2. discover: with the effects discovery finds in M1, not the true ones."""
+    """Fit M1 with the true effect (`discover`: with those that discovery finds), and test on M2."""
     series, truth = generate(Case((name,) if name != "none" else (), px, seed))
     for s in series:
         write(s, folder / s.name)
     model = folder / "camera.yaml"
     listed = effect_option(name, truth)
     if discover:
-        _run("discover", folder / "M1", "--model-out", folder / "found.yaml", "--json", "-")
+        succeed("discover", folder / "M1", "--model-out", folder / "found.yaml", "--json", "-")
         listed = ["--model", folder / "found.yaml"]
-    _run("fit", folder / "M1", "-o", model, *listed, "--json", "-")
-    stated = json.loads(_run("predict", "--model", model, "--test", folder / "M2", "--json", "-"))
-    (said,) = stated["series"]
+    succeed("fit", folder / "M1", "-o", model, *listed, "--json", "-")
+    done = succeed("predict", "--model", model, "--test", folder / "M2", "--json", "-")
+    stated = json.loads(done.stdout)
+    (tested,) = stated["series"]
     fitted = read_model(model)
     source = series_input(read_recording(folder / "M2"))
     second = reduce_series(source, strict=False)
     true = predicted_error(_with_true_noise(fitted, truth), second, READING_SD)
-    return Tested(name, seed, said["rms_px"] / true.floor_px, said["coverage"], said["rms_px"])
+    rms_px = tested["rms_px"]
+    return Tested(name, seed, rms_px / true.floor_px, tested["coverage"], rms_px)
 
 
 def pooled(cases: list[Tested]) -> tuple[float, float]:
-    """RMS of the ratios, mean coverage."""
+    """Return the RMS of the ratios, and the mean coverage."""
     ratios = np.array([c.ratio for c in cases])
     return float(np.sqrt(np.mean(ratios**2))), float(np.mean([c.coverage for c in cases]))
 
@@ -95,7 +97,3 @@ def _with_true_noise(model: ThermalModel, truth: dict) -> ThermalModel:
             sigma, effect = sigma * at_t0, ModelEffect("defocus", {"factor": rise / at_t0})
         listed.append(effect)
     return replace(model, image_sigma=sigma, effects=tuple(listed))
-
-
-def _run(*arguments: object) -> str:
-    return succeed(*arguments).stdout

@@ -1,4 +1,4 @@
-"""Measured series made of formulas: a warm-up whose every number is known."""
+"""Measured series of a warm-up, computed from formulas with known numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SDS = np.array([2e-5, 7e-6, 7e-6, 2e-6, 2e-7, np.nan, 3e-6, 3e-6, np.nan, np.nan
 
 @dataclass
 class WarmUp:
-    """A camera that warms up with 300 s; call it for a series."""
+    """A camera that warms up with a time constant of 300 s; a call returns a series."""
 
     drift: dict[str, float] = field(
         default_factory=lambda: {"c": 0.007, "x0": 0.0194, "y0": -0.0112}
@@ -66,5 +66,5 @@ class WarmUp:
 
 @pytest.fixture
 def warm_up() -> type[WarmUp]:
-    """Builds series of a camera that warms up; its fields say how."""
+    """Return the class whose instances build series of a camera that warms up."""
     return WarmUp

@@ -1,8 +1,7 @@
 """Rendered rivers: two banks with crosses on boards, water, leaves, sun, night, rain and knocks.
 
-Where a pixel looks and where a board is seen are computed by `tests.main_paths.crooked` and by what
-is written down here, which share no code with the program. Frames have a quarter of the camera's
-pixels in each direction.
+The projection and its inverse are computed by `tests.main_paths.crooked` and this module, which
+share no code with the program. Frames have a quarter of the camera's pixels in each direction.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ TAU = 600.0
 SURVEY_MM, LEVEL_SD, LINE_PX, NOISE_DN, NOISE_K = 8.0, 5.0, 0.1, 2.0, 0.05
 STEP_S = 60.0
 HOURS = 2.5
-_FINE = 8  # a board is drawn so many times as large and averaged
-_BANK = 2_500.0  # mm from the middle, where the banks begin to rise
+_FINE = 8  # boards are drawn at this scale and averaged
+_BANK = 2_500.0  # mm from the middle to the foot of the banks
 _SLOPE = 0.5
 
 
 def small(points: np.ndarray) -> np.ndarray:
-    """Pixels of the small frame of those of the sensor."""
+    """Convert pixels of the sensor to pixels of the small frame."""
     return (points + 0.5) / BINNED - 0.5
 
 
@@ -54,10 +53,10 @@ def texture(rng: np.random.Generator, smooth: float) -> np.ndarray:
 
 @dataclass
 class River:
-    """One gauge: what the camera is like, where banks and boards are, and how warm it is when.
+    """One gauge: its camera, banks, boards, and temperatures.
 
-    boards (n, 3) mm; moments s and warmth °C: the thermometer's; inside °C: the lens's, which
-    follows with a lag; shown: what the daemon reads.
+    boards (n, 3) mm; moments s; warmth °C at the thermometer; inside °C in the lens, which lags
+    behind; shown: the readings.
     """
 
     seed: int
@@ -83,17 +82,17 @@ class River:
         self._course()
 
     def _course(self) -> None:
-        """A morning: two hours before the start that only a logger knows, then the camera's."""
+        """Draw a morning: two hours that only a logger records, then the camera's hours."""
         self.moments = START + np.arange(-7200.0, HOURS * 3600 + 1, STEP_S)
         hours = (self.moments - START) / 3600
         cold = self.rng.uniform(2, 8)
         gain = {"sun": 9.0, "cold start": 3.0}.get(self.kind, 6.0) + self.rng.uniform(-1, 1)
         self.warmth = cold + gain * np.clip(hours, 0, None)
-        if self.kind == "cold start":  # it was carried out of a warm room
+        if self.kind == "cold start":  # it comes from a warm room
             self.warmth[hours < 0] = self.rng.normal(cold, 12.0)
         inside = [self.warmth[0]]
         for before, now in zip(self.warmth, self.warmth[1:], strict=False):
-            # between two readings the thermometer follows a straight line
+            # temperature is linear between two readings
             slope, gone = (now - before) / STEP_S, np.exp(-STEP_S / self.lag)
             start = before - slope * self.lag
             inside.append(start + slope * STEP_S + (inside[-1] - start) * gone)
@@ -103,26 +102,27 @@ class River:
 
     @staticmethod
     def ground(x: np.ndarray) -> np.ndarray:
-        """Height of the banks, mm."""
+        """Return the height of the banks, mm."""
         return _SLOPE * (np.abs(x) - _BANK)
 
     def interior(self, k: int) -> dict[str, float]:
-        """What the camera is like at a moment."""
+        """Return the camera's c, x0, y0 at a moment."""
         return {n: CAMERA[n] + self.off[n] + self.rate[n] * (self.inside[k] - 20.0) for n in NAMES}
 
     def image(self, points: np.ndarray, k: int) -> np.ndarray:
-        """Where the camera sees points at a moment, px of the small frame."""
+        """Project points at a moment, px of the small frame."""
         return small(project(points, self.pose, **self.interior(k)))
 
     def waterline(self) -> np.ndarray:
-        """Points (3, 3) mm where the water touches the banks."""
+        """Return points (3, 3) mm of the water line on the banks."""
         x = _BANK + self.level / _SLOPE
         z = self.level
         return np.array([[-x, 9_000, z], [x, 14_000, z], [-x, 19_000, z]])
 
     def frame(self, k: int, light: float = 1.0, clear: bool = False) -> np.ndarray:
-        """The frame of a moment: banks, sky, water that moves, boards, leaves, noise; clear: before
-        it rains and before anything stands in the way.
+        """Render the frame of a moment: banks, sky, moving water, boards, leaves, noise.
+
+        clear: without rain and obstacles.
         """
         rng = self.rng
         away, wet = self._looked_at(k)
@@ -144,7 +144,7 @@ class River:
         return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
     def _looked_at(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Where each pixel's object lies in the picture of the banks (H·W, 2); how wet it is."""
+        """Return each pixel's place in the image of the banks (H·W, 2), and the share of water."""
         at, R, now = self.pose[3:], rotation(*self.pose[:3]), self.interior(k)
         v, u = np.mgrid[0:HEIGHT, 0:WIDTH].reshape(2, -1)
         x = ((u + 0.5) * BINNED - 0.5 - (SIZE[0] - 1) / 2) * PITCH - now["x0"]
@@ -204,11 +204,11 @@ class River:
 
     @property
     def hidden(self) -> int:
-        """How many boards something stands before: of some scenes nearly all."""
+        """The number of hidden boards, in some scenes nearly all."""
         return self.seed % self.boards_count
 
     def knock(self) -> None:
-        """The mount is knocked: a turn of a twentieth of a degree or more, and centimetres."""
+        """Knock the mount: turn it by at least a twentieth of a degree, shift it by centimetres."""
         self.pose = self.pose + np.concatenate(
             [np.deg2rad(self.rng.choice([-1, 1], 3) * self.rng.uniform(0.05, 0.2, 3)),
              self.rng.normal(0, 30, 3)]
@@ -217,10 +217,11 @@ class River:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a scene gave: statuses of its epochs and events; chi2: of the water line's six
-    coordinates, with control points in the frame and with those of the first frame alone, NaN where
-    none is stated; before, after: mm that temperature moves it by, without and with the model;
-    flagged: whether the scene itself has shown that the camera moved, or could not be followed.
+    """A scene's results: statuses of its epochs, and whether a movement was reported.
+
+    chi2, chi2_first: of the water line's six coordinates with control points in the frame, and in
+    the first frame only, or NaN; before, after: thermal drift of the water line, mm, without and
+    with the model; flagged: the scene shows movement, or could not be followed.
     """
 
     kind: str
@@ -234,7 +235,7 @@ class Outcome:
 
 
 def play(seed: int, kind: str, folder: Path) -> Outcome:
-    """Render a gauge from its reference frame to hours later, and let the program work."""
+    """Render a gauge's frames, and run the program on them."""
     river = River(seed, kind)
     thermal = thermal_camera(TAU).for_images(WIDTH, HEIGHT)
     begin, last = int(7200 / STEP_S), len(river.moments) - 1
@@ -274,7 +275,7 @@ def _epoch(river: River, k: int) -> Epoch:
 
 
 def _measured(river: River, thermal, first, uv: np.ndarray, k: int) -> Places:
-    """What `measure` makes of image points of a moment with the control points of the first."""
+    """Measure image points of a moment, with the control points of the first frame."""
     control = ControlPoints(river.field, first.epoch.observations, np.zeros(3), "mm")
     observed = np.column_stack([uv, np.full(uv.shape, LINE_PX)])
     when = river.moments[int(7200 / STEP_S)]
@@ -285,7 +286,7 @@ def _measured(river: River, thermal, first, uv: np.ndarray, k: int) -> Places:
 
 
 def _drift(river: River, thermal, first, begin: int, last: int) -> tuple[float, float]:
-    """RMS mm by which temperature moves the water line, of noise-free image points."""
+    """Return the RMS thermal drift of the water line, mm, without and with the model."""
     then, now = (
         _measured(river, thermal, first, river.image(river.waterline(), k), k)
         for k in (begin, last)
@@ -311,11 +312,11 @@ def _files(folder: Path, river: River, shots) -> list[tuple[Path, float]]:
     return out
 
 
-GRID_M = np.array([192_000.0, 313_000.0, 138.0])  # where the example's coordinates count from
+GRID_M = np.array([192_000.0, 313_000.0, 138.0])  # origin of the example's coordinates
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "river"
 _MORNING = 1_714_975_200.0  # 6 May 2024, 06:00 UTC
 _SHOTS = (120, 150, 180, 210, 240, 270)  # moments of the example's photographs
-_KNOCKED = 4  # from this photograph on the mount stands otherwise
+_KNOCKED = 4  # the mount is turned from this photograph on
 
 
 def write_example(folder: Path = EXAMPLE) -> River:

@@ -1,4 +1,4 @@
-"""Trained on M1, right on M2 (another programme): every effect of the catalogue, hidden blindly."""
+"""Models fitted on M1 predict M2, another programme, for every effect of the catalogue."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NAMES = ("none", *SINGLE)
 
 @pytest.fixture(scope="module")
 def tested(tmp_path_factory):
-    """Predicts the cases of one effect; each once."""
+    """Return a function that predicts the cases of one effect, once."""
     done = {}
 
     def cases(name):
@@ -28,7 +28,7 @@ def tested(tmp_path_factory):
 def test_every_effect_by_itself(tested, name):
     ratio, coverage = pooled(tested(name))
     assert ratio <= 1.1, tested(name)
-    # a gradient is known less well than its coverage needs: kinks between two readings count for it
+    # the coverage of a gradient is larger because kinks between two readings add to its band
     assert 0.93 <= coverage <= (0.98 if name == "thermal_gradient" else 0.97), tested(name)
 
 

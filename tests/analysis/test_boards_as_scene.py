@@ -1,7 +1,7 @@
-"""Real corners as a scene: boards of unknown depth, eight corners of two others as control points.
+"""Real corners as a scene: boards of unknown depth, and two boards' corners as control points.
 
 Nothing is heated in these fifty seconds; the cameras tremble by some hundredths of a pixel. Known
-turns and changes of the principal distance are given to the image points of single epochs.
+rotations and changes of c are applied to the image points of single epochs.
 """
 
 from __future__ import annotations
@@ -19,22 +19,18 @@ from thermocald.analysis.thermal.scene import SceneCourse, common_movement
 from thermocald.photogrammetry.camera.camera_model import partials, project, rotation
 from thermocald.store.recording.reader import read_recording
 
-CORNER_PX = 0.09  # what a static corner scatters by at most, ../shared/data/README.md
+CORNER_PX = 0.09  # largest scatter of a static corner: ../shared/data/README.md
 EVERY = 4  # epochs
 
 
 @dataclass
 class Room:
-    """A fixed camera before boards, with the calibration of the whole field in its first epoch."""
+    """A fixed camera before boards, calibrated with the whole field in its first epoch."""
 
-    number: int
+    folder: Path
 
     def __post_init__(self) -> None:
-        folder = Path(__file__).resolve().parents[3] / "shared" / "data"
-        folder = folder / f"aviary-cam{self.number}"
-        if not folder.is_dir():
-            pytest.skip("the real corners are not here: ../shared/data")
-        recording = read_recording(folder)
+        recording = read_recording(self.folder)
         self.epochs = [e for e in recording.epochs if e.observations is not None]
         whole = Calibrator.of_recording(recording).calibrate(self.epochs[0]).adjustment
         sensor = recording.camera.sensor
@@ -44,44 +40,44 @@ class Room:
         self.full = [b for b in np.unique(self.board) if all((s == b).sum() == 4 for s in seen)]
 
     def shared(self, i: int, j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Board (n,) and image points (n, 2) of what two epochs both see."""
+        """Return boards (n,) and image points (n, 2) of the corners that two epochs both see."""
         a, b = (self.epochs[k].observations for k in (i, j))
         both = np.intersect1d(a.targets, b.targets)
         at = [o.points[np.searchsorted(o.targets, both)] for o in (a, b)]
         return self.board[both], *at
 
     def turned(self, points: np.ndarray, turn=(0.0, 0.0, 0.0), more_c: float = 0.0) -> np.ndarray:
-        """Image points of a camera that has turned, rad, and whose c is larger, mm."""
+        """Return image points after a rotation, rad, and an increase of c, mm."""
         values = self.camera.values.copy()
         values[0] += more_c
         rays = self.camera.rays(points) @ rotation(np.array(turn))
         return project(self.camera.sensor, values, np.zeros(6), rays / -rays[:, 2:])
 
     def control_turn(self, points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Turn (3,) and its covariance from control points alone, by least squares."""
+        """Estimate the rotation (3,) and its covariance from control points alone."""
         rays = self.camera.rays(points)
-        _, J, _ = partials(
-            self.camera.sensor, self.camera.values, np.zeros(6), rays / -rays[:, 2:]
-        )  # fmt: skip
+        at = rays / -rays[:, 2:]
+        _, J, _ = partials(self.camera.sensor, self.camera.values, np.zeros(6), at)
         J = J[:, :, 10:13].reshape(-1, 3)
         N = np.linalg.inv(J.T @ J)
         return N @ (J.T @ moved.ravel()), 2 * CORNER_PX**2 * N
 
 
 @pytest.mark.parametrize("number", mostly_slow([0, 1, 2, 6], 1))
-def test_the_turn_of_the_scene_is_that_of_control_points(number):
-    """Forty pairs of epochs; eight corners know the turn ten times worse than the scene does.
+def test_the_turn_of_the_scene_is_that_of_control_points(shared, number):
+    """Forty pairs of epochs; eight corners give the rotation ten times worse than the scene.
 
-    Conservative: the sd of a corner is the worst one's.
+    The sd of the worst corner makes the ratio conservative.
     """
-    room, rng = Room(number), np.random.default_rng(number)
+    room = Room(shared / "data" / f"aviary-cam{number}")
+    rng = np.random.default_rng(number)
     ratio, known = [], []
     for k in range(40):
         pair = rng.choice(room.full, 2, replace=False)
         board, then, now = room.shared(*rng.choice(len(room.epochs), 2, replace=False))
         control = np.isin(board, pair)
         if control.sum() < 8:
-            continue  # somebody stands before them
+            continue  # hidden by a person
         turn = rng.normal(0, 1e-3, 3)
         moved = room.turned(now, turn) - then
         scene = common_movement(room.camera, room.camera, then[~control], moved[~control], k)
@@ -93,12 +89,12 @@ def test_the_turn_of_the_scene_is_that_of_control_points(number):
     assert len(ratio) >= 30
     assert 0.3 < np.sqrt(np.mean(np.square(ratio))) < 1.0
     assert np.abs(ratio).max() < 3.5
-    # and it is the turn that was given, but for the tremble
+    # it is the applied rotation, except for the tremble
     assert np.sqrt(np.mean(np.square(known))) < 0.2
 
 
 def course(room: Room, more_c: float) -> SceneCourse:
-    """Every fourth epoch as frames of a day, c growing by `more_c` mm beside the model."""
+    """Use every fourth epoch as a frame of a day; c grows by `more_c` mm outside the model."""
     rows = range(0, len(room.epochs), EVERY)
     T = 10 + 25 * np.sin(np.linspace(0, np.pi, len(rows)))
     values, covariance = np.full((len(rows), 4), np.nan), np.full((len(rows), 4, 4), np.nan)
@@ -117,9 +113,9 @@ def course(room: Room, more_c: float) -> SceneCourse:
 
 
 @pytest.mark.parametrize("number", mostly_slow([0, 1, 2, 6], 1))
-def test_a_model_that_holds_is_not_doubted_by_real_boards_and_one_that_does_not_is(number):
-    """Real c wobbles by 0.01 to 0.02 px at the edge, up to 1.7 sds: too little for an effect."""
-    room = Room(number)
+def test_real_boards_contradict_only_a_wrong_model(shared, number):
+    """Real c varies by 0.01 to 0.02 px at the edge, up to 1.7 sds, too little for an effect."""
+    room = Room(shared / "data" / f"aviary-cam{number}")
     still = course(room, 0.0)
     assert not still.model_misses, still.values[:, 3] / still.sd[:, 3]
     size = 20 * float(np.nanmedian(still.sd[:, 3]))

@@ -1,4 +1,4 @@
-"""Frames of a hot camera as the steady one had seen them: pixels, EXIF, camera and pose in them."""
+"""Frames of a hot camera, corrected to the steady one: pixels, EXIF, camera and pose."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ ORIGIN = (192e6, 313e6, 0.0)
 
 @pytest.fixture(scope="module")
 def thermal():
-    """The gauge's camera in small frames, moving 0.2 px/K, before the rendered corner."""
+    """Return the gauge's camera for small frames, with a drift of 0.2 px/K."""
     small = thermal_camera().for_images(820, 616)
     rates = {name: 10 * rate for name, rate in small.model.rates.items()}
     return replace(small, model=replace(small.model, rates=rates))
 
 
 def seen_at(thermal, T: float) -> np.ndarray:
-    """A frame of the corner without noise."""
+    """Render a frame of the corner without noise."""
     scene = Scene(thermal.model.sensor, FIELD, Look(noise_dn=0.0))
     return scene.render(thermal.at(T).values, POSE)
 
 
 def calibrated(thermal, T: float = HOT) -> CalibratedEpoch:
-    """An epoch as the gauge leaves it."""
+    """Return an epoch as calibrated by the gauge."""
     covariance = np.zeros((16, 16))
     covariance[:10, :10] = thermal.at(T).covariance
     covariance[range(10, 16), range(10, 16)] = 1e-6
@@ -64,15 +64,15 @@ def png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", image)[1].tobytes()
 
 
-def test_targets_of_a_corrected_frame_are_where_its_camera_and_pose_put_them(thermal):
+def test_targets_of_a_corrected_frame_agree_with_its_camera_and_pose(thermal):
     hot = seen_at(thermal, HOT)
     jpeg = corrected(thermal, png(hot))
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     steady = thermal.at(thermal.model.T0)
     known = CameraSpec("", steady.sensor, interior=steady.interior)
     found, as_it_was = (Tracker(FIELD, known).measure(frame).observations for frame in (image, hot))
-    told = json.loads(Image.open(io.BytesIO(jpeg)).info["comment"])
-    pose = np.array([told["pose"][n] for n in ("omega", "phi", "kappa", "X0", "Y0", "Z0")])
+    comment = json.loads(Image.open(io.BytesIO(jpeg)).info["comment"])
+    pose = np.array([comment["pose"][n] for n in ("omega", "phi", "kappa", "X0", "Y0", "Z0")])
     at = project(steady.sensor, steady.values, pose, FIELD.points)
     left = found.points - at[found.targets]
     before = as_it_was.points - at[as_it_was.targets]
@@ -81,16 +81,15 @@ def test_targets_of_a_corrected_frame_are_where_its_camera_and_pose_put_them(the
     assert np.sqrt(np.mean(left**2)) < 0.05  # of markers of 20 px, through a JPEG
     K = steady.opencv()[0]
     for name, value in (("fx", K[0, 0]), ("fy", K[1, 1]), ("cx", K[0, 2]), ("cy", K[1, 2])):
-        assert told["opencv"][name] == pytest.approx(value)
-    assert told["opencv"]["sd_fy"] == pytest.approx(
-        thermal.at(HOT).sd["c"] / steady.sensor.pixel_pitch
-    )
-    assert (told["corrected_to"], told["temperature"], told["epoch"]) == (20.0, HOT, 7)
-    assert told["pose"]["origin_mm"] == list(ORIGIN)
-    assert told["pose"]["sd_X0"] == pytest.approx(1e-3)
+        assert comment["opencv"][name] == pytest.approx(value)
+    sd_fy = thermal.at(HOT).sd["c"] / steady.sensor.pixel_pitch
+    assert comment["opencv"]["sd_fy"] == pytest.approx(sd_fy)
+    assert (comment["corrected_to"], comment["temperature"], comment["epoch"]) == (20.0, HOT, 7)
+    assert comment["pose"]["origin_mm"] == list(ORIGIN)
+    assert comment["pose"]["sd_X0"] == pytest.approx(1e-3)
 
 
-def test_exif_is_written_where_there_is_none(thermal):
+def test_missing_exif_is_written(thermal):
     exif = Image.open(io.BytesIO(corrected(thermal, png(seen_at(thermal, HOT))))).getexif()
     details = exif.get_ifd(0x8769)
     assert (exif[0x0110], exif[0x0112], exif[0x0131]) == ("gauge", 1, "thermocald")
@@ -101,7 +100,7 @@ def test_exif_is_written_where_there_is_none(thermal):
 
 
 def test_exif_colours_and_comment_of_the_camera_stay(thermal):
-    """A phone's frame: its flag of a turned phone does not turn the pixels."""
+    """The EXIF orientation of a phone's frame does not turn the pixels."""
     grey = seen_at(thermal, HOT)
     colour = np.stack([grey, grey, np.full_like(grey, 90)], axis=-1)
     exif = Image.Exif()
@@ -128,7 +127,7 @@ def test_sixteen_bits_become_a_jpeg(thermal):
     [(png(np.zeros((60, 80), np.uint8)), "80×60 px, the model's camera 820×616"),
      (b"\xff\xd8 no image", "the JPEG is cut off")],
 )  # fmt: skip
-def test_what_cannot_be_corrected_is_said(thermal, encoded, words):
+def test_other_images_are_refused(thermal, encoded, words):
     with pytest.raises(ImageError, match=words):
         corrected(thermal, encoded)
 
@@ -140,8 +139,8 @@ def test_without_a_camera_there_is_no_corrected_frame(thermal):
 
 
 @pytest.mark.parametrize("size", [(820, 616), (821, 515), (300, 257)])
-def test_strips_are_the_whole_image(thermal, size):
-    """Of sizes that no strip and no node divides."""
+def test_strips_give_the_whole_image(thermal, size):
+    """The sizes are not multiples of a strip or a node."""
     here = thermal.for_images(1640, 1232)
     steady, hot = here.at(20.0), here.at(HOT).values
     small = replace(steady.sensor, width=size[0], height=size[1])

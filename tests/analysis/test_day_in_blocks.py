@@ -1,9 +1,8 @@
-"""A day studied and fitted in blocks: the numbers of one block that holds all of it."""
+"""A day studied and fitted in blocks gives the numbers of a single block."""
 
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -26,38 +25,32 @@ SAME = 1e-9  # of the principal distance, or of a rate
 TOGETHER = 2000  # epochs of the sample, rows of the fit
 
 
-@dataclass(frozen=True)
-class Day:
-    """A recording of a day, and all its observations in one grid."""
-
-    recording: Recording
-    grid: object
-
-    def blocks(self, size):
-        """The observations, `size` epochs at a time."""
-        return InBlocks(self.grid, size)
-
-
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
+    """Return the recording of a day, and all its observations in one grid."""
     pytest.importorskip("pyarrow")
     path = tmp_path_factory.mktemp("day") / "day"
     write_long_recording(path, DAY, 21)
     recording = open_recording(path)
-    return Day(recording, gathered(recording, [slice(0, DAY)]))
+    return recording, gathered(recording, [slice(0, DAY)])
+
+
+@pytest.fixture
+def samples(monkeypatch):
+    """Limit the epochs that are adjusted together."""
+    for module in (adjusted, recorded):
+        monkeypatch.setattr(module, "together_at_most", lambda _: TOGETHER)
 
 
 @pytest.mark.slow
-def test_the_study(day, monkeypatch):
-    for module in (adjusted, recorded):
-        monkeypatch.setattr(module, "together_at_most", lambda _: TOGETHER)
-    found = []
+def test_the_study(day, samples, monkeypatch):
+    (recording, grid), found = day, []
     for size in (DAY, 500):
-        blocks = day.blocks(size)
+        blocks = InBlocks(grid, size)
         monkeypatch.setattr(
             Recording, "blocks", lambda _, windows=None, b=blocks: b.blocks(windows)
         )
-        measured = Series(day.recording).measured()
+        measured = Series(recording).measured()
         (camera,) = study([measured], StudySettings(sets=1000)).cameras
         found.append(camera)
     one, many = found
@@ -68,15 +61,15 @@ def test_the_study(day, monkeypatch):
         assert abs(b.deviations[name].change - a.deviations[name].change) < SAME * INTERIOR.c
         assert b.significance[name].success_ratio == a.significance[name].success_ratio
         slopes = [x.channels[0].dependences[name].slope for x in (a, b)]
-        assert abs(slopes[1] - slopes[0]) < SAME * INTERIOR.c  # over a kelvin
+        assert abs(slopes[1] - slopes[0]) < SAME * INTERIOR.c  # for a change of 1 K
 
 
 @pytest.mark.slow
 def test_the_fit(day):
-    series = tc.open(day.recording.path).observed()
-    rates = []
+    (recording, grid), rates = day, []
+    series = tc.open(recording.path).observed()
     for size in (DAY, 500):
-        short = condensed(series, day.blocks(size), TOGETHER)
+        short = condensed(series, InBlocks(grid, size), TOGETHER)
         assert len(short.frame_times) < DAY / 2
         fitted = fit_thermal_model([reduce_series(short, strict=False)], [])
         rates.append([fitted.model.rates[name] for name in ("c", "x0", "y0")])
@@ -84,12 +77,10 @@ def test_the_fit(day):
 
 
 @pytest.mark.slow
-def test_a_coordinate_that_is_wrong(day, monkeypatch, tmp_path):
-    """30 mm of one target moved c by 98 µm: it is left out, and named, as in a short series."""
-    for module in (adjusted, recorded):
-        monkeypatch.setattr(module, "together_at_most", lambda _: TOGETHER)
+def test_a_wrong_coordinate(day, samples, tmp_path):
+    """A target with an error of 30 mm is left out and named; it once changed c by 98 µm."""
     path, means = tmp_path / "day", []
-    shutil.copytree(day.recording.path, path)
+    shutil.copytree(day[0].path, path)
     field = (path / "testfield.csv").read_text().splitlines()
     sure = [line.rsplit(",", 3)[0] + ",0.3,0.3,0.3" for line in field[1:]]
     name, x, rest = sure[7].split(",", 2)
@@ -100,6 +91,6 @@ def test_a_coordinate_that_is_wrong(day, monkeypatch, tmp_path):
         table = series.calibrate()
         assert table.ok.all()
         means.append(table.values[:, :3].mean(axis=0))
-        said = any(f": {name} " in doubt for doubt in series.doubts(table))
-        assert said == (lines is wrong)
+        named = any(f": {name} " in doubt for doubt in series.doubts(table))
+        assert named == (lines is wrong)
     assert (np.abs(means[1] - means[0]) < 3 * table.level_sd[:3]).all()

@@ -1,4 +1,4 @@
-"""Correlation, significance and slope against scipy, statsmodels, York, and their own claims."""
+"""Correlation, significance and slope against scipy, statsmodels, York, and simulations."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from thermocald.analysis.statistics.dependence import (
 )
 
 
-def test_pearson_and_its_t_test_are_scipys():
+def test_pearson_and_its_t_test_equal_scipys():
     rng = np.random.default_rng(1)
     temperature = 25 + 10 * WARM_UP
     values = 0.1 * WARM_UP + 0.2 * rng.standard_normal(N)
@@ -30,14 +30,14 @@ def test_pearson_and_its_t_test_are_scipys():
     assert dependence(WARM_UP, np.full(N, 0.2), 25 + 16 * WARM_UP, 0.05).p_naive == 0
 
 
-def test_holm_is_statsmodels():
+def test_holm_equals_statsmodels():
     from statsmodels.stats.multitest import multipletests
 
     p = np.random.default_rng(2).uniform(0, 0.1, 9)
     assert holm(p) == pytest.approx(multipletests(p, method="holm")[1])
 
 
-def test_correlation_matrix_is_numpys_and_silent_on_constants():
+def test_the_correlation_matrix_equals_numpys_and_is_nan_for_constants():
     rng = np.random.default_rng(3)
     columns = list(rng.standard_normal((4, 50)))
     np.testing.assert_allclose(correlation_matrix(columns), np.corrcoef(columns), atol=1e-12)
@@ -52,7 +52,7 @@ def test_correlation_matrix_is_numpys_and_silent_on_constants():
 @pytest.mark.slow
 @pytest.mark.parametrize("thermometer_sd", [0.05, 1.5])
 def test_slope_is_unbiased_and_its_sd_true(thermometer_sd):
-    """A thermometer with 1.5 K on a rise of 12 K: ordinary least squares is 20 % too flat."""
+    """With 1.5 K of noise on a rise of 12 K, ordinary least squares is 20 % too flat."""
     rng = np.random.default_rng(5)
     truth, sd = 0.4, 0.3
     slopes, sds, ordinary = [], [], []
@@ -64,14 +64,14 @@ def test_slope_is_unbiased_and_its_sd_true(thermometer_sd):
         sds.append(result.sd_slope)
         ordinary.append(np.polyfit(temperature, values, 1)[0])
     assert np.mean(slopes) == pytest.approx(truth, abs=4 * np.std(slopes) / np.sqrt(600))
-    # Counting possible autocorrelation makes the sd cautious, by 10 to 20 % for white noise.
+    # Allowing for autocorrelation makes the sd cautious, by 10 to 20 % for white noise
     off = (np.array(slopes) - truth) / sds
     assert 0.75 <= np.sqrt(np.mean(off**2)) <= 1.05
     if thermometer_sd > 1:
         assert np.mean(ordinary) < 0.9 * truth
 
 
-def test_scatter_beyond_the_sds_goes_into_the_sd_of_the_slope():
+def test_the_sd_of_the_slope_includes_scatter_beyond_the_sds():
     rng = np.random.default_rng(6)
     temperature = 25 + 12 * WARM_UP
     values = 0.4 * 12 * WARM_UP + rng.standard_normal(N)
@@ -103,7 +103,7 @@ def _error_over_sd(x, coloured, phi, draws, seed, thermometer=0.0):
     ("coloured", "phi"), [(0.0, 0.0), (1.0, 0.5), (1.0, 0.9), (0.5, 0.8), (0.5, 0.97)]
 )
 def test_errors_of_the_slope_are_as_large_as_its_sd(x, coloured, phi):
-    """150 epochs; 400 draws, whose ratio is known to 4 %, under slow noise to 8 % (1.5 before)."""
+    """400 draws of 150 epochs give the ratio to 4 %, with slow noise to 8 %; it once was 1.5."""
     assert 0.75 < _error_over_sd(x, coloured, phi, 400, 2) < 1.2
 
 
@@ -111,7 +111,7 @@ def test_a_thermometer_whose_noise_is_an_eighth_of_the_rise():
     assert 0.65 < _error_over_sd(WARM_UP, 0.0, 0.0, 400, 4, 0.125) < 1.1
 
 
-def test_where_the_memory_is_long_against_the_series_it_says_so():
+def test_a_memory_as_long_as_the_series_is_reported():
     rng = np.random.default_rng(5)
     short = [slope_noise(noise(rng, 1.0, 0.99), WARM_UP, 0.0).too_short for _ in range(40)]
     white = [slope_noise(noise(rng, 0.0, 0.0), WARM_UP, 0.0).too_short for _ in range(40)]
@@ -121,7 +121,7 @@ def test_where_the_memory_is_long_against_the_series_it_says_so():
 
 @pytest.mark.parametrize(("phi", "rel"), [(0.0, 0.2), (0.6, 0.3), (0.9, 0.3)])
 def test_slow_variations_of_x_under_autoregressive_noise(phi, rel):
-    """Their variance is (1 + phi)/(1 - phi) times that of white noise."""
+    """The slope's variance is (1 + phi)/(1 - phi) times that with white noise."""
     rng = np.random.default_rng(2)
     n = 4000
     x = np.sin(2 * np.pi * np.arange(n) / n)
@@ -132,7 +132,7 @@ def test_slow_variations_of_x_under_autoregressive_noise(phi, rel):
     assert np.median(found) == pytest.approx(n * (1 - phi) / (1 + phi), rel=rel)
 
 
-def test_long_series_pool_frequencies_without_changing_the_answer():
+def test_pooled_frequencies_of_a_long_series_give_the_same_result():
     rng = np.random.default_rng(3)
     y = np.asarray(signal.lfilter([1], [1, -0.9], rng.standard_normal(200_000)))
     x = np.cumsum(rng.standard_normal(200_000))
@@ -149,9 +149,8 @@ YORK_WY = np.array([1, 1.8, 4, 8, 20, 20, 70, 70, 100, 500])
 
 
 def test_pearsons_data_with_yorks_weights():
-    slope, sd_slope, chi2 = fit_straight_line(
-        PEARSON_X, PEARSON_Y, 1 / np.sqrt(YORK_WX), 1 / np.sqrt(YORK_WY)
-    )
+    sds = 1 / np.sqrt(YORK_WX), 1 / np.sqrt(YORK_WY)
+    slope, sd_slope, chi2 = fit_straight_line(PEARSON_X, PEARSON_Y, *sds)
     assert slope == pytest.approx(-0.480533407, abs=5e-9)
     assert chi2 == pytest.approx(11.8663532, abs=5e-7)
     assert sd_slope == pytest.approx(0.0579850, abs=5e-6)
@@ -180,20 +179,15 @@ def test_moving_statistics_are_those_of_each_window():
     np.testing.assert_allclose(variances, [w.var(ddof=1) for w in windows])
 
 
-def test_f_test_is_scipys():
+def test_the_f_test_equals_scipys():
     rng = np.random.default_rng(2)
     values, sds = rng.standard_normal(N), rng.uniform(0.8, 1.2, N)
     redundancy = rng.integers(200, 280, N).astype(float)
     index, ratio, critical, _ = moving_f_test(values, sds, redundancy, TIME_S, 31, 0.05)
-    p = [
-        stats.f.sf(
-            np.var(values[i : i + 31], ddof=1) / np.mean(sds[i : i + 31] ** 2),
-            30,
-            redundancy[i : i + 31].sum(),
-        )
-        for i in range(N - 30)
-    ]
-    np.testing.assert_array_equal(ratio > critical, np.array(p) < 0.05)
+    windows = [slice(i, i + 31) for i in range(N - 30)]
+    ratios = [np.var(values[w], ddof=1) / np.mean(sds[w] ** 2) for w in windows]
+    p = stats.f.sf(ratios, 30, [redundancy[w].sum() for w in windows])
+    np.testing.assert_array_equal(ratio > critical, p < 0.05)
     np.testing.assert_array_equal(index, np.arange(15, N - 15))
 
 
@@ -203,7 +197,7 @@ def test_windows_across_a_gap_are_left_out():
     crossing = [i for i in range(70) if i < 60 <= i + 30]
     assert not set(crossing) & set(starts.tolist())
     assert len(starts) == 70 - len(crossing)
-    # single missing epochs break nothing
+    # single missing epochs are not gaps
     time_s = np.delete(TIME_S, [20, 50, 51, 90])
     assert len(unbroken_windows(time_s, 31)) == len(time_s) - 30
 

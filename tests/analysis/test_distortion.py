@@ -1,4 +1,4 @@
-"""Series of a camera that keeps its angles, rendered by OpenCV, and of one that does not."""
+"""Series of cameras whose distortion follows the angle (from OpenCV), or the place in the image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.audit_thermal import NAMES, fitted, seen, seen_by_opencv, simulated
+from benchmarks.audit_thermal import (
+    NAMES,
+    fitted,
+    rate_errors,
+    seen,
+    seen_by_opencv,
+    simulated,
+)
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import ExteriorOrientation
@@ -21,13 +28,6 @@ from thermocald.thermal.reduce import reduce_series
 SEEDS = range(1, 7)
 
 
-def off(f, s):
-    """Errors of the rates of c, x0, y0 over their standard deviations."""
-    return np.array(
-        [(f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}") for n in NAMES]
-    )  # fmt: skip
-
-
 def test_the_rates_of_an_opencv_camera_whose_f_changes():
     errors = []
     for seed in SEEDS:
@@ -35,14 +35,14 @@ def test_the_rates_of_an_opencv_camera_whose_f_changes():
         f = fitted(seen_by_opencv(s))
         assert f.model.distortion == "angle"
         assert f.model.evidence["fit"]["effect_missing"] is False
-        errors.append(off(f, s))
+        errors.append(rate_errors(f, s))
     assert np.abs(errors).max() < 3.0
-    # eighteen numbers know a standard deviation to 17 %
+    # eighteen numbers give a standard deviation to 17 %
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
 def test_the_same_series_epoch_by_epoch():
-    """`study` and `replay`: A and B are free in each epoch, c has its rate."""
+    """In `study` and `replay`, A and B are free in each epoch; c has its rate."""
     errors = []
     for seed in SEEDS[:3]:
         s = simulated(seed, ())
@@ -66,19 +66,19 @@ def test_the_same_series_epoch_by_epoch():
 
 
 def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
-    said = 0
+    recognised = 0
     for seed in SEEDS:
         s = simulated(seed, ())
         s = replace(s, model=replace(s.model, distortion="image"))
         f = fitted(seen(s))
         lines = "\n".join(model_lines(ThermalCamera(f.model).as_dict() | {"band": True}))
         if f.model.distortion == "image":
-            said += 1
-            assert np.abs(off(f, s)).max() < 3.0
+            recognised += 1
+            assert np.abs(rate_errors(f, s)).max() < 3.0
             assert "keeps its place in the image" in lines
         else:
             assert "the data cannot tell" in lines
-    assert said >= 4  # 25 ± 10 in χ², 9 are asked for
+    assert recognised >= 4  # χ² is 25 ± 10, and 9 is required
 
 
 @pytest.mark.slow
@@ -88,20 +88,19 @@ def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
     ModelEffect("mount_motion", {"phi": 2e-6, "Z0": 2e-3}),
     ModelEffect("nonlinear_expansion", {"c": 2e-6, "x0": 6e-6, "y0": -4e-6}),
 ], ids=lambda e: e.name)  # fmt: skip
-def test_what_the_series_say_does_not_hang_on_an_effect(effect):
-    """The basis is asked before any hypothesis is."""
+def test_the_distortion_is_recognised_before_any_effect(effect):
     for seed in SEEDS[:3]:
         reduced = reduce_series(seen(simulated(seed, (effect,))), strict=False)
         assert choose_distortion([reduced])[0] == "angle"
 
 
-def test_series_change_their_basis_and_back():
+def test_a_change_of_basis_is_reversible():
     e = reduce_series(seen(simulated(1, ())), strict=False)
     other = e.in_basis("image")
     same = other.in_basis("angle")
     assert other.distortion == "image"
     np.testing.assert_allclose(same.N, e.N, rtol=1e-9, atol=1e-9 * np.abs(e.N).max())
     np.testing.assert_allclose(same.values, e.values, rtol=0, atol=1e-7 * np.abs(e.values).max())
-    # one camera in two parametrisations moves the image by the same
+    # both parametrisations move the image equally
     moved = [np.einsum("tik,ek->eti", s.columns, s.values) for s in (e, other)]
     np.testing.assert_allclose(*moved, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Drift of a series: the camera's is claimed, a target's is not, and no target is accused."""
+"""Drift of a series: the camera's is reported, a target's is not, and no target is blamed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIGMA = 0.05
 
 
 def table_of(values, sd, exterior):
-    """The epochs of a series, 10 s apart."""
+    """Return the table of a series with epochs 10 s apart."""
     n, none = len(values), np.zeros(len(values), dtype=np.int64)
     return Epochs(
         np.arange(n), 10.0 * np.arange(n), np.full(n, np.nan), values, sd, np.ones(n), none, none,
@@ -34,7 +34,7 @@ def series(
     seed: int, *, warms: bool = True, wanders: float = 0.0, epochs: int = 60, targets: int = 60,
     field_mm: float = 0.02,
 ) -> Epochs:  # fmt: skip
-    """Circles before a camera that warms up within 400 s; one of them may wander by some px."""
+    """Simulate circles before a camera that warms up with 400 s; one may wander by some px."""
     plain = corner_field("plain", per_side=5, pitch_mm=124.0)
     rng = np.random.default_rng(seed)
     rows = rng.permutation(len(plain))[:targets]
@@ -62,8 +62,8 @@ def series(
 @pytest.mark.parametrize(
     ("seed", "epochs"), [(0, 60), (1, 60), (2, 60), (101, 30), (101, 80), (101, 150)]
 )
-def test_a_warm_up_is_a_drift_however_long_and_no_target_is_accused_of_it(seed, epochs):
-    """To a straight line the bend of 150 epochs was noise with a memory, and no drift."""
+def test_a_warm_up_of_any_length_is_a_drift_and_no_target_is_blamed(seed, epochs):
+    """A test with a straight line once took the bend of 150 epochs for noise with a memory."""
     table = with_drifts(series(seed, epochs=epochs))
     assert table.left_out == ()
     assert all(not c.rests_on for c in table.drifts)
@@ -74,8 +74,8 @@ def test_a_warm_up_is_a_drift_however_long_and_no_target_is_accused_of_it(seed, 
 
 
 @pytest.mark.parametrize(("field_mm", "hangs"), [(0.02, False), (2.0, True)])
-def test_changes_are_as_wrong_as_c_and_that_is_said(field_mm, hangs):
-    """An image shows a change as a share of c, which the field shows."""
+def test_changes_that_depend_on_c_are_reported(field_mm, hangs):
+    """Images show a change relative to c, and the field shows c."""
     table = with_drifts(series(4, field_mm=field_mm))
     found = table.as_dict().get("changes_hang_on_c")
     assert (found is not None) is hangs
@@ -87,26 +87,26 @@ def test_changes_are_as_wrong_as_c_and_that_is_said(field_mm, hangs):
 
 @pytest.mark.parametrize(("targets", "few"), [(12, 12), (60, None)])
 def test_a_level_that_few_targets_cannot_test_is_flagged(targets, few):
-    """12 targets before a field three times worse than stated put it at 1.6 sd."""
+    """12 targets before a field three times worse than stated gave errors of 1.6 sd."""
     table = series(3, warms=False, epochs=12, targets=targets)
 
     assert table.as_dict().get("level_tested_by_targets") == few
-    said = "12 targets are too few to test the test field's coordinates"
-    assert any(said in line for line in table.lines()) is bool(few)
+    warning = "12 targets are too few to test the test field's coordinates"
+    assert any(warning in line for line in table.lines()) is bool(few)
 
 
-def test_a_target_that_wanders_is_no_drift_of_the_camera():
+def test_a_wandering_target_is_no_drift_of_the_camera():
     found = with_drifts(series(11, warms=False, wanders=3.0)).drifts
     assert not any(c.drifts for c in found)
 
 
-def test_without_a_drift_none_is_claimed():
+def test_without_a_drift_none_is_reported():
     claims = [any(c.drifts for c in courses(series(s, warms=False))) for s in range(20, 26)]
     assert sum(claims) <= 1
 
 
-def test_more_epochs_than_a_line_needs_are_averaged():
-    """Ended with a traceback: the standard deviations were those of all epochs."""
+def test_many_epochs_are_averaged():
+    """The standard deviations of all epochs once caused an exception."""
     n = 250_000
     rng = np.random.default_rng(5)
     sd = np.full((n, 16), 1e-4)
@@ -115,26 +115,26 @@ def test_more_epochs_than_a_line_needs_are_averaged():
     assert [c.drifts for c in courses(table_of(values, sd, "series"))] == [False, True, False]
 
 
-def test_a_group_is_left_out_once_for_all_parameters(monkeypatch):
-    """Each of them asked for the same adjustments again."""
-    table, asked = series(0), []
+def test_a_group_is_left_out_once_for_all_parameters():
+    """Each parameter once repeated the same adjustments."""
+    table, calls = series(0), []
     assert table.without is not None
 
     def without(rows, quick):
-        asked.append(tuple(rows))
+        calls.append(tuple(rows))
         return table.without(rows, quick)
 
     found = courses(replace(table, without=without))
     assert sum(c.drifts for c in found) > 1
-    assert len(asked) == len(set(asked)) > 0
+    assert len(calls) == len(set(calls)) > 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("coloured", "phi", "epochs"), [(1.0, 0.97, 150), (0.5, 0.97, 150), (1.0, 0.9, 30)]
 )
-def test_replay_claims_no_drift_of_noise_with_a_memory(coloured, phi, epochs):
-    """At 1 %; a line of its own claimed 7 to 17 % where the study held its level."""
+def test_replay_reports_no_drift_in_noise_with_a_memory(coloured, phi, epochs):
+    """At the level of 1 %; a test with its own line once reported drift in 7 to 17 %."""
     rng, claims = np.random.default_rng(16), []
     for _ in range(120):
         values = np.zeros((epochs, 16))

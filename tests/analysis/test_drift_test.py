@@ -1,4 +1,4 @@
-"""What the tests for drift and dependence claim of driftless series, and find in drifting ones."""
+"""Tests for drift and dependence: false alarms in driftless series, power in drifting ones."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ NOISES = [(0.0, 0.0), (1.0, 0.5), (1.0, 0.9), (1.0, 0.97), (0.5, 0.97), (0.5, 0.
 
 
 def noise(rng, coloured, phi, n=N):
-    """Noise of unit variance: first-order autoregressive plus white."""
+    """Draw noise of unit variance: first-order autoregressive plus white."""
     white = rng.standard_normal(n)
     if not coloured:
         return white
@@ -34,11 +34,11 @@ def noise(rng, coloured, phi, n=N):
 @pytest.mark.parametrize("size", mostly_slow([1.0, 3.0], 1.0))
 @pytest.mark.parametrize(("coloured", "phi"), NOISES)
 def test_at_most_one_in_twenty_driftless_series_drifts_or_exceeds_its_sds(coloured, phi, size):
-    """Noise of any memory, as large as stated or three times that; 200 series each.
+    """200 series each, with noise of any memory and one or three times the stated size.
 
-    The 99.9 % point of a binomial share of 5 % is 0.105. Comparing with the stated sds alone
-    claimed drift of 91 to 100 % of series whose noise exceeds them; of AR(1) of 0.97 on top of
-    white noise of equal size 9.5 % exceeded what they were within.
+    The 99.9 % point of a binomial share of 5 % is 0.105. A comparison with the stated sds alone
+    found drift in 91 to 100 % of the series whose noise exceeds them. Of AR(1) of 0.97 plus white
+    noise of equal size, 9.5 % exceeded their sds.
     """
     rng = np.random.default_rng(5)
     found = [drift_test(size * noise(rng, coloured, phi), ONES, REDUNDANCY) for _ in range(200)]
@@ -47,7 +47,7 @@ def test_at_most_one_in_twenty_driftless_series_drifts_or_exceeds_its_sds(colour
 
 
 def flicker(rng, exponent, n):
-    """Noise of spectrum 1/f^exponent and unit variance, an eighth of a longer series."""
+    """Draw noise of spectrum 1/f^exponent and unit variance, an eighth of a longer series."""
     shape = np.zeros(4 * n + 1)
     shape[1:] = np.arange(1, 4 * n + 1) ** (-exponent / 2)
     waves = rng.standard_normal(len(shape)) + 1j * rng.standard_normal(len(shape))
@@ -60,7 +60,7 @@ def flicker(rng, exponent, n):
     "exponent_and_white", mostly_slow([(1.0, 0.0), (1.5, 0.0), (1.0, 0.7)], (1.0, 0.0))
 )
 def test_flicker_noise_is_no_drift(exponent_and_white):
-    """Among autoregressive models alone, three parameters of 400 epochs of 1/f drifted in 57 %."""
+    """With autoregressive models only, three parameters in 400 epochs of 1/f drifted in 57 %."""
     exponent, white = exponent_and_white
     rng = np.random.default_rng(16)
     found = []
@@ -73,7 +73,7 @@ def test_flicker_noise_is_no_drift(exponent_and_white):
 
 
 @pytest.mark.slow
-def test_eight_driftless_parameters_are_corrected_for():
+def test_the_level_of_eight_parameters_is_corrected():
     rng = np.random.default_rng(6)
     any_found = []
     for _ in range(100):
@@ -85,8 +85,8 @@ def test_eight_driftless_parameters_are_corrected_for():
 @pytest.mark.slow
 @pytest.mark.parametrize("course", [WARM_UP, HEATED, UP_AND_DOWN])
 @pytest.mark.parametrize(("coloured", "phi"), [*NOISES, (1.0, 0.8), (0.2, 0.97)])
-def test_no_dependence_is_claimed_of_noise_with_a_memory(course, coloured, phi):
-    """At most 3 binomial sd above 5 % of 1000; up to 60 % where every epoch counted as one."""
+def test_no_dependence_is_reported_for_noise_with_a_memory(course, coloured, phi):
+    """At most 3 binomial sds above 5 % of 1000; up to 60 % if epochs counted as independent."""
     rng = np.random.default_rng(7)
     found = [slope_p_value(noise(rng, coloured, phi), course) for _ in range(1000)]
     assert np.mean(np.array(found) <= 0.05) <= 0.071
@@ -108,7 +108,7 @@ def test_drift_of_some_sds_is_found(drift):
     assert all(one.p_excess <= 1e-6 for one in tests)
 
 
-def test_the_drift_of_a_warm_up_of_a_pixel_survives_the_correction():
+def test_a_warm_up_of_a_pixel_is_highly_significant():
     result = drift_test(200 * WARM_UP + noise(np.random.default_rng(9), 0, 0), ONES, REDUNDANCY)
     assert result.p_value < 1e-4
 
@@ -121,8 +121,8 @@ def test_one_bad_epoch_is_no_drift():
 
 
 @pytest.mark.parametrize("step", [0.5, 2.0])
-def test_values_that_are_rounded_are_no_drift(step):
-    """Most steps are then 0 and the others jumps: 95 % drifted at 1 %."""
+def test_rounded_values_are_no_drift(step):
+    """Most steps are 0 and the others jumps; 95 % once drifted at 1 %."""
     rng = np.random.default_rng(17)
     found = []
     for _ in range(100):
@@ -132,7 +132,7 @@ def test_values_that_are_rounded_are_no_drift(step):
 
 
 @pytest.mark.parametrize("size", [0.5, 1.0, 2.0])
-def test_the_noise_found_is_the_noise_there_is(size):
+def test_the_estimated_noise_is_true(size):
     rng = np.random.default_rng(11)
     drift = 100 * WARM_UP
     tests = [drift_test(drift + size * noise(rng, 0, 0), ONES, REDUNDANCY) for _ in range(200)]
@@ -140,8 +140,8 @@ def test_the_noise_found_is_the_noise_there_is(size):
     assert 0.9 < np.sqrt(np.mean(np.square(off))) < 1.1
 
 
-def test_sds_that_fluctuate_from_epoch_to_epoch_are_no_noise_of_the_drift():
-    """A drift of 4000 sds, and sds known to 4 %: the noise found stays that of an epoch."""
+def test_fluctuating_sds_do_not_change_the_noise_estimate():
+    """With a drift of 4000 sds, and sds known to 4 %, the noise is still that of an epoch."""
     rng = np.random.default_rng(13)
     sds = 1 + 0.04 * rng.standard_normal(N)
     result = drift_test(4000 * WARM_UP + sds * noise(rng, 0, 0), sds, REDUNDANCY)
@@ -164,8 +164,8 @@ def test_a_daily_cycle_of_a_long_series_is_drift():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("phi", "missing"), [(0.97, 60), (0.9, 25)])
-def test_noise_forgets_in_a_gap(phi, missing):
-    """150 epochs with a piece missing: both sides counted as neighbours, 46 % depended at 1 %."""
+def test_the_memory_of_noise_decays_in_a_gap(phi, missing):
+    """When both sides of a gap counted as neighbours, 46 % depended at 1 %."""
     rng = np.random.default_rng(14)
     dependent, drifting = [], []
     for _ in range(200):
@@ -187,7 +187,7 @@ def test_a_warm_up_with_a_gap_is_found():
     assert slope_p_value(y, WARM_UP[kept], TIME_S[kept]) < 1e-3
 
 
-def test_a_prime_length_is_cut_by_a_few_epochs():
+def test_a_series_of_prime_length_is_shortened_by_a_few_epochs():
     prime_length = 200_003
     y = np.random.default_rng(1).normal(size=prime_length)
     found = cosines(y)
@@ -199,10 +199,10 @@ def test_a_prime_length_is_cut_by_a_few_epochs():
     assert n == 1
     whole = y[: len(found) + 1]
     np.testing.assert_allclose(found, dct(whole - whole.mean(), norm="ortho")[1:], atol=1e-9)
-    assert len(cosines(np.arange(997.0))) == 996  # a short series is whole
+    assert len(cosines(np.arange(997.0))) == 996  # a short series is not shortened
 
 
-def test_the_frequencies_are_means_of_what_is_pooled():
+def test_pooled_frequencies_are_means():
     at = Frequencies.of(20_001)
     assert at.count.sum() == 20_000
     every = np.pi * np.arange(1, 20_001) / 20_001

@@ -1,4 +1,4 @@
-"""Drift and time to steady, against exponentials that are known."""
+"""Drift and time to the steady state, for known exponentials."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from thermocald.analysis.online.equilibrium import EquilibriumWatch, fit_approac
 GAIN, POSE = np.zeros((3, 6)), np.zeros(6)
 
 
-def test_a_slope_scatters_as_its_sd_says():
+def test_the_sd_of_a_slope_is_true():
     rng = np.random.default_rng(1)
     t = np.arange(30) * 10.0
     deviations = []
@@ -18,11 +18,11 @@ def test_a_slope_scatters_as_its_sd_says():
         values = 0.01 * t + rng.normal(0, 0.05, 30)
         found, sd = slope(t, values[:, None], np.full((30, 1), 0.05))
         deviations.append((found[0] - 0.01) / sd[0])
-    # sds are scaled up where residuals are larger, never down: a little conservative
+    # sds are scaled up for large residuals but never down, so they are slightly conservative
     assert 0.85 < np.std(deviations) < 1.03
 
 
-def test_the_time_to_steady_is_within_its_sds():
+def test_the_time_to_the_steady_state_is_within_its_sds():
     rng = np.random.default_rng(2)
     tau, size, bound = 300.0, 8.0, 0.05 / 60.0
     t = np.arange(60) * 10.0
@@ -40,7 +40,7 @@ def test_the_time_to_steady_is_within_its_sds():
     assert 0.5 < ready.std() / sds.mean() < 1.5
 
 
-def test_a_straight_line_approaches_nothing():
+def test_a_straight_line_has_no_steady_state():
     t = np.arange(60) * 10.0
     assert fit_approach(t, 0.01 * t, np.full(60, 0.02), 1e-3) is None
 
@@ -54,7 +54,7 @@ def watch(values_of, epochs: int = 60, noise: float = 0.02) -> EquilibriumWatch:
     return made
 
 
-def test_warm_is_ready_and_warming_is_not():
+def test_a_warm_camera_is_ready_and_a_warming_one_drifts():
     steady = watch(lambda t: np.zeros(3)).assess(POSE)
     assert steady.state == "ready"
     warming = watch(lambda t: np.array([1.0, 2.0, -2.0]) * np.exp(-t / 400.0)).assess(POSE)
@@ -65,7 +65,7 @@ def test_warm_is_ready_and_warming_is_not():
     assert watch(lambda t: np.zeros(3), epochs=4).assess(POSE).state == "unknown"
 
 
-def test_a_held_parameter_is_not_asked():
+def test_a_held_parameter_does_not_count():
     made = EquilibriumWatch()
     for k in range(30):
         values, sds = np.array([np.nan, 0.0, 0.0]), np.array([np.nan, 0.01, 0.01])
@@ -73,8 +73,8 @@ def test_a_held_parameter_is_not_asked():
     assert made.assess(POSE).state == "ready"
 
 
-def test_at_20_hz_an_epoch_costs_what_one_a_second_costs():
-    """It rebuilt 14,400 epochs at every one of them."""
+def test_memory_at_20_hz_is_bounded():
+    """The watch once went through 14,400 epochs at every epoch."""
     rng = np.random.default_rng(4)
     quick, seldom = EquilibriumWatch(), EquilibriumWatch()
     for k in range(20 * 900):
@@ -87,4 +87,4 @@ def test_at_20_hz_an_epoch_costs_what_one_a_second_costs():
     found, rough = quick.assess(POSE), seldom.assess(POSE)
     assert found.state == "drifting"
     assert found.drift == pytest.approx(rough.drift, abs=3.0 * rough.sd_drift)
-    assert found.sd_drift < 0.3 * rough.sd_drift  # nothing of the 200 times as many is lost
+    assert found.sd_drift < 0.3 * rough.sd_drift  # all 200 times as many epochs count

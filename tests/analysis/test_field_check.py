@@ -1,4 +1,4 @@
-"""The check of a planned test field against real adjustments of what it would give."""
+"""The check of a planned test field, compared with adjustments of simulated images."""
 
 from __future__ import annotations
 
@@ -7,12 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.field import (
-    check_field,
-    precision,
-    station_at,
-    usual_station,
-)
+from thermocald.analysis.field import check_field, precision, station_at, usual_station
 from thermocald.errors import GeometryError
 from thermocald.output.testfield.layout import Design, field_of, lay_out, paper_size
 from thermocald.photogrammetry.camera.camera_model import (
@@ -38,8 +33,8 @@ def _printed(paper, sheets=1, diameter=12.0):
 
 
 @pytest.mark.parametrize("exact", [True, False], ids=["image noise alone", "field uncertain too"])
-def test_predicted_are_the_standard_deviations_of_an_adjustment(exact):
-    """`adjust` of one simulated image with the same stochastic model: its a-priori covariance."""
+def test_predicted_standard_deviations_are_those_of_an_adjustment(exact):
+    """Compares with the a-priori covariance of `adjust` for one simulated image."""
     field = replace(corner_field(), sigmas=np.full((147, 3), 1e-9 if exact else 0.05))
     station = usual_station(CAMERA, field)
     check = check_field(CAMERA, field, station, 0.04)
@@ -60,7 +55,7 @@ def test_predicted_are_the_standard_deviations_of_an_adjustment(exact):
 
 
 def test_design_figures_of_the_corner_field():
-    """DESIGN idea 3: 147 targets, 0.04 px: sd(x0) 0.3 px per image, 0.005 px in a series."""
+    """DESIGN idea 3: sd(x0) with 147 targets is 0.3 px per image, 0.005 px in a series."""
     field = corner_field()
     check = check_field(CAMERA, field, usual_station(CAMERA, field), 0.04)
     epoch, series, _ = check.sds_px["x0"]
@@ -68,7 +63,7 @@ def test_design_figures_of_the_corner_field():
     assert 0.003 < series < 0.007
 
 
-def test_usual_station_fills_the_image_and_looks_from_inside_the_corner():
+def test_the_usual_station_fills_the_image_and_is_inside_the_corner():
     field = corner_field()
     station = usual_station(CAMERA, field)
     image = CAMERA.project(station, field.points)
@@ -104,8 +99,8 @@ def test_edge_on_targets_are_hidden():
 
 
 @pytest.mark.parametrize("aside_deg", [0, 20, 40])
-def test_a_plane_field_never_tells_all_in_one_image_and_needs_depth(aside_deg):
-    """Eight numbers of a homography cannot tell nine unknowns apart, wherever it is taken from."""
+def test_one_image_of_a_plane_field_is_insufficient_and_needs_depth(aside_deg):
+    """Eight numbers of a homography cannot determine nine unknowns, from any station."""
     field = _printed("A2")
     centre, angle = field.points.mean(axis=0), np.radians(aside_deg)
     place = centre + 700 * np.array([np.sin(angle), 0.1, np.cos(angle)])
@@ -118,8 +113,8 @@ def test_a_plane_field_never_tells_all_in_one_image_and_needs_depth(aside_deg):
     assert "not determined" in second
 
 
-def test_proposed_targets_bring_what_is_said():
-    """The promised standard deviation is that of the field with the proposed targets in it."""
+def test_proposed_targets_give_the_promised_precision():
+    """The promised standard deviation is that of the field with the proposed targets."""
     field = corner_field()
     station = usual_station(CAMERA, field)
     check = check_field(CAMERA, field, station)
@@ -136,7 +131,7 @@ def test_proposed_targets_bring_what_is_said():
     assert promised < 0.85 * check.precision["epoch"][which] / 0.00112
 
 
-def test_empty_parts_and_unsurveyed_print_are_named():
+def test_empty_parts_and_an_unsurveyed_print_are_reported():
     field = _printed("A3", sheets=3)
     check = check_field(CAMERA, field, usual_station(CAMERA, field))
     assert (check.cells == 0).sum() > 0
@@ -149,13 +144,13 @@ def test_empty_parts_and_unsurveyed_print_are_named():
     assert not any("testfield survey" in note for note in again.advice)
 
 
-def test_small_targets_are_told_to_be_larger():
+def test_larger_targets_are_advised_for_small_ones():
     field = replace(corner_field(), diameters=np.full(147, 6.0))
     check = check_field(CAMERA, field, usual_station(CAMERA, field))
     assert any("come nearer or print larger" in note for note in check.advice)
 
 
-def test_roll_turns_the_image_and_not_the_axis():
+def test_roll_turns_the_image_about_the_axis():
     a = station_at(np.array([0, 0, 500.0]), np.zeros(3))
     b = station_at(np.array([0, 0, 500.0]), np.zeros(3), np.pi / 2)
     assert b.rotation[:, 2] == pytest.approx(a.rotation[:, 2])
@@ -164,7 +159,7 @@ def test_roll_turns_the_image_and_not_the_axis():
         station_at(np.zeros(3), np.zeros(3))
 
 
-def test_a_camera_that_looks_away_sees_nothing():
+def test_a_camera_that_looks_away_is_refused():
     away = ExteriorOrientation(0, 0, 0, 0, 0, -500)
     with pytest.raises(GeometryError, match="0 of 147 targets"):
         check_field(CAMERA, corner_field(), away)

@@ -1,14 +1,13 @@
-"""A camera at work without a test field: predicted from readings, posed by control points.
+"""A camera without a test field: predicted from readings, resected from control points.
 
-The image points are those of `tests.main_paths.crooked`, whose projection shares no code with the
-program's.
+The image points are from `tests.main_paths.crooked`, whose projection shares no code with the
+program.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ START = 1.7e9
 
 
 def thermal_camera(tau: float | None = None) -> ThermalCamera:
-    """The crooked camera about 20 °C, valid from -5 to 45 °C; tau s: it follows with a lag."""
+    """Return the crooked camera, valid from -5 to 45 °C, with T0 = 20 °C; tau: of a lag, s."""
     parameters = [f"interior.{n}" for n in NAMES] + [f"rates.{n}" for n in NAMES]
     covariance = np.diag([SD[n] ** 2 for n in NAMES] + [SD_RATE**2] * 3).tolist()
     effects = () if tau is None else (ModelEffect("thermal_lag", {"tau": tau}, {}),)
@@ -50,7 +49,7 @@ def thermal_camera(tau: float | None = None) -> ThermalCamera:
 
 
 class World:
-    """One gauge: where its control points are, what its camera is like, what it sees."""
+    """One gauge: its control points, its true camera, its observations."""
 
     def __init__(self, seed: int, n: int = 12) -> None:
         self.rng = rng = np.random.default_rng(seed)
@@ -79,18 +78,18 @@ class World:
 
 
 def followed(gauge: GaugeCalibrator, epochs):
-    """Results of epochs, and what was told."""
-    told = []
-    observer = GaugeObserver(gauge, lambda kind, text, *_: told.append((kind, text)))
+    """Return the results of epochs, and the reported events (kind, text)."""
+    events = []
+    observer = GaugeObserver(gauge, lambda kind, text, *_: events.append((kind, text)))
     results = []
     for epoch in epochs:
         done = gauge.calibrate(epoch)
         observer.observe(done)
         results.append(done)
-    return results, told
+    return results, events
 
 
-def test_without_control_points_the_prediction_and_its_sd_are_true():
+def test_predictions_without_control_points_have_true_sds():
     square = []
     for seed in range(60):
         world, T = World(seed), 38.0
@@ -117,10 +116,10 @@ def test_resected_poses_have_true_sds():
     assert np.sqrt(np.mean(square)) == pytest.approx(1.0, abs=0.12)
 
 
-def test_outside_the_fit_it_is_said_and_far_outside_nothing_is_predicted():
+def test_outside_the_range_is_reported_and_far_outside_nothing_is_predicted():
     gauge = GaugeCalibrator(thermal_camera())
     temperatures = (20.0, 44.9, 55.0, 90.0, 20.0)
-    results, told = followed(
+    results, events = followed(
         gauge, [Epoch(k, t := START + 10 * k, t, {"h": T}) for k, T in enumerate(temperatures, 1)]
     )
     words = [r.adjustment.status for r in results]
@@ -130,26 +129,26 @@ def test_outside_the_fit_it_is_said_and_far_outside_nothing_is_predicted():
     assert results[2].adjustment.interior is not None
     assert results[3].adjustment.interior is None
     assert "-5 to 45 °C" in results[3].adjustment.reason
-    assert [kind for kind, _ in told] == ["outside_range", "predicted"]
+    assert [kind for kind, _ in events] == ["outside_range", "predicted"]
 
 
-def test_a_lost_thermometer_lets_the_covariance_grow_and_its_return_ends_that():
+def test_the_covariance_grows_while_a_thermometer_is_lost():
     gauge = GaugeCalibrator(thermal_camera())
     readings = [20.0, math.nan, math.nan, math.nan, 21.0]
     epochs = [
         Epoch(k, START + 300.0 * k, START + 300.0 * k, {"h": T}) for k, T in enumerate(readings)
     ]
-    results, told = followed(gauge, epochs)
+    results, events = followed(gauge, epochs)
     words = [r.adjustment.status for r in results]
     assert words == ["predicted", *["no_temperature"] * 3, "predicted"]
     sd = [r.adjustment.sd[1] for r in results]
     assert sd[0] < sd[1] < sd[2] < sd[3]
     assert sd[4] == pytest.approx(sd[0], rel=0.1)
-    assert [kind for kind, _ in told] == ["no_temperature", "predicted"]
+    assert [kind for kind, _ in events] == ["no_temperature", "predicted"]
 
 
-def test_what_was_before_the_first_reading_fades_with_the_memory():
-    """A lag of 600 s: the unknown past is of pixels at first, and of nothing after two hours."""
+def test_the_effect_of_the_unknown_past_fades():
+    """With a lag of 600 s it is more than a pixel at first, and nothing after two hours."""
     predictor = Predictor(thermal_camera(TAU))
     unknown = []
     for k in range(720):
@@ -160,7 +159,7 @@ def test_what_was_before_the_first_reading_fades_with_the_memory():
     assert unknown[-1] < 1e-3
 
 
-def test_a_gap_is_uncertain_for_as_long_as_it_is_felt():
+def test_the_uncertainty_after_a_gap_fades():
     predictor = Predictor(thermal_camera(TAU))
     for k in range(1000):
         predictor.take(START + 10.0 * k, {"h": 20.0})
@@ -174,8 +173,8 @@ def test_a_gap_is_uncertain_for_as_long_as_it_is_felt():
 
 
 @pytest.mark.slow
-def test_the_state_after_a_restart_is_honest():
-    """Another past than the log's: errors of a camera with a lag, over their sds, 80 draws."""
+def test_the_state_after_a_restart_has_true_sds():
+    """80 draws of a camera with a lag, whose past temperature is unknown: error over sd."""
     rng = np.random.default_rng(7)
     model = replace(thermal_camera(TAU).model, fitted_on=({"thermometer_sd_K": 0.0},))
     exact, ratio = ThermalCamera(model), []
@@ -193,7 +192,7 @@ def test_the_state_after_a_restart_is_honest():
     assert np.std(ratio) == pytest.approx(1.0, abs=0.2)
 
 
-def test_remembered_epochs_go_on_where_they_stopped():
+def test_remembered_epochs_restore_the_state():
     world = World(3)
     camera = thermal_camera(TAU)
     whole = GaugeCalibrator(camera, world.field)
@@ -214,20 +213,20 @@ def test_remembered_epochs_go_on_where_they_stopped():
     assert again.sd == pytest.approx(results[-1].adjustment.sd, rel=1e-9, nan_ok=True)
 
 
-def test_hidden_control_points_keep_the_last_pose_whose_covariance_grows():
+def test_the_last_pose_is_kept_with_growing_covariance_while_points_are_hidden():
     world = World(5)
     gauge = GaugeCalibrator(thermal_camera(), world.field, mount_sd_deg=0.01)
     shown = [None, None, [0, 1], [], [4], None]
     epochs = [world.epoch(k, 25.0, rows, 600.0) for k, rows in enumerate(shown, 1)]
-    results, told = followed(gauge, epochs)
+    results, events = followed(gauge, epochs)
     words = [r.adjustment.status for r in results]
     assert words == ["resected"] * 2 + ["last_pose"] * 3 + ["resected"]
     sd = [r.adjustment.sd[10] for r in results]
     assert sd[1] < sd[2] < sd[3] < sd[4]
     grown = np.sqrt(sd[4] ** 2 - sd[1] ** 2)
     assert grown == pytest.approx(np.deg2rad(0.01) * np.sqrt(0.5), rel=1e-6)
-    assert [kind for kind, _ in told] == ["last_pose", "resected"]
-    assert "control points are seen" in told[0][1]
+    assert [kind for kind, _ in events] == ["last_pose", "resected"]
+    assert "control points are seen" in events[0][1]
 
 
 def test_a_moved_camera_is_reported_with_time_turn_and_shift():
@@ -239,31 +238,31 @@ def test_a_moved_camera_is_reported_with_time_turn_and_shift():
         epochs = [world.epoch(k, 20.0 + 0.1 * k) for k in range(1, 31)]
         world.pose = POSE + turn
         epochs += [world.epoch(k, 20.0 + 0.1 * k) for k in range(31, 41)]
-        results, told = followed(gauge, epochs)
-        events = [r.epoch.number for r in results if "event" in r.extra]
-        assert [kind for kind, _ in told] == ["camera_moved"] * len(events)
-        assert len(events) <= 1
-        if events:
-            found += events[0] == 32
-            assert "turned by 0.0" in told[0][1]
-            assert "looks alike" not in told[0][1]
+        results, events = followed(gauge, epochs)
+        moved = [r.epoch.number for r in results if "event" in r.extra]
+        assert [kind for kind, _ in events] == ["camera_moved"] * len(moved)
+        assert len(moved) <= 1
+        if moved:
+            found += moved[0] == 32
+            assert "turned by 0.0" in events[0][1]
+            assert "looks alike" not in events[0][1]
     assert found == 10
 
 
-def test_what_a_model_lacks_is_told_from_a_knock():
-    """A quadratic in c that the model has not, a degree an epoch: no frame shows it at once."""
+def test_a_missing_effect_is_reported_unlike_a_knock():
+    """c has a quadratic term that the model lacks, which no single frame shows."""
     world = World(700)
     plain = world.interior
     world.interior = lambda T: plain(T) | {"c": plain(T)["c"] + 3e-5 * (T - 20.0) ** 2}
     gauge = GaugeCalibrator(thermal_camera(), world.field)
-    _, told = followed(gauge, [world.epoch(k, 20.0 + 0.5 * k) for k in range(1, 50)])
-    assert {kind for kind, _ in told} == {"camera_moved"}
-    assert all("a model that lacks an effect looks alike" in text for _, text in told)
+    _, events = followed(gauge, [world.epoch(k, 20.0 + 0.5 * k) for k in range(1, 50)])
+    assert {kind for kind, _ in events} == {"camera_moved"}
+    assert all("a model that lacks an effect looks alike" in text for _, text in events)
 
 
 @pytest.mark.slow
-def test_a_camera_that_stands_still_in_changing_heat_is_not_moved():
-    """300 epochs of 3 gauges over 40 K, with a point hidden now and then: no movement."""
+def test_no_movement_is_reported_in_changing_heat():
+    """300 epochs of 3 gauges over 40 K, with one point hidden in most epochs."""
     for seed in range(3):
         world = World(300 + seed)
         gauge = GaugeCalibrator(thermal_camera(), world.field)
@@ -271,13 +270,13 @@ def test_a_camera_that_stands_still_in_changing_heat_is_not_moved():
             world.epoch(k, 0.0 + 0.13 * k, np.delete(np.arange(12), k % 12) if k % 3 else None)
             for k in range(1, 301)
         ]
-        _, told = followed(gauge, epochs)
-        assert told == []
+        _, events = followed(gauge, epochs)
+        assert events == []
 
 
 @pytest.mark.slow
-def test_a_past_that_fades_is_no_movement():
-    """Carried out of a warm room, with a lag of 600 s: twenty minutes of another camera."""
+def test_a_fading_past_is_no_movement():
+    """The camera comes from a warm room with a lag of 600 s: twenty minutes differ."""
     for seed in range(5):
         world = World(600 + seed)
         gauge = GaugeCalibrator(thermal_camera(TAU), world.field)
@@ -285,8 +284,8 @@ def test_a_past_that_fades_is_no_movement():
         for k in range(1, 121):
             lens = 20.0 + (warm - 20.0) * np.exp(-10.0 * k / TAU)
             epochs.append(replace(world.epoch(k, lens), temperatures={"housing": 20.0}))
-        _, told = followed(gauge, epochs)
-        assert told == []
+        _, events = followed(gauge, epochs)
+        assert events == []
 
 
 def test_the_movement_has_true_sds():
@@ -301,13 +300,13 @@ def test_the_movement_has_true_sds():
         gauge.calibrate(epoch)
         found = gauge.compare(then, gauge.pose)
         error = found.values - (world.pose - POSE)
-        # the stated noise has 0.05 px for light and air, which this world does not have
+        # the stated noise includes 0.05 px for light and air, absent here
         square.append(error @ np.linalg.solve(found.covariance, error) / 6)
     allowed = np.sqrt((2 * NOISE_PX**2) / (2 * NOISE_PX**2 + 0.05**2))
     assert np.sqrt(np.mean(square)) == pytest.approx(allowed, abs=0.12)
 
 
-def test_an_epoch_that_had_to_wait_has_the_camera_of_its_time():
+def test_a_delayed_epoch_has_the_camera_of_its_time():
     gauge = GaugeCalibrator(thermal_camera())
     epochs = [Epoch(k, t := START + 10 * k, t, {"h": 20.0 + 0.1 * k}) for k in range(1, 51)]
     results, _ = followed(gauge, epochs)
@@ -319,16 +318,13 @@ def test_an_epoch_that_had_to_wait_has_the_camera_of_its_time():
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 6])
-def test_real_poses_of_eight_corners_agree_with_those_of_the_whole_field(number):
-    """Two boards of a real room as control points, 25 pairs a camera; the rest is scene.
+def test_real_poses_of_eight_corners_agree_with_those_of_the_whole_field(shared, number):
+    """Two boards of a real room as control points, 25 pairs per camera.
 
-    The camera is the whole field's, with its covariance. Sds hold the 2 mm of the coordinates,
-    which both poses have in common: agreement is better than 1.
+    The camera is from the whole field, with its covariance. The sds include 2 mm of the
+    coordinates, which both poses have in common, so the ratio is less than 1.
     """
-    folder = Path(__file__).resolve().parents[3] / "shared" / "data" / f"aviary-cam{number}"
-    if not folder.is_dir():
-        pytest.skip("the real corners are not here: ../shared/data")
-    recording = read_recording(folder)
+    recording = read_recording(shared / "data" / f"aviary-cam{number}")
     epoch = next(e for e in recording.epochs if e.observations is not None)
     whole = Calibrator.of_recording(recording).calibrate(epoch).adjustment
     boards: dict[str, list[int]] = {}
@@ -343,7 +339,9 @@ def test_real_poses_of_eight_corners_agree_with_those_of_the_whole_field(number)
         pair = rng.choice(full, 2, replace=False)
         rows = np.array(sorted(boards[pair[0]] + boards[pair[1]]))
         pose = camera.resect(recording.testfield, epoch.observations.select(rows))
-        assert pose.status in ("ok", "ambiguous_pose"), pose.reason  # of boards in one plane
+        assert pose.status in ("ok", "ambiguous_pose"), (
+            pose.reason
+        )  # if the boards are in one plane
         if pose.ok:
             posed += 1
             ratio.append((pose.values[10:] - whole.values[10:]) / pose.sd[10:])

@@ -1,4 +1,4 @@
-"""A fit that misses an effect says so, widens its standard deviations, and states no band."""
+"""A fit that lacks an effect reports it, widens its standard deviations, and states no band."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.audit_thermal import rate_errors, seen
 from tests.analysis.test_thermal_model import LAG, for_fit, reduced, run, simulated
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.prediction_test import predicted_error
@@ -56,7 +57,7 @@ class Integral(Outside):
 
 
 def follows(history, tau):
-    """The temperature (E,) of something that follows with a time constant of its own, s."""
+    """Return the temperature (E,) after a first-order lag of `tau` s."""
     T = history.temperature()
     out = T.copy()
     for k, step in enumerate(np.diff(history.times), 1):
@@ -80,7 +81,7 @@ class OtherBody(Outside):
 
 
 class Exposure(Outside):
-    """A step with the lamp, as an exposure that follows its light."""
+    """A step with the lamp, like an exposure that depends on light."""
 
     name = "exposure"
 
@@ -110,7 +111,7 @@ class Quadratic(Outside):
 OTHERS = (TwoLags, OtherBody, Exposure, Play, Quadratic)
 
 CASES = {
-    "lag": ModelEffect("thermal_lag", {"tau": 120.0}),
+    "lag": ("thermal_lag", {"tau": 120.0}),
     "tanh": ("tanh", SIZE),
     "signed_square": ("signed_square", SIZE),
     "integral": ("integral", SIZE),
@@ -119,22 +120,18 @@ CASES = {
 
 @pytest.fixture
 def outside(monkeypatch):
-    """The catalogue with effects that no fit is told of."""
+    """Add effects to the catalogue that no fit includes."""
     own = {c.name: c() for c in (Tanh, SignedSquare, Integral, *OTHERS)}
     inside = catalogue.get
     monkeypatch.setattr(catalogue, "get", lambda name: own.get(name) or inside(name))
 
 
-def hidden(name):
-    case = CASES[name]
-    return case if isinstance(case, ModelEffect) else ModelEffect(*case)
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_a_camera_outside_the_family(outside, name):
-    """M1 is fitted by the base model; M2, heated otherwise, gets no band that it does not keep."""
-    first = simulated(1, "M1", listed=(hidden(name),))
-    second = simulated(51, "M2", listed=(hidden(name),), power=6.5)
+    """The base model is fitted to M1; for M2, heated differently, no false band is stated."""
+    effect = ModelEffect(*CASES[name])
+    first = simulated(1, "M1", listed=(effect,))
+    second = simulated(51, "M2", listed=(effect,), power=6.5)
 
     f = fit_thermal_model([reduced(first)], [])
     error = predicted_error(f.model, reduced(second), f.fitted["series"][0].thermometer_sd)
@@ -142,21 +139,21 @@ def test_a_camera_outside_the_family(outside, name):
     assert f.model.evidence["fit"]["effect_missing"]
     assert f.model.evidence["fit"]["misfit_px"] > 2 * 0.004
     assert f.model.misses_an_effect
-    # the noise is not what the model lacks: neither the image's nor the thermometer's
+    # the missing effect is not attributed to the noise of image or thermometer
     assert abs(f.fitted["sigma0"] - 1.0) < 0.03
     assert f.fitted["series"][0].thermometer_sd < 0.06
     assert error.floor_px < 1.2 * NOISE_PX
     assert error.rms_px > 2 * error.floor_px
     assert np.isnan(error.coverage)
-    if name != "tanh":  # whose linear part is a rate like any other
+    if name != "tanh":  # its linear part adds to the rates
         for n in ("c", "x0", "y0"):
             assert abs(f.model.rates[n] - first.model.rates[n]) < 3 * f.model.sd(f"rates.{n}"), n
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OTHERS)
-def test_no_band_that_does_not_hold(outside, kind):
-    """Effects from hardly visible to large: a band holds at least 90 %, or none is stated."""
+def test_no_false_band_is_stated(outside, kind):
+    """For effects from hardly visible to large, a band holds at least 90 %, or none is stated."""
     for k, size in enumerate((0.03, 0.3)):
         effect = ModelEffect(kind.name, {n: v * size for n, v in SIZE.items()})
         first = simulated(100 + k, "M1", listed=(effect,))
@@ -174,9 +171,9 @@ def test_inside_the_family_nothing_is_missing():
         assert not f.model.misses_an_effect
 
 
-def test_the_command_says_it(tmp_path):
+def test_the_commands_report_it(tmp_path):
     for k, name in enumerate(("M1", "M2")):
-        simulated(k, name, listed=(hidden("lag"),)).write(tmp_path / name)
+        simulated(k, name, listed=(ModelEffect(*CASES["lag"]),)).write(tmp_path / name)
     model = tmp_path / "camera.yaml"
     fitted = run("fit", tmp_path / "M1", "-o", model, "--json", tmp_path / "fit.json")
     tested = run("predict", "--model", model, "--test", tmp_path / "M2")
@@ -194,7 +191,7 @@ def test_the_command_says_it(tmp_path):
 
 
 def level_pulls(draws, epochs, noise=0.1, field=0.02):
-    """Errors of the level and the drifts over their stated sd, (draws, 11)."""
+    """Return errors of the level and the rates over their stated sds, (draws, 11)."""
     pulls = []
     for seed in range(draws):
         s = simulated(seed, epochs=epochs)
@@ -202,8 +199,8 @@ def level_pulls(draws, epochs, noise=0.1, field=0.02):
         s = replace(s, device=replace(s.device, thermometers=thermometers))
         rng = np.random.default_rng(1000 + seed)
         wrong = s.field.points + rng.normal(0, field, s.field.points.shape)
-        said = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field))
-        source = epochs_input(s.head, said, list(s.epochs()), "M1")
+        stated = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field))
+        source = epochs_input(s.head, stated, list(s.epochs()), "M1")
         f = fit_thermal_model([for_fit(source)], [LAG], T0=30.0, search=False)
         true = s.model.interior.as_array() + 5.0 * s.model.rate_vector
         names = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")
@@ -211,40 +208,31 @@ def level_pulls(draws, epochs, noise=0.1, field=0.02):
             (getattr(f.model.interior, n) - t) / f.model.sd(f"interior.{n}")
             for n, t in zip(names, true, strict=False)
         ]
-        pull += [
-            (f.model.rates[n] - s.model.rates[n]) / f.model.sd(f"rates.{n}")
-            for n in ("c", "x0", "y0")
-        ]
-        pulls.append(pull)
+        pulls.append(pull + rate_errors(f, s))
     return np.array(pulls)
 
 
-def test_the_level_is_not_as_uncertain_as_the_thermometer_is_noisy():
-    """A few draws: ± 0.4 px is the field's share; 2.8 px was stated for 0.1 K of noise."""
+def test_the_sd_of_the_level_does_not_grow_with_the_thermometers_noise():
+    """The field alone gives ± 0.4 px; with 0.1 K of noise, 2.8 px was once stated."""
     spread = np.sqrt(np.mean(level_pulls(4, 40)[:, :3] ** 2))
     assert 0.5 < spread < 1.6
 
 
-def short(seed, name, effects, epochs, power=9.0):
-    whole = simulated(seed, name, listed=effects, power=power)
-    return replace(whole, programme=replace(whole.programme, epochs=epochs))
-
-
-def test_what_is_not_examined_is_not_called_valid(tmp_path):
-    """Below 30 epochs: a third state, what is left beside the noise, no band where that is much."""
+def test_a_model_that_is_not_examined_is_not_called_valid(tmp_path):
+    """With fewer than 30 epochs, the excess over the noise decides on a band."""
     lag = ModelEffect("thermal_lag", {"tau": 60.0})
     for effects, sound in (((), True), ((lag,), False)):
-        s = short(5, "M1", effects, 25)
+        s = simulated(5, "M1", 25, effects)
         s.write(tmp_path / f"{sound}")
         model = tmp_path / f"{sound}.yaml"
         out = tmp_path / f"{sound}.json"
         fitted = run("fit", tmp_path / f"{sound}", "-o", model, "--json", out).stdout
-        said = run("predict", "--model", model, "--temperature", "30").stderr
+        warning = run("predict", "--model", model, "--temperature", "30").stderr
         document = json.loads(out.read_text())
         assert document["effect_missing"] is None
         assert document["not_examined"] == "fewer than 30 epochs"
         assert "not examined" in fitted
-        assert "not examined" in said
+        assert "not examined" in warning
         assert "valid from" not in fitted
         assert (document["left_over_in_noise"] < 1.1) == sound
         assert document["band"] == sound
@@ -257,14 +245,14 @@ def test_what_is_not_examined_is_not_called_valid(tmp_path):
 def test_short_series_are_examined_together():
     lag = ModelEffect("thermal_lag", {"tau": 60.0})
     for effects, missing in (((), False), ((lag,), True)):
-        series = [reduced(short(k, f"M{k}", effects, 20, 9.0 - k)) for k in (1, 2)]
+        series = [reduced(simulated(k, f"M{k}", 20, effects, 9.0 - k)) for k in (1, 2)]
         assert fit_thermal_model(series, []).model.evidence["fit"]["effect_missing"] is missing
         assert fit_thermal_model(series[:1], []).model.evidence["fit"]["effect_missing"] is None
 
 
 def on_a_mount(s, px):
-    """What was recorded, the camera's angles on a random walk of so many px."""
-    source = epochs_input(s.head, s.field, list(s.epochs()), s.programme.series)
+    """Return the series with a random walk of the camera's angles, `px` at its end."""
+    source = seen(s)
     rng = np.random.default_rng([s.seed, 9])
     epochs, eop = len(s.frame_times), s.truth.eop.copy()
     step = px / np.sqrt(epochs) * s.model.sensor.pixel_pitch / s.model.interior.c
@@ -277,8 +265,7 @@ def on_a_mount(s, px):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("px", [0.3, 0.8])
-def test_a_mount_that_wanders_is_said_beside_a_missing_effect(px):
-    """`discover` finds nothing but the mount there: `fit` claims no effect that is none."""
+def test_a_wandering_mount_is_reported_as_an_alternative_to_a_missing_effect(px):
     for seed in (1, 2):
         f = fit_thermal_model([for_fit(on_a_mount(simulated(seed, listed=()), px))], [])
         assert f.model.evidence["fit"]["effect_missing"]

@@ -1,12 +1,11 @@
-"""Points on the object plane, and the Monte-Carlo: against differences, OpenCV, and themselves."""
+"""Points on the object plane and the Monte-Carlo, against differences, OpenCV, and draws."""
 
 import tracemalloc
 
-import cv2
 import numpy as np
 import pytest
 
-from benchmarks.montecarlo import CORRELATION, IOP, SDS, SENSOR
+from benchmarks.montecarlo import CORRELATION, IOP, SDS, SENSOR, opencv_loop
 from thermocald.analysis.camera.undistortion import image_grid
 from thermocald.analysis.study import montecarlo
 from thermocald.analysis.study.montecarlo import (
@@ -25,34 +24,16 @@ OTHER_IOP = np.array([3.97, 0.021, -0.034, 0.0051, -4e-4, 1e-5, 1.2e-4, -0.9e-4,
 STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-6, 1e-7, 1e-6, 1e-6, 1e-5, 1e-5])
 
 
-def opencv_distances(sets, points, distance_mm):
-    """A loop over the sets with cv2.undistortPoints: distances (n, k) mm to the expected points."""
-    pitch = SENSOR.pixel_pitch
-    image = points.reshape(-1, 1, 2)
-    expected = on_plane(SENSOR, IOP, points, distance_mm)
-    result = np.empty((len(sets), len(points)))
-    for i, (c, x0, y0, a1, a2, a3, b1, b2, _, _) in enumerate(sets):
-        matrix = np.array(
-            [
-                [c / pitch, 0, (SENSOR.width - 1) / 2 + x0 / pitch],
-                [0, c / pitch, (SENSOR.height - 1) / 2 - y0 / pitch],
-                [0, 0, 1],
-            ]
-        )
-        distortion = np.array([a1 * c**2, a2 * c**4, -b2 * c, b1 * c, a3 * c**6])
-        ideal = cv2.undistortPoints(image, matrix, distortion)[:, 0] * [distance_mm, -distance_mm]
-        result[i] = np.linalg.norm(ideal - expected, axis=1)
-    return result
-
-
-def test_distances_are_opencvs_to_a_millionth_of_a_millimetre():
+def test_distances_equal_opencvs_to_a_millionth_of_a_millimetre():
     sets = IOP + np.random.default_rng(1).standard_normal((5000, 8)) @ draw_root(SDS, CORRELATION)
     points = image_grid(SENSOR)
     ours = np.linalg.norm(plane_errors(SENSOR, IOP, sets, points, 1e4), axis=2)
-    np.testing.assert_allclose(ours, opencv_distances(sets, points, 1e4), atol=1e-6, rtol=0)
+    plane = opencv_loop(sets, points) * [1e4, -1e4]
+    theirs = np.linalg.norm(plane - on_plane(SENSOR, IOP, points, 1e4), axis=2)
+    np.testing.assert_allclose(ours, theirs, atol=1e-6, rtol=0)
 
 
-def test_affine_terms_are_inverted_as_the_camera_model_does():
+def test_affine_terms_are_inverted_like_in_the_camera_model():
     sets = IOP + np.random.default_rng(2).standard_normal((50, 10)) * [*SDS[:8], 1e-4, 1e-4]
     points = image_grid(SENSOR)
     expected = [
@@ -71,7 +52,7 @@ def test_a_seed_gives_the_same_numbers_whatever_the_chunks(monkeypatch):
     assert not np.array_equal(first.counts, other.counts)
 
 
-def test_clusters_means_and_ellipses_are_those_of_the_errors():
+def test_clusters_means_and_covariances_are_those_of_the_errors():
     result = simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=3000, seed=3))
     rng = np.random.default_rng(3)
     root = draw_root(SDS, CORRELATION)
@@ -89,8 +70,8 @@ def test_clusters_means_and_ellipses_are_those_of_the_errors():
     np.testing.assert_allclose(result.covariance, scatter, rtol=1e-9, atol=1e-9)
 
 
-def test_large_errors_are_not_and_the_bias_is_that_of_second_order():
-    """A principal distance uncertain by 10 %: E(1/c) exceeds 1/c by 1 %."""
+def test_the_bias_of_large_errors_is_of_second_order():
+    """With an sd of c of 10 %, E(1/c) exceeds 1/c by 1 %."""
     sds = np.array([0.397, 0, 0, 0, 0, 0, 0, 0, 0, 0])
     result = simulate_errors(SENSOR, IOP, sds, CORRELATION, StudySettings())
     np.testing.assert_allclose(
@@ -98,7 +79,7 @@ def test_large_errors_are_not_and_the_bias_is_that_of_second_order():
     )
 
 
-def test_draws_have_the_standard_deviations_and_correlations_asked_for():
+def test_draws_have_the_given_standard_deviations_and_correlations():
     draws = np.random.default_rng(4).standard_normal((200_000, 8)) @ draw_root(SDS, CORRELATION)
     np.testing.assert_allclose(draws.std(axis=0)[:8], SDS[:8], rtol=0.01)
     np.testing.assert_allclose(np.corrcoef(draws[:, :8].T), CORRELATION[:8, :8], atol=0.01)
@@ -126,7 +107,7 @@ def test_sets_that_fold_the_image_are_counted_and_left_out():
     assert np.isfinite(result.overall_mean)
 
 
-def test_an_expected_point_that_does_not_exist_is_an_error():
+def test_an_expected_point_without_a_ray_is_refused():
     folded = IOP.copy()
     folded[3] = -0.2
     with pytest.raises(GeometryError, match="no ray"):
@@ -134,7 +115,7 @@ def test_an_expected_point_that_does_not_exist_is_an_error():
 
 
 @pytest.mark.parametrize("sets", [50_000, pytest.param(5_000_000, marks=pytest.mark.slow)])
-def test_any_number_of_sets_needs_less_than_20_mb_and_says_how_far_it_is(sets):
+def test_any_number_of_sets_needs_less_than_20_mb_and_reports_progress(sets):
     simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=2000))
     done = []
     tracemalloc.start()
@@ -150,8 +131,7 @@ def test_any_number_of_sets_needs_less_than_20_mb_and_says_how_far_it_is(sets):
     assert result.counts.sum() == 9 * sets
 
 
-def test_processes_do_not_matter():
-    """Sets projected on two processes give the bits of one."""
+def test_two_processes_give_the_bits_of_one():
     one, two = (
         simulate_errors(SENSOR, IOP, SDS, CORRELATION, StudySettings(sets=5000, seed=3, jobs=jobs))
         for jobs in (1, 2)
@@ -165,7 +145,7 @@ def test_the_grid_goes_from_corner_to_corner():
     np.testing.assert_array_equal(points[[0, 4, 8]], [[0, 0], SENSOR.centre, [3263, 2447]])
 
 
-def test_jacobian_is_that_of_differences():
+def test_the_jacobian_equals_differences():
     points = image_grid(SENSOR)
     jacobian = plane_jacobian(SENSOR, OTHER_IOP, points, 1e4)
     for k, step in enumerate(STEPS):
@@ -180,7 +160,7 @@ def test_jacobian_is_that_of_differences():
 
 
 @pytest.mark.parametrize("axes", [(3.0, 3.0), (3.0, 1.0), (3.0, 0.0)])
-def test_law_of_distances_is_that_of_a_million_draws(axes):
+def test_the_distribution_of_distances_is_that_of_a_million_draws(axes):
     rng = np.random.default_rng(1)
     distance = np.linalg.norm(rng.standard_normal((1_000_000, 2)) * axes, axis=1)
     mean, expected = mean_and_largest(np.array([axes]), 5000)

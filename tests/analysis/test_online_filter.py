@@ -1,4 +1,4 @@
-"""The recursive estimate: its standard deviations are true, changes are found and named."""
+"""The recursive estimate has true standard deviations, and names changes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RATES = np.array([2.0e-4, -4.5e-4, -3.0e-4])
 
 
 class Surveyed(Scene):
-    """Series of epochs before a field whose coordinates err as its sigmas state."""
+    """Epochs before a field whose coordinates have errors of the stated size."""
 
     def __init__(self, sigma_mm: float, seed: int, missing: float = 0.0) -> None:
         super().__init__(np.random.default_rng([seed, round(1e3 * sigma_mm)]), sigma_mm)
@@ -36,7 +36,7 @@ class Surveyed(Scene):
         return seen, result
 
     def filter(self):
-        """The filter, and a function that gives it an epoch."""
+        """Return the filter, and a function that updates it with an epoch."""
         errors = FieldErrors(self.sensor, self.field)
         found = OnlineFilter(self.sensor, errors.variances)
 
@@ -53,7 +53,7 @@ def one_changed(parameter: int, size: float) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_the_scatter_of_estimate_and_rates_is_what_its_covariance_says():
+def test_the_covariance_of_estimate_and_rates_is_true():
     deviations = []
     for seed in range(40):
         camera = Surveyed(0.0, seed)
@@ -61,14 +61,14 @@ def test_the_scatter_of_estimate_and_rates_is_what_its_covariance_says():
         for k in range(40):
             take(0.25 * k)
         sd = np.sqrt(np.diag(found.covariance()))[:3]
-        # the estimate is that at the last temperature read, which has noise of its own
+        # the estimate is for the last temperature reading, which is noisy
         truth = camera.iop[:3] + RATES * (found.last_temperature - 25.0)
         sd_rate = np.sqrt(np.diag(found.rates_covariance))
         deviations.append(
             [*((found.values()[:3] - truth) / sd), *((found.rates - RATES) / sd_rate)]
         )
     rms = np.sqrt(np.mean(np.square(deviations), axis=0))
-    # wander and lag are allowed for, and this camera has none: conservative, not by much more
+    # the sds allow for wander and lag, which this camera lacks, so they are conservative
     assert np.all(rms < 1.3)
     assert np.all(rms > 0.2)
     assert sd[1] < 0.35 * camera.epoch()[1].sd[1]
@@ -102,7 +102,7 @@ def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone():
     assert take().change == ""
 
 
-def test_with_the_exterior_known_an_epoch_tells_the_interior_ten_times_better():
+def test_a_given_exterior_makes_the_interior_ten_times_better():
     camera = Surveyed(0.0, 3)
     _, result = camera.epoch()
     values, gain, sds = given_exterior(result.values, result.covariance, 1.0)
@@ -126,21 +126,21 @@ def test_an_epoch_without_a_result_changes_nothing():
 
 @pytest.mark.parametrize("missing", mostly_slow([0.0, 0.1], 0.1))
 @pytest.mark.parametrize("sigma_mm", mostly_slow([0.0, 0.01, 0.05], 0.0, 0.05))
-def test_innovations_are_as_large_as_their_covariance_whatever_the_field(sigma_mm, missing):
-    """With the field's errors as noise of each epoch chi-square per degree of freedom was 0.09."""
+def test_innovations_agree_with_their_covariance_for_any_field(sigma_mm, missing):
+    """With the field's errors as noise of each epoch, χ² per degree of freedom was 0.09."""
     ratios = []
     for seed in range(6):
         _, take = Surveyed(sigma_mm, seed, missing).filter()
         found = [take() for _ in range(40)]
         assert all(one.change == "" for one in found)
         ratios += [one.chi2 / one.dof for one in found[1:]]
-    # 234 epochs of 14 degrees of freedom: sd of the mean 0.025.
+    # 234 epochs of 14 degrees of freedom: the sd of the mean is 0.025
     assert 0.9 < np.mean(ratios) < 1.1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma_mm", mostly_slow([0.01, 0.05], 0.05))
-def test_the_sds_of_the_estimate_hold_the_field_whatever_the_number_of_epochs(sigma_mm):
+def test_the_sds_of_the_estimate_include_the_field(sigma_mm):
     deviations, sds = [], []
     for seed in range(200):
         camera = Surveyed(sigma_mm, seed)
@@ -151,10 +151,10 @@ def test_the_sds_of_the_estimate_hold_the_field_whatever_the_number_of_epochs(si
         deviations.append((found.values()[:3] - camera.iop[:3]) / sd)
         sds.append(sd)
     rms = np.sqrt(np.mean(np.square(deviations), axis=0))
-    # 200 draws: a ratio scatters by 5 %.
+    # of 200 draws a ratio scatters by 5 %
     assert np.all((rms > 0.9) & (rms < 1.1)), rms
     pitch = camera.sensor.pixel_pitch
-    assert np.all(np.mean(sds, axis=0)[1:] / pitch > 0.4)  # px, where 0.1 used to be stated
+    assert np.all(np.mean(sds, axis=0)[1:] / pitch > 0.4)  # px; 0.1 was once stated
 
 
 @pytest.mark.parametrize("sigma_mm", mostly_slow([0.0, 0.01, 0.05], 0.05))
@@ -170,7 +170,7 @@ def test_a_knock_of_a_tenth_of_a_pixel_is_noticed(sigma_mm):
 
 
 @pytest.mark.parametrize("sigma_mm", [0.0, 0.05])
-def test_a_steady_camera_is_ready_in_time_before_a_field_that_errs(sigma_mm):
+def test_a_steady_camera_is_ready_in_time_before_any_field(sigma_mm):
     camera = Surveyed(sigma_mm, 1)
     events, states = [], []
     observer = OnlineObserver(camera.sensor, camera.field, lambda *a: events.append(a))
@@ -185,8 +185,8 @@ def test_a_steady_camera_is_ready_in_time_before_a_field_that_errs(sigma_mm):
     assert not events
 
 
-def test_the_noise_is_measured_apart_from_the_field():
-    """A field stated far better or worse than it is leaves the level of the noise alone."""
+def test_the_noise_is_estimated_independently_of_the_field():
+    """The level of the noise is right if the field's sigmas are far too small or too large."""
     for sigma_mm, stated in ((0.05, 0.001), (0.0, 0.05)):
         camera = Surveyed(sigma_mm, 3)
         camera.field = TestField.build(camera.field.names, camera.field.points, stated)
@@ -194,12 +194,12 @@ def test_the_noise_is_measured_apart_from_the_field():
         for _ in range(30):
             seen, result = camera.epoch()
             errors.split(result, seen)
-        # 30 differences of 96 coordinates: 3 %.
+        # 30 differences of 96 coordinates give 3 %
         assert errors.level == pytest.approx(1.0, abs=0.1)
 
 
 def test_noise_twice_as_large_as_stated_is_followed_from_the_first_epoch():
-    """The first epoch was weighted by the stated noise: error over sd 1.5 after six epochs."""
+    """When the first epoch had the stated weight, error over sd was 1.5 after six epochs."""
     off = []
     for seed in range(30):
         scene = Scene(np.random.default_rng(seed), 0.0, 0.08)

@@ -1,4 +1,4 @@
-"""A type of cameras: what is stated of a new specimen holds, and odd ones are seen."""
+"""A camera type: intervals for a new specimen hold, and odd specimens are found."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import pytest
 from thermocald.analysis.statistics.random_effects import odd_specimens, population
 from thermocald.errors import DataError
 
-# rates of c, x0, y0 (µm/K) and the level of x0 (µm): scatter between specimens and their mean
+# rates of c, x0, y0 (µm/K) and the level of x0 (µm): their mean and scatter between specimens
 MEAN = np.array([1.2, -0.8, 0.5, 3.0])
 SD = np.array([0.30, 0.25, 0.20, 6.0])
 CORRELATION = 0.6
 
 
 def fleet(rng, count, noise):
-    """True values (count, k), estimates and their covariances."""
+    """Draw true values (count, k), estimates and their covariances."""
     k = len(MEAN)
     R = np.full((k, k), CORRELATION) + (1 - CORRELATION) * np.eye(k)
     true = MEAN + rng.multivariate_normal(np.zeros(k), R * np.outer(SD, SD), count)
@@ -24,7 +24,7 @@ def fleet(rng, count, noise):
 
 
 def coverage(noise, own, fleets):
-    """Fractions (5,) of 95 % intervals that hold: of each parameter, and of x0 at T0 + 20 K.
+    """Return the shares (5,) of 95 % intervals that hold: of the parameters, and x0 at T0 + 20 K.
 
     own: the new specimen's noise over the scatter of its type.
     """
@@ -48,7 +48,7 @@ def test_the_intervals_hold_over_a_thousand_fleets(noise, own):
     assert (found > 0.92).all()
 
 
-def test_what_is_unknown_comes_from_the_type():
+def test_unknown_values_come_from_the_type():
     rng = np.random.default_rng(5)
     _, found, C = fleet(rng, 10, 0.1)
     people = population(found, C)
@@ -75,7 +75,7 @@ def test_shrinking_is_better_than_either_alone():
 
 
 @pytest.mark.slow
-def test_odd_specimens_are_seen_and_others_are_not():
+def test_only_odd_specimens_are_found():
     rng = np.random.default_rng(7)
     false, seen = [], []
     for _ in range(200):

@@ -1,9 +1,8 @@
-"""The running series: against replay of the same epochs, against the truth, and what it costs."""
+"""The running series, compared with `replay` of the same epochs and with the truth; its cost."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ MAIN = PARAMETER_NAMES[:3]
 
 
 class Scene:
-    """A camera that warms up before a corner known to `field_sd` mm, whose mount may move."""
+    """A camera that warms up before a corner with sds of `field_sd` mm; its mount may move."""
 
     def __init__(self, seed, *, field_sd=0.05, wrong=None, per_side=4, hidden=5, slow_px=0.0,
                  tremble_px=0.0, knock=None, defocus=0.0):  # fmt: skip
@@ -40,13 +39,12 @@ class Scene:
         given = self.plain.points + error * rng.normal(size=self.plain.points.shape)
         self.field = TestField.build(self.plain.names, given, field_sd)
         self.hidden, self.knock, self.defocus = hidden, knock, defocus
-        self.tremble, self.slow = (
-            px * self.sensor.pixel_pitch / 3.04 for px in (tremble_px, slow_px)
-        )
+        per_px = self.sensor.pixel_pitch / 3.04
+        self.tremble, self.slow = tremble_px * per_px, slow_px * per_px
         self.sway = np.zeros(3)
 
     def epoch(self, k: int, exterior=None) -> tuple[Epoch, np.ndarray]:
-        """The epoch, also from elsewhere, and its true values (16,)."""
+        """Return an epoch, at `exterior` if given, and its true values (16,)."""
         rng, warm = self.rng, 1 - np.exp(-k / 25)
         now = np.concatenate([self.model.interior.as_array(), self.model.exterior.as_array()])
         now[:3] += np.array([2e-3, -4.5e-3, -3e-3]) * warm
@@ -66,14 +64,14 @@ class Scene:
 
 
 def begun(sensor, field, c=3.04, exterior="auto", settings=None, offsets=True):
-    """A calibrator and a running series that have seen nothing."""
+    """Return a new calibrator and a new running series."""
     settings = settings or AdjustmentSettings()
     calibrator = Calibrator(sensor, field, settings, nominal_c=c)
     return calibrator, RunningSeries(sensor, field, settings, exterior=exterior, offsets=offsets)
 
 
 def take(scene, epochs, exterior="auto", settings=None, offsets=True):
-    """The running series, its results with their columns, and the epochs by themselves."""
+    """Return the running series, its results with columns, the single epochs, and the truth."""
     calibrator, running = begun(scene.sensor, scene.field, 3.04, exterior, settings, offsets)
     results, alone, truth = [], [], []
     for k in range(epochs):
@@ -85,7 +83,7 @@ def take(scene, epochs, exterior="auto", settings=None, offsets=True):
 
 
 def replayed(sensor, field, epochs, exterior="auto", c=3.04):
-    """The table of the same epochs, by `replay`."""
+    """Return the table of the same epochs from `replay`."""
     head = Head("replay", "M1", 10.0, CameraSpec("camera", sensor, c, None), {})
     calibrator = Calibrator(sensor, field, nominal_c=c)
     temperature = np.array([next(iter(e.temperatures.values()), np.nan) for e in epochs])
@@ -96,8 +94,8 @@ def replayed(sensor, field, epochs, exterior="auto", c=3.04):
 
 
 @pytest.mark.slow
-def test_a_series_of_which_no_epoch_is_good_goes_on():
-    """Twelve targets that hardly show c: the common adjustment ended with an error before."""
+def test_a_series_without_a_good_epoch_goes_on():
+    """Twelve targets hardly determine c; the common adjustment once failed with an exception."""
     running, results, _, _ = take(Scene(0, per_side=2, hidden=0), 60)
     assert running.epochs > 40
     assert {r.status for r, *_ in results} <= {"ok", "weak_geometry", "no_convergence"}
@@ -113,9 +111,10 @@ def assert_like_replay(columns, table, values=0.05, sds=0.02):
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_noise_that_grows_while_the_camera_warms_up_costs_few_targets_few_epochs(seed):
-    """One epoch of 15 targets does not show whether one of them is wrong or all are noisier: its
-    neighbours do. 26 of these 80 epochs had a result live.
+def test_growing_noise_costs_few_epochs_with_few_targets(seed):
+    """Neighbouring epochs show whether one of 15 targets is wrong or all are noisier.
+
+    Of these 80 epochs, 26 once had a live result.
     """
     scene = Scene(seed, per_side=3, hidden=12, defocus=1.5, field_sd=0.01)
     _, results, alone, truth = take(scene, 80)
@@ -141,13 +140,13 @@ SCENES = {
 
 
 def quick(one):
-    """All scenes, one of them in the quick suite."""
+    """Return all scenes, of which one is in the quick suite."""
     return [n if n == one else pytest.param(n, marks=pytest.mark.slow) for n in SCENES]
 
 
 @pytest.mark.parametrize("name", quick("knocked"))
-def test_the_series_is_replay_of_the_epochs_so_far(name):
-    """Values to 0.05 standard deviations, standard deviations to 2 %, whenever all are adjusted."""
+def test_the_series_equals_replay_of_the_epochs_so_far(name):
+    """After each common adjustment, values agree to 0.05 sd, and standard deviations to 2 %."""
     scene = Scene(3, **SCENES[name])
     _, results, alone, _ = take(scene, 60)
     epochs = [c.epoch for c in alone]
@@ -157,8 +156,8 @@ def test_the_series_is_replay_of_the_epochs_so_far(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
-def test_every_epoch_has_its_own_result_with_a_true_standard_deviation(name):
-    """About the mean of 60 epochs: the level is that of the field's errors, stated apart."""
+def test_every_epoch_has_a_result_with_true_standard_deviations(name):
+    """Errors are from the mean of 60 epochs; the level has sds of its own."""
     z = []
     for seed in range(3):
         _, results, alone, truth = take(Scene(seed, **SCENES[name]), 60)
@@ -167,7 +166,7 @@ def test_every_epoch_has_its_own_result_with_a_true_standard_deviation(name):
         error = np.array([r.values[:3] for r, _ in results]) - truth[:, :3]
         z.append((error - error.mean(axis=0)) / [r.sd[:3] for r, _ in results])
         share = np.mean([len(r.rejected) / r.n_observations for r, _ in results])
-    # the last scene: what is rejected is what `replay` rejects of its epochs, or less, or chance
+    # in the last scene no more is rejected than by `replay`, or by chance
     scene = Scene(seed, **SCENES[name])
     table = replayed(scene.sensor, scene.field, [scene.epoch(k)[0] for k in range(60)])
     replays = table.adjustment.rejected.sum() / table.adjustment.observed.sum()
@@ -176,38 +175,33 @@ def test_every_epoch_has_its_own_result_with_a_true_standard_deviation(name):
     assert rms == pytest.approx(np.ones(3), abs=0.15)
 
 
-def test_the_first_epoch_says_what_was_stated_where_it_shows_nothing_else():
-    """A field whose error nobody has seen takes up what one epoch leaves: the noise is not 0."""
+def test_the_first_epochs_have_the_stated_noise():
+    """The unknown errors of the field could absorb all residuals of one epoch."""
     for field_sd, wrong in ((0.02, 0.0), (2.0, 0.4), (0.05, 0.05), (0.002, 0.002)):
         _, results, alone, _ = take(Scene(4, field_sd=field_sd, wrong=wrong, hidden=0), 3)
-        for (result, _), by_itself in zip(results, alone, strict=True):
+        for (result, _), single in zip(results, alone, strict=True):
             assert 0.75 < result.sigma0 < 1.25
-            assert result.sd[1] < 1.3 * by_itself.adjustment.sd[1]
+            assert result.sd[1] < 1.3 * single.adjustment.sd[1]
             assert len(result.rejected) <= 1
         sds = [r.sd[1] for r, _ in results]
         assert sds[0] == pytest.approx(sds[1], rel=0.3)
 
 
-def test_what_is_decided_follows_the_data_and_is_said():
+def test_the_orientation_follows_the_data_and_is_reported():
     running, results, _, _ = take(Scene(5), 24)
     columns = [c for _, c in results]
     assert "mount_px" not in columns[10]
     assert columns[-1]["mount_px"] == 0.0
-    assert running.report()["orientation"] == (
-        "the camera stands still: one orientation for 24 epochs"
-    )
-    running, results, _, _ = take(Scene(5), 12)
-    assert (
-        "until 20 good epochs show whether the camera stands still; 12 so far"
-        in running.report()["orientation"]
-    )
+    report = running.report()["orientation"]
+    assert report == "the camera stands still: one orientation for 24 epochs"
+    report = take(Scene(5), 12)[0].report()["orientation"]
+    assert "until 20 good epochs show whether the camera stands still; 12 so far" in report
     running, results, _, _ = take(Scene(5, tremble_px=0.2), 24)
     assert results[-1][1]["mount_px"] > 0.05
     assert "the mount moves by 0." in running.report()["orientation"]
 
 
-def test_a_camera_that_is_carried_elsewhere_begins_another_series():
-    """Its epochs keep their results."""
+def test_the_series_begins_again_after_the_camera_was_moved():
     scene = Scene(6, hidden=0)
     running, _, _, _ = take(scene, 24)
     calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
@@ -225,7 +219,7 @@ def test_a_camera_that_is_carried_elsewhere_begins_another_series():
 
 
 def test_a_series_that_contradicts_five_epochs_begins_again_and_they_keep_their_results():
-    """Ended with an IndexError at the fifth: the epochs that were kept had been forgotten."""
+    """The fifth epoch once raised an IndexError."""
     scene = Scene(5)
     running, _, _, _ = take(scene, 24)
     calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
@@ -244,7 +238,7 @@ def test_a_series_that_contradicts_five_epochs_begins_again_and_they_keep_their_
     assert restarted == [False] * 4 + [True, False]
 
 
-def test_a_program_started_again_goes_on_where_it_was():
+def test_remembered_epochs_restore_the_series():
     scene = Scene(7)
     _, results, alone, _ = take(scene, 32)
     _, again = begun(scene.sensor, scene.field)
@@ -260,7 +254,7 @@ def test_a_program_started_again_goes_on_where_it_was():
 
 
 @pytest.mark.slow
-def test_gross_errors_in_most_epochs_are_found():
+def test_gross_errors_in_most_epochs_are_rejected():
     scene = Scene(8, hidden=8)
     calibrator, running = begun(scene.sensor, scene.field)
     for k in range(24):
@@ -274,8 +268,8 @@ def test_gross_errors_in_most_epochs_are_found():
             assert set(seen.targets[:3]) <= set(result.rejected)
 
 
-def test_a_clock_that_is_set_back_breaks_nothing():
-    """By two hours in the middle, and to the very first time at the end."""
+def test_a_clock_that_is_set_back_is_harmless():
+    """It is set back by two hours in the middle, and to the first instant at the end."""
     scene = Scene(11)
     calibrator, running = begun(scene.sensor, scene.field)
     for k in range(32):
@@ -288,12 +282,12 @@ def test_a_clock_that_is_set_back_breaks_nothing():
     assert columns["series_epochs"] == 32
 
 
-def test_nothing_shared_leaves_the_epoch_as_it_is():
+def test_without_common_unknowns_epochs_are_unchanged():
     _, results, alone, _ = take(Scene(9), 3, exterior="per_epoch", offsets=False)
     assert all(r is c.adjustment and not x for (r, x), c in zip(results, alone, strict=True))
 
 
-def test_priors_and_what_is_held_are_kept():
+def test_priors_and_held_parameters_are_kept():
     settings = AdjustmentSettings(
         free=("c", "x0", "y0"), priors={"c": (3.1, 1e-6), "Z0": (1000.0, 1e9)}
     )
@@ -304,16 +298,16 @@ def test_priors_and_what_is_held_are_kept():
 
 
 @pytest.mark.slow
-def test_an_epoch_of_month_twelve_costs_what_one_of_the_first_days_does(monkeypatch):
-    """What is adjusted together, and how often, once the epochs that are kept are all there."""
+def test_the_cost_of_an_epoch_does_not_grow_over_months(monkeypatch):
+    """Counts the common adjustments and their epochs once the window is full."""
     monkeypatch.setattr(running_series, "_WINDOW", 30)
     monkeypatch.setattr(running_series, "_FEWEST", 30)
     together: list[int] = []
     real = running_series.adjusted
 
-    def counted(sensor, field, grid, *rest, **told):
+    def counted(sensor, field, grid, *rest, **options):
         together.append(len(grid))
-        return real(sensor, field, grid, *rest, **told)
+        return real(sensor, field, grid, *rest, **options)
 
     monkeypatch.setattr(running_series, "adjusted", counted)
     scene = Scene(11)
@@ -331,14 +325,10 @@ def test_an_epoch_of_month_twelve_costs_what_one_of_the_first_days_does(monkeypa
     assert len(running._kept) == 30
 
 
-@pytest.fixture(scope="module")
-def real(shared):
-    """A real camera that stands still, its field known to some millimetres."""
-    return read_recording(Path(shared) / "data" / "aviary-cam6")
-
-
 @pytest.mark.slow
-def test_a_real_camera_is_live_what_replay_finds(real):
+def test_live_results_of_a_real_camera_equal_replay(shared):
+    """A still camera; the sds of its field are some millimetres."""
+    real = read_recording(shared / "data" / "aviary-cam6")
     calibrator, running = begun(real.camera.sensor, real.testfield, 12.7)
     epochs = list(real.epochs)[:27]
     for n, epoch in enumerate(epochs, 1):

@@ -1,4 +1,4 @@
-"""The scene as a check: rendered banks with moving water, other light, a mount that turns."""
+"""The scene as a check of the model: rendered banks, moving water, other light, a turning mount."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NOISE = 2.0
 
 
 def camera(more_per_kelvin: float = 0.0):
-    """The gauge's camera for small frames; more: µm that c changes per kelvin beside the model."""
+    """Return the gauge's camera for small frames; more_per_kelvin: added to the rate of c, µm/K."""
     thermal = thermal_camera().for_images(WIDTH, HEIGHT)
     rates = {**RATES, "c": RATES["c"] + 1e-3 * more_per_kelvin}
     return replace(thermal, model=replace(thermal.model, rates=rates))
@@ -46,7 +46,7 @@ def texture(rng: np.random.Generator, smooth: float = 1.8) -> np.ndarray:
 
 
 class Bank:
-    """What does not move, as the cold camera sees it, and water over a half of the frame."""
+    """A still bank as seen by the cold camera, and water in half of the frame."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -56,10 +56,10 @@ class Bank:
         self.pixels = np.stack([u.ravel(), v.ravel()], axis=1)
 
     def frame(self, now, turn=(0.0, 0.0, 0.0), light: float = 1.0) -> np.ndarray:
-        """As a camera sees it that has turned; each pixel looks up where the cold one saw it."""
+        """Render the frame of a turned camera; each pixel looks up its place in the cold frame."""
         rays = now.rays(self.pixels) @ rotation(np.array(turn)).T
         at = project(self.cold.sensor, self.cold.values, np.zeros(6), rays / -rays[:, 2:])
-        # OpenCV's remap rounds to 1/32 px, which a whole frame has in common
+        # OpenCV's remap rounds to 1/32 px, a systematic error of a frame
         image = map_coordinates(self.bank, at.T[::-1], prefilter=False, mode="nearest")
         image = image.reshape(HEIGHT, WIDTH)
         water = np.zeros((HEIGHT, WIDTH), np.float32)
@@ -72,7 +72,7 @@ class Bank:
 
 @pytest.mark.slow
 def test_turn_and_principal_distance_have_true_sds():
-    """40 scenes with half of the frame moving by itself: error over sd."""
+    """Error over sd in 40 scenes; half of the frame is moving water."""
     ratio = []
     for seed in range(40):
         bank, thermal = Bank(seed), camera()
@@ -89,7 +89,7 @@ def test_turn_and_principal_distance_have_true_sds():
 
 
 def series(folder, seed: int, beside: float, count: int = 8):
-    """Frames of a day from 10 to 40 °C, whose camera changes by `beside` µm/K more than known."""
+    """Follow frames of a day from 10 to 40 °C; c changes by `beside` µm/K outside the model."""
     bank, true = Bank(seed), camera(beside)
     bank.cold = true.at(10.0)
     frames, times = [], START + 3600.0 * np.arange(count)
@@ -112,22 +112,24 @@ LACKING = {
     "creep": (ModelEffect("creep", {"c": 2e-7, **NONE_OF_POINT}),),
     "permanent_set": (ModelEffect("permanent_set", {"c": 4e-4, **NONE_OF_POINT}),),
 }
-"""Effects by up to 10 µm of c, 0.8 px in the corners of these frames; the lag of 7 µm."""
+"""Effects of up to 10 µm in c, 0.8 px in the corners of these frames; the lag up to 7 µm."""
+
+
+HOURS = np.arange(0, 12.01, 1 / 12)
+WARMTH = 10 + 25 * np.sin(np.pi * HOURS / 12) ** 1.5
 
 
 def day(folder, seed: int, lacks: str = "") -> SceneCourse:
-    """Thirteen frames of a day from 10 to 35 °C and back, of a model that lacks an effect.
+    """Follow thirteen frames of a day from 10 to 35 °C and back; the model lacks an effect.
 
-    Rates, readings, light and the mount are as uncertain as the model and the scene say.
+    Rates, readings, light and mount vary as their stated uncertainties.
     """
     bank, known = Bank(seed), camera()
     rng = bank.rng
     rates = {n: r + rng.normal(0, SD_RATE) for n, r in known.model.rates.items()}
     true = replace(known, model=replace(known.model, rates=rates, effects=LACKING[lacks]))
-    hours = np.arange(0, 12.01, 1 / 12)
-    T = 10 + 25 * np.sin(np.pi * hours / 12) ** 1.5
-    times = START + 3600 * hours
-    states = true.along(times, {"housing": T}, times[::12])
+    times = START + 3600 * HOURS
+    states = true.along(times, {"housing": WARMTH}, times[::12])
     bank.cold = states[0]
     frames = []
     for k, time in enumerate(times[::12]):
@@ -135,21 +137,19 @@ def day(folder, seed: int, lacks: str = "") -> SceneCourse:
         turn = rng.normal(0, 2e-4, 3) if k else np.zeros(3)
         cv2.imwrite(str(path), bank.frame(states[k], turn, rng.uniform(0.8, 1.1)))
         frames.append((path, time))
-    log = TemperatureLog(times, {"housing": T + rng.normal(0, 0.05, len(T))})
+    log = TemperatureLog(times, {"housing": WARMTH + rng.normal(0, 0.05, len(WARMTH))})
     course = follow_scene(known, log, frames)
     for path, _ in frames:
         path.unlink()
     return course
 
 
-C_SD = 0.4e-3  # mm, of a frame's c in these days, 0.03 px in the corners
-HOURS = np.arange(0, 12.01, 1 / 12)
-WARMTH = 10 + 25 * np.sin(np.pi * HOURS / 12) ** 1.5
+C_SD = 0.4e-3  # mm, of c in a frame of these days; 0.03 px in the corners
 
 
 @cache
 def course_of(lacks: str) -> np.ndarray:
-    """What an effect does to c in the thirteen frames of a day, mm, the largest is 1."""
+    """Return an effect's course of c in the thirteen frames of a day; its largest value is 1."""
     times, known = START + 3600 * HOURS, camera()
     true = replace(known, model=replace(known.model, effects=LACKING[lacks]))
     c = [one.along(times, {"housing": WARMTH}, times[::12]).values[:, 0] for one in (true, known)]
@@ -158,9 +158,9 @@ def course_of(lacks: str) -> np.ndarray:
 
 
 def drawn(rng: np.random.Generator, lacks: str, size: float, noise: float = 1.0) -> SceneCourse:
-    """A day's course of c beside the model, drawn: an effect of so many sds of a frame.
+    """Draw a day's course of c outside the model, with an effect of `size` sds of a frame.
 
-    noise: what it is over what is stated.
+    noise: true over stated noise.
     """
     T = WARMTH[::12]
     beside = size * C_SD * course_of(lacks) if lacks else np.zeros(len(T))
@@ -179,32 +179,32 @@ def drawn(rng: np.random.Generator, lacks: str, size: float, noise: float = 1.0)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("noise", "most"), [(0.7, 4), (1.0, 4), (2.0, 35)])
-def test_false_alarms_are_as_rare_as_they_are_said_to_be(noise, most):
-    """Of 1000 days at one in a thousand; of noise that is twice what is stated, three in a hundred.
+def test_false_alarms_are_as_rare_as_stated(noise, most):
+    """1000 days: one in a thousand, or three in a hundred with twice the stated noise.
 
-    That of twelve frames contradicts what is stated, but not always.
+    Residuals of twelve frames do not always show that the noise is larger than stated.
     """
     rng = np.random.default_rng(31)
     assert sum(drawn(rng, "", 0.0, noise).model_misses for _ in range(1000)) <= most
 
 
 @pytest.mark.parametrize("lacks", [name for name in LACKING if name])
-def test_an_effect_of_the_size_of_a_frame_s_noise_is_found_in_the_day(lacks):
-    """Of 8 and 16 sds, 0.27 and 0.54 px in the corners; `python -m benchmarks.river` has more."""
+def test_a_missing_effect_is_found_in_the_course_of_a_day(lacks):
+    """Effects of 8 and 16 sds, 0.27 and 0.54 px in the corners; benchmarks.river has more."""
     rng = np.random.default_rng(32)
     for size, fewest in ((8.0, 27), (16.0, 35)):
         assert sum(drawn(rng, lacks, size).model_misses for _ in range(40)) >= fewest
 
 
 @pytest.mark.slow
-def test_courses_of_other_effects_are_found_too(tmp_path):
-    """Of `python -m benchmarks.river`, whose hundred days say how often."""
+def test_missing_effects_are_found_in_rendered_days(tmp_path):
+    """`python -m benchmarks.river` has a hundred days."""
     assert not any(day(tmp_path, 700 + k).model_misses for k in range(5))
     for lacks in ("self_heating", "permanent_set"):
         assert sum(day(tmp_path, 710 + k, lacks).model_misses for k in range(4)) >= 3
 
 
-def test_a_camera_that_was_moved_is_said_with_the_frame(tmp_path):
+def test_a_movement_is_reported_with_its_frame(tmp_path):
     bank, thermal = Bank(11), camera()
     turned = np.array([3e-4, -4e-4, 0.0])
     frames = []
@@ -218,13 +218,13 @@ def test_a_camera_that_was_moved_is_said_with_the_frame(tmp_path):
     ((row, turn, covariance),) = course.movements
     assert row == 3
     error = turn - turned
-    assert error @ np.linalg.solve(covariance, error) < 16  # of 3 degrees of freedom, one in 1000
+    assert error @ np.linalg.solve(covariance, error) < 16  # 3 degrees of freedom, one in 1000
     assert "3.png: the camera was moved since the frame before: it turned by 0.02" in str(course)
     assert course.as_dict()["movements"][0]["frame"] == "3.png"
 
 
 @pytest.mark.slow
-def test_a_model_that_lacks_an_effect_is_found_and_one_that_holds_is_not(tmp_path):
+def test_only_a_model_that_lacks_an_effect_is_contradicted(tmp_path):
     held = series(tmp_path, 100, 0.0)
     assert held.seen.sum() == 7
     assert not held.model_misses, held.lines()
@@ -237,7 +237,7 @@ def test_a_model_that_lacks_an_effect_is_found_and_one_that_holds_is_not(tmp_pat
 
 
 def test_replay_follows_a_folder_of_photographs(tmp_path):
-    """By the command: names tell the times, the log is a CSV, the model a file."""
+    """The command takes times from file names, the log from a CSV, the model from a file."""
     photographs = tmp_path / "photographs"
     photographs.mkdir()
     bank, thermal = Bank(300), camera()
@@ -260,7 +260,7 @@ def test_replay_follows_a_folder_of_photographs(tmp_path):
     assert "go together" in alone.stderr
 
 
-def test_a_frame_of_night_and_one_of_elsewhere_have_no_movement(tmp_path):
+def test_frames_of_night_and_of_another_scene_have_no_movement(tmp_path):
     bank, other = Bank(7), Bank(8)
     images = [bank.frame(bank.cold), bank.frame(bank.cold) // 60, other.frame(bank.cold)]
     frames = []
@@ -274,7 +274,7 @@ def test_a_frame_of_night_and_one_of_elsewhere_have_no_movement(tmp_path):
     assert "hardly changed" in str(course)
 
 
-def test_nothing_to_follow_is_said(tmp_path):
+def test_frames_that_cannot_be_followed_are_refused(tmp_path):
     with pytest.raises(DataError, match="features"):
         features(np.full((HEIGHT, WIDTH), 90, np.uint8))
     with pytest.raises(DataError, match="at least one more"):
@@ -282,9 +282,8 @@ def test_nothing_to_follow_is_said(tmp_path):
 
 
 def warm_day(count: int, lag_s: float):
-    """A camera with a lag that the model lacks, over a day: times, temperatures, true states."""
-    known = camera()
-    lag = ModelEffect("thermal_lag", {"tau": lag_s})
+    """Return a day's times, temperatures and true states of a camera whose lag the model lacks."""
+    known, lag = camera(), ModelEffect("thermal_lag", {"tau": lag_s})
     hours = np.linspace(0, 10, 4 * count - 3)
     T = 10 + 25 * np.sin(np.pi * hours / 10) ** 1.5
     times = START + 3600 * hours
@@ -292,8 +291,8 @@ def warm_day(count: int, lag_s: float):
     return times, T, true.along(times, {"housing": T}, times[::4])
 
 
-def test_what_does_not_move_is_a_recording(tmp_path):
-    """Its c, x0 and y0 change as the camera's did, within their sds; features that leave go."""
+def test_still_features_give_a_recording(tmp_path):
+    """Changes of c, x0 and y0 are true within their sds; features that disappear are left out."""
     rng = np.random.default_rng(41)
     times, T, states = warm_day(40, 1800.0)
     corners = rng.uniform([5, 5], [WIDTH - 5, HEIGHT - 5], (150, 2))
@@ -312,7 +311,7 @@ def test_what_does_not_move_is_a_recording(tmp_path):
     truth = np.array([state.values[:3] for state in states])[good]
     error = epochs.values[good, :3] - truth
     ratio = (error - error.mean(axis=0)) / epochs.sd[good, :3]
-    # the sds hold a trend, of which one day is a single draw
+    # the sds include a trend, of which one day is a single draw
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 1.1
     short = [None if t is None else (t[0][:11], t[1][:11]) for t in tracks]
     with pytest.raises(DataError, match="11 features"):
@@ -321,14 +320,14 @@ def test_what_does_not_move_is_a_recording(tmp_path):
 
 
 @pytest.mark.slow
-def test_discover_names_what_the_model_lacks_from_the_scene_alone(tmp_path):
-    """Photographs with half of the frame moving by itself, by the commands."""
+def test_discover_names_the_missing_effect_from_the_scene_alone(tmp_path):
+    """`replay` writes a recording from photographs; half of the frame is moving water."""
     bank = Bank(900)
     times, T, states = warm_day(41, 1800.0)
     bank.cold = states[0]
+    (tmp_path / "photographs").mkdir()
     for k, state in enumerate(states):
         moment = datetime.fromtimestamp(times[4 * k], UTC)
-        (tmp_path / "photographs").mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / f"photographs/{moment:%Y%m%d-%H%M%S}.png"), bank.frame(state))
     warm = T + bank.rng.normal(0, 0.05, T.size)
     rows = [f"{t:.3f},{v:.3f}" for t, v in zip(times, warm, strict=True)]
@@ -343,4 +342,4 @@ def test_discover_names_what_the_model_lacks_from_the_scene_alone(tmp_path):
     found = tc.discover(tc.open(out)).as_dict()
     assert found["effects"][0]["effect"] == "thermal_lag"
     tau = found["effects"][0]["estimates"]["tau"]
-    assert abs(tau["value"] - 1800.0) < 4 * tau["sd"] + 30.0, tau  # names tell whole seconds
+    assert abs(tau["value"] - 1800.0) < 4 * tau["sd"] + 30.0, tau  # file names have whole seconds

@@ -1,4 +1,4 @@
-"""A board that is knocked, a target that wanders: replay and study say it and take it off."""
+"""Replay and study report knocked boards and wandering targets, and leave them out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EPOCHS = 50
 
 
 def recorded(tmp_path, field_motion):
-    """A camera with a base drift alone, and of the same with a field that moves."""
+    """Write recordings of a camera with a base drift, before a moving and a still field."""
     for name, kind in (("still", ""), ("moved", field_motion)):
         case = Case((), 0.1, 3, epochs=EPOCHS, with_m2=False, field_motion=kind, noise_px=0.04)
         write(generate(case)[0][0], tmp_path / name)
@@ -32,11 +32,11 @@ def replayed(folder):
     ("kind", "targets"),
     [
         ("knock", [str(i + 1) for i in BOARD]),
-        pytest.param("creep", [str(i + 1) for i in BOARD], marks=pytest.mark.slow),
-        pytest.param("wander", [str(TARGET + 1)], marks=pytest.mark.slow),
+        ("creep", [str(i + 1) for i in BOARD]),
+        ("wander", [str(TARGET + 1)]),
     ],
 )
-def test_what_the_field_did_is_said_and_is_no_drift(tmp_path, kind, targets):
+def test_a_movement_of_the_field_is_reported_and_is_no_drift(tmp_path, kind, targets):
     moved, still = recorded(tmp_path, kind)
 
     found, plain = replayed(moved), replayed(still)
@@ -51,7 +51,7 @@ def test_what_the_field_did_is_said_and_is_no_drift(tmp_path, kind, targets):
 
 
 @pytest.mark.slow
-def test_the_study_notes_it(tmp_path):
+def test_the_study_reports_a_knock(tmp_path):
     moved, _ = recorded(tmp_path, "knock")
     out = tmp_path / "study.json"
 

@@ -1,4 +1,4 @@
-"""Series and cameras studied: what is found, and what is said in words where nothing can be."""
+"""Studies of series and cameras: results, and notes where there is no result."""
 
 import time
 from dataclasses import replace
@@ -26,7 +26,7 @@ SETTINGS = StudySettings(sets=2000)
 CLUSTERS = (15.0, 50.0, 100.0)
 
 
-def test_a_warm_up_is_found_where_it_was_put_and_only_there(warm_up):
+def test_a_warm_up_is_found_in_its_parameters_only(warm_up):
     found = study_series(warm_up()(), SETTINGS)
     change = found.deviations["x0"]
     expected = 0.0194 * (1 - np.exp(-1490 / 300))
@@ -40,16 +40,13 @@ def test_a_warm_up_is_found_where_it_was_put_and_only_there(warm_up):
     assert found.significance["B2"].drift.p_value > 0.01
     slope = channel.dependences["x0"]
     assert abs(slope.slope - 0.0194 / 12) < 4 * slope.sd_slope
-
-
-def test_parameters_held_fixed_are_named_and_absent(warm_up):
-    found = study_series(warm_up()(), SETTINGS)
+    # parameters held fixed are named, and absent
     assert "A3, C1, C2 were held fixed" in " ".join(found.notes)
     for part in (found.deviations, found.significance, found.channels[0].dependences):
         assert not {"A3", "C1", "C2"} & set(part)
 
 
-def test_a_single_epoch_says_so_and_computes_nothing(warm_up):
+def test_a_single_epoch_has_notes_and_no_results(warm_up):
     result = study([warm_up(epochs=1)()], SETTINGS).cameras[0]
     one = result.series[0]
     assert "a single epoch: nothing can be said about change" in " ".join(one.notes)
@@ -69,7 +66,7 @@ def test_a_single_epoch_says_so_and_computes_nothing(warm_up):
     ],
     ids=["constant", "noise only", "never read"],
 )
-def test_a_temperature_that_says_nothing(warm_up, temperature, words):
+def test_a_temperature_without_information(warm_up, temperature, words):
     series = warm_up()(thermometers=(Thermometer("temperature", temperature, 0.05),))
     found = study_series(series, SETTINGS)
     assert words in " ".join(found.notes)
@@ -79,7 +76,7 @@ def test_a_temperature_that_says_nothing(warm_up, temperature, words):
         assert np.isnan(found.matrix[column]).all()
 
 
-def test_gaps_are_said_and_not_tested_across(warm_up):
+def test_gaps_are_reported_and_not_tested_across(warm_up):
     series, rows = warm_up()(), np.r_[0:60, 100:150]
     names = ("number", "time_s", "values", "sds", "sigma0", "redundancy", "correlations")
     kept = {name: getattr(series, name)[rows] for name in names}
@@ -91,7 +88,7 @@ def test_gaps_are_said_and_not_tested_across(warm_up):
     assert found.significance["c"].tests == 30 + 20
 
 
-def test_missing_temperatures_leave_out_their_epochs_only(warm_up):
+def test_only_epochs_with_missing_temperatures_are_left_out(warm_up):
     series = warm_up()()
     values = series.thermometers[0].values.copy()
     values[40:50] = np.nan
@@ -107,7 +104,7 @@ def test_lost_epochs_are_counted_by_reason(warm_up):
     assert "7 of 157 epochs have no result (7 × too few targets)." in found.notes
 
 
-def test_a_parameter_that_never_changed_is_no_dependence(warm_up):
+def test_a_constant_parameter_has_no_dependence(warm_up):
     series = warm_up()()
     series.values[:, 3] = series.values[0, 3]
     found = study_series(series, SETTINGS)
@@ -115,7 +112,7 @@ def test_a_parameter_that_never_changed_is_no_dependence(warm_up):
     assert found.deviations["A1"].change == 0
 
 
-def test_labels_make_cameras_and_series_are_pooled(warm_up):
+def test_series_of_a_label_are_pooled_as_one_camera(warm_up):
     series = [
         warm_up(seed=1)("M1", "cold"),
         warm_up(seed=2)("M2", "cold"),
@@ -130,7 +127,7 @@ def test_labels_make_cameras_and_series_are_pooled(warm_up):
     assert warm.montecarlo.overall_mean < 0.6 * cold.montecarlo.overall_mean
 
 
-def test_series_of_one_name_are_told_apart_by_where_they_are(warm_up):
+def test_series_of_one_name_are_named_by_their_places(warm_up):
     pair = [replace(warm_up(seed=k)("M1", "cold"), source=f"/data/{k}") for k in (1, 2)]
     (camera,) = study(pair, StudySettings(sets=100)).cameras
     assert [one.series.name for one in camera.series] == ["M1 in 1", "M1 in 2"]
@@ -141,15 +138,15 @@ def test_first_order_agrees_where_errors_are_small(warm_up):
     first, drawn = camera.first_order, camera.montecarlo
     np.testing.assert_allclose(first.mean, drawn.mean, rtol=0.02)
     np.testing.assert_allclose(first.fractions, drawn.fractions, atol=0.01)
-    # Maxima of 50,000 draws scatter by some per cent.
+    # maxima of 50,000 draws scatter by several per cent
     np.testing.assert_allclose(first.expected_largest, drawn.largest, rtol=0.2)
-    # A variance is known to 0.6 %, a mean to 0.0045 of the standard deviation.
+    # the draws give a variance to 0.6 %, a mean to 0.0045 sd
     variance = first.covariance[:, 0, 0]
     np.testing.assert_allclose(drawn.covariance[:, 0, 0], variance, rtol=0.03)
     assert np.linalg.norm(drawn.mean_error, axis=1).max() < 0.02 * np.sqrt(variance[0])
 
 
-def test_without_covariances_there_is_no_monte_carlo_but_a_reason(warm_up):
+def test_without_covariances_there_is_a_note_instead_of_a_monte_carlo(warm_up):
     series = warm_up()(correlations=np.empty((0, 10, 10)))
     camera = study([series], StudySettings(sets=100)).cameras[0]
     assert camera.montecarlo is None
@@ -158,16 +155,16 @@ def test_without_covariances_there_is_no_monte_carlo_but_a_reason(warm_up):
 
 @pytest.mark.slow
 def test_two_hundred_thousand_epochs_in_seconds(warm_up):
-    """A sixteenth of a year; the year itself is in benchmarks/study.py."""
+    """A sixteenth of a year; benchmarks/study.py has a whole year."""
     series = warm_up(epochs=200_000)(correlations=np.tile(np.eye(10), (5000, 1, 1)))
-    begin = time.process_time()  # other jobs may share the machine
+    begin = time.process_time()  # so that other programs do not count
     result = study([series], StudySettings())
     assert time.process_time() - begin < 12
     assert result.cameras[0].series[0].significance["x0"].tests == 200_000 - 30
 
 
-def test_a_shift_of_the_principal_point_moves_all_points_alike(warm_up):
-    """x0 alone, no distortion to speak of: D Δx0 / c at every image point."""
+def test_a_shift_of_the_principal_point_moves_all_points_equally(warm_up):
+    """A change of x0 alone moves every image point by D Δx0 / c, with little distortion."""
     series = warm_up(drift={"x0": 0.0194}, sds=np.full(10, 1e-12))()
     first, mean, last = trajectories([series], 10_000.0, 3, CLUSTERS)
     away = np.abs(series.values[:, 1] - series.values[0, 1]) * 10_000.0 / series.values[0, 0]
@@ -178,23 +175,23 @@ def test_a_shift_of_the_principal_point_moves_all_points_alike(warm_up):
     assert mean.mean < first.mean
     assert mean.mean_largest < first.mean_largest
     assert first.fractions.sum() == pytest.approx(1.0)
-    # A warm-up leaves its start quickly and stays near its end.
+    # a warm-up leaves its start quickly and stays near its end
     assert first.fractions[0] < last.fractions[0]
 
 
-def test_correlations_over_time_are_about_each_series_mean(warm_up):
+def test_correlations_over_time_refer_to_each_series_mean(warm_up):
     made = warm_up(drift={"x0": 0.02, "y0": -0.02})
     r = correlations_over_time([made("M1"), made("M2")])
     assert r[1, 2] == pytest.approx(-1.0, abs=1e-3)
     assert np.isnan(r[IOP_NAMES.index("A3"), 1])  # held
-    # Two series at different levels: what lies between them is no correlation.
+    # a difference of levels between two series is no correlation
     still = warm_up(drift={})
     one, other = still("M1"), still("M2")
     other.values[:, 1:3] += 1.0
     assert abs(correlations_over_time([one, other])[1, 2]) < 0.3
 
 
-def test_the_summary_says_what_the_draws_are_and_what_the_camera_did(warm_up):
+def test_the_summary_explains_the_draws_and_the_cameras_course(warm_up):
     camera = study_camera("nexus", [warm_up()()], StudySettings(sets=500))
     text = " ".join(answer_sentences(camera))
     assert "drawn from independent normal distributions about the series' mean" in text
@@ -202,8 +199,8 @@ def test_the_summary_says_what_the_draws_are_and_what_the_camera_did(warm_up):
     assert "x₀ and y₀ −0.999" in text or "x₀ and y₀ −1" in text
 
 
-def test_a_camera_that_heats_and_cools_is_told_by_its_range(warm_up):
-    """The change from first to last is nothing; the text must not say that nothing changed."""
+def test_a_camera_that_heats_and_cools_is_described_by_its_range(warm_up):
+    """The text does not claim that nothing changed, though last equals first."""
     make = warm_up()
     warm = make()
     up_and_down = np.concatenate([np.arange(75), np.arange(75)[::-1]])
@@ -222,48 +219,42 @@ def test_a_camera_that_heats_and_cools_is_told_by_its_range(warm_up):
     assert "temperature rose by up to 1" in text
 
 
-def test_last_minus_first_with_its_sd_passes_over_missing_epochs():
+def test_last_minus_first_ignores_missing_epochs():
     values = np.array([np.nan, 1.0, 5.0, 2.5, np.nan])
     found = deviation(values, np.array([9.0, 0.3, 9.0, 0.4, 9.0]))
     assert found is not None
     assert (found.first, found.last, found.change) == (1.0, 2.5, 1.5)
     assert found.sd_change == pytest.approx(0.5)
     assert found.largest == 4.0
-    # one value is none
+    # a single value has no change
     assert deviation(np.array([np.nan, 1.0]), np.ones(2)) is None
 
 
-def test_a_moved_principal_point_moves_every_image_point_by_as_much():
-    first = np.array([3.97, 0.01, -0.02, 5e-3, -4e-4, 0, 1e-4, -1e-4, 0, 0])
-    later = first.copy()
-    later[1:3] += np.array([10.0, 5.0]) * 0.0014
-    moved = image_displacement(NEXUS, first, later, image_grid(NEXUS))
-    np.testing.assert_allclose(moved, np.tile([10.0, -5.0], (9, 1)), atol=1e-6)
-
-
-def test_a_longer_principal_distance_moves_points_outwards_in_proportion():
-    first = np.array([3.97, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
-    later = first.copy()
-    later[0] *= 1.002
+def test_displacements_by_principal_point_and_principal_distance():
     points = image_grid(NEXUS)
+    first = np.array([3.97, 0.01, -0.02, 5e-3, -4e-4, 0, 1e-4, -1e-4, 0, 0])
+    later = first + np.array([0, 10.0, 5.0, *[0] * 7]) * 0.0014
     moved = image_displacement(NEXUS, first, later, points)
+    np.testing.assert_allclose(moved, np.tile([10.0, -5.0], (9, 1)), atol=1e-6)
+    first = np.array([3.97, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
+    moved = image_displacement(NEXUS, first, 1.002 * first, points)
     np.testing.assert_allclose(moved, 0.002 * (points - NEXUS.centre), atol=1e-9)
 
 
 def blur(f, f_number, focus, distance):
-    """Diameter of the blur circle, by the thin lens: image distances of both objects."""
+    """Return the diameter of the blur circle of a thin lens."""
     image, other = (f * s / (s - f) for s in (focus, distance))
     return f / f_number * abs(other - image) / other
 
 
-def test_limits_have_the_blur_circle_that_was_allowed():
+def test_limits_of_the_depth_of_field_have_the_permitted_blur():
     near, far = depth_of_field(3.97, 1000.0, 2.4, 0.0029)
     assert blur(3.97, 2.4, 1000.0, near) == pytest.approx(0.0029, rel=1e-9)
     assert blur(3.97, 2.4, 1000.0, far) == pytest.approx(0.0029, rel=1e-9)
-
-
-def test_beyond_the_hyperfocal_distance_everything_far_is_sharp():
+    # beyond the hyperfocal distance
     assert np.isinf(depth_of_field(3.04, 3000.0, 2.0, 0.003)[1])
+    with pytest.raises(ValueError, match="no depth of field"):
+        depth_of_field(3.97, 3.0, 2.0, 0.003)  # a focus inside the lens
 
 
 @pytest.mark.parametrize(
@@ -275,13 +266,8 @@ def test_beyond_the_hyperfocal_distance_everything_far_is_sharp():
         (Sensor(4032, 3024, 0.0014), 4.2, 1.7, 0.003, 2),
     ],
 )
-def test_changes_of_the_reference(sensor, c, f_number, drift, quoted):
-    """Quoted in whole mm at 1 m, without f-number and circle of confusion: within 1 mm."""
+def test_changes_of_the_depth_of_field_in_the_reference_study(sensor, c, f_number, drift, quoted):
+    """The study quotes whole mm at 1 m, without f-number and circle of confusion."""
     confusion = circle_of_confusion(sensor)
     before, after = (depth_of_field(v, 1000.0, f_number, confusion) for v in (c, c + drift))
     assert np.ptp(before) - np.ptp(after) == pytest.approx(quoted, abs=1.0)
-
-
-def test_a_focus_inside_the_lens_is_refused():
-    with pytest.raises(ValueError, match="no depth of field"):
-        depth_of_field(3.97, 3.0, 2.0, 0.003)

@@ -1,4 +1,4 @@
-"""Series from recordings and stores: what is read, what is left out and why."""
+"""Series from recordings and stores: epochs read, and epochs left out with a reason."""
 
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.physics.presets import preset_simulation
 from thermocald.store.database.store import Store
+from thermocald.store.recording.reader import open_recording
 from thermocald.store.series import EpochResult
 
 FREE = ("c", "x0", "y0", "A1", "A2", "B1", "B2")
@@ -17,7 +18,7 @@ FREE = ("c", "x0", "y0", "A1", "A2", "B1", "B2")
 
 @pytest.fixture
 def recording(tmp_path):
-    """Ten epochs of a warm phone, of which two say too little or nothing."""
+    """Write ten epochs of a warm phone, of which two have too few or no observations."""
     simulation = preset_simulation("nexus5-warm", 1)
     simulation = replace(simulation, programme=replace(simulation.programme, epochs=10))
     simulation.write(tmp_path / "rec")
@@ -29,13 +30,13 @@ def recording(tmp_path):
     return tmp_path / "rec"
 
 
-def test_epochs_without_a_result_are_counted_and_the_rest_is_relative(recording):
+def test_epochs_without_a_result_are_counted(recording):
     series = tc.open(recording).measured(free=FREE, exterior="series")
     assert series.number.tolist() == [1, 2, 4, 5, 6, 8, 9, 10]
     assert sum(series.without_result.values()) == 2
     assert series.free == FREE
     assert series.exterior == "series"
-    # DESIGN idea 3: with one exterior orientation, thousandths of a pixel.
+    # DESIGN idea 3: thousandths of a pixel with one exterior orientation
     assert series.sds[0, 1] / series.sensor.pixel_pitch < 0.01
     assert series.correlations.shape == (8, 10, 10)
     assert [t.name for t in series.thermometers] == ["temperature", "board_temperature"]
@@ -48,8 +49,6 @@ def test_the_thermometers_noise_may_be_given(recording):
 
 
 def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
-    from thermocald.store.recording.reader import open_recording
-
     opened = open_recording(recording)
     covariance = np.diag(np.append(np.full(8, 1e-8), np.zeros(8)))
     broken = covariance.copy()
@@ -73,16 +72,14 @@ def test_a_store_is_read_in_columns_without_broken_epochs(recording, tmp_path):
     assert series.free == IOP_NAMES[:8]
     assert len(series.correlations) == 8
     assert series.redundancy.tolist() == [200] * 8
-    # a store's export is the numbers in it; not adjusted again
+    # the numbers in a store are exported without a new adjustment
     table = tc.open(tmp_path / "s.db").calibrate(exterior="stored")
     np.testing.assert_array_equal(table.values[:, 0], columns["c"])
     np.testing.assert_array_equal(table.sd[:, 0], columns["sd_c"])
     assert (table.sd[table.ok, 0] == 1e-4).all()
 
 
-def test_a_store_without_any_result_is_one_error(recording, tmp_path):
-    from thermocald.store.recording.reader import open_recording
-
+def test_a_store_without_any_result_is_refused(recording, tmp_path):
     opened = open_recording(recording)
     with Store.open(tmp_path / "s.db", "append", durable=False) as store:
         stored = store.create_series(opened.head, opened.testfield)
@@ -91,7 +88,7 @@ def test_a_store_without_any_result_is_one_error(recording, tmp_path):
         tc.open(tmp_path / "s.db").measured(exterior="per_epoch")
 
 
-def test_an_empty_store_is_one_error(tmp_path):
+def test_an_empty_store_is_refused(tmp_path):
     with Store.open(tmp_path / "s.db", "append", durable=False):
         pass
     with pytest.raises(DataError, match="holds no series"):

@@ -1,4 +1,4 @@
-"""The thermal camera: the same answer by every way, covariance against draws, refusals."""
+"""The thermal camera: equal results from all methods, covariance against draws, refusals."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LISTED = (
 
 
 @pytest.mark.parametrize("T", [22.0, 25.0, 37.9, 44.0])
-def test_steady_is_the_end_of_a_long_history(T):
+def test_the_steady_state_is_the_end_of_a_long_history(T):
     camera = ThermalCamera(thermal_model(*LISTED))
     now = camera.at(T)
     along = camera.along([0.0, 5e4, 1e5], [T, T, T])
@@ -52,7 +52,7 @@ def _moved(effect, change):
 
 
 def test_covariance_against_draws():
-    """400 models drawn with the file's standard deviations."""
+    """400 models are drawn with the file's standard deviations."""
     model = thermal_model(*LISTED)
     camera = ThermalCamera(model)
     rng = np.random.default_rng(5)
@@ -72,7 +72,7 @@ def test_covariance_against_draws():
     scatter = np.std(values, axis=0, ddof=1)
     stated = np.sqrt(np.diag(state.covariance))
     free = stated > 0
-    # 400 draws: a standard deviation is known to 3.5 %, 3 sd of that
+    # 400 draws give a standard deviation to 3.5 %; the bound is three of those
     np.testing.assert_allclose(scatter[free] / stated[free], 1.0, atol=0.11)
 
 
@@ -102,8 +102,8 @@ def test_undistort_is_exact():
     np.testing.assert_allclose(state.undistort(points), back, rtol=0, atol=1e-7)
 
 
-def test_folding_distortion_is_left_to_rays():
-    """A lens whose polynomial folds outside the image circle: no fast inverse, the same answer."""
+def test_a_folding_distortion_has_the_rays_of_the_camera_model():
+    """The polynomial folds outside the image circle, so there is no fast inverse."""
     sensor = Sensor(1000, 800, 0.004)
     iop = InteriorOrientation(c=3.0, A1=-0.055).as_array()
     points = np.array([[500.0, 400.0], [600.0, 300.0], [200.0, 500.0]])
@@ -120,7 +120,7 @@ def test_undistorting_a_million_points():
     assert undistorting(ThermalCamera(thermal_model()).at(30.0)) <= 2
 
 
-def test_outside_the_validity_it_warns_and_widens():
+def test_outside_the_validity_it_warns_or_refuses():
     camera = ThermalCamera(thermal_model())
     inside = camera.at(50.0)
     with pytest.warns(ExtrapolationWarning, match=r"4\.0 K outside the 20 to 50 °C"):
@@ -130,10 +130,6 @@ def test_outside_the_validity_it_warns_and_widens():
     with pytest.warns(ExtrapolationWarning):
         along = camera.along([0.0, 10.0], [45.0, 54.0])
     assert along.extrapolated.tolist() == [0.0, 4.0]
-
-
-def test_far_outside_it_is_refused():
-    camera = ThermalCamera(thermal_model())
     with pytest.raises(UsageError, match="ask for extrapolation by name"):
         camera.at(-20.0)
     with pytest.warns(ExtrapolationWarning):
@@ -149,7 +145,7 @@ def test_fahrenheit_is_refused(T):
         camera.along([0.0, 10.0, 20.0], [T - 1, T, T + 1])
 
 
-def test_another_camera_a_crop_a_binning():
+def test_images_of_another_camera_a_crop_and_a_binning():
     camera = ThermalCamera(thermal_model())
     with pytest.raises(ConfigurationError, match="belongs to one camera"):
         camera.for_images(3280, 2464, "nexus5")
@@ -157,7 +153,7 @@ def test_another_camera_a_crop_a_binning():
         camera.for_images(1920, 1080)
     half = camera.for_images(1640, 1232)
     centre = np.array([[100.0, 50.0]])
-    full = camera.at(30.0).rays(centre * 2 + 0.5)  # the middle of the four pixels that were binned
+    full = camera.at(30.0).rays(centre * 2 + 0.5)  # the middle of the four binned pixels
     np.testing.assert_allclose(half.at(30.0).rays(centre), full, atol=1e-12)
 
 
@@ -170,18 +166,18 @@ def test_second_thermometer_must_be_given():
     assert a.interior.c - b.interior.c == pytest.approx(20 * 1e-5)
 
 
-def test_thermometer_noise_is_carried():
+def test_thermometer_noise_is_propagated():
     camera = ThermalCamera(replace(thermal_model(), sds={}))
     assert camera.at(30.0, temperature_sd=0.5).sd["x0"] == pytest.approx(0.5 * 4.5e-4)
 
 
-def test_object_error_by_differences():
+def test_the_object_error_equals_differences():
     state = ThermalCamera(thermal_model()).at(30.0)
     sd = 1e-3
     only_x0 = replace(state, covariance=np.diag([0, sd**2, 0, 0, 0, 0, 0, 0, 0, 0]))
     moved = replace(state, values=state.values + np.array([0, sd, 0, 0, 0, 0, 0, 0, 0, 0]))
     found, expected = only_x0.object_error(10_000.0), moved.object_distance(state, 10_000.0)
-    # in the image's corners the distortion has its say; in the middle they must be the same
+    # distortion matters in the image's corners, not in the middle
     np.testing.assert_allclose(found, expected, rtol=0.05)
     assert found[4] == pytest.approx(sd / state.interior.c * 10_000.0, rel=1e-3)
 
@@ -198,7 +194,7 @@ def test_warm_up_time_of_an_exponential():
     assert still_moving is None
 
 
-def test_load(tmp_path):
+def test_a_written_model_is_loaded(tmp_path):
     write_model(tmp_path / "m.yaml", thermal_model(*LISTED))
     a, b = ThermalCamera.load(tmp_path / "m.yaml").at(30.0), ThermalCamera(thermal_model(*LISTED))
     np.testing.assert_array_equal(a.values, b.at(30.0).values)

@@ -1,4 +1,4 @@
-"""A type of cameras, and a camera of it that was measured at few temperatures."""
+"""A camera type, and a camera of the type that was measured at few temperatures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def values_of(model):
 
 
 def of_its_type(rng):
-    """A new camera, its true values, and what it is with what ten others say."""
+    """Draw a new camera, its true values, and its model combined with the type of ten others."""
     _, fleet = cameras(rng, 10, 0.1)
     true, (new,) = cameras(rng, 1, 1.0)
     return new, true[0], shrunk_to_type(new, type_model(fleet, "rpi-v2.1"))
@@ -54,7 +54,7 @@ def pull(true, found):
 
 
 @pytest.mark.slow
-def test_few_temperatures_and_the_type_are_better_than_few_temperatures():
+def test_the_type_improves_a_camera_measured_at_few_temperatures():
     rng = np.random.default_rng(8)
     pulls, own, shrunk = [], [], []
     for _ in range(60):
@@ -71,13 +71,13 @@ def test_few_temperatures_and_the_type_are_better_than_few_temperatures():
 
 @pytest.mark.slow
 def test_intervals_hold_over_a_thousand_fleets():
-    """A new camera that knows as much of itself as its type does: where shrinking is hardest."""
+    """The new camera's sds equal its type's scatter, the most difficult case."""
     rng = np.random.default_rng(5)
     pulls = [pull(*of_its_type(rng)[1:]) for _ in range(1000)]
     assert np.mean(np.abs(pulls) < 1.96) == pytest.approx(0.95, abs=0.01)
 
 
-def test_models_that_are_not_alike_are_refused():
+def test_models_of_different_kinds_are_refused():
     _, fleet = cameras(np.random.default_rng(9), 4, 0.1)
     kind = type_model(fleet, "rpi")
     with pytest.raises(DataError, match="not a type model"):

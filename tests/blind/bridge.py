@@ -1,4 +1,4 @@
-"""From the generator's arrays to what the program reads, without files."""
+"""The generator's arrays as the program's input, without files."""
 
 from __future__ import annotations
 

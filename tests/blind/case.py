@@ -1,4 +1,4 @@
-"""What a blind recording shall hide, and on which camera."""
+"""The effects, camera and errors of a blind recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERAS = {
 
 @dataclass
 class Case:
-    """What is asked for."""
+    """A recording to generate."""
 
     effects: tuple[str, ...] = ()
     strength_px: float = 0.3
@@ -36,6 +36,6 @@ class Case:
     camera: str | None = None
     programmes: tuple[str, str] | None = None
     with_m2: bool = True
-    influence: str = ""  # of `outside`, where the effect is OUTSIDE
+    influence: str = ""  # of the module `outside`, if the effect is OUTSIDE
     record_humidity: bool = False
-    field_motion: str = ""  # what happens to the test field in M1: knock, creep, wander
+    field_motion: str = ""  # motion of the test field in M1: knock, creep, wander

@@ -1,4 +1,4 @@
-"""What happens to the test field of a blind recording: no effect of the camera, and none is named.
+"""Motions of the test field of a blind recording, which are no effects of the camera.
 
 A board is one of the three sheets, 49 targets.
 """
@@ -15,7 +15,7 @@ TARGET = 20
 def moved_field(
     rng: np.random.Generator, kind: str, points: np.ndarray, frames: np.ndarray
 ) -> np.ndarray:
-    """Object points (E, n, 3) mm after a knock, a creep of the board, a wander of one target."""
+    """Return object points (E, n, 3) mm with a knocked or creeping board, or a wandering target."""
     out = points.copy()
     u = (frames - frames[0]) / (frames[-1] - frames[0])
     if kind == "wander":

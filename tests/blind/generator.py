@@ -1,8 +1,8 @@
-"""A generator of recordings in which an effect is hidden; shares no code with thermocald.
+"""A generator of recordings with a hidden effect, which shares no code with thermocald.
 
-Own projection, own heat, own noise, everything on a time axis of one second, written from
-CONVENTIONS and EFFECTS alone. Used in memory by the scoring, or written as a recording
-(CONVENTIONS §3) with the truth in another place.
+Projection, heat and noise are its own, on a time axis of one second, from CONVENTIONS and EFFECTS
+alone. Series are scored in memory, or written as recordings (CONVENTIONS §3), with the truth in a
+separate file.
 
     python -m tests.blind.generator --effect thermal_lag --px 0.1 --seed 3 --out DIR --truth FILE
 """
@@ -30,7 +30,7 @@ _PARAMETERS = (
 
 
 class Unseen(Exception):
-    """What was to be hidden does nothing under this seed's temperatures."""
+    """The effect changes nothing with this seed's temperatures."""
 
 
 @dataclass
@@ -49,11 +49,11 @@ class Series:
     sigma: float
     field_nominal: np.ndarray
     interval: float
-    columns: dict[str, np.ndarray] = field(default_factory=dict)  # what else was recorded
+    columns: dict[str, np.ndarray] = field(default_factory=dict)  # other recorded quantities
 
 
 def generate(case: Case) -> tuple[list[Series], dict]:
-    """M1 and M2 of one camera, and the truth."""
+    """Generate M1 and M2 of one camera; return them and the truth."""
     rng = np.random.default_rng([case.seed, 77])
     camera_name, camera = make_camera(rng, case)
     nominal = corner_field()
@@ -75,13 +75,13 @@ def generate(case: Case) -> tuple[list[Series], dict]:
         "T_quantile": lambda q: float(T1.min() + q * (T1.max() - T1.min())),
         "coldest": min(float(c["temperature"].min()) for c in climates),
     }
-    if "softening" in case.effects:  # a threshold that both series pass
+    if "softening" in case.effects:  # a threshold within the range of both series
         T2 = climates[1]["temperature"]
         low, high = max(T1.min(), T2.min()), min(T1.max(), T2.max())
         if high - low > 3:
             pool["T_quantile"] = lambda q: float(low + q * (high - low))
     hidden = [hide(rng, name, camera, pool) for name in case.effects]
-    rng.normal(0, 1, 6)  # drawn as ever: the recordings of a seed stay what they are
+    rng.normal(0, 1, 6)  # unused, but keeps the recordings of a seed unchanged
     turned = rng.normal(0, 1, 6) * np.array([2e-3, 2e-3, 2e-3, 3, 3, 3])
     views = [camera.base[10:], camera.base[10:] + turned]
     shift = np.zeros(16)
@@ -109,7 +109,7 @@ def generate(case: Case) -> tuple[list[Series], dict]:
 
     for k, e in enumerate(hidden):
         if e["effect"] in ("thermal_lag", "time_offset", "hysteresis"):
-            # half of them by the size of the camera's rates, half by the parameter itself
+            # scale the camera's rates in half of the cases, then the parameter
             if rng.random() < 0.5 and len(hidden) == 1:
                 camera.rates = camera.rates * np.clip(
                     case.strength_px / max(leftover(1.0, k), 1e-9), 0.25, 2.0
@@ -132,7 +132,7 @@ def generate(case: Case) -> tuple[list[Series], dict]:
                     break
                 size *= case.strength_px / max(got, 1e-12)
             else:
-                raise Unseen(f"{e['effect']} {case.influence or ''} does next to nothing in M1")
+                raise Unseen(f"{e['effect']} {case.influence or ''} has almost no effect in M1")
         e["size"] = size
         for s in per_series:
             s[k]["size"] = size
@@ -164,7 +164,7 @@ def generate(case: Case) -> tuple[list[Series], dict]:
 
 
 def _plain(e: dict) -> dict:
-    """The truth of an effect in the units of EFFECTS.md."""
+    """Return the truth of an effect in the units of EFFECTS.md."""
     name, size = e["effect"], e["size"]
     out: dict = {"effect": name}
     for key in ("tau", "d", "half_width"):
@@ -200,12 +200,12 @@ def _measure(
     climate_: dict[str, np.ndarray],
     nominal: np.ndarray,
 ) -> Series:
-    """What the detector and the thermometers make of the truth."""
+    """Measure the true image points and temperatures, with noise and gross errors."""
     E, n = uv.shape[:2]
     sigma = case.noise_px
     measured = uv + rng.normal(size=uv.shape) * (sigma * noise)[:, None, None]
     if case.hard:
-        if rng.random() < 0.5:  # in time: each target's own slow wander
+        if rng.random() < 0.5:  # in time: each target wanders slowly
             rho = np.exp(-case.interval / rng.uniform(30, 120))
             wander = np.empty_like(uv)
             state = rng.normal(size=uv.shape[1:])
@@ -213,7 +213,7 @@ def _measure(
                 state = rho * state + np.sqrt(1 - rho**2) * rng.normal(size=uv.shape[1:])
                 wander[i] = state
             measured += 0.01 * wander
-        else:  # in the image: air that shimmers, neighbours move together
+        else:  # in the image: shimmering air moves neighbours together
             place = uv.mean(0)
             d = np.linalg.norm(place[:, None] - place[None], axis=-1)
             L = np.linalg.cholesky(np.exp(-0.5 * (d / 250.0) ** 2) + 1e-6 * np.eye(n))
@@ -238,8 +238,8 @@ def _measure(
     keep = np.ones(E, bool)
     if case.hard:
         keep = rng.random(E) > 0.03
-        keep[0] = True  # time begins with the series: without its begin the truth is another
-        for _ in range(rng.integers(1, 4)):  # somebody walks through
+        keep[0] = True  # the truth's time begins with the first epoch
+        for _ in range(rng.integers(1, 4)):  # people walk through the image
             begin = int(rng.integers(0, E - 8))
             x = rng.uniform(0.1, 0.9) * width
             wide = rng.uniform(0.08, 0.2) * width
@@ -257,7 +257,7 @@ def _measure(
 
 
 def write(series: Series, folder: Path) -> None:
-    """Write the recording as CONVENTIONS §3 has it."""
+    """Write the recording (CONVENTIONS §3)."""
     width, height, pitch, c, _ = CAMERAS[series.camera]
     head = {
         "name": f"{series.camera}-{series.name}", "series": series.name,

@@ -1,4 +1,4 @@
-"""The camera of the generator: its base, its rates, and the effect that it hides."""
+"""The generator's camera: base, rates, and hidden effects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.blind.world import backlash, delayed, image, lagged
 
 @dataclass
 class Camera:
-    """The physical truth of one camera: base, rates, hidden effects with their constants."""
+    """The truth of one camera: base, rates, hidden effects with their constants."""
 
     sensor: tuple[int, int, float]
     base: np.ndarray
@@ -22,7 +22,7 @@ class Camera:
 
 
 def _view(rng: np.random.Generator, c: float) -> np.ndarray:
-    """A camera that looks into the corner: (6,) EOP."""
+    """Draw the exterior orientation (6,) of a camera that looks into the corner."""
     target = np.array([225.0, 225.0, 225.0]) + rng.normal(0, 12, 3)
     direction = np.array([1.0, 1.0, 1.0]) + rng.normal(0, 0.08, 3)
     place = target + direction / np.linalg.norm(direction) * 1050.0 * rng.uniform(0.95, 1.1)
@@ -55,7 +55,7 @@ def make_camera(rng: np.random.Generator, case: Case) -> tuple[str, Camera]:
 
 
 def _direction(rng: np.random.Generator, camera: Camera) -> np.ndarray:
-    """A random mix of c, x0, y0 in which every part is worth about as much in the image."""
+    """Draw a mix of c, x0, y0 that contribute about equally in the image."""
     v = rng.normal(size=3)
     v /= np.linalg.norm(v)
     out = np.zeros(16)
@@ -85,7 +85,7 @@ def hide(rng: np.random.Generator, name: str, camera: Camera, truth: dict) -> di
         e["targets"] = sorted(int(v) for v in rng.choice(147, rng.integers(1, 5), replace=False))
         e["vector"] = rng.normal(size=3)
     elif name == "defocus":
-        e["coldest"] = truth["coldest"]  # one law of noise for the camera, not one per series
+        e["coldest"] = truth["coldest"]  # the noise depends on temperature equally in both series
     if name in ("nonlinear_expansion", "softening", "thermal_gradient", "permanent_set",
                 "self_heating", "creep", "slip", "cyclic_interference", "second_heat_source",
                 OUTSIDE):  # fmt: skip
@@ -93,7 +93,7 @@ def hide(rng: np.random.Generator, name: str, camera: Camera, truth: dict) -> di
     elif name == "housing_tilt":
         e["along"] = np.zeros(16)
         e["along"][10:13] = rng.normal(size=3) * 1e-5
-    elif name == "mount_motion":  # a bracket of some decimetres: it bends late, or at once
+    elif name == "mount_motion":  # a bracket of some decimetres that bends with or without a lag
         e["tau"] = float(rng.choice([1e-3, np.exp(rng.uniform(np.log(60), np.log(500)))]))
         e["along"] = np.zeros(16)
         e["along"][10:13] = rng.normal(size=3) * 1e-5
@@ -115,7 +115,7 @@ def hide(rng: np.random.Generator, name: str, camera: Camera, truth: dict) -> di
 
 
 def fresh(rng: np.random.Generator, e: dict, first: bool, seconds: int) -> dict:
-    """What belongs to one series: instants and phases."""
+    """Draw the instants and phases of one series."""
     f = dict(e)
     if e["effect"] in ("slip", "target_displacement"):
         f["time"] = float(rng.uniform(0.2, 0.8) * seconds)
@@ -135,7 +135,7 @@ def true_parameters(
     eop: np.ndarray,
     offsets: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parameters (E, 16), object points (E, n, 3) and noise factor (E,) at the frames."""
+    """Return parameters (E, 16), object points (E, n, 3) and noise factors (E,) at the frames."""
     T = climate_["temperature"]
     t = np.arange(len(T), dtype=float)
     drive = T
@@ -172,12 +172,8 @@ def true_parameters(
             course = np.sin(2 * np.pi * t / e["P"] + e["phase"])
         elif name == "second_heat_source":
             course = climate_[e["channel"]]
-        elif name in (
-            "housing_tilt",
-            "radial_distortion_drift",
-            "decentering_drift",
-            "affinity_drift",
-        ):
+        elif name in ("housing_tilt", "radial_distortion_drift", "decentering_drift",
+                      "affinity_drift"):  # fmt: skip
             course = T - camera.T0
         elif name == "mount_motion":
             course = lagged(T, e["tau"]) - camera.T0
@@ -208,7 +204,7 @@ def true_parameters(
                 s = e["size"] * e["happens"]
                 p -= s * at((t >= e["time"]).astype(float))[:, None] * e["along"]
                 p += s * (frames >= e["time"])[:, None] * e["along"]
-    # the lens moves along its axis: its rays keep their angles
+    # the lens moves along its axis, so the rays keep their angles
     p[:, 3:10] *= (camera.base[0] / p[:, :1]) ** np.array([2, 4, 6, 1, 1, 0, 0])
     X = points[None] * (1 + np.stack([at(scale[:, k]) for k in range(3)], 1))[:, None, :]
     for rows, vector, time in moved:
@@ -219,7 +215,7 @@ def true_parameters(
 def left_over(
     uv: np.ndarray, camera: Camera, points: np.ndarray, eop: np.ndarray, T: np.ndarray
 ) -> float:
-    """RMS px that the base model, fitted to noise-free image points, leaves over."""
+    """Return the RMS, px, of noise-free image points that the base model leaves."""
     p0 = camera.base.copy()
     p0[10:] = eop
     steps = np.array([1e-4, 1e-4, 1e-4, 1e-6, 1e-7, 1e-8, 1e-6, 1e-6, 1e-6, 1e-6,
@@ -230,9 +226,9 @@ def left_over(
     J = J / np.linalg.norm(J, axis=0)
     y = (uv - uv.mean(0)).reshape(len(uv), -1)
     T = T - T.mean()
-    # the constants take the mean of each epoch's image; rates of c, x0, y0 take the part along T
+    # constants explain the mean over the epochs; rates of c, x0, y0 explain the part along T
     slope = (T @ y) / (T @ T)
     G = J[:, :3]
     y = y - np.outer(T, G @ np.linalg.lstsq(G, slope, rcond=None)[0])
-    # the mean is taken by IOP and EOP as far as they can; the rest is a target offset, also base
+    # IOP, EOP and target offsets of the base model explain the mean completely
     return float(np.sqrt(np.mean(y**2)))

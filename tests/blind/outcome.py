@@ -1,4 +1,4 @@
-"""What came of one case, blind or on real corners."""
+"""The outcome of one case, blind or on real corners."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from thermocald.discovery.result import Discovery
 
 @dataclass
 class Outcome:
-    """found: names said; listed: alternatives not excluded; pulls: (estimate - truth) / sd;
-    gap_closed: share of M2's excess of reduced χ²; seconds: CPU.
+    """The discovery of one case, compared with the truth.
+
+    found: names; listed: alternatives not excluded; pulls: (estimate - truth) / sd; gap_closed:
+    share of M2's excess of reduced χ²; seconds: CPU time.
     """
 
     case: Any
@@ -29,7 +31,7 @@ class Outcome:
 def compare(
     case: Any, discovery: Discovery, seconds: float, accepted: tuple[tuple[str, ...], ...] = ()
 ) -> Outcome:
-    """Compare what was discovered with what is hidden; accepted: names that are right instead."""
+    """Compare the discovery with the hidden effects, or with other `accepted` names."""
     found = tuple(sorted(e.effect for e in discovery.effects))
     listed = tuple(a for e in discovery.effects for a in e.alternative_names)
     hidden = tuple(sorted(case.effects))

@@ -1,7 +1,6 @@
-"""Influences that the catalogue has no name for; shares no code with thermocald.
+"""Influences outside the catalogue, on an axis of one second; shares no code with thermocald.
 
-Everything on an axis of one second. RECORDED follow something that was recorded, through operators
-of their own; UNRECORDED have a cause that nobody recorded.
+RECORDED influences are functions of recorded quantities; UNRECORDED ones have an unrecorded cause.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ def _leaking(x: np.ndarray, tau: float) -> np.ndarray:
 
 
 def _humidity(rng: np.random.Generator, seconds: int) -> np.ndarray:
-    """A room's humidity, %: wanders with a time constant of a quarter of an hour."""
+    """Draw a room's humidity, %, which wanders with a time constant of a quarter of an hour."""
     wander = np.cumsum(rng.normal(size=seconds))
     slow = lagged(wander - np.linspace(0, wander[-1], seconds), 200.0)
     return 50.0 + 8.0 * slow / np.std(slow)
@@ -68,7 +67,7 @@ UNRECORDED = ("smooth", "random_walk", "humidity", "cosine", "bumps")
 def trajectories(
     rng: np.random.Generator, kind: str, climates: list[Climate], seconds: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The influence in each series (seconds,), and the humidity that was recorded there."""
+    """Return the influence (seconds,) and the recorded humidity in each series."""
     ranges = [(float(c["temperature"].min()), float(c["temperature"].max())) for c in climates]
     known = _recorded(rng, ranges)
     humid = [_humidity(rng, seconds) for _ in climates]

@@ -1,10 +1,10 @@
-"""Scoring of the proposals on influences that the catalogue has no name for.
+"""Score the formulas proposed for influences outside the catalogue.
 
     python -m tests.blind.outside_score [--first 0] [--seeds 1] [--kind tanh …] [--px 0.3] [--check]
 
-Runs in memory through `discover_series`, the same function the command calls. With --check the exit
-status is 1 where fewer than 60 % of the recorded ones get a description that closes 80 % of the gap
-on M2, or one that nobody recorded is claimed.
+Runs `discover_series`, the function of the command, in memory. With --check, the exit status is 1
+if fewer than 60 % of the recorded influences have a description that closes 80 % of the gap on M2,
+or if an unrecorded one has a description.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from tests.blind.outside import HUMID, RECORDED, UNRECORDED
 from tests.blind.score import discover_case
 
 DESCRIBED = 0.6
-"""Share of recorded influences that get a transferable description."""
+"""Least share of recorded influences with a transferable description."""
 
 
 @dataclass
 class Described:
-    """statement: what was said; proposed: a formula; closed: share of the gap on M2."""
+    """A described influence: statement, whether by formula or name, and share of the gap on M2."""
 
     kind: str
     seed: int
@@ -38,12 +38,12 @@ class Described:
 
     @property
     def transferable(self) -> bool:
-        """Whether something that holds on M2 was said: a formula, or names of the catalogue."""
+        """Whether a formula, or names of the catalogue, hold on M2."""
         return (self.proposed or self.named) and self.closed >= 0.8
 
 
 def describe(kind: str, seed: int, px: float = 0.3) -> Described:
-    """One recorded or unrecorded influence, hidden and looked for."""
+    """Hide one influence, run discovery, and return its description."""
     case = Case((OUTSIDE,), px, seed, influence=kind, record_humidity=kind in HUMID)
     found, _, seconds = discover_case(case)
     first = found.effects[0] if found.effects else None
@@ -73,16 +73,16 @@ def main() -> None:
             done.append(d)
             print(f"{kind:18s} {seed} closed {d.closed:6.3f} {d.seconds:4.1f} s  "
                   f"{d.statement[:150]}", flush=True)  # fmt: skip
-    told = [d for d in done if d.kind not in UNRECORDED]
-    if told:
-        print(f"recorded: {sum(d.proposed and d.transferable for d in told)} formulas and "
-              f"{sum(d.named and d.transferable for d in told)} of the catalogue close 80 % on M2, "
-              f"of {len(told)}")  # fmt: skip
+    recorded = [d for d in done if d.kind not in UNRECORDED]
+    if recorded:
+        print(f"recorded: {sum(d.proposed and d.transferable for d in recorded)} formulas and "
+              f"{sum(d.named and d.transferable for d in recorded)} names of the catalogue close "
+              f"80 % of the gap on M2, of {len(recorded)} cases")  # fmt: skip
     left = [d for d in done if d.kind in UNRECORDED]
     if left:
-        print(f"unrecorded: {sum(d.proposed for d in left)} formulas of {len(left)}, "
-              f"{sum(d.named for d in left)} names of the catalogue")  # fmt: skip
-    few = sum(d.transferable for d in told) < DESCRIBED * len(told)
+        print(f"unrecorded: {sum(d.proposed for d in left)} formulas and "
+              f"{sum(d.named for d in left)} names of the catalogue, of {len(left)}")  # fmt: skip
+    few = sum(d.transferable for d in recorded) < DESCRIBED * len(recorded)
     if a.check and (few or any(d.proposed or d.named for d in left)):
         raise SystemExit("the goal is missed")
 

@@ -1,9 +1,9 @@
-"""Scoring of the discovery on blind recordings: the confusion matrix, and what goes with it.
+"""Score the discovery on blind recordings: confusion matrix, parameters, gap, power.
 
     python -m tests.blind.score [--seeds 5] [--part single-0.3 …] [--store FILE.jsonl]
         [--write FILE.md]
 
-Runs in memory through `examine_series`, the same function the command calls.
+Runs `discover_series`, the function of the command, in memory.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NUMBERS = {
 
 
 def discover_case(case: Case) -> tuple[Discovery, dict, float]:
-    """Return what discovery says of a case, the truth, and the seconds of processor."""
+    """Run discovery on a case; return its result, the truth, and processor time, s."""
     series, truth = generate(case)
     begin = time.process_time()
     first = reduce_series(series_input(series[0]))
@@ -47,12 +47,12 @@ def discover_case(case: Case) -> tuple[Discovery, dict, float]:
 
 
 def judge(case: Case) -> Outcome:
-    """Run one case and judge it."""
+    """Run and score one case."""
     return judge_discovery(case, *discover_case(case))
 
 
 def judge_discovery(case: Case, discovery: Discovery, truth: dict, seconds: float) -> Outcome:
-    """Compare what was discovered with what is hidden."""
+    """Compare the discovery with the hidden effects."""
     outside = case.effects == (OUTSIDE,)
     out = compare(case, discovery, seconds, (("unnamed",),) if outside else ())
     if out.right and case.effects and not outside:
@@ -63,22 +63,22 @@ def judge_discovery(case: Case, discovery: Discovery, truth: dict, seconds: floa
 
 
 def _pulls(discovery: Discovery, truth: dict) -> Iterator[tuple[str, float]]:
-    """(estimate - truth) / sd of every parameter that the truth knows."""
+    """Yield (name, (estimate - truth) / sd) of every parameter of the truth."""
     by_name = {e["effect"]: e for e in truth["effects"][0]}
     for effect in discovery.effects:
         true = by_name.get(effect.effect, {})
         for key, estimate in effect.estimates.items():
             if key in true and isinstance(estimate["value"], float):
-                value, said = float(true[key]), estimate["value"]
+                value, estimated = float(true[key]), estimate["value"]
                 if effect.effect == "cyclic_interference" and key != "P":
-                    # a sine is the same with its sign and half a turn of its phase changed
+                    # a sine is the same with the opposite sign and phase + π
                     turned = np.cos(effect.estimates["phase"]["value"] - float(true["phase"])) < 0
                     if key == "phase":
-                        said += np.pi * turned
-                        value = said - (said - value + np.pi) % (2 * np.pi) + np.pi
+                        estimated += np.pi * turned
+                        value = estimated - (estimated - value + np.pi) % (2 * np.pi) + np.pi
                     elif turned:
-                        said = -said
-                yield f"{effect.effect}.{key}", (said - value) / estimate["sd"]
+                        estimated = -estimated
+                yield f"{effect.effect}.{key}", (estimated - value) / estimate["sd"]
 
 
 def cases(part: str, seeds: Iterable[int]) -> Iterator[Case]:
@@ -112,7 +112,7 @@ PARTS = (
 )  # fmt: skip
 
 
-# a wrong name without an effect shall come in one of a hundred: that takes more recordings
+# more recordings without an effect, to show that fewer than one in a hundred has a name
 MORE_SEEDS = {"none": 5, "none2": 5}
 
 
@@ -123,9 +123,9 @@ def run(
     store: Path | None = None,
     done_only: bool = False,
 ) -> list[Outcome]:
-    """All cases of a part; those that `store` (JSON lines) has already are read, not run again.
+    """Score all cases of a part; outcomes in `store` (JSON lines) are read instead.
 
-    done_only: leave the others.
+    done_only: skip cases that are not in the store.
     """
     done = stored(store)
     outcomes = []
@@ -147,7 +147,7 @@ def run(
 
 
 def stored(store: Path | None) -> dict[str, Outcome]:
-    """Outcomes of earlier runs by case."""
+    """Return stored outcomes by case."""
     out: dict[str, Outcome] = {}
     if store is None or not store.exists():
         return out
@@ -171,7 +171,7 @@ def _show(part: str, o: Outcome) -> None:
     case = o.case
     for name, pull in o.pulls.items():
         if abs(pull) > 3:
-            print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: {name} off by "
+            print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: {name} wrong by "
                   f"{pull:.1f} sd", flush=True)  # fmt: skip
     if o.gap_closed is not None and o.gap_closed < 0.9:
         print(f"    {part} seed {case.seed} {'+'.join(case.effects)}: gap closed by "
@@ -187,8 +187,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--part", action="append")
-    parser.add_argument("--store", type=Path, help="JSON lines: written as it goes, and resumed")
-    parser.add_argument("--done", action="store_true", help="only what the store has")
+    parser.add_argument(
+        "--store", type=Path, help="JSON lines of outcomes; an interrupted run is resumed"
+    )
+    parser.add_argument("--done", action="store_true", help="only outcomes in the store")
     parser.add_argument("--write", type=Path)
     a = parser.parse_args()
     seeds = range(a.first, a.first + a.seeds)

@@ -1,4 +1,4 @@
-"""Tables and the figure of the blind scoring."""
+"""Tables and figure of the blind scoring."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def summary(outcomes: list[Outcome]) -> dict[str, float]:
 
 
 def row(part: str, outcomes: list[Outcome]) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     s = summary(outcomes)
 
     def share(name: str) -> str:
@@ -43,23 +43,23 @@ def row(part: str, outcomes: list[Outcome]) -> str:
 
 
 def confusion(found: dict[str, list[Outcome]]) -> str:
-    """What was said instead of what was hidden: a line for each name that was not right."""
+    """Return a table of hidden effects with wrong names."""
     lines = ["| part | hidden | right | said instead |", "|---|---|---|---|"]
     for part, outcomes in found.items():
         rows: dict[str, Counter[str]] = {}
         for o in outcomes:
             name = "+".join(o.case.effects) or "none"
             rows.setdefault(name, Counter())["+".join(o.found) or "none"] += 1
-        for name, said in rows.items():
+        for name, given in rows.items():
             own = "unnamed" if name == OUTSIDE else "+".join(sorted(name.split("+")))
-            wrong = ", ".join(f"{c} × {n}" for c, n in sorted(said.items()) if c != own)
+            wrong = ", ".join(f"{c} × {n}" for c, n in sorted(given.items()) if c != own)
             if wrong:
-                lines.append(f"| {part} | `{name}` | {said[own]} of {said.total()} | {wrong} |")
+                lines.append(f"| {part} | `{name}` | {given[own]} of {given.total()} | {wrong} |")
     return "\n".join(lines)
 
 
 def power_figure(found: dict[str, list[Outcome]], path: Path) -> None:
-    """Share of single effects named rightly, and wrongly, against strength in px."""
+    """Plot the shares of correct and wrong names of single effects against strength, px."""
     import matplotlib as mpl
 
     mpl.use("svg")
@@ -94,7 +94,7 @@ def _strength(part: str) -> float:
 
 
 def _interval(share: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """68 % limits of a share (Wilson 1927)."""
+    """Return the 68 % limits of a share (Wilson 1927)."""
     middle = (share + 0.5 / n) / (1 + 1 / n)
     half = np.sqrt(share * (1 - share) / n + 0.25 / n**2) / (1 + 1 / n)
     return np.minimum(middle - half, share), np.maximum(middle + half, share)
@@ -106,7 +106,7 @@ REAL = "## Real corners"
 def write(
     path: Path, found: dict[str, list[Outcome]], seeds: Sequence[int], partly: bool = False
 ) -> None:
-    """The page of the documents, and the figure beside it; partly: not all cases were run."""
+    """Write the page of the documentation and its figure; partly: not all cases were run."""
     note = "Not all of its cases have been run yet: the table says how many.\n" if partly else ""
     power_figure(found, path.with_name(FIGURE))
     parts = "\n".join(row(p, o) for p, o in found.items())

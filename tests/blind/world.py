@@ -1,4 +1,4 @@
-"""The world of the generator: a corner of targets, its image, heat, and what delays it."""
+"""The generator's corner of targets, projection, temperatures, lags and delays."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def corner_field() -> np.ndarray:
-    """147 targets, 49 on each of three planes that meet in a corner, with some relief."""
+    """Return 147 targets, 49 on each of three planes that meet in a corner."""
     g = 60.0 + 80.0 * np.arange(7)
     a, b = (v.ravel() for v in np.meshgrid(g, g))
     o = np.full(49, 4.0)
@@ -14,7 +14,7 @@ def corner_field() -> np.ndarray:
 
 
 def turn(omega: np.ndarray, phi: np.ndarray, kappa: np.ndarray) -> np.ndarray:
-    """R = Rx Ry Rz, camera to object, stacked (..., 3, 3), by multiplying the three out."""
+    """Return R = Rx Ry Rz, camera to object, stacked (..., 3, 3)."""
     one, nil = np.ones_like(omega), np.zeros_like(omega)
 
     def stack(rows: list[list[np.ndarray]]) -> np.ndarray:
@@ -28,7 +28,7 @@ def turn(omega: np.ndarray, phi: np.ndarray, kappa: np.ndarray) -> np.ndarray:
 
 
 def image(points: np.ndarray, p: np.ndarray, sensor: tuple[int, int, float]) -> np.ndarray:
-    """Object points (E, n, 3) and parameters (E, 16) → px (E, n, 2), collinearity and Brown."""
+    """Project object points (E, n, 3) with parameters (E, 16), px (E, n, 2)."""
     width, height, pitch = sensor
     v = p[..., None, :]
     d = points - p[:, None, 13:16]
@@ -46,7 +46,7 @@ def image(points: np.ndarray, p: np.ndarray, sensor: tuple[int, int, float]) -> 
 
 
 def _warmed(power: np.ndarray, tau: float, start: float) -> np.ndarray:
-    """A body with one time constant, Euler steps of one second."""
+    """Return the temperature of a body with one time constant, in steps of one second."""
     out = np.empty_like(power)
     state = start
     decay = 1.0 - np.exp(-1.0 / tau)
@@ -57,7 +57,7 @@ def _warmed(power: np.ndarray, tau: float, start: float) -> np.ndarray:
 
 
 def climate(rng: np.random.Generator, programme: str, seconds: int) -> dict[str, np.ndarray]:
-    """True courses of the reference and of the board temperature, one value per second."""
+    """Draw the true reference and board temperatures, one value per second."""
     t = np.arange(seconds, dtype=float)
     ambient = rng.uniform(16, 26) + rng.uniform(-1.5, 1.5) * np.sin(
         2 * np.pi * t / rng.uniform(2500, 6000) + rng.uniform(0, 6.3)
@@ -91,7 +91,7 @@ def climate(rng: np.random.Generator, programme: str, seconds: int) -> dict[str,
     load[(t >= load_on) & (t < load_off)] = strong
     tau = rng.uniform(140, 330)
     reference = _warmed(ambient + lamp + load, tau, ambient[0])
-    # the board has its own work: bursts of processor load, and a little of everything else
+    # the board has bursts of processor load, and follows ambient and reference partly
     work, at = np.zeros(seconds), 0.0
     while at < seconds:
         hold = rng.uniform(120, 500) * scale
@@ -104,7 +104,7 @@ def climate(rng: np.random.Generator, programme: str, seconds: int) -> dict[str,
 
 
 def smooth_unknown(rng: np.random.Generator, seconds: int) -> np.ndarray:
-    """An influence nobody recorded: filtered noise with a correlation of some minutes."""
+    """Draw an unrecorded influence: filtered noise with a correlation of several minutes."""
     width = rng.uniform(90, 260) * seconds / 1800
     n = int(5 * width)
     kernel = np.exp(-0.5 * (np.arange(-n, n + 1) / width) ** 2)
@@ -114,7 +114,7 @@ def smooth_unknown(rng: np.random.Generator, seconds: int) -> np.ndarray:
 
 
 def lagged(x: np.ndarray, tau: float) -> np.ndarray:
-    """tau y' = x - y in closed form over each second, x a straight line within it."""
+    """Solve tau y' = x - y in closed form; x is linear within each second."""
     a = np.exp(-1.0 / tau)
     out, state = np.empty_like(x), x[0]
     out[0] = state

@@ -1,7 +1,7 @@
-"""Run the goldens, or renew them: `python -m tests.golden [--update] [--corpora] [NAME…]`.
+"""Run or update the goldens: `python -m tests.golden [--update] [--corpora] [NAME…]`.
 
-`--update` writes what is found as what is expected from now on: read the diff before it is
-committed, and say in the commit why each number moved.
+`--update` stores the present results as expected ones. Read the diff before you commit it, and
+explain in the commit why each number changed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tests.golden.workshop import DATA, Workshop, store, wrong
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--update", action="store_true")
-    options.add_argument("--corpora", action="store_true", help="the longer ones of discovery")
+    options.add_argument("--corpora", action="store_true", help="the longer corpora of discovery")
     options.add_argument("names", nargs="*")
     given = options.parse_args()
     if given.corpora:
@@ -46,7 +46,7 @@ def main() -> int:
             different = wrong(case, found)
             if given.update and different:
                 store(case, found)
-            word = "as it was" if not different else "renewed  " if given.update else "DIFFERENT"
+            word = "unchanged" if not different else "updated  " if given.update else "DIFFERENT"
             print(f"{word}  {case.name} ({seconds:.1f} s)")
             for line in different[:20]:
                 print(f"    {line}")

@@ -1,7 +1,7 @@
-"""What is held: commands as a user types them, in the order in which they build on one another.
+"""The golden cases: a user's commands, in the order of their dependencies.
 
-They run in one folder, with `data` beside them where the reference data are there. Not held here:
-what depends on the machine or on a running daemon (`EXCUSED` says where that is tested).
+They run in one folder, which contains `data` if the reference data are present. Commands that
+depend on the machine or on a running daemon are not here (`EXCUSED` names their tests).
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from tests.golden.compare import Bounds
 ARITHMETIC = Bounds(1e-9, 1e-6, 1e-7)
 """Sums, and solutions in closed form or at convergence."""
 ESTIMATE = Bounds(1e-5, 1e-3, 1e-4)
-"""What a search ends at: its last step is smaller than that, not zero."""
+"""Results of a search, whose last step is smaller than this but not zero."""
 REAL = Bounds(3e-6, 1e-5, 1e-2)
-"""Weakly determined: the same program on another kind of processor differs by 4e-3 in an sd, with
-the packages of Debian 13 by 4e-7 in a probability and in sigma0.
+"""Weakly determined results: another kind of processor changes an sd by 4e-3, the packages of
+Debian 13 a probability and sigma0 by 4e-7.
 """
 REAL_ESTIMATE = Bounds(1e-4, 1e-3, 2e-3)
-"""A search on real corners: with the packages of Debian 13 scores differ by 2e-5."""
+"""A search on real corners: the packages of Debian 13 change scores by 2e-5."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One command, its words in `line`; writes: files it leaves; after: cases it needs."""
+    """One command line; writes: files that it writes; after: cases that it needs."""
 
     name: str
     line: str

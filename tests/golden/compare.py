@@ -1,8 +1,8 @@
-"""Two outputs compared number by number, and long ones kept short.
+"""Two outputs compared number by number; long lists are shortened.
 
-Numbers of a document: within a relative bound, or a share of the standard deviation that stands
-beside them (`sd_c` beside `c`, `sd` beside `value`) or that their significance tells; members of a
-long list within a relative bound of its RMS. Numbers in a text: one unit of the last digit.
+Numbers of a document agree within a relative bound, or a share of their standard deviation (`sd_c`
+for `c`, `sd` for `value`, or from their significance); members of a long list within a relative
+bound of its RMS; numbers in a text within one unit of the last digit.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ _SHORTENED = ("some", "mean", "rms")
 
 
 class Bounds(NamedTuple):
-    """relative: of a number; in_sds: of the standard deviation beside it; of_sds: relative, of
-    standard deviations themselves.
-    """
+    """Bounds: relative to a number, in units of its standard deviation, and relative for sds."""
 
     relative: float
     in_sds: float
@@ -36,7 +34,7 @@ class Bounds(NamedTuple):
 
 
 def shortened(value: Any) -> Any:
-    """A document with its long lists as length, mean and RMS, or as some of their members."""
+    """Return a document with long lists as length, some members, and mean and RMS of numbers."""
     if isinstance(value, dict):
         return {str(k): shortened(v) for k, v in value.items()}
     if not isinstance(value, list):
@@ -53,7 +51,7 @@ def shortened(value: Any) -> Any:
 
 
 def parsed(name: str, text: str) -> Any:
-    """A file's content as a document: JSON, YAML, columns of a CSV; other text as it is."""
+    """Parse a file as a document: JSON, YAML, columns of a CSV, or else lines of text."""
     if name.endswith(".json"):
         return json.loads(text)
     if name.endswith((".yaml", ".yml")) and not text.startswith("%"):  # OpenCV's is text
@@ -75,7 +73,7 @@ def _cell(text: str) -> Any:
 def differences(
     expected: Any, found: Any, bounds: Bounds, where: str = "", sd: float = 0.0, size: float = 0.0
 ) -> Iterator[str]:
-    """Sentences on all that differs; `size` is the RMS of the list that a number is a member of."""
+    """Yield a sentence per difference; `size` is the RMS of the list that contains a number."""
     if isinstance(expected, dict) and isinstance(found, dict):
         if missing := [k for k in expected if k not in found]:
             yield f"{where}: without {', '.join(missing)}"
@@ -106,7 +104,7 @@ def differences(
 
 
 def _beside(document: dict[str, Any], key: str) -> float:
-    """The standard deviation that belongs to an entry, the largest of a column; 0 without."""
+    """Return the standard deviation of an entry (the largest of a column), or 0."""
     if key.endswith("_sigmas"):
         return 1.0  # it counts standard deviations
     if key == "rms_px" and (sigmas := document.get("significance_sigmas")):

@@ -1,7 +1,7 @@
-"""What discovery says of longer corpora: a line a case, verdict, names, alternatives and gap.
+"""Discovery's results for longer corpora: verdict, names, alternatives and gap, a line per case.
 
-The blind cases are the twenty kinds of `single-0.1` on three seeds, the real ones the nine effects
-hidden in the corners of each of the four cameras, and a recording of each without one.
+The blind cases are the twenty kinds of `single-0.1` with three seeds. The real ones are nine
+effects hidden in the corners of each of four cameras, and a recording of each camera without one.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ CORPORA: dict[str, tuple[Callable[[], Iterator[tuple[str, Any]]], Any]] = {
     "blind": (blind, blind_score),
     "real-corners": (real, real_score),
 }
-"""By name: the cases, and the module that discovers and judges each."""
+"""For each name, the cases, and the module that discovers and scores them."""
 
 
-def told(discovery: Any) -> dict[str, Any]:
-    """Verdict, names, alternatives, estimates and the gap, of one case."""
+def summarise(discovery: Any) -> dict[str, Any]:
+    """Return verdict, names, alternatives, estimates and gap of one case."""
     document = discovery.as_dict()
     return {
         "verdict": document["verdict"],
@@ -69,20 +69,20 @@ def path(name: str) -> Path:
 
 
 def stored(name: str) -> dict[str, Any]:
-    """What is expected of each case."""
+    """Return the expected result of each case."""
     lines = path(name).read_text().splitlines() if path(name).exists() else []
     return {row.pop("case"): row for row in map(json.loads, lines)}
 
 
 def check(name: str, update: bool = False) -> tuple[list[str], list[Any]]:
-    """Return what is not as it is stored, and the outcomes; `update` stores what is now."""
+    """Return differences from the expected results, and outcomes; `update` stores new results."""
     cases, score = CORPORA[name]
     expected, found, wrong, outcomes = stored(name), {}, [], []
     for case_name, case in cases():
         discovery, truth, seconds = score.discover_case(case)
         outcomes.append(score.judge_discovery(case, discovery, truth, seconds))
         found[case_name] = json.loads(
-            json.dumps(told(discovery)), parse_float=lambda t: float(f"{float(t):.9g}")
+            json.dumps(summarise(discovery)), parse_float=lambda t: float(f"{float(t):.9g}")
         )
         wrong += list(differences(expected.get(case_name), found[case_name], BOUNDS, case_name))
     if update:

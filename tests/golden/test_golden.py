@@ -1,4 +1,4 @@
-"""What users see stays what it is, or is renewed on purpose (`make golden`)."""
+"""The commands' output is unchanged, or updated on purpose (`make golden`)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def workshop(tmp_path_factory):
 
 
 CORPUS_TOO = ("blind-time-offset", "blind-pair", "real-lag")
-"""What the corpora of the slow suite hold a hundred times over."""
+"""Cases like those of the slow suite's corpora."""
 
 
 @pytest.mark.parametrize(
@@ -36,21 +36,21 @@ def test_golden(workshop, case: Case):
     assert wrong(case, workshop.result(case.name)) == []
 
 
-def test_every_command_is_held_or_excused():
-    held = {case.words[0] for case in CASES}
+def test_every_command_has_a_case_or_is_excused():
+    tested = {case.words[0] for case in CASES}
 
-    assert set(COMMANDS) == held | set(EXCUSED)
-    assert not held & set(EXCUSED)
+    assert set(COMMANDS) == tested | set(EXCUSED)
+    assert not tested & set(EXCUSED)
 
 
-def test_nothing_is_stored_that_no_case_makes():
+def test_every_expected_file_has_a_case():
     stored = {path.stem for path in EXPECTED.iterdir()}
 
     assert stored <= {c.name for c in CASES} | {f"corpus-{name}" for name in CORPORA}
     assert sum(path.stat().st_size for path in EXPECTED.iterdir()) < 400_000
 
 
-def test_a_number_that_moved_is_seen():
+def test_a_changed_number_is_found():
     before = {"c": 3.04, "sd_c": 1e-4, "text": "c = 3.0400 mm in 12 epochs", "n": 12}
     bound = Bounds(1e-9, 1e-6, 1e-3)
 
@@ -74,7 +74,7 @@ def test_a_number_that_moved_is_seen():
 
 @pytest.mark.timeout(1800)
 @pytest.mark.slow
-def test_the_blind_corpus_is_as_it_was_and_right():
+def test_the_blind_corpus_is_unchanged_and_reaches_its_goals():
     different, outcomes = check("blind")
 
     assert different == []
@@ -85,7 +85,7 @@ def test_the_blind_corpus_is_as_it_was_and_right():
 
 
 @pytest.mark.slow
-def test_the_corpus_of_real_corners_is_as_it_was_and_reaches_its_goals():
+def test_the_corpus_of_real_corners_is_unchanged_and_reaches_its_goals():
     if not DATA.is_dir():
         pytest.skip("the reference data are absent")
     different, outcomes = check("real-corners")

@@ -1,4 +1,4 @@
-"""The folder in which the commands run, and what they leave there."""
+"""The folder in which the golden commands run, and their results."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ sources: {housing: [{from: 0, to: 1800, value: 3.0}]}
 
 
 class Workshop:
-    """Runs each case once, those before it that it needs first."""
+    """Runs each case once, after the cases that it needs."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -47,7 +47,7 @@ class Workshop:
         write_inputs(folder)
 
     def result(self, name: str) -> dict[str, Any]:
-        """Exit status, lines printed, files written; as they are stored."""
+        """Return exit status, printed lines and written files, as they are stored."""
         if name not in self.found:
             case = _BY_NAME[name]
             for earlier in case.after:
@@ -78,7 +78,7 @@ def _run(case: Case, folder: Path) -> dict[str, Any]:
 
 
 def wrong(case: Case, found: dict[str, Any]) -> list[str]:
-    """What is not as it is stored; a line that says so where nothing is."""
+    """Return the differences from the stored result, or a line if there is none."""
     path = EXPECTED / f"{case.name}.json"
     if not path.is_file():
         return [f"{path.name} is missing: python -m tests.golden --update {case.name}"]
@@ -86,10 +86,10 @@ def wrong(case: Case, found: dict[str, Any]) -> list[str]:
 
 
 def store(case: Case, found: dict[str, Any]) -> None:
-    """Keep a result as what is expected from now on; 14 digits of each number."""
+    """Store a result as the expected one, with 14 digits of each number."""
     EXPECTED.mkdir(exist_ok=True)
     text = json.dumps(_rounded(found), separators=(",", ":"), ensure_ascii=False)
-    # one entry a line, so that a change is a line of a diff
+    # one entry per line, for readable diffs
     text = text.replace(',"', ',\n"').replace(":{", ":\n{")
     (EXPECTED / f"{case.name}.json").write_text(text + "\n")
 
@@ -103,7 +103,7 @@ def _rounded(value: Any) -> Any:
 
 
 def write_inputs(folder: Path) -> None:
-    """Small files that commands read."""
+    """Write small files that commands read."""
     (folder / "lag.yaml").write_text(_LAG)
     (folder / "programme.yaml").write_text(PROGRAMME)
     camera = {
@@ -116,7 +116,7 @@ def write_inputs(folder: Path) -> None:
 
 
 def points(folder: Path) -> None:
-    """Points of an image at the times of M1's epochs."""
+    """Write image points at the times of M1's epochs."""
     rows = parsed("epochs.csv", (folder / "M1/epochs.csv").read_text())
     rng = np.random.default_rng(0)
     text = "time,x,y\n" + "".join(
@@ -128,7 +128,7 @@ def points(folder: Path) -> None:
 
 
 def photographs(folder: Path) -> None:
-    """Six small photographs with EXIF times, and a German logger's file."""
+    """Write six small photographs with EXIF times, and a German logger's file."""
     (folder / "photos").mkdir(exist_ok=True)
     for i in range(6):
         tags = {TAKEN: f"2026:06:14 12:00:{10 * i:02d}", FOCAL: 3.04}
@@ -139,7 +139,7 @@ def photographs(folder: Path) -> None:
 
 
 def blind(folder: Path, name: str, effects: tuple[str, ...], strength: float, seed: int) -> None:
-    """A blind recording: written by code that shares nothing with the program."""
+    """Write a blind recording with code that shares nothing with the program."""
     from tests.blind.case import Case as Blind
     from tests.blind.generator import generate, write
 
@@ -148,7 +148,7 @@ def blind(folder: Path, name: str, effects: tuple[str, ...], strength: float, se
 
 
 def real(folder: Path, camera: str, effect: str, seed: int) -> None:
-    """An effect hidden in the corners of a real camera."""
+    """Write recordings with an effect hidden in the corners of a real camera."""
     from tests.real_corners.generator import RealCase, generate, write
 
     for series in generate(RealCase(camera, (effect,) if effect else (), seed))[0]:
@@ -156,7 +156,7 @@ def real(folder: Path, camera: str, effect: str, seed: int) -> None:
 
 
 def walls(folder: Path) -> None:
-    """Tags on the walls of a hall; corner 0 of these is the bottom right one."""
+    """Write the field of tags on the walls of a hall; corner 0 is bottom right."""
     corner = ("viewer_bottom_right", "viewer_bottom_left", "viewer_top_left", "viewer_top_right")
     with (DATA / "frc" / "targets.csv").open() as source:
         rows = list(csv.DictReader(source))

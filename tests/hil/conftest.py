@@ -1,4 +1,4 @@
-"""Fixtures of the laboratory; what was not built is skipped, with what would build it."""
+"""Fixtures of the laboratory; tests of parts that were not built are skipped."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(autouse=True)
 def no_leaked_threads():
-    """An instrument that is plugged in again serves on in a new thread; its fixture joins it."""
+    """Allow threads: a replugged instrument has a new one, which its fixture joins."""
 
 
 @pytest.fixture(scope="session")
 def report():
-    """A line at the end of the run, for figures that were measured."""
+    """Collect lines with measured figures, which the run prints at its end."""
     lines: list[str] = []
     yield lines.append
     path = BUILT / "measured.txt"
@@ -43,7 +43,7 @@ def report():
 
 @pytest.fixture(scope="session")
 def machine(tmp_path_factory):
-    """The booted guest with this checkout's thermocald in it."""
+    """Boot the guest with this checkout's thermocald."""
     if not (BUILT / "guest" / "built").exists():
         pytest.skip("the laboratory's guest is not built: make hil")
     guest = Machine(BUILT / "guest", tmp_path_factory.mktemp("guest"))
@@ -64,7 +64,7 @@ def machine(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def video(machine):
-    """v4l2loopback at /dev/video40 (drivers) and 41 (station), vivid at its lasting name."""
+    """Load v4l2loopback at /dev/video40 (drivers), 41 (station), and vivid at its stable name."""
     machine.run(
         "modprobe v4l2loopback video_nr=40,41 card_label=laboratory,station exclusive_caps=1,1"
     )
@@ -76,20 +76,16 @@ def video(machine):
 
 @pytest.fixture(scope="session")
 def i2c_bus(machine):
-    """The number of an SMBus: LM75 at 0x48, 0x49, MCP9808 0x18, BME280 0x76, TMP117 0x4b."""
+    """Return the number of an SMBus: LM75 0x48, 0x49, MCP9808 0x18, BME280 0x76, TMP117 0x4b."""
     machine.run(
         "modprobe -a i2c-dev lm75 bmp280-i2c; modprobe i2c-stub chip_addr=0x48,0x49,0x18,0x76,0x4b"
     )
-    return int(
-        machine.wait(
-            "grep -l 'SMBus stub' /sys/class/i2c-dev/*/name | sed 's/.*i2c-\\([0-9]*\\).*/\\1/' "
-            "| grep ."
-        )
-    )
+    find = "grep -l 'SMBus stub' /sys/class/i2c-dev/*/name"
+    return int(machine.wait(f"{find} | sed 's/.*i2c-\\([0-9]*\\).*/\\1/' | grep ."))
 
 
 class Instrument:
-    """A thermometer at the far end of the guest's USB serial adapter: answers `T?` with T=…"""
+    """A thermometer at the guest's USB serial adapter, which answers `T?` with T=…"""
 
     def __init__(self, path: Path) -> None:
         self.path, self.celsius = path, 21.25
@@ -121,7 +117,7 @@ class Instrument:
 
 @contextlib.contextmanager
 def plugged_instrument(machine):
-    """The instrument, plugged in, and `port`: its lasting name in the guest."""
+    """Plug the instrument in, and set `port` to its stable name in the guest."""
     machine.run("modprobe -a xhci-pci ftdi_sio")
     one = Instrument(machine.serial)
     one.plug()
@@ -140,7 +136,7 @@ def instrument(machine):
 
 @pytest.fixture
 def wire(machine):
-    """A DS9490R with two DS18B20, which the guest has found."""
+    """Plug in a DS9490R with two DS18B20, and wait until the guest has found them."""
     machine.run("modprobe xhci-pci")
     adapter = Adapter(machine.wire, Probe(0xBFE244, 21.5), Probe(0x1B2C3D, -10.125))
     adapter.plug()
@@ -154,7 +150,7 @@ def wire(machine):
 
 @pytest.fixture
 def phone(tmp_path):
-    """A real adbd behind the real adb server; both in a network of their own."""
+    """Start a real adbd behind the real adb server, in their own network."""
     if not (BUILT / "phone" / "built").exists():
         pytest.skip("the laboratory's phone is not built: make hil")
     if os.environ.get("THERMOCALD_NETWORK") != "own":

@@ -1,4 +1,4 @@
-"""The laboratory's subject: a heating camera before a test field."""
+"""The laboratory's scene: a camera that warms up before a test field."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["heating", "subject"]
 
 
 def subject(width: int, height: int) -> tuple[TestField, ThermalModel]:
-    """The demonstration's field and camera, on a sensor of this many pixels."""
+    """Return the demonstration's field and camera, with a sensor of this size."""
     field = demonstration_field("markers")
     model = demonstration_model(field)
     pitch = model.sensor.pixel_pitch * model.sensor.width / width
@@ -32,7 +32,7 @@ def subject(width: int, height: int) -> tuple[TestField, ThermalModel]:
 def heating(
     width: int, height: int, count: int, low_c: float = 25.0, high_c: float = 45.0
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """(frames (count, height, width), temperatures (count,) in °C) of an even warm-up."""
+    """Return frames (count, height, width) and temperatures (count,), °C, of a linear warm-up."""
     field, model = subject(width, height)
     temperatures = np.linspace(low_c, high_c, count)
     times = np.arange(count, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The laboratory's virtual machine: boot, wait until it answers, run, cut the power."""
+"""The laboratory's virtual machine: boot it, run commands, cut the power."""
 
 from __future__ import annotations
 
@@ -18,22 +18,21 @@ if TYPE_CHECKING:
 __all__ = ["Machine"]
 
 BOOT_S = 240.0
-# The least that NumPy and OpenCV want (x86-64-v2). With "max", which has AVX too, Python and NumPy
-# crashed now and then in the emulation (QEMU 7.2).
+# The least that NumPy and OpenCV need (x86-64-v2). With "max", which also has AVX, Python and NumPy
+# sometimes crashed in the emulation (QEMU 7.2)
 CPU = "Nehalem"
-_SSH_FAILED = 255  # no status of a command of ours
-STORE_SIZE = "48M"  # so that a little frees enough for observations again (20 MB)
+_SSH_FAILED = 255  # our commands never end with it
+STORE_SIZE = "48M"  # small, so that little has to be freed for observations (20 MB)
 WRITES_BYTES = 4 << 30  # sparse
 
 
 class Machine:
-    """A guest on disks that are thrown away.
+    """A guest with temporary disks.
 
-    `store` is an empty file system of its own for the daemon's store, /dev/vdb in the guest, and
-    `writes` the disk to which device mapper logs what is written there, /dev/vdc. `serial` is a
-    socket behind a USB serial adapter: QEMU plugs the adapter in while somebody is connected to it,
-    and pulls it when he leaves; `wire` likewise, for whoever speaks the USB redirection protocol.
-    `share` is /mnt/host in the guest.
+    `store` is an empty file system for the daemon's store, /dev/vdb in the guest; `writes` is the
+    disk to which device mapper logs the writes there, /dev/vdc. `serial` is the socket of a USB
+    serial adapter, which QEMU plugs in while a client is connected; `wire` likewise for a client
+    with the USB redirection protocol. `share` is /mnt/host in the guest.
     """
 
     def __init__(self, built: Path, folder: Path, accelerator: str = "tcg,thread=multi") -> None:
@@ -54,14 +53,14 @@ class Machine:
         self.boot_s = 0.0
 
     def boot(self) -> None:
-        """Start it and wait until a command can be run in it."""
+        """Start the guest and wait until it runs commands."""
         if not self.disk.exists():
             base = (self.built / "root.ext4").resolve()
             subprocess.run(
                 ["qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", base, self.disk],
                 check=True,
             )
-            # all of it is there from the beginning: nothing is written later but what is asked for
+            # initialise everything now, so that the kernel writes nothing later by itself
             features = "lazy_itable_init=0,lazy_journal_init=0,nodiscard"
             subprocess.run(
                 ["mke2fs", "-q", "-t", "ext4", "-m", "0", "-E", features, self.empty, STORE_SIZE],
@@ -95,7 +94,7 @@ class Machine:
             "systemd.show_status=0"
         )
         return [
-            *("setpriv", "--pdeathsig", "KILL"),  # it ends with whoever started it
+            *("setpriv", "--pdeathsig", "KILL"),  # QEMU ends with its parent
             *("qemu-system-x86_64", "-M", "q35", "-accel", self.accelerator, "-cpu", CPU),
             *("-smp", "2", "-m", "1536", "-nodefaults", "-no-user-config", "-display", "none"),
             *("-kernel", str(self.built / "kernel"), "-initrd", str(self.built / "initrd")),
@@ -124,7 +123,7 @@ class Machine:
         ]
 
     def _share_a_connection(self) -> None:
-        """One connection for all commands: a key exchange takes two seconds in there."""
+        """Open one connection for all commands: a key exchange takes two seconds."""
         quiet = subprocess.DEVNULL
         self._master = subprocess.Popen(
             self._ssh("-M", "-N"), stdin=quiet, stdout=quiet, stderr=quiet
@@ -135,7 +134,7 @@ class Machine:
     def run(
         self, command: str, *, check: bool = True, timeout_s: float = 120.0, tries: int = 3
     ) -> subprocess.CompletedProcess[str]:
-        """A shell command in the guest, as root; again where a busy guest refuses us."""
+        """Run a shell command as root in the guest; retry if a busy guest refuses to connect."""
         quiet = subprocess.DEVNULL
         ssh = [*self._ssh(), command]
         try:
@@ -154,13 +153,13 @@ class Machine:
         return done
 
     def python(self, script: str, *arguments: object, timeout_s: float = 300.0) -> object:
-        """Run a script of tests/hil/guest in the guest; its last line of output is JSON."""
+        """Run a script of tests/hil/guest in the guest; return the JSON of its last line."""
         words = " ".join(shlex.quote(str(a)) for a in arguments)
         out = self.run(f"python3 /mnt/host/guest/{script} {words}", timeout_s=timeout_s).stdout
         return json.loads(out.strip().splitlines()[-1])
 
     def wait(self, command: str, timeout_s: float = 60.0) -> str:
-        """Until a command succeeds in the guest; its output."""
+        """Wait until a command succeeds in the guest; return its output."""
         deadline = time.monotonic() + timeout_s
         while True:
             done = self.run(command, check=False)
@@ -171,7 +170,7 @@ class Machine:
             time.sleep(0.2)
 
     def cut_power(self) -> None:
-        """No shutdown, no flush by the guest; what the host already has survives."""
+        """Kill the guest without shutdown or flush; only data that the host has survive."""
         for process in (self.process, self._master):
             if process is not None:
                 process.kill()

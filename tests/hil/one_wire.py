@@ -1,8 +1,8 @@
 """A 1-wire bus with DS18B20 probes behind a USB adapter DS9490R, plugged into the guest by QEMU.
 
-QEMU's usb-redir device speaks the USB redirection protocol with whoever is at its socket. This end
-is the adapter (a DS2490 bridge) with the probes on its wire; in the guest the kernel's ds2490 and
-w1_therm drivers do what they do with the real ones, 0.75 s for a conversion included.
+QEMU's usb-redir device uses the USB redirection protocol on its socket. This module is the adapter
+(a DS2490 bridge) with its probes; the guest's ds2490 and w1_therm drivers work as with real ones,
+including 0.75 s per conversion.
 Source: USB Network Redirection protocol 0.7; data sheets DS2490 and DS18B20 (19-7487).
 """
 
@@ -27,7 +27,7 @@ SET_CONFIGURATION, GET_CONFIGURATION, CONFIGURATION = 6, 7, 8
 SET_ALTERNATE, GET_ALTERNATE, ALTERNATE = 9, 10, 11
 START_INTERRUPT, STOP_INTERRUPT, INTERRUPT_STATUS = 15, 16, 17
 CONTROL, BULK, INTERRUPT = 100, 101, 103
-# device version, largest packets, identities of 64 bits, lengths of 32: what QEMU's xHCI wants
+# required by QEMU's xHCI: device version, largest packets, identities of 64 bits, lengths of 32
 CAPABILITIES = 1 << 1 | 1 << 4 | 1 << 5 | 1 << 6
 HEAD, BULK_HEAD = struct.Struct("<IIQ"), struct.Struct("<BBHIH")
 STALL = 4
@@ -38,7 +38,7 @@ ENDPOINT_TABLE = {STATUS: (3, 1, 32), OUT: (2, 0, 64), IN: (2, 0, 64)}  # type, 
 RESET_DEVICE = (0, 0)
 COMMUNICATION = 1
 BIT_IO, RESET, BYTE_IO, BLOCK_IO, SEARCH = 0x20, 0x42, 0x52, 0x74, 0xF4
-KIND = 0xF6  # of a command word: less the bits that modify it
+KIND = 0xF6  # mask of a command word without its modifier bits
 IDLE = 0x20
 
 
@@ -52,7 +52,7 @@ class Probe:
     serial: int
     celsius: float = 20.0
     scratchpad: bytes = POWER_ON
-    damage: int = 0  # exclusive-or of the first byte that is read: a disturbed line
+    damage: int = 0  # XORed with the first byte read, like a disturbed line
     converts: bool = True
     selected: bool = field(default=False, init=False)
     _answer: list[int] = field(default_factory=list, init=False)
@@ -64,14 +64,14 @@ class Probe:
 
     @property
     def name(self) -> str:
-        """As the kernel calls it."""
+        """The kernel's name of the probe."""
         return f"28-{self.serial:012x}"
 
     def reset(self) -> None:
         self.selected, self._answer = False, []
 
     def command(self, byte: int) -> None:
-        """A function command to a probe that was selected."""
+        """Execute a function command; the probe is selected."""
         if byte == 0x44 and self.converts:
             raw = round(self.celsius * 16).to_bytes(2, "little", signed=True)
             body = raw + bytes.fromhex("4b467fff0c10")
@@ -85,7 +85,7 @@ class Probe:
 
 
 class Wire:
-    """The bus: what is read back for each byte that is written."""
+    """The bus, which returns a byte for each byte written."""
 
     def __init__(self, probes: list[Probe]) -> None:
         self.probes = probes
@@ -114,7 +114,7 @@ class Wire:
             for probe in chosen:
                 probe.command(out)
             return out
-        level = 0xFF  # the wire is low where anybody pulls
+        level = 0xFF  # the wire is low if any probe pulls it low
         for probe in chosen:
             level &= probe.answer()
         return level
@@ -126,7 +126,7 @@ class Wire:
 
 
 class Adapter:
-    """Plugged in and pulled; serves in a thread of its own."""
+    """The adapter, which serves in its own thread while plugged in."""
 
     def __init__(self, path: Path, *probes: Probe) -> None:
         self.path, self.probes = path, list(probes)
@@ -152,12 +152,12 @@ class Adapter:
             self._socket = None
 
     def _serve(self, line: socket.socket) -> None:
-        # a greeting has the short head of the first versions
+        # the greeting has the short header of the first versions
         hello = struct.pack("<64sI", b"laboratory", CAPABILITIES)
         line.sendall(struct.pack("<III", HELLO, len(hello), 0) + hello)
         with line.makefile("rb") as stream:
             stream.read(struct.unpack("<III", stream.read(12))[1])
-            self._tell_endpoints(line)
+            self._send_endpoints(line)
             connect = struct.pack("<BBBBHHH", 1, 0xFF, 0, 0, 0x04FA, 0x2490, 0x0002)
             self._send(line, CONNECT, 0, connect)
             while len(head := stream.read(HEAD.size)) == HEAD.size:
@@ -170,7 +170,7 @@ class Adapter:
     def _send(line: socket.socket, kind: int, identity: int, body: bytes) -> None:
         line.sendall(HEAD.pack(kind, len(body), identity) + body)
 
-    def _tell_endpoints(self, line: socket.socket) -> None:
+    def _send_endpoints(self, line: socket.socket) -> None:
         one = bytes([0]).ljust(32, b"\0")
         self._send(
             line, INTERFACES, 0, struct.pack("<I", 1) + one + b"\xff".ljust(32, b"\0") + 2 * one
@@ -186,17 +186,17 @@ class Adapter:
 
     def _packet(self, line: socket.socket, kind: int, identity: int, body: bytes) -> None:
         if kind in (SET_CONFIGURATION, GET_CONFIGURATION):
-            self._tell_endpoints(line)
+            self._send_endpoints(line)
             self._send(line, CONFIGURATION, identity, b"\0\1")
         elif kind in (SET_ALTERNATE, GET_ALTERNATE):
             if kind == SET_ALTERNATE:
                 self._alternate = body[1]
-            self._tell_endpoints(line)
+            self._send_endpoints(line)
             self._send(line, ALTERNATE, identity, bytes([0, 0, self._alternate]))
         elif kind in (START_INTERRUPT, STOP_INTERRUPT):
             self._listening = kind == START_INTERRUPT
             self._send(line, INTERRUPT_STATUS, identity, bytes([0, STATUS]))
-            self._tell_status(line)
+            self._send_status(line)
         elif kind == CONTROL:
             self._control(line, identity, body)
         elif kind == BULK:
@@ -224,10 +224,10 @@ class Adapter:
                 buffer.clear()
         head = struct.pack("<BBBBHHH", endpoint, request, kind, status, value, index, len(data))
         self._send(line, CONTROL, identity, head + data)
-        self._tell_status(line)
+        self._send_status(line)
 
     def _command(self, value: int, index: int) -> None:
-        """A communication command: done at once, and the driver waits for one status after it."""
+        """Execute a communication command, and queue the status for which the driver waits."""
         kind = value & KIND
         if kind == RESET:
             self._wire.reset()
@@ -240,21 +240,21 @@ class Adapter:
             self._read += bytes(self._wire.byte(byte) for byte in self._written[:index])
             del self._written[:index]
         elif kind == SEARCH:
-            self._written.clear()  # where to begin: always at the first
+            self._written.clear()  # the start of the search; this one begins at the first probe
             self._read += b"".join(probe.rom for probe in self.probes)
         else:
             return
         flags = bytes([0, 0, 0, 0, 0, 0, 0, 0, IDLE, 0, 0, 0, 0, min(len(self._read), 255), 0, 0])
         self._waiting.append(flags)
 
-    def _tell_status(self, line: socket.socket) -> None:
+    def _send_status(self, line: socket.socket) -> None:
         while self._listening and self._waiting:
             data = self._waiting.pop(0)
             self._send(line, INTERRUPT, 0, struct.pack("<BBH", STATUS, 0, len(data)) + data)
 
 
 def descriptor(value: int) -> bytes:
-    """The device's and its configuration's: four settings that differ in nothing here."""
+    """Return the descriptor of the device, or of its configuration with four equal settings."""
     kind = value >> 8
     if kind == 1:
         return struct.pack(

@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 __all__ = ["ADB_PORT", "PHONE_PORT", "Phone"]
 
-# not 5555 to 5585: the adb server takes those for emulators
+# not 5555 to 5585, which the adb server uses for emulators
 PHONE_PORT = 5600
 ADB_PORT = 5037
 ADBD = "/usr/lib/android-sdk/platform-tools/adbd"
 
 
 class Phone:
-    """`state` is the folder that its scripts look into; see tests/hil/handset/bin."""
+    """The phone; its scripts (tests/hil/handset/bin) read and write the folder `state`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -37,7 +37,7 @@ class Phone:
         self._adbd: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """As it comes out of the drawer: no photographs, asleep; attached to the adb server."""
+        """Reset the phone (no photographs, asleep), and attach it to the adb server."""
         for folder in (self.state, self.camera_folder):
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
@@ -47,8 +47,8 @@ class Phone:
         self.plug()
 
     def plug(self) -> None:
-        """Begin to answer, and tell the adb server."""
-        # a mount namespace of its own: nothing of /dev and /proc stays behind
+        """Start adbd, and connect the adb server."""
+        # in its own mount namespace, so that no mount of /dev and /proc remains
         script = (
             f"mount --rbind /dev {self.root}/dev && mount -t proc proc {self.root}/proc && "
             f"ADBD_PORT={PHONE_PORT} exec chroot {self.root} {ADBD}"
@@ -60,7 +60,7 @@ class Phone:
         self.attach()
 
     def attach(self, timeout_s: float = 30.0) -> None:
-        """`adb connect` until the phone is listed as a device."""
+        """Repeat `adb connect` until the phone is listed as a device."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             self.adb("connect", self.serial)
@@ -76,7 +76,7 @@ class Phone:
         return done.stdout + done.stderr
 
     def pull(self) -> None:
-        """The cable falls out."""
+        """Kill adbd, as if the cable were pulled."""
         if self._adbd is not None:
             self._adbd.send_signal(signal.SIGKILL)
             self._adbd.wait()
@@ -103,7 +103,7 @@ class Phone:
         )
 
     def load(self, images: np.ndarray, first: int = 1) -> None:
-        """Put photographs in: what the camera shows at its next exposures, numbered."""
+        """Load numbered photographs for the camera's next exposures."""
         for k, image in enumerate(images):
             tags = Image.Exif()
             sub = tags.get_ifd(0x8769)
@@ -113,6 +113,6 @@ class Phone:
             Image.fromarray(stamp(image, first + k)).save(path, "JPEG", quality=92, exif=tags)
 
     def exposures(self) -> dict[int, float]:
-        """{number: s UTC} when each was really exposed."""
+        """Return {number: s UTC} of the true exposures."""
         lines = (self.state / "exposures").read_text().splitlines()
         return {int(n): float(t) for n, t in (line.split() for line in lines)}

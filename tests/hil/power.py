@@ -1,7 +1,7 @@
-"""What a disk really holds at an instant: its writes replayed as far as they had been flushed.
+"""The content of a disk at an instant, with the writes replayed that had been flushed.
 
-dm-log-writes logs a write when the flush after it is done, so that everything before a mark is what
-a disk may hold at the worst whose power goes at that instant.
+dm-log-writes logs a write once the flush after it is complete, so the writes before a mark are the
+least that a disk contains if its power fails at that instant.
 Source: Linux, Documentation/admin-guide/device-mapper/log-writes.rst, drivers/md/dm-log-writes.c.
 """
 
@@ -23,11 +23,11 @@ DISCARD, MARK = 4, 8
 
 
 def entries(log: Path) -> Iterator[tuple[int, bytes, str]]:
-    """(offset in bytes, data, mark) of each entry, as many as the log's head counts."""
+    """Yield (offset in bytes, data, mark) of each entry counted in the log's header."""
     with log.open("rb") as file:
         magic, version, count, size = SUPER.unpack(file.read(SUPER.size))
         if (magic, version) != (MAGIC, 1):
-            return  # nothing has been written yet
+            return  # the log is still empty
         at = size
         for _ in range(count):
             file.seek(at)
@@ -43,7 +43,7 @@ def entries(log: Path) -> Iterator[tuple[int, bytes, str]]:
 
 
 def wait_for_mark(log: Path, mark: str, timeout_s: float = 30.0) -> None:
-    """Until a mark stands in the log; the kernel writes it a little later."""
+    """Wait until a mark is in the log; the kernel writes it with a delay."""
     deadline = time.monotonic() + timeout_s
     while not any(found == mark for _, _, found in entries(log)):
         if time.monotonic() > deadline:
@@ -52,7 +52,7 @@ def wait_for_mark(log: Path, mark: str, timeout_s: float = 30.0) -> None:
 
 
 def replay(log: Path, disk: Path, mark: str) -> int:
-    """Apply the writes before a mark to an image of the disk before them; how many there were."""
+    """Apply the writes before a mark to a disk image; return their number."""
     with disk.open("r+b") as file:
         for number, (offset, data, found) in enumerate(entries(log)):
             if found == mark:

@@ -1,4 +1,4 @@
-"""What the guest's daemon is given (test field, frames, configuration), and what its store says."""
+"""Test field, frames and configuration of the guest's daemon."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VIVID = "/dev/v4l/by-path/platform-vivid.0-video-index0"
 
 
 def configuration(serial_port: str) -> dict[str, Any]:
-    """A calibrated camera, one that is only recorded, two thermometers, two outputs."""
+    """Return a configuration: a calibrated and a recorded camera, two thermometers, two outputs."""
     width, height = SIZE
     _, model = subject(width, height)
     line = r"T=(?P<temperature>[-+]?\d+\.\d+)"
@@ -43,11 +43,8 @@ def configuration(serial_port: str) -> dict[str, Any]:
                 "pixel_format": "GREY",
                 "timeout_s": 5.0,
                 "period_s": PERIOD_S,
-                "sensor": {
-                    "width_px": width,
-                    "height_px": height,
-                    "pixel_pitch_mm": model.sensor.pixel_pitch,
-                },
+                "sensor": {"width_px": width, "height_px": height,
+                           "pixel_pitch_mm": model.sensor.pixel_pitch},
                 "principal_distance_mm": 3.04,
                 "testfield": "/etc/thermocald/testfield.csv",
                 "thermometers": ["lens", "line"],
@@ -77,15 +74,15 @@ def configuration(serial_port: str) -> dict[str, Any]:
 
 
 def prepare(folder: Path, serial_port: str, epochs: int) -> None:
-    """Frames, temperatures, test field and configuration into a folder that the guest sees.
+    """Write frames, temperatures, test field and configuration into a folder shared with the guest.
 
-    Of the field's markers every third is in the test field: 64 corners.
+    The test field contains every third of the field's markers: 64 corners.
     """
     images, temperatures = heating(*SIZE, epochs)
     np.save(folder / "frames.npy", images)
     np.save(folder / "temperatures.npy", temperatures)
     field = subject(*SIZE)[0]
-    # An epoch of all 192 corners takes the emulated processor three times the period.
+    # an epoch with all 192 corners takes the emulated processor three periods
     third = field.subset(np.flatnonzero(field.groups % 3 == 0))
     write_testfield(folder / "testfield.csv", third)
     text = yaml.safe_dump(configuration(serial_port), sort_keys=False)

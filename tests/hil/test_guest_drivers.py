@@ -1,4 +1,4 @@
-"""Drivers on real kernel drivers in the guest: v4l2loopback, vivid, i2c-stub, lm75, ftdi_sio."""
+"""Drivers with real kernel drivers in the guest: v4l2loopback, vivid, i2c-stub, lm75, ftdi_sio."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def captured(video):
 
 @pytest.mark.parametrize("case", CASES)
 def test_v4l2_frames_are_new_and_their_times_right(captured, report, case):
-    """Each frame carries its number; the feeder logged when each was written."""
+    """Each frame contains its number; the feeder logs when each was written."""
     frames = captured[case]
     numbers = [frame["number"] for frame in frames]
     assert numbers == sorted(set(numbers))
@@ -51,11 +51,11 @@ def test_v4l2_frames_are_new_and_their_times_right(captured, report, case):
 
 
 @pytest.mark.parametrize("backend", ["linuxpy", "opencv"])
-def test_v4l2_feeder_that_stops_and_dies(video, backend):
+def test_v4l2_feeder_that_stalls_and_is_killed(video, backend):
     result = check(video, "stalls", backend)
     stopped = result["stopped"]
     assert stopped["error"] == "DeviceTimeout"
-    assert stopped["took_s"] < 2.5  # the driver's 1.5 s, and not OpenCV's 10 s
+    assert stopped["took_s"] < 2.5  # the driver's 1.5 s instead of OpenCV's 10 s
     assert result["continued"]["error"] is None
     assert result["killed"]["error"] in TRANSIENT
     assert result["again"]["error"] is None
@@ -85,15 +85,13 @@ def test_v4l2_faults_of_the_kernel(video, report):
 
 def test_i2c(machine, i2c_bus, report):
     result = check(machine, "i2c", i2c_bus)
-    assert result["kernel"]["values"] == [{"temperature": 25.062}] * 20  # it cuts to 1/1000
+    assert result["kernel"]["values"] == [{"temperature": 25.062}] * 20  # truncated to 1/1000
     assert result["registers"]["values"] == [{"temperature": 25.0625}] * 20
     assert result["mcp9808"]["values"] == [{"temperature": 25.0625}] * 20
     assert result["kernel cold"]["value"] == {"temperature": pytest.approx(-25.062, abs=1e-3)}
     assert result["mcp9808 cold"]["value"] == {"temperature": -0.0625}
-    assert (result["0xffff"]["error"], result["another chip"]["error"]) == (
-        "BadReading",
-        "WrongDevice",
-    )
+    assert result["0xffff"]["error"] == "BadReading"
+    assert result["another chip"]["error"] == "WrongDevice"
     assert result["kernel has it"]["error"] == "DeviceDenied"
     assert result["nobody"]["error"] == "DeviceNotFound"
     assert result["no bus"]["error"] == "DeviceNotFound"
@@ -104,7 +102,7 @@ def test_i2c(machine, i2c_bus, report):
         report(f"{driver}: read to value {milliseconds(result[name]['took_s'])}")
 
 
-def test_what_the_kernel_reads(machine, i2c_bus, report):
+def test_thermometers_of_the_kernel(machine, i2c_bus, report):
     result = check(machine, "kernel", i2c_bus)
     assert result["iio"]["values"] == [{"temperature": 25.08}] * 20
     assert result["iio unbound"]["error"] == "DeviceGone"
@@ -114,7 +112,7 @@ def test_what_the_kernel_reads(machine, i2c_bus, report):
     report(f"thermal_zone (ACPI firmware): read to value {milliseconds(took)}")
 
 
-def test_chips_that_convert_when_asked(machine, i2c_bus, report):
+def test_chips_that_convert_on_request(machine, i2c_bus, report):
     result = check(machine, "registers", i2c_bus)
     for name, celsius, fastest in (("bme280", 25.08, 0.0), ("tmp117", 25.0625, 0.1245)):
         for values in result[name]["values"]:
@@ -131,7 +129,7 @@ def test_serial(machine, instrument, report):
 
 
 def unplugged(machine, device, scenario, argument):
-    """A scenario during which a device is pulled and plugged in again."""
+    """Run a scenario while a device is pulled and plugged in again; return its result."""
     machine.run("rm -f /run/cable /run/result /run/errors")
     machine.run(
         f"nohup python3 /mnt/host/guest/check.py {scenario} {argument} "
@@ -156,7 +154,7 @@ def test_serial_unplugged_and_plugged_again(machine, instrument):
 
 
 def test_ds18b20(machine, wire, report):
-    """Two probes on the kernel's w1_therm, which converts one after the other."""
+    """The kernel's w1_therm converts two probes one after the other."""
     names = [probe.name for probe in wire.probes]
     result = check(machine, "ds18b20", *names)
     assert result["opened"]["error"] is None, result["opened"]["text"]
@@ -167,15 +165,15 @@ def test_ds18b20(machine, wire, report):
     report(f"ds18b20 (w1_therm, ds2490), two probes: read to values {milliseconds(took)}")
 
 
-def test_ds18b20_that_is_not_believed(machine, wire):
-    """A disturbed line, and a probe that lost its power and never converted since."""
+def test_ds18b20_with_wrong_readings(machine, wire):
+    """A disturbed line, and a probe that lost its power and has not converted since."""
     disturbed, restarted = wire.probes
     disturbed.damage = 1
     restarted.converts, restarted.scratchpad = False, POWER_ON
     names = [probe.name for probe in wire.probes]
     (first,) = check(machine, "ds18b20", *names, "count=1")["readings"]
     assert first["error"] == "BadReading"
-    assert "CRC" in first["text"]  # Linux 6.1 gives nothing then, earlier ones the bytes
+    assert "CRC" in first["text"]  # Linux 6.1 returns nothing, earlier ones the bytes
     restarted.converts = True
     (second,) = check(machine, "ds18b20", *names, "count=1")["readings"]
     values, missing = second["value"]
@@ -204,7 +202,7 @@ def test_mqtt_with_a_real_broker(machine, report):
     assert len(results) == 5
     assert sum(topic.startswith("homeassistant/sensor/") for topic, _, _ in received) == 11
     available = [p for topic, p, _ in received if topic == "thermocald/thermocald/available"]
-    assert available == ["online", "offline"]  # killed: the broker speaks the last will
+    assert available == ["online", "offline"]  # the killed client's last will, from the broker
     report(f"mqtt (mosquitto): result to acknowledgement {milliseconds(result['took_s'][1:])}")
 
 

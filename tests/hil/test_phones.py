@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+import threading
 import time
 
 import pytest
@@ -36,7 +37,7 @@ def thermometer(phone, **more):
 
 
 def test_a_heating_series(phone, subject, report):
-    """Frame numbers, temperatures and times of every epoch; photographs deleted from the phone."""
+    """Frame numbers, temperatures and times are right; photographs are deleted from the phone."""
     images, temperatures = subject
     phone.load(images)
     phone.say("shutter_lag", "0.12")
@@ -56,7 +57,7 @@ def test_a_heating_series(phone, subject, report):
             assert reading.values == {"temperature": tenths / 10}
             errors.append(frame.utc - (phone.exposures()[epoch + 1] + 0.005))
         uncertainty = device.clock_offset()[2]
-    # exposure 0.01 s: its middle. On a busy machine the clocks cannot be compared to 5 ms
+    # the middle of 0.01 s; on a busy machine, clocks are compared less exactly than 5 ms
     assert max(abs(error) for error in errors) < max(0.005, uncertainty + 0.001)
     assert list(phone.camera_folder.iterdir()) == []
     activities = (phone.state / "activities").read_text().splitlines()
@@ -64,7 +65,7 @@ def test_a_heating_series(phone, subject, report):
     report(
         f"android (adbd 34, {WIDTH}x{HEIGHT}): trigger to frame in memory median "
         f"{statistics.median(took):.2f} s (shutter lag 0.12 s, file written for 0.3 s), "
-        f"times off by at most {1e3 * max(map(abs, errors)):.1f} ms (clocks compared to "
+        f"times wrong by at most {1e3 * max(map(abs, errors)):.1f} ms (clocks compared to "
         f"{1e3 * uncertainty:.1f} ms); read to value median "
         f"{1e3 * statistics.median(read):.0f} ms"
     )
@@ -83,7 +84,7 @@ def test_no_camera_app(phone):
         device.capture()
 
 
-def test_focus_that_moved(phone, subject):
+def test_a_changed_focus(phone, subject):
     phone.load(subject[0][:4])
     with camera(phone) as device:
         device.capture()
@@ -108,14 +109,12 @@ def test_a_full_phone(phone):
         camera(phone, minimum_free_mb=1e6).open()
 
 
-def test_the_cable_falls_out_and_is_put_back(phone, subject):
-    """adbd is killed in the middle of a capture; nothing truncated comes of it."""
+def test_a_pulled_cable_is_plugged_in_again(phone, subject):
+    """adbd is killed during a capture, which gives no truncated frame."""
     phone.load(subject[0][:2])
     phone.say("write_lag", "30")
     device = camera(phone, timeout_s=5.0)
     device.open()
-    import threading
-
     killer = threading.Timer(0.8, phone.pull)
     killer.start()
     with pytest.raises((DeviceGone, DeviceTimeout)):
@@ -132,16 +131,15 @@ def test_the_cable_falls_out_and_is_put_back(phone, subject):
 
 
 def test_warm_up_by_processor_load(phone):
-    """Real processes on the phone, gone at the limit and when the lease ends."""
+    """Real processes on the phone end at the limit, and with the lease."""
     programme = [{"seconds": 1000, "hold_c": 38.0}]
     options = {"serial": phone.serial, "limit_c": 42, "programme": programme, "processes": 2}
     clock = VirtualClock()
 
     def running():
-        # adbd's own line carries the command too; only the loops' shells count
-        return phone.adb(
-            "-s", phone.serial, "shell", "pgrep -fc '^sh -c [t]hermocald_load'"
-        ).strip()
+        # adbd's own command line also contains the command; count only the loops' shells
+        count = "pgrep -fc '^sh -c [t]hermocald_load'"
+        return phone.adb("-s", phone.serial, "shell", count).strip()
 
     with open_device("output", "android_load", {**options, "lease_s": 4}, clock) as output:
         output.emit({})
@@ -155,7 +153,7 @@ def test_warm_up_by_processor_load(phone):
     output.open()
     output.emit({})
     assert running() == "2"
-    deadline = time.monotonic() + 10  # nobody renews: it ends by itself
+    deadline = time.monotonic() + 10  # without renewal the load ends by itself
     while running() != "0" and time.monotonic() < deadline:
         time.sleep(0.2)
     assert running() == "0"

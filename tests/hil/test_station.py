@@ -1,8 +1,8 @@
-"""The daemon under systemd in the guest: a heating test field end to end, then the faults.
+"""The daemon under systemd in the guest: a warm-up before a test field, then faults.
 
 Frames come through v4l2loopback, temperatures through the kernel's lm75 driver and a USB serial
-adapter. The feeder's log says which frame and which temperature stood when; every frame carries its
-number, so that the stored epoch can be held against the log.
+adapter. The feeder logs the times of frames and temperatures, and every frame contains its number,
+so that stored epochs can be compared with the log.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tests.hil.power import replay, wait_for_mark
 from tests.hil.station import CAMERA, PERIOD_S, SIZE, STORE, VIVID, prepare
 
 EPOCHS = 60
-CALIBRATED = 54  # of them, once the daemon has made up for what it put off
+CALIBRATED = 54  # at least, after the daemon has calibrated postponed epochs
 FPS = 4.0
 HOLD = round(PERIOD_S * FPS)
 STAMP_S = 0.005
@@ -59,7 +59,7 @@ class Station:
         self.until(lambda status: river(status)["stored"] >= 1, "the first epoch")
 
     def feed(self):
-        """Start the camera's feeder; the test field begins to heat."""
+        """Start the camera's feeder."""
         self.machine.run(
             "rm -f /run/feed.log; systemd-run -q --unit=feeder --collect "
             f"python3 /mnt/host/guest/feed.py {CAMERA} /mnt/host/station/frames.npy "
@@ -73,22 +73,22 @@ class Station:
             raise AssertionError(f"the feeder does not run:\n{why}") from error
 
     def stop_feeding(self):
-        """The camera stalls; a feeder that died could not come back while the daemon looks on."""
+        """Stall the camera; a killed feeder could not restart while the device is open."""
         self.machine.run("systemctl kill -s SIGSTOP feeder")
 
     def go_on_feeding(self):
         self.machine.run("systemctl kill -s SIGCONT feeder")
 
     def stored(self):
-        """What the store holds, after its own check of the whole file."""
+        """Return the store's content after a check of the whole file."""
         return self.machine.python("store.py")
 
     def numbers(self):
-        """Of the river's epochs in the store, in their order."""
+        """Return the numbers of the river's epochs in the store, in order."""
         return [epoch["number"] for epoch in self.stored()["series"]["river"]]
 
     def events(self):
-        """Kinds of what happened, as the store tells it."""
+        """Return the kinds of the store's events."""
         return [event["kind"] for event in self.stored()["events"]]
 
     def status(self):
@@ -96,19 +96,19 @@ class Station:
         return json.loads(out)
 
     def until(self, condition, what, timeout_s=180.0):
-        """Look at the daemon's status until something is so; the status."""
+        """Wait until the daemon's status fulfils a condition; return the status."""
         deadline = time.monotonic() + timeout_s
         while True:
             status = self.status()
             if condition(status):
                 return status
-            if time.monotonic() > deadline:  # what went wrong stands there
+            if time.monotonic() > deadline:
                 journal = self.machine.run("journalctl -u thermocald -n 20 --no-pager").stdout
                 raise AssertionError(f"not in {timeout_s:g} s: {what}\n{journal}")
             time.sleep(0.5)
 
     def journal(self, pattern):
-        """Lines of the daemon's journal that fit."""
+        """Return the lines of the daemon's journal that match a pattern."""
         done = self.machine.run(
             f"journalctl -u thermocald --no-pager -o cat | grep -E '{pattern}'", check=False
         )
@@ -133,7 +133,7 @@ def device_states(status):
 
 
 def caught_up(station, timeout_s=120.0):
-    """Wait until every epoch of the river has been calibrated, as long as it gets on."""
+    """Wait until all epochs of the river are calibrated; fail if there is no progress."""
     deadline, before = time.monotonic() + timeout_s, None
     while True:
         left = station.machine.python("calibrated.py").get("not_calibrated", 0)
@@ -148,12 +148,12 @@ def caught_up(station, timeout_s=120.0):
 
 @pytest.fixture(scope="module")
 def series(station):
-    """What the store holds after 60 epochs of heating, and the feeder's log."""
+    """Return the store after 60 epochs of heating, the feeder's log, and the clock offset."""
     first = station.until(lambda s: river(s)["stored"] >= 2, "the first epochs", 240)
     station.machine.run("touch /run/heating")
     last = river(first)["stored"] + EPOCHS + 2
     station.until(lambda s: river(s)["stored"] >= last, f"{EPOCHS} epochs", 420)
-    station.stop_feeding()  # with no new frames the daemon makes up for what it put off
+    station.stop_feeding()  # without new frames, the daemon calibrates postponed epochs
     station.until(
         lambda s: river(s)["waiting"] == 0 and river(s)["device"] == "out", "no frames left", 120
     )
@@ -163,7 +163,7 @@ def series(station):
     for line in station.machine.run("cat /run/feed.log").stdout.splitlines():
         number, before, after, celsius = line.split()
         log[int(number)] = (float(before), float(after), float(celsius))
-    # the closest of several: a busy guest waits between the two clocks
+    # the closest pair of several: a busy guest may pause between the two clocks
     read = "((m(), t(), m()) for _ in range(50))"
     offset = float(
         station.machine.run(
@@ -174,8 +174,8 @@ def series(station):
     return stored, log, offset
 
 
-def test_the_probe_shows_one_of_each(station, report):
-    """`thermocald check config.yaml --probe`, before the daemon takes the devices."""
+def test_the_probe_shows_every_device(station, report):
+    """`thermocald check config.yaml --probe` runs before the daemon."""
     probes = {probe["name"]: probe for probe in station.probed["probes"]}
     assert {name for name, probe in probes.items() if probe["error"]} == set()
     assert probes["river"]["values"]["width_px"] == SIZE[0]
@@ -200,14 +200,14 @@ def test_sixty_epochs_of_frames_and_times(series, report):
     assert max(errors) < STAMP_S
     gaps = np.diff([e["frame_time"] for e in epochs])
     report(
-        f"daemon: {len(epochs)} epochs stored, frame times off by at most {1e3 * max(errors):.2f} "
-        f"ms, interval median {statistics.median(gaps):.3f} s (asked {PERIOD_S:g} s), largest "
+        f"daemon: {len(epochs)} epochs stored, times wrong by at most {1e3 * max(errors):.2f} ms, "
+        f"interval median {statistics.median(gaps):.3f} s (set {PERIOD_S:g} s), largest "
         f"{max(gaps):.2f} s"
     )
 
 
 def test_sixty_epochs_of_temperatures(series):
-    """Each temperature stood in the register at the instant that is stored with it."""
+    """Each temperature was in the register at its stored time."""
     stored, log, offset = series
     times = sorted((before, celsius) for before, _, celsius in log.values())
     starts = [at for at, _ in times]
@@ -216,7 +216,7 @@ def test_sixty_epochs_of_temperatures(series):
         if epoch["frame"] not in log or epoch["temperatures"].get("lens") is None:
             continue
         at = epoch["temperature_time"] - offset
-        # the kernel's driver may give a value as old as its refresh interval, 0.22 s
+        # the kernel's driver may return a value as old as its refresh interval, 0.22 s
         here = {times[max(0, bisect.bisect(starts, t) - 1)][1] for t in (at - 0.5, at, at + 0.05)}
         low, high = min(here), max(here)
         assert low - 0.001 <= epoch["temperatures"]["lens"] <= high + 0.001
@@ -226,7 +226,7 @@ def test_sixty_epochs_of_temperatures(series):
 
 
 def test_sixty_epochs_are_calibrated(series, report):
-    """The stored interior orientation follows the temperature as the rendered camera does."""
+    """The stored interior orientation follows the temperature like the rendered camera."""
     stored, log, _ = series
     good = [e for e in stored["series"]["river"] if e["status"] == "ok" and e["frame"] in log]
     assert len(good) >= CALIBRATED
@@ -242,11 +242,11 @@ def test_sixty_epochs_are_calibrated(series, report):
     )
 
 
-def test_the_camera_stalls_and_comes_back(station, series):
-    """After the series the feeder was stopped: no epoch since, one warning, one return."""
+def test_a_stalled_camera_comes_back(station, series):
+    """The feeder is stopped since the end of the series: one warning, and one return."""
     before = river(station.status())["stored"]
     outs, backs = station.journal("camera river is out"), station.journal("camera river is back")
-    assert len(outs) == len(backs) + 1  # told once, though it was tried again and again
+    assert len(outs) == len(backs) + 1  # one warning for many attempts
     station.go_on_feeding()
     station.until(lambda s: river(s)["stored"] > before + 1, "epochs again", 120)
     assert len(station.journal("camera river is out")) == len(outs)
@@ -254,7 +254,7 @@ def test_the_camera_stalls_and_comes_back(station, series):
 
 
 def test_the_other_camera_is_unplugged(station):
-    """vivid is unbound and bound: its epochs pause, the river's do not."""
+    """vivid is unbound and bound again: its epochs pause, the river's do not."""
     station.until(lambda s: s["cameras"]["yard"]["stored"] > 0, "frames of the yard", 120)
     station.machine.run(f"echo vivid.0 > {VIVID_DRIVER}/unbind")
     out = station.until(lambda s: device_states(s)["yard"] == "out", "yard out")
@@ -271,25 +271,25 @@ def test_the_other_camera_is_unplugged(station):
 
 
 def bare_epochs(station, last):
-    """Stored epochs of the river behind number `last` that have no temperature at all."""
+    """Return the river's stored epochs after number `last` without any temperature."""
     epochs = station.stored()["series"]["river"]
     return [e for e in epochs if e["number"] > last and set(e["temperatures"].values()) <= {None}]
 
 
 def both_are_read(station):
-    """Whether the river's last stored epoch has both temperatures, the line's as it was set."""
+    """Return whether the river's last stored epoch has both temperatures."""
     temperatures = station.stored()["series"]["river"][-1]["temperatures"]
     return temperatures["lens"] is not None and temperatures["line"] == 21.25
 
 
-def test_thermometers_come_and_go(station):
-    """The kernel's driver is unbound, the serial adapter pulled: missing, never made up."""
+def test_thermometers_are_unplugged_and_plugged_in_again(station):
+    """The kernel's driver is unbound, the serial adapter pulled; their values are missing."""
     bus = f"/sys/bus/i2c/devices/i2c-{station.i2c_bus}"
     last = station.numbers()[-1]
     station.machine.run(f"echo 0x48 > {bus}/delete_device")
     station.instrument.pull()
     station.until(lambda s: {device_states(s)[k] for k in ("lens", "line")} == {"out"}, "both out")
-    # a busy guest stores a few epochs late: those that were read before the pull say nothing
+    # a busy guest may store epochs late that were read before the pull
     station.until(lambda _: len(bare_epochs(station, last)) >= 2, "epochs without temperatures")
     station.machine.run(f"echo tmp75 0x48 > {bus}/new_device")
     station.instrument.plug()
@@ -301,12 +301,12 @@ def test_thermometers_come_and_go(station):
     for name in ("lens", "line"):
         assert station.journal(f"thermometer {name} is out")
         assert station.journal(f"thermometer {name} is back")
-        told = [e["text"] for e in stored["events"] if f"thermometer {name} is" in e["text"]]
-        assert [text.split(" is ")[1].split()[0].strip(":") for text in told] == ["out", "back"]
+        texts = [e["text"] for e in stored["events"] if f"thermometer {name} is" in e["text"]]
+        assert [text.split(" is ")[1].split()[0].strip(":") for text in texts] == ["out", "back"]
 
 
 def test_the_clock_is_set(station):
-    """Two hours back, then forwards: the rhythm goes on, the store says that the clock stepped."""
+    """The clock is set two hours back, then forwards: epochs go on, the store has the steps."""
     before = river(station.status())["stored"]
     station.machine.run("date -s '-2 hours'")
     station.until(lambda s: river(s)["stored"] > before + 3, "epochs after the step")
@@ -320,17 +320,17 @@ def test_the_clock_is_set(station):
     epochs = stored["series"]["river"][max(0, before - 2) :]
     times = [e["frame_time"] for e in epochs]
     assert times == sorted(times)
-    assert max(np.diff(times)) < 60.0  # no step of two hours in what is stored
+    assert max(np.diff(times)) < 60.0  # stored times have no step of two hours
 
 
-def store_is_well(status):
+def store_is_ok(status):
     return status["store"]["state"] == "ok" and not status["store"]["waiting"]
 
 
 def test_the_stores_disk_is_full(station):
-    """Not a byte is left: results wait in memory; when there is room again none is missing."""
-    station.until(store_is_well, "a well store")
-    # what waits in the -wal file is room that SQLite would use first
+    """Results wait in memory while no byte is free; afterwards none is missing."""
+    station.until(store_is_ok, "a working store")
+    # otherwise SQLite would first use the space in the -wal file
     station.machine.run(
         f"python3 -c 'import sqlite3; "
         f'sqlite3.connect("{STORE}/thermocald.db").execute("PRAGMA wal_checkpoint(TRUNCATE)")\'; '
@@ -340,19 +340,19 @@ def test_the_stores_disk_is_full(station):
     assert station.status()["store"]["state"] == "out"
     assert "disk is full" in station.journal("results wait in memory")[-1]
     station.machine.run(f"rm {STORE}/balloon {STORE}/rest")
-    station.until(store_is_well, "a well store again")
+    station.until(store_is_ok, "a working store again")
     assert station.status()["store"]["lost"] == 0
-    for told in ("observations no more", "can be written again", "observations are kept again"):
-        assert station.journal(told)
+    for text in ("observations no more", "can be written again", "observations are kept again"):
+        assert station.journal(text)
     kinds = station.events()
     assert {"store_out", "observations_paused", "observations_resumed"} <= set(kinds)
     numbers = station.numbers()
     assert numbers == list(range(1, len(numbers) + 1))
 
 
-def test_a_hung_daemon_is_started_again(station):
-    """SIGSTOP: systemd's watchdog ends it, the new one goes on with the next number."""
-    # a guest without processor time may have been started again just now
+def test_a_hung_daemon_is_restarted(station):
+    """systemd's watchdog ends the stopped daemon; the new one goes on with the next number."""
+    # on a busy machine the watchdog may have restarted the daemon just now
     show = 'pid="$(systemctl show -P MainPID thermocald)"; test "$pid" != 0 && echo "$pid"'
     pid = station.machine.wait(show, 120).strip()
     last, started = station.numbers()[-1], station.events().count("started")
@@ -371,10 +371,10 @@ def test_a_hung_daemon_is_started_again(station):
 
 
 def test_power_cut(station, report):
-    """The power goes, and with it all that the disk had not flushed: no stored epoch is lost.
+    """The power fails, and everything not flushed is lost, but no stored epoch.
 
-    What another process has read of the store counts as stored. A file that nobody flushed shows
-    that something is lost.
+    Epochs that another process has read from the store count as stored. A file that was not flushed
+    shows that data are lost.
     """
     machine = station.machine
     acknowledged = station.numbers()[-1]
@@ -392,6 +392,6 @@ def test_power_cut(station, report):
     assert numbers[-1] >= acknowledged
     assert machine.run(f"test -s {STORE}/never-flushed", check=False).returncode == 1
     report(
-        f"power cut: {numbers[-1]} epochs there, {acknowledged} had been read before; {writes} "
+        f"power cut: {numbers[-1]} epochs stored, {acknowledged} read before it; {writes} "
         f"flushed writes replayed, booted again in {machine.boot_s:.0f} s"
     )

@@ -11,12 +11,12 @@ import struct
 
 __all__ = ["CELSIUS", "table"]
 
-CELSIUS = 37.0  # as the kernel gives it: 310.2 K less 273.2 K
+CELSIUS = 37.0  # the kernel's value: 310.2 K − 273.2 K
 NOW, CRITICAL = 3102, 3782
 
 
 def table() -> bytes:
-    """A secondary system description table (SSDT)."""
+    """Return a secondary system description table (SSDT)."""
     method = _package(b"\x14", b"_TMP\x00\xa4" + _word(NOW))
     name = b"\x08_CRT" + _word(CRITICAL)
     code = _package(b"\x5b\x85", b"\\\x2e_TZ_LAB0" + method + name)
@@ -33,7 +33,7 @@ def _word(value: int) -> bytes:
 
 
 def _package(opcode: bytes, content: bytes) -> bytes:
-    """With its length, which counts itself: one byte as long as there are fewer than 64."""
+    """Return a package with its length, which includes the length byte and is less than 64."""
     length = len(content) + 1
     assert length < 64
     return opcode + bytes([length]) + content

@@ -1,8 +1,8 @@
-"""Recordings of fields that are not what a simulation would make: crooked, badly surveyed, moving.
+"""Recordings of fields unlike the simulation's: crooked, badly surveyed, moving.
 
-The image points share no code with the program: the projection is CONVENTIONS §2 written down once
-more, the errors are those that real set-ups have. Frames are rendered by the simulation, whose
-field is bent. The truth of each epoch is returned.
+The image points share no code with the program: the projection is an own implementation of
+CONVENTIONS §2, with errors as in real set-ups. Frames are rendered by the simulation, with a bent
+field. The truth of each epoch is returned.
 """
 
 from __future__ import annotations
@@ -22,19 +22,13 @@ from thermocald.store.recording.testfield_file import write_testfield
 PITCH = 0.00112
 SIZE = (3280, 2464)
 CAMERA = {
-    "c": 3.04,
-    "x0": 0.012,
-    "y0": -0.021,
-    "A1": -6.0e-3,
-    "A2": 4.0e-4,
-    "B1": 2e-5,
-    "B2": -3e-5,
-}
+    "c": 3.04, "x0": 0.012, "y0": -0.021, "A1": -6.0e-3, "A2": 4.0e-4, "B1": 2e-5, "B2": -3e-5,
+}  # fmt: skip
 NOISE_PX = 0.05
 
 
 def rotation(omega: float, phi: float, kappa: float) -> np.ndarray:
-    """R_x(omega) R_y(phi) R_z(kappa), camera to object."""
+    """Return R_x(omega) R_y(phi) R_z(kappa), camera to object."""
     (so, co), (sp, cp), (sk, ck) = ((np.sin(a), np.cos(a)) for a in (omega, phi, kappa))
     x = np.array([[1, 0, 0], [0, co, -so], [0, so, co]])
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -43,7 +37,7 @@ def rotation(omega: float, phi: float, kappa: float) -> np.ndarray:
 
 
 def project(points: np.ndarray, pose: np.ndarray, c: float, x0: float, y0: float) -> np.ndarray:
-    """Image points (n, 2) px of object points (n, 3) mm; pose: three angles and a centre."""
+    """Project object points (n, 3) mm, px (n, 2); pose: three angles and a centre."""
     inside = (points - pose[3:]) @ rotation(*pose[:3])
     x, y = -c * inside[:, 0] / inside[:, 2], -c * inside[:, 1] / inside[:, 2]
     r2 = x**2 + y**2
@@ -57,7 +51,7 @@ def project(points: np.ndarray, pose: np.ndarray, c: float, x0: float, y0: float
 
 
 def corner(rows: int, rng: np.random.Generator, crooked_mm: float) -> np.ndarray:
-    """Targets (3·rows², 3) mm on three walls of a corner, each turned and bent."""
+    """Draw targets (3·rows², 3) mm on three walls of a corner, each turned and bent."""
     grid = np.linspace(60.0, 660.0, rows)
     a, b = (g.ravel() for g in np.meshgrid(grid, grid))
     walls = []
@@ -72,7 +66,7 @@ def corner(rows: int, rng: np.random.Generator, crooked_mm: float) -> np.ndarray
 
 
 def pose_before(distance_mm: float) -> np.ndarray:
-    """Before the corner, looking along its diagonal."""
+    """Return the pose of a camera that looks into the corner along its diagonal."""
     centre = np.full(3, 250.0) + distance_mm / np.sqrt(3)
     back = (centre - 250.0) / np.linalg.norm(centre - 250.0)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -84,7 +78,7 @@ def pose_before(distance_mm: float) -> np.ndarray:
 
 
 def smooth(rng: np.random.Generator, epochs: int, memory: float) -> np.ndarray:
-    """(epochs,): a first-order autoregressive series of variance 1."""
+    """Draw a first-order autoregressive series (epochs,) of variance 1."""
     k = np.exp(-1.0 / memory) if memory > 0 else 0.0
     out = np.empty(epochs)
     out[0] = rng.normal()
@@ -94,7 +88,7 @@ def smooth(rng: np.random.Generator, epochs: int, memory: float) -> np.ndarray:
 
 
 def head_of(name: str, camera: str, size: tuple[int, int], pitch: float) -> dict[str, object]:
-    """The head of a recording of one thermometer."""
+    """Return the head of a recording with one thermometer."""
     return {
         "name": name, "series": "M1", "interval": 10.0,
         "camera": {"name": camera, "width": size[0], "height": size[1], "pixel_pitch": pitch,
@@ -107,12 +101,12 @@ KINDS = ("surveyed", "badly_surveyed", "knocked", "trembling")
 
 
 def write(folder: Path, kind: str, seed: int, epochs: int = 70) -> dict[str, np.ndarray]:
-    """A recording of one kind; the true c, x0, y0 (epochs,) mm.
+    """Write a recording of one kind; return the true c, x0, y0 (epochs,) mm.
 
-    surveyed: to 2 µm, but each target's image is off by 0.04 px for good, as edges of prints are;
-    badly_surveyed: 0.4 mm wrong where 0.15 mm is stated, boards hidden and shown again; knocked:
-    the camera is turned by 0.03° at two thirds and stays, two targets wander; trembling: the mount
-    moves by 0.06 px, most of it slowly.
+    surveyed: to 2 µm, but each target's image has a constant error of 0.04 px, like edges of
+    prints; badly_surveyed: errors of 0.4 mm instead of the stated 0.15 mm, boards hidden at times;
+    knocked: the camera is turned by 0.03° at two thirds, two targets wander; trembling: the mount
+    moves by 0.06 px, mostly slowly.
     """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     field = corner(11 if kind == "surveyed" else 7, rng, crooked_mm=3.0)
@@ -167,7 +161,7 @@ def write(folder: Path, kind: str, seed: int, epochs: int = 70) -> dict[str, np.
 
 
 def write_frames(folder: Path, epochs: int, seed: int) -> dict[str, np.ndarray]:
-    """A recording of JPEG frames (1640 × 1232) of bent planes of markers, surveyed to 2 µm."""
+    """Write a recording of JPEG frames (1640 × 1232) of bent planes of markers; sds are 2 µm."""
     rng = np.random.default_rng([seed, 99])
     plane = corner_field("markers", per_side=4)
     u, v, w = plane.points.T
@@ -196,7 +190,7 @@ def write_frames(folder: Path, epochs: int, seed: int) -> dict[str, np.ndarray]:
         time = 1.7e9 + 10.0 * e
         heads.append([e + 1, time, time, f"{temperature[e]:.3f}", name])
     head = head_of(f"frames-{seed}", "bent", (sensor.width, sensor.height), sensor.pixel_pitch)
-    head["temperatures"] = {"temperature": {"unit": "degC"}}  # as exact as it is written
+    head["temperatures"] = {"temperature": {"unit": "degC"}}  # without a stated resolution
     write_recording(folder, head, heads)
     write_testfield(folder / "testfield.csv", known)
     return truth

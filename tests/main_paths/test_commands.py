@@ -1,7 +1,7 @@
-"""Every command that computes, as users call it, on every real recording and a rendered session.
+"""The user's commands on every real recording and on a rendered session.
 
-Nothing thermal happens in the 50 s of the real cameras: whoever finds an effect there is wrong. The
-rendered session goes the way of somebody with a folder of photographs and a logger.
+The 50 s of the real cameras contain no thermal effect, so none may be found. The rendered session
+is that of a user with a folder of photographs and a logger.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from PIL import Image
 import thermocald as tc
 from tests.commands import call
 from tests.main_paths import crooked
+from tests.main_paths.tables import read_rows, write_rows
 from tests.marks import mostly_slow
 
 REAL = ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"]
@@ -27,7 +28,7 @@ SOME = mostly_slow(REAL, "aviary-cam2")
 
 
 def run(*arguments: object, status: int = 0):
-    """A command that ends as it should, without a warning of Python's."""
+    """Run a command; check its exit status, and that Python gave no warning."""
     done = call(*arguments)
     assert done.returncode == status, done.stderr
     assert "Warning:" not in done.stderr
@@ -35,36 +36,30 @@ def run(*arguments: object, status: int = 0):
 
 
 def with_temperature(recording: Path, out: Path, first: int, last: int) -> Path:
-    """Rows first to last of a recording, 30 s apart, with a temperature that was made up."""
+    """Copy rows first to last of a recording, 30 s apart, with an invented temperature."""
     shutil.copytree(recording, out)
-    with (out / "epochs.csv").open() as table:
-        heads = list(csv.DictReader(table))[first:last]
+    heads = read_rows(out / "epochs.csv")[first:last]
     kept = {r["epoch"] for r in heads}
     rng = np.random.default_rng([first, last])
     for k, row in enumerate(heads):
         row["frame_time"] = row["temperature_time"] = f"{1.7e9 + 30.0 * k:.1f}"
         row["temperature"] = f"{22 + 12 * np.sin(k / 16) ** 2 + rng.normal(0, 0.03):.3f}"
-    with (out / "observations.csv").open() as table:
-        points = [r for r in csv.DictReader(table) if r["epoch"] in kept]
-    for name, content in (("epochs.csv", heads), ("observations.csv", points)):
-        with (out / name).open("w", newline="") as table:
-            writer = csv.DictWriter(table, content[0])
-            writer.writeheader()
-            writer.writerows(content)
+    points = [r for r in read_rows(out / "observations.csv") if r["epoch"] in kept]
+    write_rows(out / "epochs.csv", heads)
+    write_rows(out / "observations.csv", points)
     return out
 
 
 @pytest.mark.parametrize("camera", SOME)
 def test_without_a_temperature(shared, tmp_path, camera):
-    """What needs a thermometer says so in one line; what does not gives its result."""
+    """Commands that need a thermometer end with a one-line error; the others give results."""
     recording = shared / "data" / camera
     checked = run("check", recording)
     assert "101" in checked.stdout
     replayed = json.loads(run("replay", recording, "--json", "-").stdout)
     assert replayed["ok"] >= 100
     run("export", recording, "-o", tmp_path / "rows.csv")
-    with (tmp_path / "rows.csv").open() as table:
-        assert len(list(csv.DictReader(table))) == 101
+    assert len(read_rows(tmp_path / "rows.csv")) == 101
     for command in (("fit", recording, "-o", tmp_path / "m.yaml"), ("discover", recording)):
         refused = run(*command, status=1)
         last = refused.stderr.strip().splitlines()[-1]
@@ -74,8 +69,8 @@ def test_without_a_temperature(shared, tmp_path, camera):
 
 
 @pytest.mark.parametrize("camera", SOME)
-def test_where_nothing_thermal_happens(shared, tmp_path, camera):
-    """No drift, no rate, no effect."""
+def test_a_recording_without_thermal_effects(shared, tmp_path, camera):
+    """No drift, no rate and no effect are found."""
     m1 = with_temperature(shared / "data" / camera, tmp_path / "M1", 0, 50)
     m2 = with_temperature(shared / "data" / camera, tmp_path / "M2", 50, 101)
     study = json.loads(run("study", m1, m2, "--json", "-").stdout)
@@ -93,13 +88,12 @@ def test_where_nothing_thermal_happens(shared, tmp_path, camera):
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory):
-    """A folder of JPEGs with EXIF times, a logger's file, the field; and the truth."""
+    """Return a folder of JPEGs with EXIF times, a logger's file and a field; and the truth."""
     folder = tmp_path_factory.mktemp("photographs")
     truth = crooked.write_frames(folder / "frames", 12, seed=4)
     photos = folder / "photos"
     photos.mkdir()
-    with (folder / "frames" / "epochs.csv").open() as table:
-        heads = list(csv.DictReader(table))
+    heads = read_rows(folder / "frames" / "epochs.csv")
     with (folder / "logger.csv").open("w", newline="") as out:
         log = csv.writer(out, delimiter=";")
         log.writerow(["Datum", "Uhrzeit", "Temperatur [°C]", "Feuchte [%]"])
@@ -119,7 +113,7 @@ def photographs(tmp_path_factory):
 
 
 def test_photographs_and_a_logger(photographs, tmp_path):
-    """import, replay, study, fit, predict: the drift that was put in comes out, within 4 sd."""
+    """The drift is recovered; import, replay, study, fit and predict work."""
     folder, truth = photographs
     m1 = tmp_path / "M1"
     taken = run(
@@ -130,8 +124,7 @@ def test_photographs_and_a_logger(photographs, tmp_path):
     replayed = json.loads(run("replay", m1, "--exterior", "series", "--json", "-").stdout)
     assert replayed["ok"] == 12
     run("export", m1, "-o", tmp_path / "rows.csv", "--exterior", "series")
-    with (tmp_path / "rows.csv").open() as table:
-        rows = list(csv.DictReader(table))
+    rows = read_rows(tmp_path / "rows.csv")
     for name in ("c", "x0", "y0"):
         values, sds = (np.array([float(r[f"{p}{name}"]) for r in rows]) for p in ("", "sd_"))
         error = values - truth[name]
@@ -145,7 +138,7 @@ def test_photographs_and_a_logger(photographs, tmp_path):
 
 
 def test_calibrate_photographs(photographs, tmp_path):
-    """The same photographs as those of one calibration: one camera, c within the drift."""
+    """Photographs of the session give one camera, with c within the drift."""
     folder, truth = photographs
     some = sorted((folder / "photos").glob("*.jpg"))[::4]
     document = json.loads(
@@ -160,35 +153,29 @@ def test_calibrate_photographs(photographs, tmp_path):
 
 @pytest.fixture(scope="module")
 def odd(tmp_path_factory):
-    """A camera that warms up, and a copy of it with rows that are left out or changed."""
+    """Return the fit of a warm-up, and a function that copies it with rows left out or changed."""
     folder = tmp_path_factory.mktemp("odd")
     tc.simulate("rpi-v2.1-heating", seed=5, epochs=90, out=folder / "plain")
 
     def write(name, table, change):
         out = folder / name
         shutil.copytree(folder / "plain", out)
-        with (out / table).open() as file:
-            before = list(csv.DictReader(file))
-        kept = [row for k, row in enumerate(before) if change(k, row)]
-        with (out / table).open("w", newline="") as file:
-            writer = csv.DictWriter(file, before[0])
-            writer.writeheader()
-            writer.writerows(kept)
+        kept = [row for k, row in enumerate(read_rows(out / table)) if change(k, row)]
+        write_rows(out / table, kept)
         return out
 
     return rate_of_c(folder / "plain", folder / "camera.yaml"), write
 
 
 def rate_of_c(recording: Path, out: Path) -> tuple[float, float, str]:
-    """The fitted rate of c and its standard deviation, µm/K; what was said."""
+    """Fit; return the rate of c and its standard deviation, µm/K, and the printed text."""
     done = run("fit", recording, "-o", out)
     line = next(line for line in done.stdout.splitlines() if line.strip().startswith("c:"))
     words = line.replace("−", "-").split()
     return float(words[1]), float(words[3]), done.stdout + done.stderr
 
 
-def test_epochs_of_few_targets_among_others_of_many(odd, tmp_path):
-    """They carry no weight, and took what hidden targets have in common off the others."""
+def test_epochs_with_few_targets_do_not_harm_the_others(odd, tmp_path):
     (whole, sd, _), write = odd
     few = write("few", "observations.csv", lambda k, row: int(row["epoch"]) % 3 != 0 or k % 16 == 0)
     part, sd_part, _ = rate_of_c(few, tmp_path / "camera.yaml")
@@ -198,8 +185,8 @@ def test_epochs_of_few_targets_among_others_of_many(odd, tmp_path):
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_epochs_of_the_same_time(odd, tmp_path):
-    """A rate over no time is not infinite."""
+def test_epochs_with_equal_times(odd, tmp_path):
+    """The rate between them is not infinite."""
     _, write = odd
     times: list[str] = []
 
@@ -213,8 +200,8 @@ def test_epochs_of_the_same_time(odd, tmp_path):
     run("discover", same)
 
 
-def test_names_of_targets_that_are_exchanged(odd, tmp_path):
-    """They are said where the series is read, and tell nothing of the camera."""
+def test_exchanged_names_of_targets(odd, tmp_path):
+    """They are reported by each command, and do not affect the camera."""
     (whole, sd, of_plain), write = odd
 
     def change(k, row):
@@ -225,17 +212,17 @@ def test_names_of_targets_that_are_exchanged(odd, tmp_path):
     found, sd_found, of_fit = rate_of_c(exchanged, tmp_path / "camera.yaml")
     assert abs(found - whole) < sd
     assert sd_found < 1.5 * sd
-    told = {"fit": of_fit}
+    printed = {"fit": of_fit}
     for command in ("check", "replay", "study", "discover"):
         done = run(command, exchanged)
-        told[command] = done.stdout + done.stderr
-    for command, said in told.items():
+        printed[command] = done.stdout + done.stderr
+    for command, text in printed.items():
         exchange = r"x22 4\d\d px, y37 4\d\d px off; their names look exchanged"
-        assert re.search(exchange, " ".join(said.split())), command
+        assert re.search(exchange, " ".join(text.split())), command
     assert "elsewhere" not in of_plain
 
 
-def test_a_thermometer_that_never_answered(odd, tmp_path):
+def test_a_thermometer_without_readings(odd, tmp_path):
     _, write = odd
 
     def change(k, row):

@@ -1,12 +1,11 @@
-"""What the daemon calibrates live is what `replay` finds: real cameras and crooked fields.
+"""The daemon's live results equal those of `replay`, for real cameras and crooked fields.
 
-As users run it: `run --recording R --fast`, `export` of the store; `replay R`, `export R`.
+With the user's commands: `run --recording R --fast` and `export` of the store; `export R`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import csv
 import shutil
 import sqlite3
 import time
@@ -18,15 +17,11 @@ import pytest
 from tests.commands import call
 from tests.daemon.forking import Forker
 from tests.main_paths import crooked
+from tests.main_paths.tables import read_rows as rows
+from tests.main_paths.tables import write_rows
 
 REAL = ["aviary-cam0", "aviary-cam1", "aviary-cam2", "aviary-cam6"]
 MAIN = ("c", "x0", "y0")
-
-
-def rows(path: Path) -> list[dict[str, str]]:
-    """The rows of an exported table."""
-    with path.open() as table:
-        return list(csv.DictReader(table))
 
 
 def good(table: list[dict[str, str]]) -> list[dict[str, str]]:
@@ -38,35 +33,35 @@ def column(table: list[dict[str, str]], name: str) -> np.ndarray:
 
 
 def exported(source: Path, out: Path, *more: str) -> list[dict[str, str]]:
-    """The table that `export` writes of a recording or a store."""
+    """Export a recording or a store; return its table."""
     assert call("export", source, *more, "-o", out).returncode == 0
     return rows(out)
 
 
 def live_and_replayed(forker: Forker, recording: Path, folder: Path):
-    """Both tables of a recording, and what the daemon said on the way."""
+    """Return a recording's live and replayed tables, and what the daemon printed."""
     own = folder / recording.name
     if own != recording:
         shutil.copytree(recording, own)
     store = folder / "live.db"
-    said = played(forker, own, store)
-    return exported(store, folder / "live.csv", "--extra"), exported(own, folder / "r.csv"), said
+    text = played(forker, own, store)
+    return exported(store, folder / "live.csv", "--extra"), exported(own, folder / "r.csv"), text
 
 
 def agree(live: list[dict[str, str]], replayed: list[dict[str, str]]) -> None:
-    """The table of the issue: as many epochs, as many rejected, the same sigma0, the same end."""
+    """Check that epochs, rejections, sigma0 and the last series result agree."""
     pairs = list(zip(live, replayed, strict=True))
     without = {a["epoch"]: a["status"] for a, b in pairs if b["status"] == "ok" != a["status"]}
     assert not without
     a, b = good(live), good(replayed)
-    # each row is that of `replay` of the epochs so far: the first ones rest on few
+    # a live row has only the epochs so far, so the first rows have few
     rejected, expected = column(a, "n_rejected").sum(), column(b, "n_rejected").sum()
     seen = column(b, "n_observations").sum()
     assert rejected <= 1.3 * expected + 10 + 0.002 * seen, (rejected, expected)
     ratio = np.median(column(a, "sigma0")) / np.median(column(b, "sigma0"))
     assert 0.93 <= ratio <= 1.07, f"sigma0 {ratio:.3f} of replay's"
     assert column(a, "sigma0").max() < 3 * np.median(column(a, "sigma0"))
-    for name in MAIN:  # the series' result, which stands next to the epoch's own
+    for name in MAIN:  # the result of the series, not of the epoch
         difference = float(a[-1][f"series_{name}"]) - float(b[-1][name])
         assert abs(difference) <= 0.2 * float(b[-1][f"sd_{name}"]), f"last epoch's {name}"
 
@@ -74,21 +69,21 @@ def agree(live: list[dict[str, str]], replayed: list[dict[str, str]]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", REAL)
 def test_real_cameras(shared, forker, tmp_path, camera):
-    """Fixed cameras in whose 50 s nothing happens: the scatter is what the sds say."""
-    live, replayed, said = live_and_replayed(forker, shared / "data" / camera, tmp_path)
+    """Fixed cameras, stable for 50 s, scatter as their sds state."""
+    live, replayed, text = live_and_replayed(forker, shared / "data" / camera, tmp_path)
     agree(live, replayed)
     assert len(good(live)) == len(good(replayed)) >= 100
-    assert "was moved" not in said
+    assert "was moved" not in text
     for name in MAIN:
         values, sds = column(good(live), name), column(good(live), f"sd_{name}")
         each = (values - values.mean()) / sds
         ratio = each.std(ddof=1)
-        # the aim is 0.9 to 1.1; eight of cam1's targets wander, which its first rows could not know
+        # the aim is 0.9 to 1.1; eight of cam1's targets wander, which its first rows do not show
         most = 1.4 if camera == "aviary-cam1" else 1.25
         assert ratio <= most, f"{name}: {ratio:.2f} sd"
-        # the first nine rest on the stated noise, which is more than there is
+        # the first nine have the stated noise, which is too large
         assert each[9:].std(ddof=1) >= 0.75, f"{name}: {each[9:].std(ddof=1):.2f} sd"
-    # as somebody would see it who looks at the table: cam1 loses half of its boards on the way
+    # over the whole table; cam1 loses half of its boards
     spread = column(good(live), "c").std() / np.median(column(good(live), "sd_c"))
     assert 0.6 < spread < 1.5, f"c scatters {spread:.2f} of the usual sd"
 
@@ -96,15 +91,15 @@ def test_real_cameras(shared, forker, tmp_path, camera):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "epochs"),
-    [("badly_surveyed", 40), *(pytest.param(k, 70, marks=pytest.mark.slow) for k in crooked.KINDS)],
+    [("badly_surveyed", 40), *((kind, 70) for kind in crooked.KINDS)],
 )
 def test_crooked_fields(forker, tmp_path, kind, epochs):
-    """Errors about their mean are what the sds say, for the live rows as for replay's."""
+    """Errors of live rows about their mean agree with their sds."""
     truth = crooked.write(tmp_path / kind, kind, seed=1, epochs=epochs)
-    live, replayed, said = live_and_replayed(forker, tmp_path / kind, tmp_path)
+    live, replayed, text = live_and_replayed(forker, tmp_path / kind, tmp_path)
     agree(live, replayed)
     assert len(good(live)) == epochs
-    assert kind == "knocked" or "was moved" not in said
+    assert kind == "knocked" or "was moved" not in text
     for name in MAIN:
         error = column(live, name) - truth[name]
         ratio = (error - error.mean()).std() / np.median(column(live, f"sd_{name}"))
@@ -113,12 +108,12 @@ def test_crooked_fields(forker, tmp_path, kind, epochs):
 
 @pytest.mark.slow
 def test_frames_of_crooked_planes(forker, tmp_path):
-    """Rendered frames of a field whose planes are bent, surveyed to 2 µm."""
+    """Rendered frames of a field with bent planes, surveyed to 2 µm."""
     recording, truth = tmp_path / "frames", crooked.write_frames(tmp_path / "frames", 14, seed=3)
-    live, replayed, said = live_and_replayed(forker, recording, tmp_path)
+    live, replayed, text = live_and_replayed(forker, recording, tmp_path)
     agree(live, replayed)
     assert len(good(live)) == 14
-    assert "was moved" not in said
+    assert "was moved" not in text
     error = column(live, "c") - truth["c"]
     assert abs(error - error.mean()).max() < 5 * np.median(column(live, "sd_c"))
 
@@ -126,26 +121,25 @@ def test_frames_of_crooked_planes(forker, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", REAL)
 def test_a_steady_temperature(shared, forker, tmp_path, camera):
-    """With a thermometer nothing hides what the mounts do, and they sway: no knock, no slip."""
+    """With a constant temperature, the sway of the mounts gives no knock and no slip."""
     shutil.copytree(shared / "data" / camera, own := tmp_path / camera)
     heads = rows(own / "epochs.csv")
-    with (own / "epochs.csv").open("w", newline="") as table:
-        writer = csv.DictWriter(table, heads[0])
-        writer.writeheader()
-        for k, row in enumerate(heads):
-            reading = f"{25.0 + 0.0625 * (k % 3 == 0):.4f}"
-            writer.writerow(row | {"temperature": reading, "temperature_time": row["frame_time"]})
-    live, replayed, said = live_and_replayed(forker, own, tmp_path)
+    for k, row in enumerate(heads):
+        row["temperature"] = f"{25.0 + 0.0625 * (k % 3 == 0):.4f}"
+        row["temperature_time"] = row["frame_time"]
+    write_rows(own / "epochs.csv", heads)
+    live, replayed, text = live_and_replayed(forker, own, tmp_path)
     agree(live, replayed)
     # cam2 twice moves by 0.2 px for two epochs
-    assert said.count("was moved") + said.count("slipped") <= 2 * (camera == "aviary-cam2")
+    assert text.count("was moved") + text.count("slipped") <= 2 * (camera == "aviary-cam2")
 
 
 def part_of(
     recording: Path, part: Path, first: int, every: int = 1, drawn: tuple[int, int] | None = None
 ) -> Path:
-    """A recording of every so many targets of another one, or of so many that a seed draws, from
-    one of its epochs on.
+    """Copy a recording from epoch `first` on, with every `every`-th target.
+
+    drawn: (seed, number) of randomly drawn targets instead.
     """
     shutil.copytree(recording, part)
     heads = [r for r in rows(part / "epochs.csv") if int(r["epoch"]) >= first]
@@ -154,27 +148,22 @@ def part_of(
     kept = set(names[::every])
     if drawn is not None:
         kept = set(np.random.default_rng(drawn[0]).choice(names, drawn[1], replace=False).tolist())
-    for name, content in (
-        ("epochs.csv", heads),
-        ("observations.csv", [r for r in table if r["epoch"] in epochs and r["target"] in kept]),
-    ):
-        with (part / name).open("w", newline="") as out:
-            writer = csv.DictWriter(out, content[0])
-            writer.writeheader()
-            writer.writerows(content)
+    write_rows(part / "epochs.csv", heads)
+    table = [r for r in table if r["epoch"] in epochs and r["target"] in kept]
+    write_rows(part / "observations.csv", table)
     return part
 
 
 def test_a_part_of_a_real_camera(shared, forker, tmp_path):
-    """Every other target and the last 30 epochs: no recording is one that was seen before."""
+    """Every other target and the last 30 epochs, a recording used in no other test."""
     part = part_of(shared / "data" / "aviary-cam0", tmp_path / "part", 72, every=2)
     live, replayed, _ = live_and_replayed(forker, part, tmp_path)
     agree(live, replayed)
 
 
 @pytest.mark.slow
-def test_epochs_too_weak_by_themselves(shared, forker, tmp_path):
-    """14 targets leave y0 of an epoch unknown by 80 px; together the epochs carry it."""
+def test_epochs_too_weak_for_single_calibration(shared, forker, tmp_path):
+    """y0 of a single epoch has an sd of 80 px; together, the epochs determine it."""
     part = part_of(shared / "data" / "aviary-cam1", tmp_path / "part", 62, every=5)
     checked = call("check", part)
     assert "none of 3 epochs can be calibrated by itself" in checked.stdout
@@ -184,12 +173,11 @@ def test_epochs_too_weak_by_themselves(shared, forker, tmp_path):
 
 
 def test_few_targets_of_a_wall(shared, tmp_path):
-    """Whole steps of Gauss-Newton lead away from what 14 targets show: `replay` had no epoch of
-    any of these parts.
+    """Full Gauss-Newton steps diverge with 14 targets; `replay` once had no result for any part.
 
-    Of 264 parts of the four walls, of 10 to 19 targets, 222 had a result, and 244 have, with errors
-    of at most 2.5 of the level's sds; those that the result says to be doubtful had up to 3. In
-    geometry so weak rounding decides which: of four parts two have to have one.
+    Of 264 parts of the four walls with 10 to 19 targets, 222 had a result before and 244 now, with
+    errors up to 2.5 sds of the level, doubtful results up to 3. In such weak geometry rounding
+    decides which; two of four parts must have one.
     """
     means = []
     for seed in (4, 14, 22, 26):
@@ -199,25 +187,22 @@ def test_few_targets_of_a_wall(shared, tmp_path):
             found = good(rows(tmp_path / "part.csv"))
             means += [column(found, "c").mean()] if len(found) > 60 else []
     assert len(means) >= 2
-    assert np.abs(np.array(means) - 12.68).max() < 0.3  # of all targets: 12.68
+    assert np.abs(np.array(means) - 12.68).max() < 0.3  # 12.68 from all targets
 
 
 @pytest.mark.slow
-def test_names_of_targets_that_are_exchanged(shared, forker, tmp_path):
-    """Live and replay leave both out, as if nobody had seen them; replay had no epoch at all."""
+def test_exchanged_names_of_targets(shared, forker, tmp_path):
+    """Live and replay leave both targets out; replay once had no result."""
     real = part_of(shared / "data" / "aviary-cam2", tmp_path / "part", 61)
-    told = {"19.3": "107.0", "107.0": "19.3"}
+    exchange = {"19.3": "107.0", "107.0": "19.3"}
     replays = []
     for name in ("exchanged", "without"):
         shutil.copytree(real, out := tmp_path / name)
         seen = rows(real / "observations.csv")
         if name == "without":
-            seen = [row for row in seen if row["target"] not in told]
-        with (out / "observations.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, seen[0])
-            writer.writeheader()
-            for row in seen:
-                writer.writerow(row | {"target": told.get(row["target"], row["target"])})
+            seen = [row for row in seen if row["target"] not in exchange]
+        seen = [row | {"target": exchange.get(row["target"], row["target"])} for row in seen]
+        write_rows(out / "observations.csv", seen)
         replays.append(exported(out, tmp_path / f"{name}.csv"))
     assert len(good(replays[0])) == len(good(replays[1])) == 41
     for name in MAIN:
@@ -229,9 +214,9 @@ def test_names_of_targets_that_are_exchanged(shared, forker, tmp_path):
 
 
 def played(forker: Forker, recording: Path, store: Path, kill_at: int = 0) -> str:
-    """Play a recording into a store; kill the program as soon as it holds so many epochs.
+    """Play a recording into a store; return what the program prints.
 
-    Returns what it said where it was not killed.
+    kill_at: kill it once the store has this many epochs, and return "".
     """
     words = ("run", "--recording", str(recording), "--fast", "--store", str(store))
     process = forker.start(recording.parent, *words, log=f"{store.stem}-{recording.name}.txt")
@@ -250,7 +235,7 @@ def played(forker: Forker, recording: Path, store: Path, kill_at: int = 0) -> st
 
 
 def stored(store: Path) -> int:
-    """How many epochs a store holds that another process writes."""
+    """Return the number of epochs in a store that another process writes."""
     try:
         with contextlib.closing(sqlite3.connect(f"file:{store}?mode=ro", uri=True)) as database:
             return int(database.execute("SELECT count(*) FROM epoch").fetchone()[0])
@@ -259,8 +244,9 @@ def stored(store: Path) -> int:
 
 
 def restarted(forker: Forker, recording: Path, folder: Path, kill_at: int) -> np.ndarray:
-    """By how many standard deviations (epochs, 6) the epochs after a kill are others than those
-    without: c, x0, y0 of each epoch by itself, and in its series.
+    """Return the differences (epochs, 6) in sds of the epochs after a kill from an unbroken run.
+
+    The columns are c, x0, y0 of each epoch, and of the series.
     """
     tables = []
     for name, kill in (("whole", 0), ("killed", kill_at)):
@@ -276,23 +262,17 @@ def restarted(forker: Forker, recording: Path, folder: Path, kill_at: int) -> np
     rest = list(whole)[kill_at:]
     assert [whole[t]["status"] for t in rest] == [killed[t]["status"] for t in rest]
     assert len(rest) > 10
-    return np.array(
-        [
-            [
-                (float(killed[t][f"{of}{n}"]) - float(whole[t][f"{of}{n}"]))
-                / np.hypot(float(whole[t][f"sd_{of}{n}"]), float(whole[t].get(level + n) or 0.0))
-                for of, level in (("", ""), ("series_", "level_sd_"))
-                for n in MAIN
-            ]
-            for t in rest
-            if whole[t]["status"] == "ok"
-        ]
-    )
+    pairs = [(killed[t], whole[t]) for t in rest if whole[t]["status"] == "ok"]
+    return np.array([
+        [(float(a[f"{of}{n}"]) - float(b[f"{of}{n}"]))
+         / np.hypot(float(b[f"sd_{of}{n}"]), float(b.get(level + n) or 0.0)) for a, b in pairs]
+        for of, level in (("", ""), ("series_", "level_sd_")) for n in MAIN
+    ]).T  # fmt: skip
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_the_rest_is_the_same(forker, tmp_path):
-    """The program goes on with the epochs of its store as if it had never been away."""
+def test_epochs_after_a_kill_are_the_same(forker, tmp_path):
+    """A restarted program continues with the epochs in its store."""
     crooked.write(tmp_path / "trembling", "trembling", seed=2, epochs=28)
     apart = restarted(forker, tmp_path / "trembling", tmp_path, 15)
     assert np.abs(apart).max() <= 0.1
@@ -306,19 +286,13 @@ def test_a_real_camera_killed_in_the_middle(shared, forker, tmp_path, camera):
     assert np.abs(apart).max() <= 0.1
 
 
-@pytest.fixture(scope="module")
-def beginning(forker, tmp_path_factory):
-    """The first epochs of the shipped configuration, one a second."""
-    folder = tmp_path_factory.mktemp("shipped")
+def test_the_first_epochs_of_the_shipped_configuration(forker, tmp_path):
+    """From the first epoch on, sigma0 is near 1, few targets are rejected, no epoch is lost."""
     text = (Path(__file__).parents[2] / "config.yaml").read_text()
-    (folder / "config.yaml").write_text(text.replace("period_s: 10", "period_s: 1"))
-    done = forker.start(folder, "run", "--config", "config.yaml", "--epochs", "5")
+    (tmp_path / "config.yaml").write_text(text.replace("period_s: 10", "period_s: 1"))
+    done = forker.start(tmp_path, "run", "--config", "config.yaml", "--epochs", "5")
     assert done.wait(120) == 0, done.printed()
-    return exported(folder / "thermocald.db", folder / "rows.csv")
-
-
-def test_the_shipped_configuration_begins_well(beginning):
-    """From the first epoch on sigma0 is near 1, nothing is rejected, no epoch is lost."""
+    beginning = exported(tmp_path / "thermocald.db", tmp_path / "rows.csv")
     assert [r["status"] for r in beginning] == ["ok"] * 5
     assert all(0.8 < float(r["sigma0"]) < 1.25 for r in beginning)
     assert all(int(r["n_rejected"]) < 4 for r in beginning)

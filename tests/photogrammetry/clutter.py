@@ -1,4 +1,4 @@
-"""Frames full of things that are no coded targets, some of them nearly."""
+"""Frames full of things that are not coded targets, though some look nearly like them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FINER = 2
 
 
 def clutter(seed: int) -> np.ndarray:
-    """A frame of ellipses, discs with closed rings, flowers of discs, chessboards, letters."""
+    """Draw a frame of ellipses, discs with closed rings, flowers of discs, chessboards, letters."""
     rng = np.random.default_rng(seed)
     image = np.full((HEIGHT * FINER, WIDTH * FINER), int(rng.integers(60, 220)), dtype=np.uint8)
     for _ in range(rng.integers(20, 90)):

@@ -1,4 +1,4 @@
-"""A camera before a corner field, as arrays: what the adjustment's tests measure."""
+"""A camera before a corner field, as arrays, for the tests of the adjustment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SIGMA_PX = 0.04
 
 
 def corner_field(sigma_mm: float = 0.0, per_side: int = 7) -> TestField:
-    """147 targets, or so many on a side, on three mutually perpendicular planes."""
+    """Return 3 × per_side² targets on three mutually perpendicular planes."""
     at = np.linspace(60, 600, per_side)
     a, b = (g.ravel() for g in np.meshgrid(at, at))
     z = np.zeros_like(a)
@@ -26,15 +26,16 @@ def corner_field(sigma_mm: float = 0.0, per_side: int = 7) -> TestField:
 
 
 EXTERIOR = look_at([950, 900, 800], [150, 180, 160])
+TRUTH = np.concatenate([INTERIOR.as_array(), EXTERIOR.as_array()])
 
 
 def true_points(field: TestField, interior=INTERIOR, exterior=EXTERIOR):
-    """Image points without noise, px."""
+    """Return image points without noise, px."""
     return project(SENSOR, interior.as_array(), exterior.as_array(), field.points)
 
 
 def observe(field: TestField, rng, interior=INTERIOR, exterior=EXTERIOR, sigma_px=SIGMA_PX):
-    """All targets in the image, with their noise."""
+    """Draw noisy observations of all targets inside the image."""
     points = true_points(field, interior, exterior)
     seen = np.flatnonzero(np.nan_to_num(points[:, 0], nan=-1) > 0)
     seen = seen[SENSOR.contains(points[seen])]
@@ -43,12 +44,12 @@ def observe(field: TestField, rng, interior=INTERIOR, exterior=EXTERIOR, sigma_p
 
 
 def adjusted(field: TestField, observations: Observations, **settings):
-    """An epoch's adjustment that begins at the truth."""
+    """Adjust one epoch, with the truth as initial values."""
     return adjust(SENSOR, field, observations, INTERIOR, EXTERIOR, AdjustmentSettings(**settings))
 
 
 def adjusted_series(field: TestField, observations, **settings):
-    """A series' adjustment that begins at the truth."""
+    """Adjust a series, with the truth as initial values."""
     return adjust_series(
         SENSOR, field, observations, INTERIOR, EXTERIOR, SeriesSettings(**settings)
     )

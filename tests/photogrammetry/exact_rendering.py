@@ -1,10 +1,10 @@
-"""Frames by exact area coverage: what a target measurement is tested against.
+"""Frames rendered by exact area coverage, to test target measurements against.
 
-Shares no code with `thermocald.physics`. A shape is a polygon whose vertices go through the full
-camera model one by one; the area that it covers of each sub-pixel is computed exactly (Green's
-theorem, segments split at the grid lines), the sub-pixel image is blurred with a sampled Gaussian
-and averaged over the pixels. So nothing is approximated but the outline by its vertices (720 of
-them: a sagitta of 1e-5 of the radius) and the blur by samples 1/`finer` px apart.
+Shares no code with `thermocald.physics`. A shape is a polygon whose vertices are projected with the
+full camera model. The area that it covers of each sub-pixel is computed exactly (Green's theorem,
+segments split at the grid lines); the sub-pixel image is blurred with a sampled Gaussian and
+averaged over the pixels. The only approximations are the outline by its vertices (720 of them: a
+sagitta of 1e-5 of the radius) and the blur by samples 1/`finer` px apart.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ VERTICES = 720
 
 
 def coverage(polygon: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Covered area (height, width) of each cell by a polygon (n, 2); cell (0, 0) is [0, 1]².
+    """Return the area (height, width) of each cell that a polygon (n, 2) covers.
 
-    The sign follows the polygon's turn and is taken away; parts outside the grid are clipped in y
-    by leaving them out, and in x by holding them at the border.
+    Cell (0, 0) is [0, 1]². The result is positive for either orientation of the polygon. Parts
+    outside the grid are left out in y and clamped to the border in x.
     """
     a = np.asarray(polygon, dtype=float)
     b = np.roll(a, -1, axis=0)
-    # Cut long edges so that none crosses more than one grid line of each direction.
+    # Cut long edges so that none crosses more than one grid line in each direction
     pieces = np.maximum(np.ceil(np.abs(b - a).max(axis=1)).astype(int), 1)
     which = np.repeat(np.arange(len(a)), pieces)
     k = np.arange(len(which)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
@@ -62,9 +62,9 @@ def coverage(polygon: np.ndarray, width: int, height: int) -> np.ndarray:
 
 @dataclass
 class Scene:
-    """Shapes in object space, drawn in `ink` on `paper` DN.
+    """Shapes in object space, drawn in `ink` on `paper` (DN).
 
-    shapes: polygons (n, 3) mm; light: (gx, gy) relative change of the light per px.
+    shapes: polygons (n, 3) mm; light: relative change of the light per px in x and y.
     """
 
     shapes: list[np.ndarray] = field(default_factory=list)
@@ -78,22 +78,18 @@ class Scene:
         self.shapes.append(centre + diameter / 2 * (np.cos(t) * e1 + np.sin(t) * e2))
 
     def ring(self, centre, normal, diameter, bits, number, turn=0.0) -> None:
-        """A coded target; `turn` in turns rotates it in its plane."""
+        """Add a coded target, rotated in its plane by `turn` turns."""
         self.disc(centre, normal, diameter)
         e1, e2 = plane_axes(normal)
         for begin, end in ring_code.segments(bits, number):
-            # Clockwise as the viewer sees it: from e1 to -e2, the normal points at the viewer.
+            # Clockwise for the viewer, at whom the normal points: from e1 to -e2
             t = -2 * np.pi * (np.linspace(begin, end, VERTICES // 3) + turn)[:, None]
             arc = np.cos(t) * e1 + np.sin(t) * e2
-            self.shapes.append(
-                centre
-                + diameter
-                / 2
-                * np.vstack([ring_code.RING_INNER * arc, ring_code.RING_OUTER * arc[::-1]])
-            )
+            band = np.vstack([ring_code.RING_INNER * arc, ring_code.RING_OUTER * arc[::-1]])
+            self.shapes.append(centre + diameter / 2 * band)
 
     def patch(self, corners) -> None:
-        """A polygon (n, 3) mm, its edges cut finely so that distortion bends them."""
+        """Add a polygon (n, 3) mm, its edges subdivided so that distortion bends them."""
         c = np.asarray(corners, dtype=float)
         t = np.linspace(0, 1, 200, endpoint=False)[:, None]
         self.shapes.append(np.vstack([c[i - 1] * (1 - t) + c[i] * t for i in range(len(c))]))
@@ -106,9 +102,9 @@ class Scene:
         blur: float = 0.8,
         finer: int = 4,
     ) -> np.ndarray:
-        """Grey values (h, w), float and without noise, of the frame or of window (x, y, w, h).
+        """Return noise-free grey values (h, w) of the frame or of a window (x, y, w, h).
 
-        Blur and pixel average are linear: each shape is drawn, blurred, and added by itself.
+        Blur and pixel average are linear, so each shape is drawn, blurred, and added separately.
         """
         x0, y0, w, h = window or (0, 0, camera.sensor.width, camera.sensor.height)
         cx, cy = camera.sensor.centre
@@ -128,7 +124,7 @@ class Scene:
             low, top = np.maximum(low, (x0, y0)), np.minimum(top, (x0 + w, y0 + h))
             if np.any(top <= low):
                 continue
-            # The patch is drawn with a margin of its own, so that its edge is right as well.
+            # The patch has a margin of its own, so that its edge is also right
             px, py = low - margin
             wide, high = (top - low + 2 * margin) * finer
             part = coverage((points + 0.5 - (px, py)) * finer, wide, high)
@@ -146,7 +142,7 @@ class Scene:
 
 
 def plane_axes(normal) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors that with the normal make a right-handed frame."""
+    """Return two unit vectors that form a right-handed frame with the normal."""
     n = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
     helper = np.eye(3)[np.argmin(np.abs(n))]
     e1 = np.cross(helper, n)
@@ -155,16 +151,20 @@ def plane_axes(normal) -> tuple[np.ndarray, np.ndarray]:
 
 
 def noisy(image: np.ndarray, rng: np.random.Generator, sd: float = 2.0) -> np.ndarray:
-    """White noise of `sd` DN, rounded to 8 bit."""
+    """Add white noise of `sd` DN and round to 8 bit."""
     return np.clip(np.rint(image + rng.normal(0, sd, image.shape)), 0, 255).astype(np.uint8)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def look_at(
     centre, target, roll: float = 0.0, up=(0.0, 0.0, 1.0), else_up=(0.0, 1.0, 0.0), nearly=0.99
 ) -> ExteriorOrientation:
-    """A camera at `centre` that looks at `target`; roll in rad about the viewing axis.
+    """Return the orientation of a camera at `centre` that looks at `target`, with roll in rad.
 
-    up: what is up in the image, `else_up` where the view is along it: cosine above `nearly`.
+    `up` is up in the image; `else_up` if the view is nearly along `up` (cosine above `nearly`).
     """
     z = np.asarray(centre, dtype=float) - target
     z /= np.linalg.norm(z)

@@ -1,4 +1,4 @@
-"""Test fields for the tests of target measurement: a corner of three sheets, coded and plain."""
+"""Test fields for the tests of target measurement: a corner of coded and plain circles."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def corner_field(
     coded_every: int = 3,
     inset: float = 45.0,
 ) -> tuple[TestField, np.ndarray]:
-    """Three sheets in a room's corner; the field and each target's normal (n, 3)."""  # fmt: skip
+    """Return a field of three sheets in a room's corner, and its targets' normals (n, 3)."""
     codes = ring_code.codes(bits)
     names, points, normals, kinds = [], [], [], []
     number = 0
@@ -44,7 +44,7 @@ def corner_field(
 
 
 def draw(field: TestField, normals: np.ndarray, **scene) -> Scene:
-    """The scene of a field; coded targets are turned differently each."""
+    """Return the scene of a field; each coded target is turned differently."""
     drawn = Scene(**scene)
     for i, code in enumerate(field.codes):
         if ring_code.is_ring(code):
@@ -58,7 +58,7 @@ def draw(field: TestField, normals: np.ndarray, **scene) -> Scene:
 
 
 def station(distance: float = 750.0, target=(200.0, 200.0, 200.0), roll: float = 0.0):
-    """Before the corner, looking in along its diagonal."""
+    """Return the orientation of a camera that looks into the corner along its diagonal."""
     direction = np.ones(3) / np.sqrt(3)
     return look_at(np.array(target) + distance * direction, np.array(target), roll)
 
@@ -68,14 +68,14 @@ SMALL_CAMERA = CameraModel(SMALL_SENSOR, PI_CAMERA.interior)
 
 
 def small_field(bits: int = 14) -> tuple[TestField, np.ndarray]:
-    """108 targets of 15 mm, for the binned camera."""
+    """Return a field of 108 targets of 15 mm, for the binned camera."""
     return corner_field(per_side=6, spacing=75.0, diameter=15.0, bits=bits)
 
 
 def draw_marker(
     scene: Scene, dictionary: str, number: int, corners: np.ndarray, markers: dict
 ) -> None:
-    """A marker whose outer corners (4, 3) mm are in OpenCV's order; noted in `markers`."""
+    """Draw a marker with outer corners (4, 3) mm in OpenCV's order; record it in `markers`."""
     import cv2
 
     d = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
@@ -83,7 +83,7 @@ def draw_marker(
     image = cv2.aruco.generateImageMarker(d, number, cells)
     a, b, _, e = corners
     for row in range(cells):
-        # Black runs in one piece: no seams between their cells.
+        # Each black run is one piece, without seams between its cells
         dark = np.flatnonzero(np.diff(np.r_[0, image[row] < 128, 0]))
         for begin, end in zip(dark[::2], dark[1::2], strict=True):
             u = np.array([begin, end, end, begin])[:, None] / cells

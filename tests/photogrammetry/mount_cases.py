@@ -1,4 +1,4 @@
-"""Series of a camera on a mount that trembles, as arrays and without files: the truth is known."""
+"""Simulated series of a camera on a trembling mount, as arrays."""
 
 from __future__ import annotations
 
@@ -14,17 +14,15 @@ from thermocald.photogrammetry.series.normals import ObservationGrid, linearise
 
 @dataclass(frozen=True)
 class Tremble:
-    """px of the image, and the correlation of neighbouring epochs."""
+    """A mount's tremble: its size in the image, px, and the correlation of neighbouring epochs."""
 
     px: float
     memory: float = 0.0
 
 
 def simulate(rng, field: TestField, epochs: int, tremble: Tremble):
-    """Observations and the truth (E, 16) of a camera that warms up on a mount that moves."""
-    truth = np.tile(
-        np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()]), (epochs, 1)
-    )
+    """Return observations and true values (E, 16) of a camera that warms up on a moving mount."""
+    truth = np.tile(scene.TRUTH, (epochs, 1))
     at = linearise(scene.SENSOR, field, truth[0, :10], truth[0, 10:])
     per_px = 1.0 / np.sqrt((at.A[..., EOP] ** 2).sum(axis=1).mean(axis=0))
     warm = 8.0 * (1 - np.exp(-np.arange(epochs) / 25))
@@ -44,7 +42,7 @@ def simulate(rng, field: TestField, epochs: int, tremble: Tremble):
 
 
 def standardised(seed: int, count: int, epochs: int, tremble: Tremble, exterior: str = "auto"):
-    """Errors of c, x0, y0 about the series' mean over their sds (count·E, 3), and the sds in px."""
+    """Return errors of c, x0, y0 about each series' mean over sds (count·E, 3), and the sds, px."""
     field = scene.corner_field(per_side=4)
     z, sds = [], []
     for k in range(count):

@@ -1,15 +1,11 @@
-"""Simulated surveys for the tests of the network: stations around a field, and what they see."""
+"""Simulated surveys for the tests of the network: stations around a field, and photographs."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from tests.photogrammetry.exact_rendering import look_at
-from thermocald.photogrammetry.camera.camera_model import (
-    CameraModel,
-    InteriorOrientation,
-    Sensor,
-)
+from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import Observations
 
 SENSOR = Sensor(3280, 2464, 0.00112)
@@ -21,7 +17,7 @@ CAMERA = CameraModel(SENSOR, INTERIOR)
 
 
 def bent_sheet(nx=12, ny=9, size=(800.0, 560.0), sag=6.0):
-    """A grid on a sheet of paper that is bent like a cylinder and a little twisted, (n, 3) mm."""
+    """Return a grid (n, 3) mm on a cylindrically bent and slightly twisted sheet of paper."""
     x, y = np.meshgrid(np.linspace(0, size[0], nx), np.linspace(0, size[1], ny))
     u, v = x / size[0] - 0.5, y / size[1] - 0.5
     z = sag * (1 - 4 * u * u) + 0.4 * sag * u * v
@@ -29,12 +25,12 @@ def bent_sheet(nx=12, ny=9, size=(800.0, 560.0), sag=6.0):
 
 
 def looking_at(centre, target, roll):
-    """The orientation of a camera at `centre` that looks at `target`, turned by `roll` rad."""
+    """Return the orientation of a camera at `centre` that looks at `target`, with roll in rad."""
     return look_at(centre, target, roll, up=(0.0, 1.0, 0.0), else_up=(1.0, 0.0, 0.0), nearly=0.95)
 
 
 def convergent_stations(field, n=12, distance=950.0, tilt=0.66, rolled=True):
-    """n stations on a ring and one height, every second one turned by 90°."""
+    """Return n stations on a ring, rolled by 0, 90, 180 and 270° in turn."""
     centre = field.mean(axis=0)
     stations = []
     for i in range(n):
@@ -49,7 +45,7 @@ def convergent_stations(field, n=12, distance=950.0, tilt=0.66, rolled=True):
 
 
 def photographs(field, stations, sigma, rng, camera=CAMERA, loss=0.03, gross=0.0):
-    """Noisy photographs: inside the image only, some targets missed, some grossly wrong."""
+    """Draw noisy photographs in which some targets are missing and some have gross errors."""
     photos, wrong = {}, []
     for i, station in enumerate(stations):
         image = camera.project(station, field)
@@ -64,7 +60,7 @@ def photographs(field, stations, sigma, rng, camera=CAMERA, loss=0.03, gross=0.0
 
 
 def onto(points, truth):
-    """The points moved (not scaled) onto the truth by least squares, and by what turn."""
+    """Move points (without scaling) onto the truth by least squares; return also the rotation."""
     p, q = points.mean(axis=0), truth.mean(axis=0)
     U, _, Vt = np.linalg.svd((points - p).T @ (truth - q))
     R = Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
@@ -72,7 +68,7 @@ def onto(points, truth):
 
 
 def normalised_errors(network, truth):
-    """Errors in the truth's axes (n, 3) mm, and the same over their stated standard deviations."""
+    """Return errors in the truth's axes (n, 3) mm, and errors over stated standard deviations."""
     moved, R = onto(network.points, truth)
     blocks = network.covariance.reshape(len(truth), 3, len(truth), 3)
     own = np.array([R @ blocks[i, :, i, :] @ R.T for i in range(len(truth))])

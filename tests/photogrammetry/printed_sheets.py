@@ -1,8 +1,8 @@
-"""Photographs of a printed test field, taken of the PDF itself: pages rasterised, sheets put up.
+"""Simulated photographs of a printed test field, from the PDF itself.
 
-Shares nothing with the drawing or with `thermocald.physics` but the page: every pixel's ray is
-cut with the sheets' planes and looks up the rasterised page there. Four rays a pixel and a Gaussian
-make it a lens.
+Shares nothing with the drawing or with `thermocald.physics` but the page: the rays of every pixel
+are intersected with the sheets' planes, and look up the rasterised page there. Several rays per
+pixel and a Gaussian blur imitate a lens.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ BEYOND = 120.0
 
 @cache
 def rasterised(pdf: Path, page: int, dpi: float) -> np.ndarray:
-    """One page as a grey image (H, W)."""
+    """Return one page as a grey image (H, W)."""
     pdfium = pytest.importorskip("pypdfium2")
     document = pdfium.PdfDocument(pdf)
     try:
@@ -45,9 +45,7 @@ def page_count(pdf: Path) -> int:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A page put up: its image (H, W), its size mm, the place (3,) mm of the page's lower left
-    corner, and the directions (2, 3) of the page's x and y.
-    """
+    """A page in space: image (H, W), size mm, its lower left corner (3,) mm, axes x, y (2, 3)."""
 
     image: np.ndarray
     size: tuple[float, float]
@@ -67,9 +65,9 @@ def photograph(
     ink: float = 35.0,
     finer: int = 3,
 ) -> np.ndarray:
-    """A frame (H, W), 8 bit, from a place that sees no sheet through another.
+    """Take a frame (H, W), 8 bit, from a place where no sheet hides another.
 
-    finer: rays along a pixel; two will do for circles.
+    finer: rays per pixel in each direction; two suffice for circles.
     """
     w, h = camera.sensor.width, camera.sensor.height
     image = np.full((h * finer, w * finer), BEYOND, np.float32)
@@ -92,8 +90,9 @@ def photograph(
 def _smoothed(
     sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation, finer: int
 ) -> np.ndarray:
-    """The sheet's image without what is finer than the rays are apart where it is seen smallest:
-    they would skip it, and corners would be off by a hundredth of a pixel.
+    """Return the sheet's image, smoothed to the spacing of the rays where it is seen smallest.
+
+    The rays would skip finer details, and corners would be off by a hundredth of a pixel.
     """
     corners = sheet.origin + np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) * sheet.size @ sheet.axes
     view = exterior.centre - corners
@@ -107,11 +106,10 @@ def _smoothed(
 def _places(
     sheet: Sheet, camera: CameraModel, exterior: ExteriorOrientation, finer: int
 ) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
-    """The part of the fine image in which the sheet is seen, and where on the sheet's image (px)
-    every ray of that part arrives.
+    """Return the part of the fine image that shows the sheet, and its rays' places on it (px).
 
-    Only the rays are interpolated between those of a grid of pixels (distortion is smooth: to
-    3e-4 px); a place interpolated on the sheet would be 0.01 px off where it is seen obliquely.
+    Rays are interpolated in a grid of pixels (distortion is smooth: to 3e-4 px). Places on the
+    sheet are not: they would be 0.01 px off in an oblique view.
     """
     w, h = camera.sensor.width, camera.sensor.height
     at = [np.arange(-1, -(-n // GRID_PX) + 1) * GRID_PX + (GRID_PX - 1) / 2 for n in (w, h)]
@@ -141,7 +139,7 @@ def _places(
     ]
     size = [p.stop - p.start for p in part]
     places = np.empty((2, *size), np.float32)
-    for first in range(0, size[0], ROWS):  # few enough for the processor's cache
+    for first in range(0, size[0], ROWS):  # small enough for the processor's cache
         rows = slice(first, min(first + ROWS, size[0]))
         found = _on_sheet(sheet, exterior, *(f[rows, : size[1]] for f in fine))
         for place, out in zip(found, places[:, rows], strict=True):
@@ -152,7 +150,7 @@ def _places(
 def _on_sheet(
     sheet: Sheet, exterior: ExteriorOrientation, x: np.ndarray, y: np.ndarray
 ) -> list[np.ndarray]:
-    """Places on the sheet's image (px) of rays (x, y, 1) in the camera: a quotient of linear forms.
+    """Return the places on the sheet's image (px) of rays (x, y, 1): quotients of linear forms.
 
     Rays go along -z; one that meets the plane behind the camera gets a place far away.
     """
@@ -176,8 +174,9 @@ def _on_sheet(
 
 
 def put_up(pdf: Path, page_mm: tuple[float, float], trim: float, dpi: float = 150.0) -> list[Sheet]:
-    """The pages of a printed PDF as a flat sheet, or cut along the crop marks and made a corner:
-    floor, left wall, right wall. trim: mm of the page outside of the crop marks.
+    """Return a printed PDF as a flat sheet or, cut along the crop marks, as a corner.
+
+    The corner's sheets are floor, left wall, right wall. trim: mm outside the crop marks.
     """
     pages = [rasterised(pdf, i, dpi) for i in range(min(page_count(pdf), 3))]
     if len(pages) < 3:

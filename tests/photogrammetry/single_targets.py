@@ -1,8 +1,8 @@
-"""Single discs by exact area coverage, with the Cramér-Rao bound of each centre.
+"""Single discs rendered by exact area coverage, with the Cramér-Rao bound of each centre.
 
-The bound is computed from the exact images themselves: derivatives by rendering each disc moved by
-±0.05 px, nothing but the centre unknown. It shares nothing with the model that is fitted, and no
-operator that estimates more can reach it quite.
+The bound is computed from the exact images: each disc is rendered with shifts of ±0.05 px for the
+derivatives, and only its centre is unknown. It shares nothing with the fitted model. An operator
+that estimates more parameters cannot quite reach it.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ QUANTISATION = 1 / 12
 
 @dataclass
 class SingleTargets:
-    """n discs: diameters (n,) px and tilts (n,) deg as asked for, true projected centres (n, 2),
-    exact maps, patches [(x, y, image)], and what makes the gradients per patch (2, h, w) DN/px,
-    which are drawn only where the bound is asked for.
+    """n discs: nominal diameters (n,) px and tilts (n,) deg, and true projected centres (n, 2).
+
+    Also their exact maps, patches [(x, y, image)], and functions that draw the gradients of each
+    patch (2, h, w) DN/px, which only the bound needs.
     """
 
     diameters: np.ndarray
@@ -45,7 +46,7 @@ class SingleTargets:
         return [make() for make in self.gradient_makers]
 
     def bound(self, noise_sd: float) -> np.ndarray:
-        """Cramér-Rao bounds (n, 2) px of x and y for white noise that is then rounded."""
+        """Return the Cramér-Rao bounds (n, 2) px of x and y for white noise with rounding."""
         variance = noise_sd**2 + QUANTISATION
         bounds = []
         for g in self.gradients:
@@ -54,7 +55,7 @@ class SingleTargets:
         return np.array(bounds)
 
     def frame(self, rng: np.random.Generator | None, noise_sd: float) -> np.ndarray:
-        """A full frame with all patches, noise in the patches; rounded but clean without rng."""
+        """Return a full frame with noise in the patches; without `rng`, only rounded."""
         image = np.full((PI_SENSOR.height, PI_SENSOR.width), round(PAPER), dtype=np.uint8)
         for x, y, patch in self.patches:
             value = np.rint(patch).astype(np.uint8) if rng is None else noisy(patch, rng, noise_sd)
@@ -72,10 +73,10 @@ def single_targets(
     bits=0,
     ink=INK,
 ) -> SingleTargets:
-    """Discs on a raster over the Pi camera's frame, each tilted about a random axis.
+    """Draw discs on a raster over the Pi camera's frame, each tilted about a random axis.
 
-    Drawn once for all tests, which change nothing in it.
-    bits: with a code ring of so many bits (up to 30 px then); ink: DN of the discs on PAPER.
+    The result is cached; tests do not change it.
+    bits: of a code ring (diameters up to 30 px), 0 for none; ink: DN of the discs on PAPER.
     """
     rng = np.random.default_rng(seed)
     cases = [(d, t) for d in diameters for t in tilts]
@@ -108,7 +109,7 @@ def single_targets(
             return scene.render(PI_CAMERA, AT_ORIGIN, window, blur, finer=8)
 
         def gradient(centre=centre, draw=draw):
-            # Moves in the image by ±0.05 px, made in object space parallel to the image plane.
+            # ±0.05 px in the image, moved in object space parallel to the image plane
             moves, by = [], []
             for e in np.eye(3)[:2] * 0.05 / scale * 1000:
                 a, b = (PI_CAMERA.project(AT_ORIGIN, (centre + s * e)[None])[0] for s in (1, -1))

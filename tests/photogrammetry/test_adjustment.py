@@ -1,4 +1,4 @@
-"""The adjustment of one epoch: true standard deviations, gross errors, weak geometry reported."""
+"""The adjustment of one epoch: standard deviations, gross errors, weak geometry."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from thermocald.photogrammetry.epoch.adjustment import (
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 
 FREE = np.array([0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15])
-TRUTH = np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()])
+TRUTH = scene.TRUTH
 DRAWS = 5000
 
 
 @pytest.mark.slow
 def test_no_bias_and_the_scatter_is_the_stated_sd_and_the_cramer_rao_bound():
-    """5,000 draws of an epoch: a mean has a standard error of 0.014 sd, an sd one of 1 %.
+    """5,000 draws of an epoch: the standard error of a mean is 0.014 sd, that of an sd 1 %.
 
-    The bound is from the partials at the truth, formed here and not by the adjustment.
+    The bound is computed here from the partials at the truth, not by the adjustment.
     """
     rng = np.random.default_rng(20)
     field = scene.corner_field()
@@ -55,7 +55,7 @@ def test_no_bias_and_the_scatter_is_the_stated_sd_and_the_cramer_rao_bound():
 
 
 def test_same_interior_as_opencv():
-    """To 1e-3 px, for the same observations and parameters."""
+    """With the same observations and parameters, c and x0, y0 agree to 1e-3 px."""
     field = scene.corner_field()
     obs = scene.observe(field, np.random.default_rng(3))
     a = scene.adjusted(field, obs, snooping_alpha=0.0)
@@ -71,15 +71,15 @@ def test_same_interior_as_opencv():
     assert i.c / p == pytest.approx(K[0, 0], abs=1e-3)
     assert cx + i.x0 / p == pytest.approx(K[0, 2], abs=1e-3)
     assert cy - i.y0 / p == pytest.approx(K[1, 2], abs=1e-3)
-    # distortion: by how much its difference moves a corner of the image
+    # the difference of distortion, as the shift of a corner of the image
     ours = np.array([i.A1 * i.c**2, i.A2 * i.c**4, -i.B2 * i.c, i.B1 * i.c, i.A3 * i.c**6])
     corner = np.array([[[10.0, 10.0]]])
     moved = cv2.undistortPoints(corner, K, ours, P=K) - cv2.undistortPoints(corner, K, d, P=K)
     assert np.abs(moved).max() < 5e-3
 
 
-def test_it_ends_where_full_convergence_ends():
-    """To 1e-4 px in c, x0, y0, though the last step uses the partials of the one before."""
+def test_the_result_is_that_of_full_convergence():
+    """c, x0, y0 agree to 1e-4 px, though the last step uses the partials of the previous one."""
     rng, field = np.random.default_rng(23), scene.corner_field()
     settings = AdjustmentSettings(snooping_alpha=0.0)
     for _ in range(60):
@@ -92,27 +92,23 @@ def test_it_ends_where_full_convergence_ends():
 
 
 def test_priors_and_held_parameters():
+    """A prior of a held parameter adds no redundancy."""
     field = scene.corner_field()
     obs = scene.observe(field, np.random.default_rng(4))
-    a = scene.adjusted(field, obs, free=("c", "x0", "y0"), priors={"c": (3.05, 1e-7)})
-    assert a.interior.c == pytest.approx(3.05, abs=1e-6)
-    assert a.interior.A1 == scene.INTERIOR.A1
-    assert np.isnan(a.sd[3])
-    assert a.sd[0] / a.sigma0 == pytest.approx(1e-7, rel=0.01)
-
-
-def test_a_prior_of_a_held_parameter_adds_no_redundancy():
-    field = scene.corner_field()
-    obs = scene.observe(field, np.random.default_rng(4))
-    plain = scene.adjusted(field, obs, free=("c", "x0", "y0"))
-    held = scene.adjusted(field, obs, free=("c", "x0", "y0"), priors={"A1": (0.0, 1e-3)})
-    free = scene.adjusted(field, obs, free=("c", "x0", "y0"), priors={"X0": (0.0, 1e6)})
+    sure, plain, held, free = (
+        scene.adjusted(field, obs, free=("c", "x0", "y0"), priors=priors)
+        for priors in ({"c": (3.05, 1e-7)}, {}, {"A1": (0.0, 1e-3)}, {"X0": (0.0, 1e6)})
+    )
+    assert sure.interior.c == pytest.approx(3.05, abs=1e-6)
+    assert sure.interior.A1 == scene.INTERIOR.A1
+    assert np.isnan(sure.sd[3])
+    assert sure.sd[0] / sure.sigma0 == pytest.approx(1e-7, rel=0.01)
     assert held.redundancy == plain.redundancy == free.redundancy - 1
     assert held.sigma0 == plain.sigma0
 
 
-def test_object_sigmas_count():
-    """With noise of the coordinates in the draws and their sigmas in the field, sds stay true."""
+def test_sigmas_of_the_coordinates_count():
+    """Sds stay true if the coordinates are noisy as the field's sigmas state."""
     rng = np.random.default_rng(5)
     exact, known = scene.corner_field(), scene.corner_field(0.05)
     values, sds = [], []
@@ -127,13 +123,13 @@ def test_object_sigmas_count():
     assert ratio.max() < 1.13
 
 
-def test_gross_errors_are_found_and_named():
+def test_gross_errors_are_rejected():
     rng = np.random.default_rng(6)
     field = scene.corner_field()
     obs = scene.observe(field, rng)
     points = obs.points.copy()
     bad = rng.choice(len(points), 15, replace=False)
-    # 8 sigma to 300 px, in any direction
+    # 8 sigma to 300 px in random directions
     size = np.geomspace(8 * scene.SIGMA_PX, 300, 15)
     angle = rng.uniform(0, 2 * np.pi, 15)
     points[bad] += size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -147,7 +143,7 @@ def test_gross_errors_are_found_and_named():
 
 
 @pytest.mark.parametrize("nominal", [None, 3.0])
-def test_without_start_values(nominal):
+def test_without_initial_values(nominal):
     field = scene.corner_field()
     obs = scene.observe(field, np.random.default_rng(8))
     a = cold_start(scene.SENSOR, field, obs, AdjustmentSettings(), nominal_c=nominal)
@@ -155,13 +151,9 @@ def test_without_start_values(nominal):
     assert np.all(np.abs((a.values - TRUTH)[FREE]) < 5 * a.sd[FREE])
 
 
-def frontal_plane():
-    a, b = (g.ravel() for g in np.meshgrid(np.linspace(-300, 300, 9), np.linspace(-200, 200, 7)))
-    return TestField.build([str(i) for i in range(len(a))], np.c_[a, b, 0 * a], 0.0)
-
-
 def test_one_plane_seen_frontally_is_weak():
-    field = frontal_plane()
+    a, b = (g.ravel() for g in np.meshgrid(np.linspace(-300, 300, 9), np.linspace(-200, 200, 7)))
+    field = TestField.build([str(i) for i in range(len(a))], np.c_[a, b, 0 * a], 0.0)
     exterior = ExteriorOrientation(0.02, 0.03, 0.0, 0.0, 0.0, 700.0)
     obs = scene.observe(field, np.random.default_rng(9), exterior=exterior)
     a = cold_start(scene.SENSOR, field, obs, AdjustmentSettings(), nominal_c=3.04)
@@ -196,8 +188,8 @@ def test_another_test_field_is_reported():
     assert a.interior is None or a.reason
 
 
-def test_a_mirrored_pose_is_reported():
-    """Two poses explain one small plane far away."""
+def test_an_ambiguous_pose_is_reported():
+    """Two poses fit a small plane far away."""
     field = TestField.build(
         [str(i) for i in range(8)],
         [[0, 0, 0], [160, 0, 0], [160, 160, 0], [0, 160, 0],
@@ -214,7 +206,7 @@ def test_a_mirrored_pose_is_reported():
 
 @pytest.mark.slow
 def test_one_gross_error_among_twelve_targets_is_found_or_the_epoch_has_no_result():
-    """200 epochs: never `ok` with residuals that contradict the sigmas, and true sds if `ok`."""
+    """No epoch of 200 is `ok` with residuals that contradict the sigmas; sds are true if `ok`."""
     field, z, ok = scene.corner_field(), [], 0
     for k in range(200):
         rng = np.random.default_rng([12, k])
@@ -232,17 +224,17 @@ def test_one_gross_error_among_twelve_targets_is_found_or_the_epoch_has_no_resul
 
 
 def test_twelve_clean_targets_pass_the_global_test():
-    field, words = scene.corner_field(), []
+    field, statuses = scene.corner_field(), []
     for k in range(100):
         rng = np.random.default_rng([13, k])
         o = scene.observe(field, rng).select(rng.choice(140, 12, replace=False))
-        words.append(scene.adjusted(field, o).status)
-    assert words.count("ok") >= 97
+        statuses.append(scene.adjusted(field, o).status)
+    assert statuses.count("ok") >= 97
 
 
 @pytest.mark.parametrize(("factor", "most"), [(2.0, 0.45), (3.0, 0.1)])
 def test_noise_larger_than_stated_does_not_pass_by_rejecting_targets(factor, most):
-    """Twelve targets: with noise of three times the stated sigmas 19 % of the epochs were `ok`."""
+    """Of epochs with twelve targets and three times the stated noise, 19 % once were `ok`."""
     field = scene.corner_field().subset(range(3, 147, 12))
     rng = np.random.default_rng(41)
     passed = []

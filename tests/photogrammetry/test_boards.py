@@ -1,4 +1,4 @@
-"""Boards that people own, as their programs draw them: all found, where they are, and numbered."""
+"""Common boards, drawn as by their programs: all corners found, measured and numbered."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ CAMERA = CameraModel(Sensor(1640, 1232, 0.00224), InteriorOrientation(3.05, 0.02
 
 @pytest.fixture(scope="module")
 def taken():
-    """The photographs taken, by board and stand: a second look at one needs no second one."""
+    """Photographs by board, stand and roll, each taken once."""
     return {}
 
 
 def seen(sheet, field, stand, roll=0.3, taken=None):
-    """A measurement of a photograph, and its errors (n, 2) px."""
+    """Measure a photograph; return also errors (n, 2) px, and the number of visible corners."""
     middle = field.points.mean(axis=0)
     station = looking_at(middle + np.array(stand), middle, roll)
     taken = {} if taken is None else taken
@@ -62,7 +62,7 @@ def test_all_corners_of_an_aprilgrid(april, stand, taken):
 
 
 def drawn_exactly(field, columns, rows, size, spacing):
-    """An AprilGrid as Kalibr draws it, of polygons whose area is computed, not of a raster."""
+    """Draw Kalibr's AprilGrid from polygons of computed area instead of a raster."""
     scene = exact_rendering.Scene(paper=205.0, ink=35.0)
 
     def rectangle(x, y, wide, high):
@@ -84,8 +84,8 @@ def drawn_exactly(field, columns, rows, size, spacing):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stand", mostly_slow(OBLIQUE, OBLIQUE[2]))
-def test_standard_deviations_of_an_aprilgrid_are_true_however_obliquely_it_is_seen(stand):
-    """384 coordinates of white noise: error over sd is 1 ± 0.036."""
+def test_standard_deviations_of_an_aprilgrid_are_true_at_any_obliquity(stand):
+    """For 384 coordinates with white noise, error over sd is 1 ± 0.036."""
     field = boards.aprilgrid(4, 4, 40.0, 0.3)
     middle = field.points.mean(axis=0)
     station = looking_at(middle + np.array(stand), middle, 0.3)
@@ -100,8 +100,8 @@ def test_standard_deviations_of_an_aprilgrid_are_true_however_obliquely_it_is_se
     assert 0.9 < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 1.1
 
 
-def test_the_tags_of_an_aprilgrid_are_those_of_its_makers():
-    """Drawn from the published word, not from OpenCV's picture."""
+def test_the_tags_of_an_aprilgrid_are_the_published_ones():
+    """Compares with the published code, not with OpenCV's drawing."""
     cells = markers.marker_cells("DICT_APRILTAG_36h11", 0)[1:7, 1:7]
     word = "".join("01"[int(not black)] for black in cells[::-1, ::-1].ravel())
     assert int(word, 2) == images.APRIL_TAG_0
@@ -136,7 +136,7 @@ def test_all_corners_of_a_charuco_board(name, columns, rows, legacy):
 
 
 @pytest.mark.parametrize("roll", mostly_slow([0.0, 1.5, 3.1, 4.5], 1.5))
-def test_a_chessboard_is_numbered_however_it_is_turned(roll):
+def test_a_chessboard_is_numbered_at_any_roll(roll):
     field = boards.chessboard(9, 6, 25.0)
     sheet = images.chessboard_sheet(9, 6, 25.0)
     found, errors, _ = seen(sheet, field, (150.0, -120.0, 330.0), roll)
@@ -182,10 +182,10 @@ colSpacingMeters: 0.025
     ],
 )  # fmt: skip
 def test_files_that_describe_boards(tmp_path, text, expected):
-    """With or without underscores and units; squares of a chessboard are one more than corners."""
+    """Keys may have underscores and units; a chessboard has one more square than corners."""
     (tmp_path / "board.yaml").write_text(text)
-    field, said = read_board(tmp_path / "board.yaml")
-    assert " × " in said
+    field, description = read_board(tmp_path / "board.yaml")
+    assert " × " in description
     assert field.names == expected.names
     assert field.codes == expected.codes
     assert field.points == pytest.approx(expected.points)
@@ -201,9 +201,9 @@ def test_files_that_describe_boards(tmp_path, text, expected):
         ("calib.io_checker_A4_7x8_18.5", boards.chessboard(7, 6, 18.5)),
     ],
 )  # fmt: skip
-def test_boards_of_calib_io_by_the_name_of_their_file(tmp_path, name, expected):
-    field, said = read_board(tmp_path / name)
-    assert "calib.io" in said
+def test_boards_of_calib_io_by_file_name(tmp_path, name, expected):
+    field, description = read_board(tmp_path / name)
+    assert "calib.io" in description
     assert field.codes == expected.codes
     assert field.points == pytest.approx(expected.points)
 
@@ -222,7 +222,7 @@ def test_a_first_tag_that_is_no_number_is_refused(tmp_path, start):
         read_board(tmp_path / "target.yaml")
 
 
-def test_a_name_that_does_not_state_the_markers_says_what_to_give(tmp_path):
+def test_a_name_without_the_marker_size_is_refused_with_the_option_to_give(tmp_path):
     with pytest.raises(TestFieldError, match="--charuco 11x8 --square 24 with --marker"):
         read_board(tmp_path / "calib.io_charuco_279x215_8x11_24_DICT_4X4.pdf")
 
@@ -237,7 +237,7 @@ def test_a_name_that_does_not_state_the_markers_says_what_to_give(tmp_path):
         ("[1, 2]", "key: value"),
     ],
 )
-def test_files_that_do_not_are_refused(tmp_path, text, reason):
+def test_other_files_are_refused(tmp_path, text, reason):
     (tmp_path / "board.yaml").write_text(text)
     with pytest.raises(TestFieldError, match=reason):
         read_board(tmp_path / "board.yaml")

@@ -1,4 +1,4 @@
-"""The camera model: forward, inverse, partials, and that it is OpenCV's (CONVENTIONS §2)."""
+"""The camera model: projection, rays, partials, equality with OpenCV's (CONVENTIONS §2)."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def points():
     return np.random.default_rng(1).uniform(-300, 300, (60, 3)) * [1, 1, 0.5]
 
 
-def test_partials_are_differences(points):
-    """To 1e-7 of the column; the model itself is tested against OpenCV below."""
+def test_partials_equal_differences(points):
+    """They agree to 1e-7 of each column; the model itself is compared with OpenCV's below."""
 
     def seen(values):
         return project(SENSOR, values[:10], values[10:16], points + values[16:])
@@ -78,8 +78,8 @@ def test_a_folding_distortion_has_no_ray():
         rays(SENSOR, [3.04, 0, 0, -0.2, 0, 0, 0, 0, 0, 0], [[0.0, 0.0]])
 
 
-def test_it_is_opencv_s_model(points):
-    """Every term but C2, by CONVENTIONS' table of conversion, to 1e-9 px."""
+def test_the_model_equals_opencvs(points):
+    """All terms but C1 and C2, converted with CONVENTIONS' table, agree to 1e-9 px."""
     iop = IOP.copy()
     iop[8] = iop[9] = 0.0
     c, x0, y0, A1, A2, A3, B1, B2 = iop[:8]
@@ -95,7 +95,7 @@ def test_it_is_opencv_s_model(points):
 
 
 def test_a_camera_looks_along_its_own_minus_z():
-    """A point to the right is right in the image, one above is above (smaller v)."""
+    """A point on the right is right in the image, one above is above (smaller v)."""
     camera = CameraModel(SENSOR, InteriorOrientation(3.04))
     stand = ExteriorOrientation(0, 0, 0, 0, 0, 0)
     image = camera.project(stand, [[100.0, 50.0, -1000.0], [0, 0, -1000.0], [0, 0, 1000.0]])

@@ -1,4 +1,4 @@
-"""Centres of circles at the Cramér-Rao bound, with true standard deviations, or with a reason."""
+"""Centres of circles reach the Cramér-Rao bound with true standard deviations, or have a reason."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.photogrammetry.exact_rendering import Scene, noisy
+from tests.photogrammetry.exact_rendering import Scene, noisy, rms
 from tests.photogrammetry.fields import PI_CAMERA, PI_SENSOR
 from tests.photogrammetry.single_targets import AT_ORIGIN, SIZE, SingleTargets, single_targets
 from thermocald.photogrammetry.frame.tracking import GradientWeights
@@ -30,7 +30,7 @@ def targets() -> SingleTargets:
 
 
 def _scatter(targets: SingleTargets, draws: int, seed: int, coded: bool = False):
-    """Errors over the bound, and over the stated sigmas, (draws, n, 2) each."""
+    """Return errors over the bound and over the stated sigmas, (draws, n, 2) each."""
     rng = np.random.default_rng(seed)
     rings = np.full(len(targets.true), coded)
     over_bound, over_stated = [], []
@@ -44,18 +44,14 @@ def _scatter(targets: SingleTargets, draws: int, seed: int, coded: bool = False)
     return np.array(over_bound), np.array(over_stated)
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 @pytest.mark.slow
 def test_every_size_and_tilt_is_at_the_bound(targets):
     over_bound, over_stated = _scatter(targets, 400, seed=12)
-    # 800 errors a target: RMS to 2.5 %, so that 1.25 is a bound on each and not on the mean alone.
+    # 800 errors per target give its RMS to 2.5 %, so 1.25 is a bound for each target
     for k in range(len(targets.true)):
         label = f"{targets.diameters[k]:.0f} px, {targets.tilts[k]:.0f}°"
-        assert _rms(over_bound[:, k]) <= 1.25, label
-        assert 0.9 <= _rms(over_stated[:, k]) <= 1.1, label
+        assert rms(over_bound[:, k]) <= 1.25, label
+        assert 0.9 <= rms(over_stated[:, k]) <= 1.1, label
 
 
 @pytest.mark.slow
@@ -68,7 +64,7 @@ def test_the_covariance_has_the_right_shape():
         errors.append(fit.points[0] - targets.true[0])
         stated.append(fit.covariances[0])
     scatter = np.cov(np.array(errors).T)
-    # Elements of a covariance from 1,500 draws are known to 4 %; three of those.
+    # Elements of a covariance from 1,500 draws have sds of 4 %; the bound is three of those
     assert scatter == pytest.approx(np.mean(stated, axis=0), abs=0.12 * scatter.max())
 
 
@@ -82,32 +78,32 @@ def test_the_covariance_has_the_right_shape():
     ],
     ids=["light on dark", "uneven light", "sharp"],
 )
-def test_sigmas_are_true_in_other_light(case):
+def test_sigmas_are_true_in_other_light_and_focus(case):
     _, over_stated = _scatter(single_targets(**case), 60, seed=13)
-    assert 0.9 <= _rms(over_stated) <= 1.1
+    assert 0.9 <= rms(over_stated) <= 1.1
     assert np.abs(over_stated.mean(axis=0)).max() < 4.5 / np.sqrt(60)  # no bias
 
 
 @pytest.mark.slow
-def test_a_code_ring_does_not_pull_its_centre():
+def test_a_code_ring_does_not_bias_the_centre():
     rings = single_targets(diameters=(12, 24), bits=14)
     _, over_stated = _scatter(rings, 60, seed=14, coded=True)
-    assert 0.9 <= _rms(over_stated) <= 1.1
-    # The largest mean of 16 coordinates: a hundredth of a pixel's bias would stand out.
+    assert 0.9 <= rms(over_stated) <= 1.1
+    # The largest mean of 16 coordinates would show a bias of a hundredth of a pixel
     assert np.abs(over_stated.mean(axis=0)).max() < 5 / np.sqrt(60)
 
 
-def test_the_centre_is_the_projected_centre_and_the_switch_works(targets):
+def test_the_eccentricity_is_corrected(targets):
     clean = _sixteen_bit(targets)
-    with_it = fit_circles(clean, targets.maps).points - targets.true
+    corrected = fit_circles(clean, targets.maps).points - targets.true
     without = fit_circles(clean, _of_ellipses(targets.maps)).points - targets.true
-    assert np.abs(with_it).max() < 0.002
+    assert np.abs(corrected).max() < 0.002
     large = targets.diameters == 40
     assert np.abs(without[large]).max() > 0.05
 
 
 def test_distortion_across_the_target_counts(targets):
-    """Eccentricity of the undistorted perspective alone would leave a bias of the noise's size."""
+    """Eccentricity of the perspective alone would leave a bias as large as the noise."""
     pinhole = PI_CAMERA.interior.with_values(A1=0.0, A2=0.0, B1=0.0, B2=0.0)
     with_lens, without_lens = (_frontal_map(interior) for interior in (PI_CAMERA.interior, pinhole))
     assert np.abs(with_lens.second).max() > 5 * np.abs(without_lens.second).max()
@@ -123,14 +119,14 @@ def _frontal_map(interior):
 
 
 def _sixteen_bit(targets: SingleTargets) -> np.ndarray:
-    """The clean patches without 8-bit rounding."""
+    """Return the clean patches in 16 bit."""
     image = np.full((PI_SENSOR.height, PI_SENSOR.width), 190 * 250, dtype=np.uint16)
     for x, y, patch in targets.patches:
         image[y : y + SIZE, x : x + SIZE] = np.rint(patch * 250)
     return image
 
 
-def test_noise_that_grows_with_the_light_is_weighed(targets):
+def test_noise_that_grows_with_the_light_is_estimated(targets):
     rng = np.random.default_rng(15)
     over = []
     for _ in range(30):
@@ -141,7 +137,7 @@ def test_noise_that_grows_with_the_light_is_weighed(targets):
         fit = fit_circles(image, targets.maps)
         over.append((fit.points - targets.true) / np.sqrt(np.einsum("nii->ni", fit.covariances)))
     assert fit.noise.gain == pytest.approx(0.06, abs=0.015)
-    assert 0.9 <= _rms(np.array(over)) <= 1.1
+    assert 0.9 <= rms(np.array(over)) <= 1.1
 
 
 def test_a_step_with_fixed_weights_is_at_the_bound_and_its_sigmas_are_true(targets):
@@ -156,12 +152,12 @@ def test_a_step_with_fixed_weights_is_at_the_bound_and_its_sigmas_are_true(targe
         error = step.parameters[:, :2] - targets.true
         over_bound.append(error / targets.bound(NOISE))
         over_stated.append(error / np.sqrt(np.einsum("nii->ni", step.covariances)))
-    assert _rms(np.array(over_bound)) <= 1.25
-    assert 0.95 <= _rms(np.array(over_stated)) <= 1.05
+    assert rms(np.array(over_bound)) <= 1.25
+    assert 0.95 <= rms(np.array(over_stated)) <= 1.05
 
 
 def _one(diameter_px: float, at: tuple[float, float], spoil=None, **render):
-    """A frontal target at an image point; its map, and a frame that `spoil` may change."""
+    """Return a frame with a frontal target, which `spoil` may change, and the target's map."""
     ray = PI_CAMERA.rays(np.array([at]))[0]
     centre = ray * 1000 / -ray[2]
     size = diameter_px * np.linalg.norm(centre) * PI_SENSOR.pixel_pitch / PI_CAMERA.interior.c
@@ -200,8 +196,8 @@ def _glare(frame: np.ndarray) -> None:
         ("blurred", {"diameter_px": 8, "at": (200, 150), "blur": 5.5}),
     ],
 )
-def test_what_cannot_be_measured_has_a_reason(reason, case):
-    # One target cannot tell the noise of a frame from what disturbs it.
+def test_a_target_that_cannot_be_measured_has_a_reason(reason, case):
+    # One target alone cannot separate a frame's noise from disturbances
     fit = fit_circles(*_one(**case), noise=KNOWN_NOISE)
     assert (reason in fit.reasons[0]) if reason else fit.good.tolist() == [True]
 

@@ -1,4 +1,4 @@
-"""One camera from several photographs: a target's coordinate error is the same in all of them."""
+"""One camera from several photographs, in which a target's coordinate error is the same."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STATIONS = [
 
 
 def photographs(rng, sigma_mm: float, gross: int = 0, stations=STATIONS):
-    """The field as surveyed, and image points of the true field."""
+    """Return the surveyed field, and image points of the true field."""
     known = scene.corner_field(sigma_mm)
     rows = np.arange(0, len(known), 2)
     known = known.subset(rows)
@@ -40,13 +40,12 @@ def photographs(rng, sigma_mm: float, gross: int = 0, stations=STATIONS):
 
 
 def test_the_camera_is_as_accurate_as_stated():
-    """Error over sd of c, x0, y0 in draws of field and image noise, all of which converge.
+    """Error over sd of c, x0, y0 in 40 draws of field and image noise.
 
-    More of them: the section `calibrate` of benchmarks.audit.
+    The section `calibrate` of benchmarks.audit has more draws.
     """
-    count = 40
     z, sigma0 = [], []
-    for k in range(count):
+    for k in range(40):
         known, measured = photographs(np.random.default_rng([7, k]), 0.05)
         r = adjust_common_interior(
             scene.SENSOR, known, measured, InteriorOrientation(3.0), STATIONS
@@ -55,11 +54,11 @@ def test_the_camera_is_as_accurate_as_stated():
         z.append((r.interior.as_array() - scene.INTERIOR.as_array())[PRINCIPAL] / sd)
         sigma0.append(r.sigma0)
     rms = np.sqrt(np.mean(np.square(z), axis=0))
-    assert rms == pytest.approx(np.ones(3), abs=3 / np.sqrt(2 * count))
+    assert rms == pytest.approx(np.ones(3), abs=3 / np.sqrt(2 * 40))
     assert np.mean(sigma0) == pytest.approx(1.0, abs=0.03)
 
 
-def test_gross_errors_are_found():
+def test_gross_errors_are_rejected():
     known, measured = photographs(np.random.default_rng(8), 0.05, gross=2)
     r = adjust_common_interior(scene.SENSOR, known, measured, InteriorOrientation(3.0), STATIONS)
     assert sum(int((~m).sum()) for m in r.used) == pytest.approx(8, abs=2)
@@ -67,7 +66,7 @@ def test_gross_errors_are_found():
 
 
 def test_a_moved_target_is_left_out_of_all_photographs():
-    """A target that is 2 mm off in 20 photographs, whose rays are rejected one at a time."""
+    """Rays are rejected one at a time; this target is 2 mm off in 20 photographs."""
     rng = np.random.default_rng(3)
     centres = np.array([950, 900, 800]) + rng.uniform(-250, 250, (20, 3))
     stations = [look_at(c.tolist(), [150, 180, 160], k * np.pi / 2) for k, c in enumerate(centres)]

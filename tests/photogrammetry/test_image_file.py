@@ -1,4 +1,4 @@
-"""JPEGs decoded whole and in parts: the same grey values, and the same centres."""
+"""JPEGs decoded whole and in parts give the same grey values and the same centres."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets import image_file
 from thermocald.photogrammetry.targets.image_file import EncodedImage, decode_grey, decode_parts
 
-WIDTH, HEIGHT = 331, 247  # of units cut off at both edges
+WIDTH, HEIGHT = 331, 247  # not whole numbers of units
 BOXES = np.array([[40, 30, 60, 50], [200, 100, 231, 117], [320, 200, 400, 230], [-9, -9, 3, 3]])
 
 
@@ -46,7 +46,7 @@ def test_grey_values_are_opencv_s(subsampling):
     assert np.array_equal(decode_grey(data), _opencv(data))
 
 
-def test_what_simplejpeg_refuses_is_read_by_opencv():
+def test_files_that_simplejpeg_refuses_are_read_by_opencv():
     damaged = bytearray(_cv2_jpeg(_colours()))
     damaged[len(damaged) // 2 : len(damaged) // 2 + 2] = b"\xff\xc0"
     with pytest.raises(ValueError):
@@ -57,7 +57,7 @@ def test_what_simplejpeg_refuses_is_read_by_opencv():
 @pytest.mark.parametrize("units", [1, 7, 21, 42, 84, 336])
 @pytest.mark.parametrize("grey", [True, False])
 def test_segments_give_the_same_grey_values(units, grey, monkeypatch):
-    """Segments that divide a row of 8 or 16 px, are a row, or hold several and the last fewer."""
+    """A row of 8 or 16 px has several segments, or one; or a segment has several rows."""
     image = _colours()
     data = _cv2_jpeg(image[..., 0] if grey else image, cv2.IMWRITE_JPEG_RST_INTERVAL, units)
     decoded = []
@@ -87,19 +87,18 @@ def test_without_restart_markers_decoding_ends_with_the_last_row():
 
 
 @pytest.mark.parametrize("progressive", [True, False])
-def test_others_are_decoded_whole(progressive):
-    """A progressive file, and one with a restart marker that is lost."""
+def test_other_files_are_decoded_whole(progressive):
+    """A progressive file, and one with a missing restart marker."""
     if progressive:
         data = _cv2_jpeg(_colours(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
     else:
         data = _cv2_jpeg(_colours(), cv2.IMWRITE_JPEG_RST_INTERVAL, 21)
         at = data.index(b"\xff\xd3")
         data = data[:at] + data[at + 2 :]
-    found = decode_parts(data, np.array([[0, 200, 9, HEIGHT]]))
-    assert found is None
+    assert decode_parts(data, np.array([[0, 200, 9, HEIGHT]])) is None
 
 
-def test_a_cut_off_jpeg_is_named():
+def test_a_truncated_jpeg_is_refused():
     with pytest.raises(ImageError, match="its end is missing"):
         EncodedImage(_cv2_jpeg(_colours())[:-200])
 
@@ -115,7 +114,7 @@ def frames() -> list[np.ndarray]:
 
 @pytest.mark.parametrize("restart", [0, 41])
 def test_tracked_centres_are_the_same_to_the_last_bit(frames, restart, monkeypatch):
-    """Of a frame decoded in parts and as a whole; only the first is decoded whole."""
+    """Frames decoded in parts and as a whole give the same; only the first is decoded whole."""
     options = [cv2.IMWRITE_JPEG_RST_INTERVAL, restart] if restart else []
     encoded = [_cv2_jpeg(frame, *options) for frame in frames]
     field, _ = small_field()

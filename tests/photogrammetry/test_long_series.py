@@ -1,4 +1,4 @@
-"""A series adjusted in blocks: the same numbers for any blocks, true standard deviations."""
+"""A series adjusted in blocks: equal numbers for any blocks, true standard deviations."""
 
 from __future__ import annotations
 
@@ -17,33 +17,27 @@ OWN = np.arange(8)
 EPOCHS = 480
 
 
-def scenery(epochs=EPOCHS):
-    """A drifting camera that sees every third target of the corner; a board is hidden at times."""
+@pytest.fixture(scope="module")
+def case():
+    """Return a drifting camera's field, truth and grid; a board is hidden at times."""
     rng = np.random.default_rng(40)
     whole = scene.corner_field(0.02)
     known = whole.subset(np.arange(0, len(whole), 3))
     true = TestField.build(known.names, known.points + rng.normal(0, 0.02, known.points.shape))
-    truth = np.tile(
-        np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()]), (epochs, 1)
-    )
-    warm = 20 * np.sin(np.arange(epochs) / epochs * 9.0)
+    truth = np.tile(scene.TRUTH, (EPOCHS, 1))
+    warm = 20 * np.sin(np.arange(EPOCHS) / EPOCHS * 9.0)
     truth[:, 0] += warm * 1e-4
     truth[:, 1] += warm * 5e-4
     truth[:, 2] -= warm * 4e-4
-    shape = (epochs, len(known))
+    shape = (EPOCHS, len(known))
     points = project(scene.SENSOR, truth[:, :10], truth[:, 10:], true.points)
     points += rng.normal(0, scene.SIGMA_PX, points.shape)
     see = np.ones(shape, dtype=bool)
-    see[epochs // 3 : epochs // 2, : len(known) // 5] = False
+    see[EPOCHS // 3 : EPOCHS // 2, : len(known) // 5] = False
     points[200, 20] += 40.0  # a gross error outside the sample
     rows, targets = np.nonzero(see)
     sigmas = np.full((len(rows), 2), scene.SIGMA_PX)
     return known, truth, ObservationGrid.from_rows(shape, rows, targets, points[see], sigmas)
-
-
-@pytest.fixture(scope="module")
-def case():
-    return scenery()
 
 
 def blocked(case, size, exterior="series", jobs=1, **other):
@@ -60,35 +54,35 @@ def test_the_blocks_do_not_matter(case, exterior):
     apart = (many.rows.values - one.rows.values)[:, OWN]
     assert np.abs(apart / one.rows.sd[:, OWN]).max() < 1e-5
     assert np.abs(apart[:, 0] / one.rows.values[:, 0]).max() < 1e-9
-    # the effect of offsets on rare kinds of epochs is the mean one of a block
+    # for rare sets of targets, the effect of offsets is the mean over a block
     np.testing.assert_allclose(many.rows.sd[:, OWN], one.rows.sd[:, OWN], rtol=2e-3)
     np.testing.assert_allclose(many.rows.sigma0, one.rows.sigma0, rtol=1e-7)
     np.testing.assert_allclose(many.level_sd, one.level_sd, rtol=1e-5)
     assert many.rows.status == one.rows.status
 
 
-def test_it_is_the_adjustment_of_all_at_once(case):
-    """Except that a sample of 120 epochs gives the noise less well than all 480."""
+def test_blocks_equal_the_adjustment_of_all_at_once(case):
+    """The noise differs a little: it is from a sample of 120 of the 480 epochs."""
     field, truth, grid = case
     whole = scene.adjusted_series(field, grid, exterior="series", target_noise=False)
     parts = blocked(case, 50, target_noise=False)
     apart = (parts.rows.values - whole.values)[:, OWN]
     level = apart.mean(axis=0)
     assert np.abs(level / whole.level_sd[OWN]).max() < 0.05
-    # a borderline point that only one of the two rejects moves its epoch by half an sd
+    # a borderline point that only one of them rejects changes its epoch by half an sd
     assert np.quantile(np.abs(apart - level) / whole.sd[:, OWN], 0.95) < 0.1
     assert np.quantile(np.abs(parts.rows.sd[:, OWN] / whole.sd[:, OWN] - 1), 0.95) < 0.05
     np.testing.assert_allclose(parts.level_sd[OWN], whole.level_sd[OWN], rtol=0.05)
     assert parts.rows.n_rejected[200] == 1
     error = (parts.rows.values - truth)[:, OWN]
     ratio = np.sqrt(np.mean(((error - error.mean(axis=0)) / parts.rows.sd[:, OWN]) ** 2, axis=0))
-    # 480 epochs give a standard deviation to 3.2 %: four times that, for eight parameters
+    # 480 epochs give a standard deviation to 3.2 %; the bound is four times that
     assert ratio.min() > 0.87
     assert ratio.max() < 1.13
 
 
-def test_what_the_sample_never_saw_is_still_adjusted(case):
-    """A board seen only between two windows of the sample gets its offsets from the sums."""
+def test_targets_outside_the_sample_are_adjusted(case):
+    """The offsets of a board seen only between the sample's windows are from the sums."""
     field, truth, grid = case
     windows = spread_windows(EPOCHS, 120)
     hidden = np.zeros(grid.observed.shape, dtype=bool)

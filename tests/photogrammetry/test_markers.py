@@ -1,6 +1,8 @@
-"""Markers of OpenCV's dictionaries: corners at sub-pixel with true standard deviations."""
+"""Markers of OpenCV's dictionaries: sub-pixel corners with true standard deviations."""
 
 from __future__ import annotations
+
+from functools import cache
 
 import cv2
 import numpy as np
@@ -26,10 +28,10 @@ APRILTAG, ARUCO = "DICT_APRILTAG_36h11", "DICT_5X5_50"
 
 
 def _board(dictionaries=(APRILTAG, ARUCO), size=60.0):
-    """4 × 3 markers in the plane Z = 0, of alternating dictionaries; field and scene."""
+    """Return field and scene of 4 × 3 markers in Z = 0, from alternating dictionaries."""
     scene, markers = Scene(), {}
     for k in range(12):
-        # The viewer looks along -Z: x right, y up; OpenCV's order is clockwise from the top left.
+        # For a viewer along -Z, x is right and y up; OpenCV's order is clockwise from top left
         x, y = 130.0 * (k % 4), 130.0 * (k // 4)
         corners = np.array(
             [[x, y + size, 0], [x + size, y + size, 0], [x + size, y, 0], [x, y, 0.0]]
@@ -56,11 +58,20 @@ def _truth(exterior) -> np.ndarray:
     return SMALL_CAMERA.project(exterior, FIELD.points)
 
 
+@cache
+def _rendered(view: str) -> np.ndarray:
+    return SCENE.render(SMALL_CAMERA, VIEWS[view])
+
+
+def _frontal(seed: int) -> np.ndarray:
+    return noisy(_rendered("frontal"), np.random.default_rng(seed))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
 def test_corners_scatter_as_stated(view):
     exterior = VIEWS[view]
-    image = SCENE.render(SMALL_CAMERA, exterior)
+    image = _rendered(view)
     rng = np.random.default_rng(1)
     found = locate_markers(noisy(image, rng), FIELD)
     assert len(found) == 48
@@ -74,26 +85,24 @@ def test_corners_scatter_as_stated(view):
         error.append(e)
         z.append(e / observed.sigmas)
     assert 0.9 <= np.sqrt(np.mean(np.square(z))) <= 1.1
-    # Far better than the twentieth of a pixel of corner operators.
+    # Corner operators reach a twentieth of a pixel
     assert np.sqrt(np.mean(np.square(error))) < 0.03
 
 
-def test_several_dictionaries_at_once_and_in_the_fields_order():
-    image = noisy(SCENE.render(SMALL_CAMERA, VIEWS["frontal"]), np.random.default_rng(2))
-    observed = measure_markers(image, FIELD)
+def test_markers_of_two_dictionaries_are_in_the_fields_order():
+    observed = measure_markers(_frontal(2), FIELD)
     assert list(observed.targets) == list(range(48))
     assert set(observed.quality) == {"blur", "contrast", "grey", "noise", "saturation"}
     assert np.median(observed.quality["blur"]) == pytest.approx(0.8, abs=0.05)
 
 
-def test_markers_that_are_not_of_the_field_are_ignored():
-    image = noisy(SCENE.render(SMALL_CAMERA, VIEWS["frontal"]), np.random.default_rng(3))
+def test_markers_outside_the_field_are_ignored():
     part = FIELD.subset(np.arange(8))
-    assert list(measure_markers(image, part).targets) == list(range(8))
+    assert list(measure_markers(_frontal(3), part).targets) == list(range(8))
 
 
-def test_a_marker_that_is_there_twice_is_dropped():
-    image = noisy(SCENE.render(SMALL_CAMERA, VIEWS["frontal"]), np.random.default_rng(4))
+def test_a_marker_seen_twice_is_dropped():
+    image = _frontal(4)
     u, v = np.rint(_truth(VIEWS["frontal"])[:4].mean(axis=0)).astype(int)
     patch = image[v - 70 : v + 70, u - 70 : u + 70].copy()
     image[20:160, 1480:1620] = patch
@@ -104,7 +113,7 @@ def test_a_marker_that_is_there_twice_is_dropped():
 
 
 @pytest.mark.slow
-def test_a_large_frame_is_found_at_half_size_and_measured_at_full():
+def test_markers_are_found_at_half_size_and_measured_at_full_size():
     from tests.photogrammetry.fields import PI_CAMERA
 
     image = noisy(SCENE.render(PI_CAMERA, VIEWS["frontal"]), np.random.default_rng(5))
@@ -115,10 +124,9 @@ def test_a_large_frame_is_found_at_half_size_and_measured_at_full():
 
 
 def test_a_corner_at_the_edge_is_missed_with_a_reason():
-    exterior = VIEWS["frontal"]
-    image = noisy(SCENE.render(SMALL_CAMERA, exterior), np.random.default_rng(6))
+    image = _frontal(6)
     found = locate_markers(image, FIELD)
-    x = int(np.floor(_truth(exterior)[1, 0])) + 1
+    x = int(np.floor(_truth(VIEWS["frontal"])[1, 0])) + 1
     missed: dict[int, str] = {}
     measure_corners(np.ascontiguousarray(image[:, :x]), found, missed)
     assert "edge" in missed[1]
@@ -132,12 +140,12 @@ def test_a_corner_at_the_edge_is_missed_with_a_reason():
         pytest.param("DICT_4X4_50:1:" + 5000 * "1", id="5000 digits"),
     ],
 )  # fmt: skip
-def test_what_is_no_marker_code_is_said(code):
+def test_other_texts_than_marker_codes_are_refused(code):
     with pytest.raises(TestFieldError, match="DICT_"):
         parse_marker(code)
 
 
-def test_a_code_stands_once_in_a_field():
+def test_a_duplicated_code_is_refused():
     field = TestField.build(
         ["a", "b"], np.zeros((2, 3)), kinds="marker_corner", codes="DICT_4X4_50:1:0"
     )
@@ -146,7 +154,7 @@ def test_a_code_stands_once_in_a_field():
 
 
 def test_photographs_of_apriltags(shared):
-    """Three to twelve corners a picture; the numbers are those that stand on the walls."""
+    """Four to twelve corners per photograph; the numbers are those on the walls."""
     field = TestField.build(
         [f"{n}.{k}" for n in range(1, 17) for k in range(4)],
         np.zeros((64, 3)),
@@ -159,7 +167,7 @@ def test_photographs_of_apriltags(shared):
         "StageLeft_51in": {15},
     }  # fmt: skip
     if int(cv2.__version__.split(".")[0]) < 5:
-        expected["GeneralField3"] = {7}  # OpenCV 4 does not find the small one, number 8
+        expected["GeneralField3"] = {7}  # OpenCV 4 does not find the small number 8
     for name, numbers in expected.items():
         path = shared / "data" / "frc" / f"{name}.jpg"
         observed = measure_markers(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), field)

@@ -1,4 +1,4 @@
-"""A frame in, observations out: found, identified, measured, or a status with a reason."""
+"""Frames give observations of identified targets, or a status with a reason."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def _z(observations, truth) -> np.ndarray:
     return (observations.points - truth[observations.targets]) / observations.sigmas
 
 
-def test_all_targets_from_nothing(frame):
+def test_all_targets_without_a_prior(frame):
     found = measure(frame, FIELD)
     assert found.status.ok
     assert len(found.observations) == SMALL_SENSOR.contains(_truth(), 15).sum()
     assert set(found.missed.values()) <= {"cut off by the image's edge"}
     z = _z(found.observations, _truth())
-    assert 0.85 <= np.sqrt(np.mean(z**2)) <= 1.15  # 200 values: 5 %
+    assert 0.85 <= np.sqrt(np.mean(z**2)) <= 1.15  # 200 values have 5 %
     assert np.abs(z).max() < 5
     quality = found.observations.quality
     assert np.median(quality["blur"]) == pytest.approx(0.8, abs=0.03)
@@ -72,7 +72,7 @@ def test_all_targets_from_nothing(frame):
         ("dim", lambda image: image // 4),
     ],
 )
-def test_unusual_frames_are_measured_all_the_same(frame, name, change):
+def test_unusual_frames_are_measured(frame, name, change):
     found = measure(change(frame), FIELD)
     assert found.status.ok, name
     assert len(found.observations) >= 0.99 * len(measure(frame, FIELD).observations)
@@ -101,7 +101,7 @@ def test_useless_frames_have_a_status_and_a_reason(frame, word, change):
     assert len(found.observations) == 0
 
 
-def test_another_field_is_told(frame):
+def test_another_field_is_detected(frame):
     other, _ = small_field(bits=12)
     found = measure(frame, other)
     assert found.status.word == "other_field"
@@ -118,15 +118,15 @@ def test_the_same_codes_elsewhere_are_another_field(frame):
     assert "not where" in found.status.reason
 
 
-def test_plain_circles_alone_cannot_be_told_apart(frame):
+def test_plain_circles_alone_are_not_identified(frame):
     plain = TestField.build(FIELD.names, FIELD.points, 0.01, FIELD.diameters)
     found = measure(frame, plain)
     assert found.status.word == "nothing_found"
     assert "coded" in found.status.reason
 
 
-def test_a_camera_that_has_drifted_from_its_calibration_is_measured_whole(frame):
-    """Thirty px of the principal point and 1 % of c: a day in the sun."""
+def test_all_targets_are_measured_after_a_large_drift(frame):
+    """30 px of the principal point and 1 % of c, as after a day in the sun."""
     i = SMALL_CAMERA.interior
     earlier = i.with_values(c=i.c * 0.99, x0=i.x0 + 30 * SMALL_SENSOR.pixel_pitch)
     found = measure(frame, FIELD, CameraSpec("", SMALL_SENSOR, interior=earlier))
@@ -156,7 +156,7 @@ def test_hidden_targets_are_missed_with_a_reason(clean):
     assert np.abs(_z(found.observations, _truth())).max() < 6
 
 
-def test_codes_that_do_not_exist_are_an_error(frame):
+def test_an_invalid_code_is_refused(frame):
     wrong = TestField.build(["a"], [[0, 0, 0]], diameters=10, codes="RING14:1")
     with pytest.raises(TestFieldError, match="RING14:1"):
         measure(frame, wrong)
@@ -164,7 +164,7 @@ def test_codes_that_do_not_exist_are_an_error(frame):
 
 @pytest.fixture(scope="module")
 def mixed():
-    """Plain circles among markers: some corners named, and circles that a marker names."""
+    """Return a field of plain circles among markers, some with their corners, and its image."""
     field, normals = corner_field(per_side=4, spacing=110.0, diameter=15.0, inset=60.0)
     names, points = list(field.names), list(field.points)
     kinds, codes = ["circle"] * len(field), [""] * len(field)
@@ -176,8 +176,8 @@ def mixed():
         u, v = np.eye(3)[(plane + 1) % 3], np.eye(3)[(plane + 2) % 3]
         for i, j in ((0, 0), (1, 2), (2, 1)):
             at = (60.0 + 110 * i + 35) * u + (60.0 + 110 * j + 35) * v
-            # The viewer looks against the normal u × v: u to the right, v up; OpenCV's order is
-            # clockwise from the top left.
+            # For a viewer against the normal u × v, u is right and v up; OpenCV's order is
+            # clockwise from the top left
             corners = np.array([at + 40 * v, at + 40 * u + 40 * v, at + 40 * u, at])
             draw_marker(scene, "DICT_APRILTAG_36h11", number, corners, markers)
             if number % 3:
@@ -206,8 +206,8 @@ def test_plain_circles_are_identified_through_markers(mixed):
         assert np.abs(z).max() < 5.5
 
 
-def test_circles_that_a_marker_names(mixed):
-    """DICT_…:17 without a corner: the circle nearest to that marker."""
+def test_circles_named_by_a_marker(mixed):
+    """DICT_…:17 without a corner is the circle nearest to that marker."""
     whole, image = mixed
     circles = whole.subset(np.arange(48))
     codes = list(circles.codes)
@@ -215,15 +215,15 @@ def test_circles_that_a_marker_names(mixed):
         for k, (i, j) in enumerate(((0, 0), (1, 2), (2, 1))):
             codes[16 * plane + 4 * i + j] = f"DICT_APRILTAG_36h11:{3 * plane + k}"
     field = TestField.build(circles.names, circles.points, 0.01, 15.0, "circle", codes)
-    # A fourth of a side nearer to the lower left than to the other three circles about it.
+    # A marker is a quarter of its side nearer to its circle than to the other three around it
     found = measure(noisy(image, np.random.default_rng(6)), field)
     assert found.status.ok, found.status.reason
     assert np.abs(_z(found.observations, _truth(field=field))).max() < 5.5
 
 
 @pytest.mark.slow
-def test_what_a_person_would_call_visible_is_found(capsys):
-    """Random stations, 60° and more, both inks, blur, uneven light, things in front, highlights."""
+def test_visible_targets_are_found(capsys):
+    """Random stations, up to 63° oblique, both inks, blur, uneven light, obstacles, highlights."""
     visible = found = wrong = 0
     causes: Counter[str] = Counter()
     z = []
@@ -306,7 +306,7 @@ def _blur(points: np.ndarray, b=0.9, tx=0.1, ty=-0.05, k=0.2) -> np.ndarray:
     return b + tx * x + ty * y + k * 2 * (x * x + y * y)
 
 
-def test_trend_is_found_with_true_sds_and_outliers_do_not_count():
+def test_the_blur_trend_has_true_sds_in_spite_of_outliers():
     rng = np.random.default_rng(1)
     z = []
     for _ in range(300):
@@ -316,7 +316,7 @@ def test_trend_is_found_with_true_sds_and_outliers_do_not_count():
         blur[3] = np.nan
         values, sd = blur_trend(points, blur, SMALL_SENSOR)
         z.append((values - (0.9, 0.1, -0.05, 0.2)) / sd)
-    # 1,200 values: 2 %; cutting at 3.5 sd costs another per cent.
+    # 1,200 values have 2 %; the limit of 3.5 sd adds one per cent
     assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.08)
 
 
@@ -335,7 +335,7 @@ def test_figures_of_a_frame():
     assert found["blur_curvature"] == pytest.approx(0.2)
     assert (found["contrast"], found["grey"], found["saturation"]) == (-120, 180, 0)
 
-    # few targets tell the middle only
+    # few targets give the blur in the middle only
     points = np.array([[10.0, 10.0], [20.0, 400.0]])
     quality = {"blur": np.array([0.8, 1.0])}
     found = frame_figures(

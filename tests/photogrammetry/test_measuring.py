@@ -1,4 +1,4 @@
-"""Pose from control points with a known camera, and points on planes: true standard deviations."""
+"""Resection with a known camera, and points on planes, with true standard deviations."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ INTERIOR = InteriorOrientation(
     CAMERA["c"], CAMERA["x0"], CAMERA["y0"], A1=CAMERA["A1"], A2=CAMERA["A2"], B1=CAMERA["B1"],
     B2=CAMERA["B2"],
 )  # fmt: skip
-# A bridge: 6 m above the water, looking along it and down by 20°.
+# On a bridge, 6 m above the water, looking along it and 20° down
 POSE = np.array([np.deg2rad(70.0), 0.02, -0.01, 500.0, -1000.0, 6000.0])
 WATER = Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]), sd_mm=4.0, sd_tilt=1e-3)
 SIGMA = 0.3
 
 
 def camera_covariance() -> np.ndarray:
-    """Of c, x0, y0, which one thermometer's noise changes together, and a little each alone."""
+    """Return a covariance of c, x0, y0: a thermometer's noise in common, and small own parts."""
     together = np.array([0.4e-3, 0.35e-3, -0.2e-3]) * 1.5
     Q = np.zeros((10, 10))
     Q[:3, :3] = np.outer(together, together) + np.diag([0.1e-3, 0.2e-3, 0.2e-3]) ** 2
@@ -37,14 +37,14 @@ def camera_covariance() -> np.ndarray:
 
 
 def control_points(n: int, rng: np.random.Generator) -> np.ndarray:
-    """On both banks, at several heights."""
+    """Draw control points on both banks, at several heights."""
     y = rng.uniform(9_000, 30_000, n)
     x = np.where(np.arange(n) % 2, 0.3, -0.3) * y + rng.normal(0, 400, n)
     return np.column_stack([x, y, rng.uniform(-200, 2_500, n)])
 
 
 def drawn(rng: np.random.Generator, points: np.ndarray, Q: np.ndarray, sigma_mm: float):
-    """One draw of the camera, the surveyed points and their images."""
+    """Draw a camera (c, x0, y0), the surveyed field and its image points."""
     delta = rng.multivariate_normal(np.zeros(3), Q[:3, :3])
     c, x0, y0 = INTERIOR.c + delta[0], INTERIOR.x0 + delta[1], INTERIOR.y0 + delta[2]
     image = project(points, POSE, c, x0, y0) + rng.normal(0, SIGMA, (len(points), 2))
@@ -55,8 +55,8 @@ def drawn(rng: np.random.Generator, points: np.ndarray, Q: np.ndarray, sigma_mm:
     return (c, x0, y0), field, seen
 
 
-def test_errors_are_what_the_covariance_says():
-    """Pose, camera and a point on the water over 300 draws: χ² and error/sd near 1."""
+def test_errors_agree_with_the_covariance():
+    """Over 300 draws, χ²/6 of the pose and error/sd of points on the water are near 1."""
     rng = np.random.default_rng(6)
     points, Q = control_points(6, rng), camera_covariance()
     places = np.array([[300.0, 9_000.0, 0.0], [-2_000.0, 25_000.0, 0.0]])
@@ -65,7 +65,9 @@ def test_errors_are_what_the_covariance_says():
         (c, x0, y0), field, seen = drawn(rng, points, Q, 10.0)
         r = resect(SENSOR, INTERIOR, Q, field, seen, snooping_alpha=0.0)
         assert r.status == "ok", r.reason
-        prior = r.covariance if r.sigma0 <= 1 else r.covariance / r.sigma0**2  # as it was stated
+        prior = (
+            r.covariance if r.sigma0 <= 1 else r.covariance / r.sigma0**2
+        )  # with the stated sigmas
         d = r.values[10:] - POSE
         d[:3] = np.arctan2(np.sin(d[:3]), np.cos(d[:3]))
         square.append(d @ np.linalg.solve(prior[10:, 10:], d))
@@ -79,7 +81,7 @@ def test_errors_are_what_the_covariance_says():
 
 
 def test_points_on_a_plane_against_monte_carlo():
-    """Sd within 3 %, covariance within 6 % of 10,000 draws of an independent intersection."""
+    """Sds agree to 3 %, a variance to 6 %, with 10,000 draws of an independent intersection."""
     rng = np.random.default_rng(2)
     points, Q = control_points(10, rng), camera_covariance()
     _, field, seen = drawn(rng, points, Q, 10.0)
@@ -106,7 +108,7 @@ def test_points_on_a_plane_against_monte_carlo():
 
 
 def intersect(uv: np.ndarray, draws: np.ndarray, level: np.ndarray, normal: np.ndarray):
-    """Rays of n cameras with the plane normal·X = level, distortion removed by iteration."""
+    """Intersect the rays of n cameras with planes normal·X = level; iterate the distortion."""
     x = (uv[:, 0] - (SIZE[0] - 1) / 2) * PITCH - draws[:, 1]
     y = -(uv[:, 1] - (SIZE[1] - 1) / 2) * PITCH - draws[:, 2]
     a, b = x.copy(), y.copy()
@@ -123,7 +125,7 @@ def intersect(uv: np.ndarray, draws: np.ndarray, level: np.ndarray, normal: np.n
     return centre + t[:, None] * ray
 
 
-def test_a_gross_error_is_found():
+def test_a_gross_error_is_rejected():
     rng = np.random.default_rng(4)
     points, Q = control_points(14, rng), camera_covariance()
     _, field, seen = drawn(rng, points, Q, 10.0)
@@ -139,21 +141,17 @@ def test_a_gross_error_is_found():
      (slice(0, 3), True, "ok")],
 )  # fmt: skip
 def test_few_points(rows, start, word):
-    """Three points suffice if an earlier pose shows which of four poses it is."""
+    """Three points suffice if an earlier pose selects one of four solutions."""
     rng = np.random.default_rng(5)
     points, Q = control_points(12, rng)[rows], camera_covariance()
     _, field, seen = drawn(rng, points, Q, 10.0)
-    near = (
-        ExteriorOrientation.from_array(POSE + np.array([1e-3, 1e-3, 1e-3, 20, 20, 20]))
-        if start
-        else None
-    )
-    assert resect(SENSOR, INTERIOR, Q, field, seen, near).status == word
+    near = ExteriorOrientation.from_array(POSE + np.array([1e-3, 1e-3, 1e-3, 20, 20, 20]))
+    assert resect(SENSOR, INTERIOR, Q, field, seen, near if start else None).status == word
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 def test_corners_of_three_markers_on_one_board_give_a_pose(noise):
-    """Exactly in one plane and on two lines, for which a solver of OpenCV fails."""
+    """The points are in one plane and on two lines, where a solver of OpenCV fails."""
     points = np.array([[0.0, y, z] for z in range(6) for y in (22.5, 127.5)])
     points[:, 2] = np.repeat([577.5, 472.5, 427.5, 322.5, 277.5, 172.5], 2)
     pose = np.array([-0.7854, 0.6155, 2.6180, 950.0, 950.0, 950.0])
@@ -164,7 +162,7 @@ def test_corners_of_three_markers_on_one_board_give_a_pose(noise):
     r = resect(SENSOR, INTERIOR, np.zeros((10, 10)), field, seen)
     assert r.status == "ok", r.reason
     d = r.values[10:] - pose
-    assert d @ np.linalg.solve(r.covariance[10:, 10:], d) < 22.5  # of 6 degrees of freedom
+    assert d @ np.linalg.solve(r.covariance[10:, 10:], d) < 22.5  # 6 degrees of freedom
 
 
 def test_points_on_one_line_determine_no_pose():
@@ -178,7 +176,7 @@ def test_points_on_one_line_determine_no_pose():
 
 
 def test_a_staff_is_read_along_its_line():
-    """A staff at 12 m: the height is the truth's, its sd smaller than that along the water."""
+    """The height on a staff at 12 m is right, and its sd smaller than that along the water."""
     Q = np.zeros((16, 16))
     values = np.concatenate([INTERIOR.as_array(), POSE])
     staff = Line(np.array([800.0, 12_000.0, 0.0]), np.array([0.0, 0.0, 1.0]))
@@ -191,7 +189,7 @@ def test_a_staff_is_read_along_its_line():
     assert on_water[0, 2] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_above_the_horizon_there_is_no_water():
+def test_a_point_above_the_horizon_is_refused():
     values = np.concatenate([INTERIOR.as_array(), POSE])
     with pytest.raises(GeometryError, match="above the horizon"):
         place_on(SENSOR, values, np.zeros((16, 16)), [[1640.0, 20.0]], SIGMA, WATER)

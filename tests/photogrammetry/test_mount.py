@@ -1,4 +1,4 @@
-"""The mount as a random effect: true standard deviations of a camera on a tripod."""
+"""The mount as a random effect: standard deviations of a camera on a tripod are true."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def rms(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_mount_that_stands_still_costs_nothing():
-    """60 series without a tremble have the sds of `series`, within 5 %."""
+def test_a_still_mount_costs_nothing():
+    """60 series without tremble have the sds of `series`, within 5 %."""
     z, sd = standardised(41, 60, 100, STILL)
     _, still = standardised(41, 60, 100, STILL, "series")
     assert rms(z) == pytest.approx(np.ones(3), abs=0.1)
@@ -29,8 +29,9 @@ def test_a_mount_that_stands_still_costs_nothing():
 
 @pytest.mark.parametrize("tremble", [STILL, TREMBLES, SWAYS])
 def test_errors_are_as_large_as_stated(tremble):
-    """Of six series, which know the ratio to some 8 %, with memory to 20 %; hundreds, with further
-    trembles, are the section `mount` of benchmarks.audit.
+    """Six series give the ratio to about 8 %, with memory to 20 %.
+
+    The section `mount` of benchmarks.audit has hundreds, with further trembles.
     """
     z, sd = standardised(42, 6, 100, tremble)
     assert rms(z) == pytest.approx(np.ones(3), abs=0.4 if tremble.memory else 0.2)
@@ -40,8 +41,7 @@ def test_errors_are_as_large_as_stated(tremble):
         assert rms(sd)[PRINCIPAL_POINT] == pytest.approx([0.095, 0.09], rel=0.25)
 
 
-def test_series_states_what_the_movement_does_too():
-    """With one orientation for all the estimate is the same, and its sds include the movement."""
+def test_sds_of_one_orientation_for_all_include_the_movement():
     z, sd = standardised(43, 5, 100, TREMBLES, "series")
     assert rms(z) == pytest.approx(np.ones(3), abs=0.2)
     assert rms(sd)[1] == pytest.approx(0.1, rel=0.25)
@@ -54,11 +54,9 @@ def adjusted(seed: int, epochs: int, tremble: Tremble, **settings):
     return r, truth
 
 
-def test_auto_reports_its_choice_and_why():
+def test_auto_reports_its_choice_with_a_reason():
     chosen = {}
-    for name, epochs, tremble in (
-        ("short", 12, STILL), ("moves", 60, TREMBLES),
-    ):  # fmt: skip
+    for name, epochs, tremble in (("short", 12, STILL), ("moves", 60, TREMBLES)):
         r, _ = adjusted(44, epochs, tremble)
         chosen[name] = r.exterior
         assert r.choice
@@ -68,8 +66,8 @@ def test_auto_reports_its_choice_and_why():
     assert kinds.count("series") >= 1
 
 
-def test_a_knock_makes_the_mount_loose_not_the_camera_wrong():
-    """The tripod is moved by 2 px in mid-series: sds are true, and as with EOP per epoch."""
+def test_a_knock_moves_the_mount_and_not_the_camera():
+    """The tripod moves by 2 px in mid-series; sds of the camera are true."""
     field = scene.corner_field(per_side=4)
     rng = np.random.default_rng(45)
     grid, truth = simulate(rng, field, 80, STILL)
@@ -89,8 +87,8 @@ def test_a_knock_makes_the_mount_loose_not_the_camera_wrong():
     assert rms(error / r.sd[:, PRINCIPAL]).max() < 1.5
 
 
-def test_a_straight_line_through_a_swaying_mount_is_as_uncertain_as_stated():
-    """Movement.tilt against the scatter of lines through simulated movements."""
+def test_the_variance_of_a_line_through_a_swaying_mount_is_true():
+    """Compares Movement.tilt with the scatter of lines through simulated movements."""
     n, phi = 60, np.exp(-1 / 12)
     rng = np.random.default_rng(46)
     m = rng.normal(size=(20_000, n))
@@ -102,7 +100,7 @@ def test_a_straight_line_through_a_swaying_mount_is_as_uncertain_as_stated():
     assert movement.tilt(weights)[0, 0] == pytest.approx((about @ weights).var(), rel=0.05)
 
 
-def test_a_camera_cannot_drift_within_a_minute_unless_it_warms_up():
+def test_a_camera_drifts_within_a_minute_only_if_it_warms_up():
     minute, hour = np.arange(0, 60, 0.5), np.arange(0, 3600, 10.0)
     unknown = np.full(len(minute), np.nan)
     assert drift_period(minute, unknown) == 0.0
@@ -110,8 +108,8 @@ def test_a_camera_cannot_drift_within_a_minute_unless_it_warms_up():
     assert drift_period(hour, np.full(len(hour), 20.0)) == 24.0
 
 
-def test_a_strong_warm_up_is_no_movement_of_the_mount():
-    """16 px with a time constant of 15 epochs, measured to 0.004 px, are all the camera's."""
+def test_a_strong_warm_up_is_not_attributed_to_the_mount():
+    """A drift of 16 px with a time constant of 15 epochs, measured to 0.004 px."""
     t = np.arange(150)
     drift = 4000.0 * (1 - np.exp(-t / 15.0))[:, None] * np.array([1.0, -0.6])
     for seed in range(5):
@@ -120,8 +118,8 @@ def test_a_strong_warm_up_is_no_movement_of_the_mount():
         assert white.max() + slow.max() < 1.0
 
 
-def test_gross_errors_in_most_epochs_do_not_take_the_epochs_out():
-    """Three targets of 48 are 20 px off in two of three epochs of a field with sigmas."""
+def test_epochs_with_gross_errors_have_results():
+    """Three of 48 targets are 20 px off in two of three epochs, in a field with sigmas."""
     rng = np.random.default_rng(3)
     plain = scene.corner_field(per_side=4)
     field = TestField.build(plain.names, plain.points, 0.03)

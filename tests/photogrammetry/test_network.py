@@ -1,4 +1,4 @@
-"""The free network on simulated photographs: coordinates, covariance, gross errors, refusals."""
+"""The free network from simulated photographs: coordinates, covariance, gross errors, refusals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thermocald.photogrammetry.network.adjustment import adjust_network, advice
 
 
 def _survey(field, stations, sigma, seed, distances=None, **options):
-    """Survey a simulated field; returns the network, the truth of its targets, the gross errors."""
+    """Survey a simulated field; return the network, its targets' true points, the gross errors."""
     rng = np.random.default_rng(seed)
     simulation = {k: options.pop(k) for k in ("loss", "gross") if k in options}
     photos, wrong = cases.photographs(field, stations, sigma, rng, **simulation)
@@ -27,7 +27,7 @@ def _survey(field, stations, sigma, seed, distances=None, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("with_nominal", [False, True], ids=["from nothing", "from nominal"])
+@pytest.mark.parametrize("with_nominal", [False, True], ids=["without nominal", "with nominal"])
 def test_bent_sheet_from_twelve_rolled_stations(with_nominal):
     field = cases.bent_sheet()
     nominal = field * [1, 1, 0] if with_nominal else None
@@ -36,7 +36,7 @@ def test_bent_sheet_from_twelve_rolled_stations(with_nominal):
     )
     assert len(network.stations) == 12
     errors, normalised = cases.normalised_errors(network, truth)
-    # 324 normal values: 1 % beyond 3 would be four times too many, and 4.5 is one in 500 cases
+    # of 324 normal values, 1 % above 3 would be four times too many; 4.5 occurs in one case of 500
     assert np.mean(np.abs(normalised) < 3.0) > 0.99
     assert np.abs(normalised).max() < 4.5
     assert network.relative_accuracy < 1 / 20_000
@@ -50,7 +50,7 @@ def test_bent_sheet_from_twelve_rolled_stations(with_nominal):
 
 
 def _distance_squares(network, truth, pairs):
-    """Squared errors of distances of 30 targets over their stated variance."""
+    """Return squared errors of distances between 30 targets over their stated variances."""
     squares = []
     for a, b in pairs:
         e = (truth[b] - truth[a]) / np.linalg.norm(truth[b] - truth[a])
@@ -64,12 +64,12 @@ def _distance_squares(network, truth, pairs):
 
 @pytest.mark.slow
 def test_standard_deviations_and_correlations_are_true():
-    """Scatter over stated sd of targets, interior orientation, distances: 100 repetitions.
+    """Scatter over stated sd of targets, interior orientation and distances in 100 repetitions.
 
-    Distances of targets that neighbour each other are far better than the sigmas alone say. The
-    mean over 90 coordinates is known to 1 % from 100 repetitions (neighbouring coordinates
-    correlate, so somewhat less), that of one interior parameter to 7 %: three of those are allowed.
-    The observations are normal; what the model does not have is not tested.
+    Distances between neighbouring targets are far better than the sigmas alone imply. The
+    repetitions give the mean over 90 coordinates to 1 % (or a little worse, because neighbouring
+    coordinates correlate) and an interior parameter's to 7 %; the bounds are three of those. The
+    observations are normal; errors outside the model are not tested.
     """
     field = cases.bent_sheet(6, 5)
     stations = cases.convergent_stations(field, 8)
@@ -99,7 +99,7 @@ def test_standard_deviations_and_correlations_are_true():
 
 
 def test_inner_constraints_give_the_smallest_trace():
-    """Any other datum of the same network has a larger trace of the covariance (Granshaw 1980)."""
+    """Other datums of the same network have a larger trace of the covariance (Granshaw 1980)."""
     field = cases.bent_sheet(6, 5)
     network, _, _ = _survey(
         field, cases.convergent_stations(field, 8), 0.05, 3, interior=cases.INTERIOR,
@@ -125,7 +125,7 @@ def test_two_distances_are_weighted_and_lower_the_scale_uncertainty():
     stations = cases.convergent_stations(field, 8)
     lengths = [float(np.linalg.norm(field[b] - field[a])) for a, b in ((0, 29), (5, 24))]
     one = _survey(field, stations, 0.05, 3, [Distance("t0", "t29", lengths[0], 0.1)])[0]
-    # the second is 1 mm too long and ten times worse: its effect is a hundredth of that at most
+    # the second is 1 mm too long, but has ten times the sd: a hundredth of 1 mm remains at most
     two = _survey(
         field, stations, 0.05, 3,
         [Distance("t0", "t29", lengths[0], 0.1), Distance("t5", "t24", lengths[1] + 1.0, 1.0)],
@@ -133,18 +133,14 @@ def test_two_distances_are_weighted_and_lower_the_scale_uncertainty():
     assert two.sd_scale < one.sd_scale
     assert two.extent == pytest.approx(one.extent, rel=0.02 / 900)
     assert two.extent > one.extent
-    # the distance's own sd, and a little from the photographs
+    # mostly the distance's own sd
     assert 1.0 < one.sd_scale / (0.1 / lengths[0]) < 1.1
-
-
-def _shift(*xyz):
-    return np.array(xyz, dtype=float)
 
 
 def _parallel(field, steps_x, steps_y):
     centre = field.mean(axis=0)
     return [
-        cases.looking_at(centre + _shift(x, y, 900), centre + _shift(x, y, 0), 0.0)
+        cases.looking_at(np.add(centre, (x, y, 900)), np.add(centre, (x, y, 0)), 0.0)
         for x in steps_x
         for y in steps_y
     ]
@@ -155,27 +151,24 @@ _BENT = cases.bent_sheet(8, 6)
 _SPOT = _BENT.mean(axis=0)
 
 
+def _adjust(photos):
+    """Adjust photographs of the bent sheet, scaled by one distance."""
+    scale = Distance("t0", "t47", float(np.linalg.norm(_BENT[47] - _BENT[0])), 0.01)
+    return adjust_network(cases.SENSOR, photos, [f"t{i}" for i in range(48)], [scale])
+
+
 @pytest.mark.parametrize(
     ("field", "stations", "reason"),
     [
         (_BENT, cases.convergent_stations(_BENT)[:2], "2 photographs"),
-        (
-            _FLAT,
-            _parallel(_FLAT, (-180, 0, 180), (-130, 0, 130)),
-            "principal distance is uncertain",
-        ),
-        (
-            _BENT,
-            [
-                cases.looking_at(_SPOT + _shift(0, 0, 900), _SPOT + _shift(10 * i, 0, 0), i)
-                for i in range(6)
-            ],
-            "rays meet at|oriented to each other",
-        ),
+        (_FLAT, _parallel(_FLAT, (-180, 0, 180), (-130, 0, 130)),
+         "principal distance is uncertain"),
+        (_BENT, [cases.looking_at(np.add(_SPOT, (0, 0, 900)), np.add(_SPOT, (10 * i, 0, 0)), i)
+                 for i in range(6)], "rays meet at|oriented to each other"),
         (_BENT[:6], cases.convergent_stations(_BENT[:6]), "6 targets"),
     ],
     ids=["two photographs", "flat and parallel", "one place", "six targets"],
-)
+)  # fmt: skip
 def test_weak_networks_are_refused(field, stations, reason):
     with pytest.raises(GeometryError, match=reason):
         _survey(field, stations, 0.05, seed=0)
@@ -183,28 +176,23 @@ def test_weak_networks_are_refused(field, stations, reason):
 
 @pytest.mark.parametrize(
     ("distances", "reason"),
-    [
-        ([], "--scale"),
-        ([Distance("t0", "elsewhere", 100.0, 0.1)], "elsewhere"),
-    ],
+    [([], "--scale"), ([Distance("t0", "elsewhere", 100.0, 0.1)], "elsewhere")],
 )
 def test_a_missing_scale_is_refused(distances, reason):
     with pytest.raises(GeometryError, match=reason):
         _survey(_BENT, cases.convergent_stations(_BENT), 0.05, 0, distances)
 
 
-def test_wrong_sigmas_show_in_sigma0_and_twenty_fold_ones_are_refused():
+def test_sigmas_twice_too_small_show_in_sigma0_and_twenty_times_are_refused():
     stations = cases.convergent_stations(_BENT, 8)
     photos, _ = cases.photographs(_BENT, stations, 0.05, np.random.default_rng(0))
-    names = [f"t{i}" for i in range(len(_BENT))]
-    scale = [Distance("t0", "t47", float(np.linalg.norm(_BENT[47] - _BENT[0])), 0.01)]
     for seen in photos.values():
         seen.sigmas[:] = 0.05 / 20
     with pytest.raises(GeometryError, match="times their stated sigmas"):
-        adjust_network(cases.SENSOR, photos, names, scale)
+        _adjust(photos)
     for seen in photos.values():
         seen.sigmas[:] = 0.05 / 2
-    assert adjust_network(cases.SENSOR, photos, names, scale).sigma0 == pytest.approx(2.0, rel=0.1)
+    assert _adjust(photos).sigma0 == pytest.approx(2.0, rel=0.1)
 
 
 def test_advice_names_the_missing_roll():
@@ -218,42 +206,34 @@ def test_advice_names_the_missing_roll():
 
 
 def test_a_foreign_photograph_is_left_out_and_named():
-    field = _BENT
     rng = np.random.default_rng(5)
-    photos, _ = cases.photographs(field, cases.convergent_stations(field, 8), 0.05, rng)
+    photos, _ = cases.photographs(_BENT, cases.convergent_stations(_BENT, 8), 0.05, rng)
     photos["photo4"].points[:] = rng.uniform(0, 2400, photos["photo4"].points.shape)
-    length = float(np.linalg.norm(field[47] - field[0]))
-    network = adjust_network(
-        cases.SENSOR, photos, [f"t{i}" for i in range(48)], [Distance("t0", "t47", length, 0.01)]
-    )
+    network = _adjust(photos)
     assert "photo4" in network.unused
     assert "photo4" not in {s.photo for s in network.stations}
-    assert np.abs(cases.normalised_errors(network, field)[1]).max() < 4.5
+    assert np.abs(cases.normalised_errors(network, _BENT)[1]).max() < 4.5
 
 
 def test_a_photograph_of_another_focus_is_left_out_and_named():
-    """With a principal distance 3 % longer it can be oriented, but not with the others."""
-    field = _BENT
+    """With a principal distance 3 % longer, it can be oriented alone but not with the others."""
     rng = np.random.default_rng(6)
-    stations = cases.convergent_stations(field, 8)
-    photos, _ = cases.photographs(field, stations, 0.05, rng)
+    stations = cases.convergent_stations(_BENT, 8)
+    photos, _ = cases.photographs(_BENT, stations, 0.05, rng)
     zoomed = CameraModel(cases.SENSOR, cases.INTERIOR.with_values(c=cases.INTERIOR.c * 1.03))
-    other, _ = cases.photographs(field, stations[7:8], 0.05, rng, camera=zoomed)
+    other, _ = cases.photographs(_BENT, stations[7:8], 0.05, rng, camera=zoomed)
     del photos["photo7"]
     photos["zoomed"] = other["photo0"]
-    length = float(np.linalg.norm(field[47] - field[0]))
-    network = adjust_network(
-        cases.SENSOR, photos, [f"t{i}" for i in range(48)], [Distance("t0", "t47", length, 0.01)]
-    )
+    network = _adjust(photos)
     assert "zoomed" in network.unused
     assert 0.9 < network.sigma0 < 1.1
     assert {r.photo for r in network.rejected} <= {"zoomed"}
-    assert np.abs(cases.normalised_errors(network, field)[1]).max() < 4.5
+    assert np.abs(cases.normalised_errors(network, _BENT)[1]).max() < 4.5
 
 
 @pytest.mark.slow
-def test_photographs_of_a_field_that_moves_are_refused():
-    """Every photograph shows another random field: whatever fits together by chance is refused."""
+def test_photographs_of_a_moving_field_are_refused():
+    """Each photograph shows another random field; chance agreement is refused."""
     rng = np.random.default_rng(8)
     stations = cases.convergent_stations(_BENT)
     photos = {}
@@ -261,7 +241,4 @@ def test_photographs_of_a_field_that_moves_are_refused():
         moved = _BENT + rng.normal(0, 30, _BENT.shape)
         photos[f"photo{i}"] = cases.photographs(moved, [station], 0.05, rng)[0]["photo0"]
     with pytest.raises(GeometryError):
-        adjust_network(
-            cases.SENSOR, photos, [f"t{i}" for i in range(48)],
-            [Distance("t0", "t47", 900.0, 0.01)],
-        )  # fmt: skip
+        _adjust(photos)

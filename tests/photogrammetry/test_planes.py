@@ -1,4 +1,4 @@
-"""Boards of a field, and normals of targets from their neighbours."""
+"""The sheets of a field, and targets' normals from their neighbours."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thermocald.photogrammetry.field.testfield import (
 @pytest.mark.parametrize(
     "layout", [{}, {"per_side": 3}, {"per_side": 4, "inset": 20.0}], ids=["7", "3", "near the edge"]
 )
-def test_sheets_of_a_corner_are_told_apart(layout):
+def test_the_sheets_of_a_corner_are_separated(layout):
     field, normals = corner_field(**layout)
     found = field_normals(field)
     assert np.all(np.abs(np.sum(found * normals, axis=1)) > 0.9999)
@@ -52,9 +52,7 @@ def test_a_sheet_may_bulge():
 @pytest.mark.parametrize(
     ("columns", "rows", "step", "bend"), [(12, 9, 30, 2), (16, 12, 50, 50), (20, 14, 25, 20)]
 )
-def test_a_row_between_two_planes_of_a_bent_sheet_has_its_neighbours_normal(
-    columns, rows, step, bend
-):
+def test_all_rows_of_a_bent_sheet_have_its_normals(columns, rows, step, bend):
     x, y = (g.ravel() * step for g in np.meshgrid(np.arange(columns), np.arange(rows)))
     u = 2 * x / x.max() - 1
     z = bend * (1 - u**2) + np.random.default_rng(1).normal(0, 0.05, x.shape)
@@ -69,7 +67,7 @@ def test_scattered_and_few_targets_have_no_plane(points):
     assert np.isnan(target_normals(points)).all()
 
 
-def test_marker_corners_help_and_get_none():
+def test_marker_corners_help_but_have_no_normals():
     points = [[0, 0, 0], [100, 0, 0], [0, 100, 0], [100, 100, 0], [50, 50, 0]]
     field = TestField.build(
         list("abcde"), points, kinds=["marker_corner"] * 4 + ["circle"], diameters=10

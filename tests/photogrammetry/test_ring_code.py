@@ -1,4 +1,4 @@
-"""Ring codes: the published rule, and read where they are and nowhere else."""
+"""Ring codes follow the published rule, and are read where they are and nowhere else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from thermocald.photogrammetry.targets.ring_code import read_codes
 
 
 def _rule(bits: int) -> list[int]:
-    """The patent's rule on strings of segments, written without a look at the module."""
+    """Return the codes of the patent's rule on strings of segments, independently of the module."""
     kept = []
     for number in range(1 << bits):
         ring = format(number, f"0{bits}b")
@@ -37,7 +37,7 @@ def test_codes_follow_the_published_rule(bits, count):
 
 
 @pytest.mark.parametrize("bits", ring_code.BITS)
-def test_segments_draw_the_code_from_wherever_one_begins(bits):
+def test_segments_draw_the_code_up_to_rotation(bits):
     for number in ring_code.codes(bits):
         drawn = 0
         for begin, end in ring_code.segments(bits, number):
@@ -51,7 +51,7 @@ def test_segments_draw_the_code_from_wherever_one_begins(bits):
     ["RING12:1", "RING13:65", "RING12:", "RING12:x", "RING14:65.0",
      pytest.param("RING12:" + 5000 * "1", id="5000 digits")],
 )  # fmt: skip
-def test_what_is_no_code_is_said(code):
+def test_other_texts_than_codes_are_refused(code):
     with pytest.raises(TestFieldError, match="ring code"):
         ring_code.parse(code)
 
@@ -69,8 +69,8 @@ def test_codes_are_read_at_all_sizes_and_tilts(bits, blur):
     expected = {(bits, ring_code.codes(bits)[7 * k]) for k in range(len(targets.true))}
     found = _codes(image)
     assert found <= expected
-    # Gap and ring of three or four px are too little at a blur of 1.2 px; such targets are found
-    # by resection through the others.
+    # Gap and ring of three or four px are too narrow for a blur of 1.2 px; such targets are found
+    # by resection from the others
     tiny = {(bits, ring_code.codes(bits)[7 * k]) for k in (1, 2, 3, 7)} if blur > 1 else set()
     assert found >= expected - tiny
 
@@ -82,7 +82,7 @@ def test_light_on_dark():
     assert _codes(image, ink=-1) == set()
 
 
-def test_a_code_that_is_there_twice_is_dropped():
+def test_a_code_seen_twice_is_dropped():
     targets = single_targets(diameters=(24,), tilts=(0, 30), bits=14)
     image = targets.frame(np.random.default_rng(4), 2.0)
     (_, _, patch), (x, y, _) = targets.patches
@@ -91,7 +91,7 @@ def test_a_code_that_is_there_twice_is_dropped():
     assert _codes(image) == {(14, ring_code.codes(14)[7])}
 
 
-def test_a_mirrored_target_is_not_itself():
+def test_a_mirrored_target_has_the_mirrored_code():
     targets = single_targets(diameters=(24,), tilts=(0, 20, 40), bits=14)
     image = np.ascontiguousarray(targets.frame(np.random.default_rng(6), 2.0)[:, ::-1])
     drawn = {(14, ring_code.codes(14)[7 * k]) for k in range(3)}
@@ -105,7 +105,7 @@ def _mirrored(number: int, bits: int = 14) -> int:
 
 @pytest.mark.slow
 def test_no_code_in_a_thousand_frames_of_clutter():
-    """Not the seeds that the thresholds were found with, which are those below 12,000."""
+    """The seeds are new: the thresholds were found with those below 12,000."""
     candidates, found = 0, []
     for seed in range(20_000, 21_000):
         frame = clutter(seed)

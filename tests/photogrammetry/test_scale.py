@@ -1,4 +1,4 @@
-"""What is found of a printed sheet does not depend on how many pixels it is seen with."""
+"""A printed sheet is found at any image scale."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def aslant(sheet):
 
 
 @pytest.mark.slow
-def test_a_tilted_sheet_is_found_whole_at_every_scale(sheet, aslant):
+def test_all_targets_of_a_tilted_sheet_are_found_at_every_scale(sheet, aslant):
     frame, seen = aslant
     found = [found_at(frame, sheet[0], scale) for scale in (1.0, 0.9, 0.75, 0.5, 0.25)]
     assert min(found) >= 0.97 * seen >= 50
@@ -59,7 +59,7 @@ def test_a_tilted_sheet_is_found_whole_at_every_scale(sheet, aslant):
 @pytest.mark.parametrize("stand", STANDS)
 @pytest.mark.parametrize("noise", [0.0, 2.0])
 def test_fifty_scales(sheet, stand, noise):
-    """Every second one without noise, the others with it."""
+    """Every second scale is without noise, the others with it."""
     frame, seen = frame_from(sheet, stand, noise)
     scales = np.linspace(0.2, 1.0, 50)[noise > 0 :: 2]
     found = [found_at(frame, sheet[0], scale) for scale in scales]
@@ -68,7 +68,7 @@ def test_fifty_scales(sheet, stand, noise):
 
 
 @pytest.mark.slow
-def test_a_saturated_sheet_says_so(sheet, aslant):
+def test_a_saturated_sheet_is_reported(sheet, aslant):
     bright = np.clip(aslant[0].astype(float) * 1.6, 0, 255).astype(np.uint8)
     status = measure(bright, sheet[0]).status
     assert status.word == "nothing_found"

@@ -1,4 +1,4 @@
-"""The adjustment of a series: true standard deviations with common unknowns, and its figures."""
+"""The adjustment of a series: standard deviations with common unknowns, and figures."""
 
 from __future__ import annotations
 
@@ -17,14 +17,12 @@ OWN = np.arange(8)
 
 
 def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None, per_side=7):
-    """A drifting camera; the true field differs from the surveyed one by its sigma."""
+    """Return field, truth and observations of a drifting camera; the field errs by its sigma."""
     known = scene.corner_field(coordinate_error, per_side)
     true = TestField.build(
         known.names, known.points + rng.normal(0, coordinate_error, known.points.shape)
     )
-    truth = np.tile(
-        np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()]), (epochs, 1)
-    )
+    truth = np.tile(scene.TRUTH, (epochs, 1))
     warm = 20 * (1 - np.exp(-np.arange(epochs) / 25))
     truth[:, 0] += warm * 1e-4
     truth[:, 1] += warm * 5e-4
@@ -35,18 +33,15 @@ def series(rng, epochs=60, coordinate_error=0.02, hidden=0.02, moved=None, per_s
     for e in range(epochs):
         points = project(scene.SENSOR, truth[e, :10], truth[e, 10:], true.points)
         points += rng.normal(0, scene.SIGMA_PX, points.shape)
-        # boards are hidden now and then
         see = rng.random(len(points)) > (0.4 if e % 10 == 3 else hidden)
-        observations.append(
-            Observations(
-                np.flatnonzero(see), points[see], np.full((int(see.sum()), 2), scene.SIGMA_PX)
-            )
-        )
+        seen = points[see]
+        sigmas = np.full(seen.shape, scene.SIGMA_PX)
+        observations.append(Observations(np.flatnonzero(see), seen, sigmas))
     return known, truth, observations
 
 
-def test_a_static_set_up_is_fifty_times_as_accurate():
-    """DESIGN idea 3: 0.3 px with a free orientation per epoch, 0.005 px with one for the series."""
+def test_a_static_set_up_is_fifty_times_as_precise():
+    """DESIGN idea 3: 0.3 px with an orientation per epoch, 0.005 px with one for the series."""
     field, _, observations = series(np.random.default_rng(32), coordinate_error=0.0, hidden=0.0)
     px = {}
     for exterior in ("series", "per_epoch"):
@@ -56,8 +51,8 @@ def test_a_static_set_up_is_fifty_times_as_accurate():
     assert px["series"] == pytest.approx(0.005, abs=0.002)
 
 
-def test_ignoring_the_targets_errors_understates():
-    """Without offsets, changing visibility alone looks like movement."""
+def test_target_offsets_halve_the_scatter():
+    """Without them, changes of visibility look like movement."""
     field, truth, observations = series(np.random.default_rng(33), coordinate_error=0.1, epochs=100)
     ratio = {}
     for offsets in (True, False):
@@ -69,7 +64,7 @@ def test_ignoring_the_targets_errors_understates():
     assert ratio[True] < 0.5 * ratio[False]
 
 
-def test_stillness_is_tested():
+def test_an_epoch_that_moved_is_found():
     rng = np.random.default_rng(34)
     field, _, observations = series(rng, epochs=40, moved=17)
     r = scene.adjusted_series(field, observations)
@@ -79,10 +74,9 @@ def test_stillness_is_tested():
     assert np.median(others) == pytest.approx(5.35, abs=1.5)  # χ² with 6 degrees of freedom
 
 
-# with the same matrices for all epochs, and with different ones
+# with equal matrices for all epochs, and with different ones
 @pytest.mark.parametrize(("hidden", "correlation"), [(0.0, 0.0), (0.02, 0.4)])
-def test_epochs_by_themselves_are_those_of_the_epoch_adjustment(hidden, correlation):
-    """Without common unknowns the batch is the single adjustment, epoch by epoch."""
+def test_without_common_unknowns_the_series_equals_single_adjustments(hidden, correlation):
     rng = np.random.default_rng(35)
     field, _, observations = series(rng, epochs=150, coordinate_error=0.0, hidden=hidden)
     for obs in observations[::7]:
@@ -95,7 +89,7 @@ def test_epochs_by_themselves_are_those_of_the_epoch_adjustment(hidden, correlat
         field, grid, exterior="per_epoch", target_offsets=False, target_noise=False,
         snooping_alpha=0.0005,
     )  # fmt: skip
-    np.testing.assert_array_equal(grid.weights, before)  # the caller's
+    np.testing.assert_array_equal(grid.weights, before)  # they are the caller's
     assert r.rejected.sum() >= 40
     for e, obs in enumerate(observations):
         one = scene.adjusted(field, obs)
@@ -105,7 +99,7 @@ def test_epochs_by_themselves_are_those_of_the_epoch_adjustment(hidden, correlat
         assert r.sigma0[e] == pytest.approx(one.sigma0, rel=1e-3)
 
 
-def test_gross_errors_are_found():
+def test_gross_errors_are_rejected():
     rng = np.random.default_rng(36)
     field, _, observations = series(rng, epochs=30)
     for obs in observations:
@@ -129,8 +123,8 @@ def test_epochs_without_a_result_have_a_reason():
 
 
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])
-def test_sigma0_is_against_the_stated_sigmas(exterior):
-    """With noise of twice the stated sigmas it is 2, and the standard deviations follow."""
+def test_sigma0_refers_to_the_stated_sigmas(exterior):
+    """With twice the stated noise it is 2, and the standard deviations follow."""
     field, _, observations = series(np.random.default_rng(38), epochs=60, coordinate_error=0.0)
     halved = [replace(o, sigmas=o.sigmas / 2) for o in observations]
     stated, wrong = (
@@ -147,11 +141,9 @@ def test_sigma0_is_against_the_stated_sigmas(exterior):
     [(14, 1500, "per_epoch"), (36, 1500, "auto"), (23, 30, "series")],
 )
 def test_gross_errors_among_twelve_targets_end_in_a_status(seed, gross_px, exterior):
-    """8 % gross errors of any size: an epoch has a result that is true, or a reason."""
-    field, truth, observations = series(
-        np.random.default_rng(seed), coordinate_error=0.0, epochs=25
-    )
+    """With 8 % gross errors of any size, an epoch has a true result, or a reason."""
     rng = np.random.default_rng(seed)
+    field, truth, observations = series(np.random.default_rng(seed), 25, coordinate_error=0.0)
     targets = np.sort(rng.choice(len(field), 12, replace=False))
     few = [o.select(np.isin(o.targets, targets)) for o in observations]
     for o in few:
@@ -170,7 +162,7 @@ def test_gross_errors_among_twelve_targets_end_in_a_status(seed, gross_px, exter
 
 @pytest.mark.parametrize("factor", [1.0, 5.0])
 def test_a_field_worse_than_stated_is_reported_and_scales_the_level(factor):
-    """Over 20 series of 25 epochs; with the stated sigmas the level was wrong by `factor` sd."""
+    """Over 20 series of 25 epochs; with the stated sigmas, the level would be `factor` sd wrong."""
     rng = np.random.default_rng(32)
     z, ratios = [], []
     for _ in range(20):
@@ -186,7 +178,7 @@ def test_a_field_worse_than_stated_is_reported_and_scales_the_level(factor):
 
 
 def noisy_outside(rng, factor):
-    """25 epochs of a camera at rest, whose outermost target is `factor` times as noisy."""
+    """Return field and 25 epochs of a stable camera; the outermost target has `factor` × noise."""
     field = scene.corner_field(0.0)
     interior, exterior = scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()
     true = project(scene.SENSOR, interior, exterior, field.points)
@@ -201,24 +193,23 @@ def noisy_outside(rng, factor):
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0])
-def test_noise_that_grows_towards_the_edge_is_seen_with_its_sd(factor):
+def test_noise_that_grows_towards_the_edge_is_estimated_with_its_sd(factor):
     off = []
     for seed in range(12):
         field, observations = noisy_outside(np.random.default_rng(seed), factor)
         r = scene.adjusted_series(field, observations)
         value, sd = r.outer_noise
         off.append((value - factor) / sd)
-    assert np.sqrt(np.mean(np.square(off))) < 1.6  # 99.9 % point of twelve
+    assert np.sqrt(np.mean(np.square(off))) < 1.6  # 99.9 % point of twelve draws
     if factor > 1.0:
         assert value - 1.0 > 5.0 * sd
 
 
-def test_the_perspective_sd_is_that_of_an_epoch_by_itself():
+def test_the_perspective_sd_is_that_of_a_single_epoch():
     field, observations = noisy_outside(np.random.default_rng(1), 1.0)
     alike, apart = (
-        scene.adjusted_series(field, observations, exterior=exterior)
-        for exterior in ("series", "per_epoch")
-    )  # fmt: skip
+        scene.adjusted_series(field, observations, exterior=e) for e in ("series", "per_epoch")
+    )
     assert np.isnan(apart.perspective_sd).all()
     own = np.median(apart.sd[:, :3], axis=0)
     assert alike.perspective_sd[:3] == pytest.approx(own, rel=0.15)
@@ -227,7 +218,7 @@ def test_the_perspective_sd_is_that_of_an_epoch_by_itself():
 
 @pytest.mark.parametrize(("held", "moved"), [("C1", 2), ("C2", 1)])
 def test_the_effect_of_a_held_affinity_on_the_level_is_reported(held, moved):
-    """A camera with an affinity of 1e-4 that is not estimated; nothing else is wrong."""
+    """The camera has an affinity of 1e-4 that is held at 0; there is no other error."""
     field, truth = scene.corner_field(0.02), scene.INTERIOR.as_array()
     values = replace(scene.INTERIOR, **{held: 1e-4}).as_array()
     seen = project(scene.SENSOR, values, scene.EXTERIOR.as_array(), field.points)
@@ -250,8 +241,8 @@ def test_the_effect_of_a_held_affinity_on_the_level_is_reported(held, moved):
 
 
 @pytest.mark.parametrize("exterior", ["per_epoch", "series"])
-def test_frames_that_are_all_the_same_keep_a_variance(exterior):
-    """If a camera repeats its last frame, errors of whole markers seem to correlate."""
+def test_repeated_frames_have_positive_variances(exterior):
+    """A camera repeats its last frame, so the errors of whole markers seem to correlate."""
     plain, _, observations = series(np.random.default_rng(4), 45, coordinate_error=0.02, hidden=0.0)
     names = [f"{i // 4}.{i % 4}" for i in range(len(plain))]
     field = TestField.build(names, plain.points, 0.02, kinds="marker_corner")

@@ -1,4 +1,4 @@
-"""Surveys of rendered test fields: bent paper, corners put up by hand, photographs of a print."""
+"""Surveys of rendered test fields on bent paper."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CAMERA = CameraModel(
 
 
 def bent(field, size, sag=5.0):
-    """The true field of a nominal sheet: bent, twisted, and stretched by the printer."""
+    """Return the true field of a nominal sheet: bent, twisted, and stretched by the printer."""
     points = field.points * [1.002, 0.999, 1.0]
     u, v = field.points[:, 0] / size[0] - 0.5, field.points[:, 1] / size[1] - 0.5
     points[:, 2] = sag * (1 - 4 * u * u) + 0.6 * sag * u * v
@@ -33,7 +33,7 @@ def bent(field, size, sag=5.0):
 
 
 def photograph(truth, stations, camera=CAMERA):
-    """Pictures of a field by the program's own renderer."""
+    """Render photographs of a field with the program's own renderer."""
     scene = Scene(camera.sensor, truth)
     pictures = {}
     for i, station in enumerate(stations):
@@ -48,7 +48,7 @@ def measured_distance(truth, a, b, sigma, seed=0):
 
 
 def assert_true(result, truth, least_accuracy=1 / 20_000):
-    """Check coordinates to three stated standard deviations, and the relative accuracy."""
+    """Check coordinates against their standard deviations, and the relative accuracy."""
     known = truth.points[[truth.index[name] for name in result.network.names]]
     errors, normalised = cases.normalised_errors(result.network, known)
     assert np.mean(np.abs(normalised) < 3.0) > 0.99
@@ -70,7 +70,7 @@ def sheet():
 
 @pytest.mark.slow
 def test_bent_sheet_with_its_nominal_field(sheet):
-    """A black and a foreign photograph among them are named and do no harm."""
+    """A black and a foreign photograph are named and do no harm."""
     nominal, truth, pictures, distance = sheet
     shape = pictures["photo0.png"]().shape
     noise = np.random.default_rng(0).integers(60, 180, (77, 103), dtype=np.uint8)
@@ -95,7 +95,7 @@ def test_bent_sheet_with_its_nominal_field(sheet):
 
 
 def test_bent_sheet_without_a_nominal_field(sheet):
-    """Codes alone: names from the codes, diameters from the pictures."""
+    """The codes give the names, the photographs the diameters."""
     _, truth, pictures, distance = sheet
     result = survey(pictures, [distance], CAMERA.sensor.pixel_pitch)
     coded = {name for name, code in zip(truth.names, truth.codes, strict=True) if code}
@@ -106,7 +106,7 @@ def test_bent_sheet_without_a_nominal_field(sheet):
         assert truth.codes[truth.index[name]] == code
 
 
-def test_pictures_that_do_not_belong_together_are_refused(sheet):
+def test_photographs_that_do_not_fit_together_are_refused(sheet):
     nominal, _, pictures, distance = sheet
     turned = {"portrait.png": lambda: np.ascontiguousarray(pictures["photo1.png"]().T)}
     with pytest.raises(ImageError, match=r"portrait\.png.*1232×1640"):

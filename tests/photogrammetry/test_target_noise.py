@@ -1,4 +1,4 @@
-"""The noise of single targets: how well it is estimated, and its effect on the test of a point."""
+"""The noise of single targets: its estimation, and its effect on the test of a point."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ ALPHA = 0.002
 
 
 def drawn(rng, epochs, spread):
-    """Residuals and weights of targets whose standard deviations scatter by exp(spread z)."""
+    """Draw residuals, weights and true variances of targets whose sds vary by exp(spread z)."""
     true = np.exp(2.0 * spread * rng.standard_normal(TARGETS))
     noise = np.sqrt(true)[:, None] * rng.standard_normal((epochs, TARGETS, 2))
     weights = np.ones((epochs, TARGETS, 3))
@@ -26,16 +26,17 @@ def test_the_limit_is_the_quantile_of_f(alpha):
     np.testing.assert_allclose(limit_2d(alpha, 1.0 / freedom), expected, rtol=1e-9)
 
 
-def test_targets_of_equal_noise_do_not_differ_by_chance():
+def test_targets_of_equal_noise_have_equal_estimates():
     rng = np.random.default_rng(5)
     ratio, freedom = noise_ratios(*drawn(rng, 10, 0.0)[:3], 1.0)
-    assert np.std(np.log(ratio)) < 0.1  # of single targets: 0.45
+    assert np.std(np.log(ratio)) < 0.1  # from single targets 0.45
     assert freedom.min() > 100
 
 
 def failing(epochs, spread, lost):
-    """Share of good points of further epochs that fail the test with the targets' noise from the
-    first ones, and the targets' scatter of ln noise; lost: epochs that offsets use up.
+    """Return the share of good points in further epochs that fail the test, and sd of ln noise.
+
+    The targets' noise is from the first epochs; `lost` of them are used up by offsets.
     """
     outside, tried, scatter = 0, 0, []
     for seed in range(40):
@@ -53,7 +54,7 @@ def failing(epochs, spread, lost):
 
 @pytest.mark.parametrize(("epochs", "spread"), [(10, 0.8), (20, 0.0), (100, 0.3)])
 def test_as_many_good_points_fail_as_stated(epochs, spread):
-    """Medians of few epochs have cautious weights: no more points fail than stated."""
+    """Medians of few epochs have cautious weights, so no more points fail than stated."""
     share, _ = failing(epochs, spread, 0)
     assert share < 1.35 * ALPHA
     assert share > 0.5 * ALPHA or epochs < 100
@@ -61,7 +62,7 @@ def test_as_many_good_points_fail_as_stated(epochs, spread):
 
 @pytest.mark.parametrize("epochs", [4, 6, 9])
 @pytest.mark.parametrize("spread", [0.0, 0.3, 0.8])
-def test_few_epochs_whose_offsets_take_one_of_them(epochs, spread):
+def test_offsets_use_up_one_of_few_epochs(epochs, spread):
     """No more good points fail than stated, and targets of equal noise hardly differ."""
     share, scatter = failing(epochs, spread, 1)
     assert share < 1.35 * ALPHA
@@ -85,14 +86,14 @@ def test_a_few_jumps_do_not_raise_a_targets_noise():
     assert np.median(np.abs(after / before - 1.0)) < 0.2
 
 
-def test_the_noise_of_neighbours_follows_what_changes_slowly_and_no_single_epoch():
+def test_the_noise_of_neighbours_follows_slow_changes_and_no_single_epoch():
     unit = np.concatenate([np.ones(30), np.linspace(1.0, 6.0, 50), np.full(20, 40.0)])
     unit[[10, 60, 0]] = 500.0
     all_count = np.ones(100, dtype=bool)
     about = neighbours_variance(unit, all_count)
     assert about[10] == about[0] == 1.0
     assert about[60] == pytest.approx(np.median(unit[53:68]))
-    assert about[-1] == 9.0  # three times the noise: no more is taken for noise
+    assert about[-1] == 9.0  # three times the noise is the limit
     some = all_count.copy()
     some[20:40] = False
     assert neighbours_variance(unit, some)[30] == 1.0

@@ -1,4 +1,4 @@
-"""Natural control points: centres of crosses, patches found again, errors over their sds."""
+"""Natural control points: centres of crosses and matched patches, with true sds."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.frame.templates import MATCHING_SD, Templates
 
 SIZE = (640, 480)
-FINE = 8  # a scene is drawn so many times as large and averaged
+FINE = 8  # scenes are drawn at this scale and averaged
 CLICK = 1.0
 
 
 def scene(centres: np.ndarray, affine: np.ndarray, seed: int, light: float = 1.0) -> np.ndarray:
-    """White crosses on dark boards in grass, drawn fine and averaged: (H, W) without noise.
+    """Draw white crosses on dark boards in grass, (H, W), without noise.
 
-    affine (2, 3): of the whole scene, px.
+    affine (2, 3): a transformation of the whole scene, px.
     """
     rng = np.random.default_rng(seed)
     grass = rng.normal(0, 1, (SIZE[1] + 80, SIZE[0] + 80)).astype(np.float32)
@@ -47,7 +47,7 @@ STILL = np.array([[1.0, 0, 0], [0, 1, 0]])
 
 
 def placed(rng: np.random.Generator, n: int = 6):
-    """Centres, their field, and clicks at whole pixels."""
+    """Return true centres, their field, and clicks at whole pixels."""
     grid = np.stack(np.meshgrid([110, 320, 530], [120, 340]), axis=-1).reshape(-1, 2)[:n]
     centres = grid + rng.uniform(-20, 20, (n, 2))
     field = TestField.build([f"g{i}" for i in range(n)], np.zeros((n, 3)), 1.0)
@@ -56,7 +56,7 @@ def placed(rng: np.random.Generator, n: int = 6):
 
 
 def prepared(seed: int, drawn: int | None = None):
-    """Random numbers, centres of crosses, clicks, templates of a noisy scene that shows them."""
+    """Return generator, centres, clicks, and the templates of a noisy scene."""
     rng = np.random.default_rng(seed)
     centres, field, clicks = placed(rng)
     still = scene(centres, STILL, seed if drawn is None else drawn)
@@ -74,13 +74,13 @@ def test_centres_of_crosses_are_better_than_the_clicks_and_have_true_sds():
         clicked.append(clicks.points - centres)
         ratio.append(error / found.sigmas)
     assert np.std(errors) < 0.1 * np.std(clicked)
-    # the grass about a board is not symmetric, and its share in the sd is an estimate
+    # the grass around a board is not symmetric; its part of the sd is an estimate
     assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.3
 
 
 @pytest.mark.slow
 def test_patches_are_found_again_with_true_sds():
-    """A camera that turns and zooms a little, in other light: error over sd from frame to frame."""
+    """Error over sd between frames of a camera that turns and zooms a little, in other light."""
     ratio = []
     for seed in range(6):
         rng, centres, _, made = prepared(50 + seed, seed)
@@ -97,7 +97,7 @@ def test_patches_are_found_again_with_true_sds():
     assert 0.8 < rms < 1.2, f"error/sd {rms:.2f}"
 
 
-def test_hidden_points_are_left_out_and_the_dark_gives_none():
+def test_hidden_points_are_left_out_and_a_dark_frame_has_none():
     rng, centres, _, made = prepared(4)
     clear = scene(centres, STILL, 4)
     hidden = clear.copy()
@@ -113,14 +113,14 @@ def test_hidden_points_are_left_out_and_the_dark_gives_none():
     assert len(again.observations) == 6
 
 
-def test_another_scene_is_not_taken_for_it():
+def test_another_scene_is_not_matched():
     rng, _, _, made = prepared(6)
     found = made.measure(noisy(scene(np.zeros((0, 2)), STILL, 7), rng))
     assert found.status.word == "too_few"
     assert len(found.observations) == 0
 
 
-def test_clicks_outside_the_reference_are_said(tmp_path):
+def test_clicks_outside_the_reference_are_refused(tmp_path):
     rng = np.random.default_rng(8)
     centres, field, clicks = placed(rng)
     path = tmp_path / "reference.png"

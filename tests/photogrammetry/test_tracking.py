@@ -1,11 +1,11 @@
-"""Tracking: windows only, weights renewed, and a full search when too much is lost."""
+"""Tracking measures windows only, renews weights, and searches again if targets are lost."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from tests.photogrammetry.exact_rendering import noisy
+from tests.photogrammetry.exact_rendering import noisy, rms
 from tests.photogrammetry.fields import SMALL_CAMERA, SMALL_SENSOR, draw, small_field, station
 from thermocald.photogrammetry.camera.camera_model import CameraModel, CameraSpec
 from thermocald.photogrammetry.frame import tracking
@@ -20,7 +20,7 @@ def _render(camera=SMALL_CAMERA, exterior=STATION) -> np.ndarray:
 
 
 def _shifted(px: float) -> CameraModel:
-    """The camera whose principal point has drifted by so many px along x, and half along y."""
+    """Return the camera with its principal point drifted by `px` in x and half as much in y."""
     shift = px * SMALL_SENSOR.pixel_pitch
     i = SMALL_CAMERA.interior
     return CameraModel(SMALL_SENSOR, i.with_values(x0=i.x0 + shift, y0=i.y0 - shift / 2))
@@ -38,7 +38,7 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture
 def tracker(clean, rng) -> Tracker:
-    """A tracker that has seen the first frame."""
+    """Return a tracker that has measured the first frame."""
     tracker = Tracker(FIELD, CameraSpec("", SMALL_SENSOR))
     first = tracker.measure(noisy(clean, rng))
     assert first.status.ok
@@ -51,13 +51,9 @@ def _z(measured, camera=SMALL_CAMERA, exterior=STATION) -> np.ndarray:
     return (o.points - camera.project(exterior, FIELD.points)[o.targets]) / o.sigmas
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 @pytest.fixture
 def no_search(monkeypatch):
-    """A full search fails the test."""
+    """Fail the test on a full search."""
 
     def search(*arguments):
         raise AssertionError("the whole frame was searched")
@@ -74,9 +70,9 @@ def test_windows_are_enough_and_sigmas_stay_true(tracker, clean, rng, no_search)
         assert not measured.searched
         assert len(measured.observations) >= 100
         z.append(_z(measured))
-    assert 0.93 <= _rms(np.array(z)) <= 1.07
-    # Fixed weights carry no error of their own from epoch to epoch.
-    assert _rms(np.mean(z, axis=0)) < 1.35 / np.sqrt(15)
+    assert 0.93 <= rms(np.array(z)) <= 1.07
+    # Fixed weights add no error that epochs have in common
+    assert rms(np.mean(z, axis=0)) < 1.35 / np.sqrt(15)
 
 
 @pytest.mark.slow
@@ -85,12 +81,12 @@ def test_drift_is_followed_without_bias(tracker, rng, no_search, px):
     camera = _shifted(px)
     image = _render(camera)
     z = np.array([_z(tracker.measure(noisy(image, rng)), camera) for _ in range(6)])
-    assert _rms(z) <= 1.12
-    # 200 targets × 6 frames: a common bias of 0.001 px of a sigma of 0.008 px would show.
+    assert rms(z) <= 1.12
+    # 200 targets × 6 frames would show a common bias of 0.001 px (sigma 0.008 px)
     assert np.abs(z.mean(axis=(0, 1))).max() < 4 / np.sqrt(z.shape[0] * z.shape[1])
 
 
-def test_weights_are_renewed_when_targets_have_moved(tracker, rng, no_search):
+def test_weights_are_renewed_after_movement(tracker, rng, no_search):
     weights = []
     for px in (0.0, 0.08, 0.4, 0.4):
         tracker.measure(noisy(_render(_shifted(px)), rng))
@@ -102,15 +98,15 @@ def test_light_and_noise_may_change(tracker, clean, rng, no_search):
     for factor in (0.9, 0.5, 1.1):
         measured = tracker.measure(noisy(clean * factor, rng))
         assert len(measured.observations) >= 100
-        assert 0.88 <= _rms(_z(measured)) <= 1.12
+        assert 0.88 <= rms(_z(measured)) <= 1.12
         contrast = np.median(measured.observations.quality["contrast"])
         assert contrast == pytest.approx(-150 * factor, rel=0.02)
     measured = tracker.measure(noisy(clean, rng, 4.0))
-    assert 0.88 <= _rms(_z(measured)) <= 1.12
+    assert 0.88 <= rms(_z(measured)) <= 1.12
     assert np.median(measured.observations.quality["noise"]) == pytest.approx(4.0, rel=0.1)
 
 
-def test_defocus_is_seen_in_the_blur(tracker, rng, no_search):
+def test_defocus_shows_in_the_blur(tracker, rng, no_search):
     image = draw(FIELD, NORMALS).render(SMALL_CAMERA, STATION, blur=1.2)
     measured = tracker.measure(noisy(image, rng))
     assert np.median(measured.observations.quality["blur"]) == pytest.approx(1.2, abs=0.02)
@@ -130,7 +126,7 @@ def test_a_target_may_be_hidden_and_come_back(tracker, clean, rng, no_search):
     assert np.abs(_z(back)).max() < 5
 
 
-def test_a_knock_is_answered_by_a_search_that_says_so(tracker, rng):
+def test_a_knock_leads_to_a_reported_search(tracker, rng):
     knocked = station(760.0, target=(215.0, 190.0, 200.0), roll=0.03)
     image = _render(exterior=knocked)
     measured = tracker.measure(noisy(image, rng))
@@ -140,7 +136,7 @@ def test_a_knock_is_answered_by_a_search_that_says_so(tracker, rng):
     assert not tracker.measure(noisy(image, rng)).searched
 
 
-def test_the_light_goes_out_and_on_again(tracker, clean, rng):
+def test_tracking_goes_on_after_dark_frames(tracker, clean, rng):
     for _ in range(2):
         dark = tracker.measure(noisy(np.full_like(clean, 4.0), rng))
         assert dark.status.word == "black"
@@ -148,10 +144,10 @@ def test_the_light_goes_out_and_on_again(tracker, clean, rng):
         assert len(dark.observations) == 0
     light = tracker.measure(noisy(clean, rng))
     assert light.status.ok
-    assert not light.searched  # where the targets were is still known
+    assert not light.searched  # the targets' places are still stored
 
 
-def test_frames_of_another_kind(tracker, clean, rng):
+def test_frames_of_other_formats(tracker, clean, rng):
     frame = noisy(clean, rng)
     assert tracker.measure(frame[:-10]).status.word == "wrong_size"
     assert tracker.measure(frame[:0]).status.word == "no_image"

@@ -1,4 +1,4 @@
-"""A year of a camera, drawn as the means to which three million epochs are condensed."""
+"""A camera's year, drawn as the means to which three million epochs are condensed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HOUR = 360  # epochs
 
 
 def rows(afternoons=(200,)):
-    """Middles s and lengths (epochs) of hours, of five minutes on some days."""
+    """Return middles (s), lengths and starts (epochs) of rows: hours, on some days five minutes."""
     first, count = [], []
     for day in range(365):
         n = 30 if day in afternoons else HOUR
@@ -28,18 +28,19 @@ def rows(afternoons=(200,)):
 
 
 def year(temperature, moved, seed, afternoons=(200,), noise_K=0.02, targets=24):
-    """The reduced series; temperature(t s) °C; moved(t, T) K·px: what c, x0, y0 follow instead."""
+    """Return the reduced series.
+
+    temperature(t s) °C; moved(t, T) °C: the temperature that c, x0, y0 really follow.
+    """
     rng = np.random.default_rng(seed)
     t, count, start = rows(afternoons)
     whole = scene.corner_field(0.02)
     field = whole.subset(np.linspace(0, len(whole) - 1, targets).astype(int))
-    # means over a row, from eight instants of it
+    # a row's mean is taken over eight instants
     inside = (np.arange(8) - 3.5) / 8.0
     at = t[:, None] + 10.0 * count[:, None] * inside
     T = temperature(at)
-    values = np.tile(
-        np.concatenate([scene.INTERIOR.as_array(), scene.EXTERIOR.as_array()]), (len(t), 1)
-    )
+    values = np.tile(scene.TRUTH, (len(t), 1))
     drive = moved(at, T).mean(axis=1)
     for column, rate in RATES.items():
         values[:, column] += rate * (drive - 15.0)

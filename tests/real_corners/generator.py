@@ -1,11 +1,10 @@
-"""Effects hidden in real image points: a fixed camera's corners, moved as heat would move them.
+"""Effects hidden in real image points: a fixed camera's corners, moved as by heat.
 
-The corners are those of `aviary-*` (shared/data): a camera that trembles and is knocked, boards
-that people walk past. Nothing thermal happens in them. Each corner is moved by the difference of
-two projections, of the camera as it would be at a temperature and at rest; the first half of the
-epochs is M1, the second M2, relabelled 30 s apart, with an invented temperature. The noise is real,
-the truth is known. Climate and effects are those of `tests.blind`, which share no code with the
-program.
+The corners are those of `aviary-*` (shared/data), without thermal effects: a camera that trembles
+and is knocked, boards that people hide. Each corner is moved by the difference of two projections,
+with the camera at a temperature and at rest. The first half of the epochs is M1, the second M2;
+they are 30 s apart and have an invented temperature. The noise is real, the truth known. Climate
+and effects are from `tests.blind`, which shares no code with the program.
 
     python -m tests.real_corners.generator --camera aviary-cam1 --effect thermal_lag --seed 3 \
         --out DIR --truth FILE
@@ -39,7 +38,7 @@ INTERVAL = 30.0
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 # Interior and exterior orientation (CONVENTIONS §2) of the four cameras, from an adjustment of
-# their mean images: only differences of projections enter.
+# their mean images; only differences of projections are used
 _POSES = {
     "aviary-cam0": [12.7227907, -0.00394516905, -0.00917670977, -0.00115192562, 5.22191654e-06,
                     1.14776586e-08, -5.26401957e-05, 7.77528791e-05, -0.000329844366,
@@ -62,7 +61,7 @@ _POSES = {
 
 @dataclass(frozen=True)
 class RealCase:
-    """What is hidden in which camera's corners; strength_px of each effect, None: 0.2 to 0.3."""
+    """Effects hidden in a camera's corners; strength_px of each effect, by default 0.2 to 0.3."""
 
     camera: str
     effects: tuple[str, ...] = ()
@@ -72,7 +71,7 @@ class RealCase:
 
 @dataclass(frozen=True, eq=False)
 class RealSeries:
-    """One half: points (E, T, 2) px with NaN, times (E,) s, channels {name: (E,)} °C."""
+    """One half: points (E, T, 2) px or NaN, times (E,) s, temperatures {name: (E,)} °C."""
 
     name: str
     camera: str
@@ -84,7 +83,7 @@ class RealSeries:
 
 @cache
 def corners(camera: str) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Names and object points (T, 3) mm of the targets, image points (E, T, 2) px with NaN."""
+    """Return the targets' names and points (T, 3) mm, and image points (E, T, 2) px or NaN."""
     with (SHARED / camera / "testfield.csv").open() as f:
         field = list(csv.DictReader(f))
     names = tuple(row["target"] for row in field)
@@ -100,7 +99,7 @@ def corners(camera: str) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
 
 
 def generate(case: RealCase) -> tuple[list[RealSeries], dict]:
-    """M1 and M2, and the truth."""
+    """Generate M1 and M2; return them and the truth."""
     rng = np.random.default_rng([case.seed, 4711, CAMERAS.index(case.camera)])
     _, place, points = corners(case.camera)
     head = yaml.safe_load((SHARED / case.camera / "recording.yaml").read_text())["camera"]
@@ -166,9 +165,9 @@ def generate(case: RealCase) -> tuple[list[RealSeries], dict]:
 
 
 def _size(left, e: dict, camera: Camera, strength: float) -> float:
-    """The factor of an effect's constants that makes the base model leave `strength` px."""
+    """Return the factor of an effect's constants with which the base model leaves `strength` px."""
     if e["effect"] in ("thermal_lag", "time_offset", "hysteresis"):
-        # the parameter stays what a camera may have; the camera's rates make up for it
+        # the parameter is limited to realistic values; larger rates compensate for that
         limits = {"thermal_lag": 300 / e.get("tau", 1), "time_offset": 90 / abs(e.get("d", 1)),
                   "hysteresis": 4 / e.get("half_width", 1)}  # fmt: skip
         most = limits[e["effect"]]

@@ -1,11 +1,11 @@
-"""Scoring of the discovery on effects hidden in real corners.
+"""Score the discovery of effects hidden in real corners.
 
     python -m tests.real_corners.score --first 500 --seeds 2 [--part nine] [--camera aviary-cam1]
         [--check]
 
-Runs in memory through `discover_series`, the same function the command calls. Parts: `nine`, the
-nine effects of the target; `others`; `none`: no effect, 25 recordings of each camera and seed. With
---check the exit status is 1 where a part misses its goal (`GOALS`).
+Runs `discover_series`, the function of the command, in memory. Parts: `nine`, the nine effects of
+the goal; `others`; `none`, no effect, with 25 recordings per camera and seed. With --check, the
+exit status is 1 if a part misses its goal (`GOALS`).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from thermocald.thermal.source import series_input
 
 NONE_PER_SEED = 25
 GOALS = {"nine": 0.9, "others": 0.9, "none": 1.0}
-"""Share of a part that is named exactly or listed; without an effect, of no name at all."""
+"""Least share of cases with exact or listed names, or without an effect, with no name."""
 GAP_CLOSED = 0.8
-"""Share of the excess on M2 that what was named right closes, down to the camera's own noise."""
+"""Least share of the excess on M2 over the camera's noise that correct names explain."""
 
 
 def input_of(series: RealSeries, source: str) -> SeriesInput:
-    """What the program reads, without files."""
+    """Return the series as the program reads it, without files."""
     recorded = series_input(read_recording(SHARED / source))
     grid = recorded.grid
     weights = np.zeros((len(series.times), len(recorded.field), 3))
@@ -56,7 +56,7 @@ def input_of(series: RealSeries, source: str) -> SeriesInput:
 
 
 def discover_case(case: RealCase) -> tuple[Discovery, dict, float]:
-    """Return what discovery says of a case, the truth, and the seconds of processor."""
+    """Run discovery on a case; return its result, the truth, and processor time, s."""
     series, truth = generate(case)
     inputs = [input_of(s, case.camera) for s in series]
     begin = time.process_time()
@@ -65,18 +65,18 @@ def discover_case(case: RealCase) -> tuple[Discovery, dict, float]:
 
 
 def judge(case: RealCase) -> Outcome:
-    """Run one case and judge it."""
+    """Run and score one case."""
     return judge_discovery(case, *discover_case(case))
 
 
 def judge_discovery(case: RealCase, discovery: Discovery, truth: dict, seconds: float) -> Outcome:
-    """Compare what was discovered with what is hidden."""
-    # what nobody recorded may be seen; it must not be named
+    """Compare the discovery with the hidden effects."""
+    # real movements may be found, but not named
     return compare(case, discovery, seconds, () if case.effects else ((), ("unnamed",)))
 
 
 def cases(part: str, seeds: Iterable[int], cameras: Iterable[str] = CAMERAS) -> Iterator[RealCase]:
-    """The cases of a part."""
+    """Yield the cases of a part."""
     for camera in cameras:
         for seed in seeds:
             if part == "none":
@@ -88,7 +88,7 @@ def cases(part: str, seeds: Iterable[int], cameras: Iterable[str] = CAMERAS) -> 
 
 
 def missed(part: str, done: list[Outcome]) -> list[str]:
-    """What a part does not reach of its goals, in words."""
+    """Return a sentence for each missed goal of a part."""
     named = float(np.mean([o.right_or_listed for o in done]))
     out = []
     if named < GOALS[part]:
@@ -115,10 +115,10 @@ def main() -> None:
             o = judge(case)
             done.append(o)
             mark = "  " if o.right else "l " if o.right_or_listed else "X "
-            closed = "" if o.gap_closed is None else f"{o.gap_closed:.2f}"
+            closed = "-" if o.gap_closed is None else f"{o.gap_closed:.2f}"
             print(
                 f"{mark}{case.camera} {'+'.join(case.effects) or 'none'} seed {case.seed}: "
-                f"{'+'.join(o.found) or 'none'} ({o.verdict}) listed {o.listed} gap {closed} "
+                f"{'+'.join(o.found) or 'none'} ({o.verdict}), listed {o.listed}, gap {closed}, "
                 f"{o.seconds:.1f} s", flush=True,
             )  # fmt: skip
         print(

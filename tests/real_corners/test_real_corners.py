@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.blind.outcome import Outcome
 from tests.real_corners import generator
 from tests.real_corners.generator import SHARED, RealCase
+from tests.real_corners.score import judge, missed
 
 pytestmark = pytest.mark.skipif(
-    not (SHARED / "aviary-cam0").exists(), reason="shared/data/aviary-* is not there"
+    not (SHARED / "aviary-cam0").exists(), reason="shared/data/aviary-* is absent"
 )
 
 
 @pytest.fixture
 def still(monkeypatch):
-    """The boards come and go as they did; the corners stand still but for white noise."""
+    """Keep the boards' visibility, but replace the corners by means with white noise."""
     real = generator.corners
 
     def quiet(camera):
@@ -30,9 +32,7 @@ def still(monkeypatch):
 
 
 @pytest.mark.slow
-def test_boards_that_come_and_go_do_not_pull_at_the_camera(still):
-    from tests.real_corners.score import judge
-
+def test_boards_hidden_at_times_do_not_bias_the_camera(still):
     found = judge(RealCase("aviary-cam1", ("creep",), 0))
 
     assert found.right
@@ -44,25 +44,18 @@ def test_boards_that_come_and_go_do_not_pull_at_the_camera(still):
     ("camera", "effect", "seed"),
     [("aviary-cam6", "thermal_lag", 1), ("aviary-cam1", "softening", 1)],
 )
-def test_a_cause_is_named_beside_a_mount_that_moves(camera, effect, seed):
-    from tests.real_corners.score import judge
-
+def test_an_effect_is_named_in_spite_of_a_moving_mount(camera, effect, seed):
     assert judge(RealCase(camera, (effect,), seed)).right_or_listed
 
 
 @pytest.mark.slow
-def test_a_wander_of_the_mount_is_no_effect():
-    from tests.real_corners.score import judge
-
+def test_a_wandering_mount_is_no_effect():
     found = [judge(RealCase("aviary-cam0", (), seed)) for seed in (52, 58, 61)]
 
     assert all(o.right for o in found)
 
 
-def test_a_score_that_misses_its_goal_is_said():
-    from tests.blind.outcome import Outcome
-    from tests.real_corners.score import missed
-
+def test_a_missed_goal_is_reported():
     case = RealCase("aviary-cam0", ("creep",), 500)
     good = Outcome(case, ("creep",), "effects_found", (), True, True, {}, 0.95, 1.0)
     bad = Outcome(case, ("slip",), "effects_found", (), False, False, {}, None, 1.0)

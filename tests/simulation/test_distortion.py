@@ -1,4 +1,4 @@
-"""The distortion follows the angle while c changes, or stays where it is in the image."""
+"""The distortion follows the angle while c changes, or stays fixed in the image."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def follows_angle(*effects):
 
 
 def opencv(iop):
-    """OpenCV's k1, k2, k3, p1, p2 (E, 5)."""
+    """Convert to OpenCV's k1, k2, k3, p1, p2 (E, 5)."""
     c, A, B = iop[:, :1], iop[:, 3:6], iop[:, 6:8]
     return np.hstack([A * c ** np.array([2, 4, 6]), -B[:, 1:] * c, B[:, :1] * c])
 
 
-def test_opencv_constants_stay_while_c_changes():
+def test_opencvs_constants_stay_while_c_changes():
     iop = follows_angle(ModelEffect("thermal_lag", {"tau": 60.0})).predict(history()).iop
     assert np.ptp(iop[:, 0]) > 0.02
     start = opencv(INTERIOR.as_array()[None])
@@ -35,7 +35,7 @@ def test_opencv_constants_stay_while_c_changes():
     np.testing.assert_array_equal(still[:, 3:], np.tile(INTERIOR.as_array()[3:], (len(still), 1)))
 
 
-def test_a_drift_of_the_distortion_is_that_of_the_angles_constants():
+def test_a_drift_of_the_distortion_adds_to_the_constants_of_the_angle():
     drifts = follows_angle(ModelEffect("radial_distortion_drift", {"A1": 1e-5}))
     h = history()
     T = h.temperature() - drifts.T0
@@ -44,8 +44,8 @@ def test_a_drift_of_the_distortion_is_that_of_the_angles_constants():
 
 
 @pytest.mark.parametrize("distortion", ["angle", "image"])
-def test_the_covariance_follows_the_model_itself(distortion):
-    """Of the steady camera, and along a history: against differences of the predictions."""
+def test_the_covariance_equals_differences(distortion):
+    """For the steady camera and along a history, compared with differences of predictions."""
     effects = (
         ModelEffect("nonlinear_expansion", {"c": 2e-5}),
         ModelEffect("radial_distortion_drift", {"A1": 1e-5}),

@@ -1,4 +1,4 @@
-"""Every effect against its formula, and its recovery from a noisy recording of itself."""
+"""Every effect, compared with its formula."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAMES = catalogue.names()
 
 
 def history(epochs=400, step=5.0, fine=0.25, T=None, board=None):
-    """Frames every 5 s, offset to the readings; the true course on a fine polygon."""
+    """Return a history with frames every 5 s, offset from finely spaced readings of a course."""
     t = np.arange(0.0, epochs * step, fine)
     course = T or (lambda s: T0 + 12.0 * np.sin(s / 300.0))
     other = board or (lambda s: T0 + 5.0 * np.cos(s / 170.0))
@@ -32,7 +32,7 @@ def history(epochs=400, step=5.0, fine=0.25, T=None, board=None):
 
 
 def model(*listed, rates=None):
-    """A camera whose parameters are the sum of their courses: the distortion does not follow c."""
+    """Return a model whose distortion does not follow c, so that courses simply add."""
     return ThermalModel(
         camera="test",
         sensor=Sensor(3280, 2464, 0.00112),
@@ -45,7 +45,7 @@ def model(*listed, rates=None):
 
 
 def shift(h, *listed, rates=None):
-    """What effects add to the base model's prediction, (E, 16)."""
+    """Return what effects add to the base model's prediction, (E, 16)."""
     a = model(*listed, rates=rates).predict(h)
     b = model(rates=rates).predict(h)
     return np.hstack([a.iop - b.iop, a.eop - b.eop])
@@ -65,12 +65,12 @@ OFF = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_switched_off_changes_nothing(name):
+def test_an_effect_of_size_zero_changes_nothing(name):
     effect, h, field = catalogue.get(name), history(), corner_field("circles", 3, 200.0)
     values = {k: p.default for k, p in effect.nonlinear.items()}
     values |= dict.fromkeys(effect.usual, 0.0) | OFF.get(name, {})
     on, off = model(ModelEffect(name, values)).predict(h, field), model().predict(h, field)
-    # a lag of a microsecond is not off: it may differ by rate × tau × dT/dt = 1e-11 mm
+    # a lag of a microsecond may change values by rate × tau × dT/dt = 1e-11 mm
     np.testing.assert_allclose(on.iop, off.iop, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(on.eop, off.eop)
     np.testing.assert_array_equal(on.noise_factor, 1.0)
@@ -94,7 +94,7 @@ def test_thermal_lag_of_a_ramp_and_a_sine():
     assert np.all(added[:, [column(n) for n in PARAMETER_NAMES if n not in ("c", "x0", "y0")]] == 0)
 
 
-def test_mount_motion_follows_late_by_its_lag():
+def test_mount_motion_follows_with_a_lag():
     h = history()
     late = catalogue.get("thermal_lag").drive(h, tau=400.0) - T0
     added = shift(h, ModelEffect("mount_motion", {"tau": 400.0, "kappa": 1e-5, "X0": 3e-3}))
@@ -124,7 +124,7 @@ def test_hysteresis_of_a_triangle():
 
 
 T_SINE = lambda t: 12.0 * np.sin(t / 300.0)  # noqa: E731
-# parameters, coefficients, and what the coefficients multiply
+# parameters, coefficients, and the course that they multiply
 FORMULAS = {
     "nonlinear_expansion": ({}, {"c": 2e-6}, lambda t: T_SINE(t) ** 2),
     "softening": ({"T_k": 30.0}, {"y0": 1e-4}, lambda t: np.maximum(T_SINE(t) - 5.0, 0)),
@@ -171,27 +171,28 @@ def test_test_field_expansion_scales_each_axis():
     np.testing.assert_allclose(p.points(field.points)[-1], expected, rtol=1e-13)
 
 
-def test_target_displacement_moves_its_targets_alone():
+def test_target_displacement_moves_only_its_targets():
     h, field = history(), corner_field("circles", 3, 200.0)
     values = {"time": 500.0, "targets": ("x12", "z33"), "dX": 0.2, "dY": -0.1}
     moved = model(ModelEffect("target_displacement", values)).predict(h, field)
     change = moved.points(field.points) - field.points
     rows = [field.index["x12"], field.index["z33"]]
     late = h.times >= 500.0
-    np.testing.assert_allclose(change[np.ix_(late, rows)], np.broadcast_to([0.2, -0.1, 0], (late.sum(), 2, 3)), atol=1e-12)  # fmt: skip  # noqa: E501
+    expected = np.broadcast_to([0.2, -0.1, 0], (late.sum(), 2, 3))
+    np.testing.assert_allclose(change[np.ix_(late, rows)], expected, atol=1e-12)
     assert np.all(change[~late] == 0)
     assert np.all(np.delete(change, rows, axis=1) == 0)
     with pytest.raises(ConfigurationError, match="no target 'nobody'"):
         model(ModelEffect("target_displacement", {**values, "targets": "nobody"})).predict(h, field)
 
 
-READING = [n for n in NAMES if catalogue.get(n).kind != "image" or n in ("defocus",)]
+READING = [n for n in NAMES if catalogue.get(n).kind != "image" or n == "defocus"]
 
 
 @pytest.mark.parametrize("name", READING)
 @pytest.mark.parametrize("coarse", [False, True])
 def test_sensitivity_is_the_derivative(name, coarse):
-    """The matrix against differences; missing readings have no column."""
+    """The matrix equals differences; missing readings have no column."""
     rng = np.random.default_rng(3)
     step = 10.0 if coarse else 1.0
     t = np.arange(0, 70) * step + rng.uniform(-0.4, 0.4, 70) * step
@@ -209,7 +210,7 @@ def test_sensitivity_is_the_derivative(name, coarse):
     np.testing.assert_allclose(exact, by_differences, atol=5e-6)
 
 
-def test_two_drives_follow_each_other():
+def test_two_drives_are_applied_in_order():
     h = history()
     both = model(
         ModelEffect("time_offset", {"d": 20.0}), ModelEffect("thermal_lag", {"tau": 60.0})
@@ -219,7 +220,7 @@ def test_two_drives_follow_each_other():
     np.testing.assert_allclose(both, lagged, atol=1e-5)
 
 
-def test_past_begins_with_the_series():
+def test_the_temperature_before_a_series_is_its_first():
     h = history(T=lambda s: np.full_like(s, T0 + 7.0))
     for name, values in (("thermal_lag", {"tau": 500.0}), ("time_offset", {"d": 100.0}),
                          ("hysteresis", {"half_width": 3.0})):  # fmt: skip
@@ -227,18 +228,18 @@ def test_past_begins_with_the_series():
 
 
 @pytest.mark.parametrize(
-    ("values", "says"),
+    ("values", "reason"),
     [({}, "'tau' .s. is missing"), ({"tau": 3.0, "width": 1.0}, "no parameter 'width'")],
 )
-def test_bad_parameters(values, says):
-    with pytest.raises(ConfigurationError, match=says):
+def test_bad_parameters(values, reason):
+    with pytest.raises(ConfigurationError, match=reason):
         ModelEffect("thermal_lag", values)
 
 
-def test_words():
+def test_sentences():
     lag, play = catalogue.get("thermal_lag"), catalogue.get("hysteresis")
-    said = lag.sentence({"tau": {"value": 84.13, "sd": 1.92, "unit": "s"}})
-    assert said == "the camera follows the thermometer with a lag of 84.1 ± 1.9 s"
+    sentence = lag.sentence({"tau": {"value": 84.13, "sd": 1.92, "unit": "s"}})
+    assert sentence == "the camera follows the thermometer with a lag of 84.1 ± 1.9 s"
     assert lag.experiment_against(play) == (
         "hold the lamp at 45 °C for 20 minutes: a thermal lag settles, hysteresis does not settle: "
         "it stays where it is"
@@ -248,7 +249,7 @@ def test_words():
             assert a == b or catalogue.get(a).experiment_against(catalogue.get(b))
 
 
-def test_a_play_is_unsure_at_both_ends_of_its_rest_and_nowhere_else():
+def test_a_play_is_uncertain_only_at_both_ends_of_its_rest():
     knots = np.arange(0.0, 400.0, 10.0)
     T = np.interp(knots, [0.0, 200.0, 390.0], [0.0, 20.0, 1.0])  # up and down by 0.1 K/s
     rest = play(knots, T, 3.0, knots)

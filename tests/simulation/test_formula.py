@@ -1,4 +1,4 @@
-"""Formulas: read as text, evaluated against plain numpy, errors carried through, never executed."""
+"""Formulas: parsed from text, never executed; values as by numpy, errors propagated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ B = 31.0 + 6.0 * np.cos(SECONDS / 120.0)
 
 @pytest.fixture
 def history():
-    """Read every second, asked for every ten; a humidity was recorded beside it."""
+    """Return a history read every second, evaluated every 10 s, with a column of humidity."""
     frames = SECONDS[::10]
     return History(
         frames, SECONDS, {"temperature": T, "board": B}, "temperature", 25.0,
@@ -33,7 +33,7 @@ def history():
 
 
 def stepped(x, tau, fading=False):
-    """A lag, or a peak that fades, second by second."""
+    """Compute a lag, or a fading peak, second by second."""
     out, state = [], x[0]
     for v in x:
         state = v if fading and v > state else v + (state - v) * np.exp(-1.0 / tau)
@@ -65,20 +65,20 @@ CASES = {
 
 
 @pytest.mark.parametrize("text", CASES)
-def test_a_formula_is_what_numpy_makes_of_it(history, text):
+def test_a_formula_equals_numpy(history, text):
     values, expected = CASES[text]
     effect = catalogue.get(text)
     found = effect.signal(history, **values)[:, 0]
-    if expected is None:  # a backlash: never further away than its half-width, and it moves
+    if expected is None:  # a backlash stays within its half-width, and reaches it
         assert np.max(np.abs(found - T[::10])) == pytest.approx(1.5, abs=1e-6)
         return
     size = np.ptp(expected)
-    # the polygon's rates are those of parabolas, at the ends one-sided
+    # rates are from parabolas, one-sided at the ends
     assert found[1:-1] == pytest.approx(expected[::10][1:-1], abs=0.012 * size)
 
 
 @pytest.mark.parametrize("text", CASES)
-def test_errors_of_readings_are_carried_as_differences_say(history, text):
+def test_the_sensitivity_equals_differences(history, text):
     values, _ = CASES[text]
     effect = catalogue.get(text)
     short = History(
@@ -90,8 +90,8 @@ def test_errors_of_readings_are_carried_as_differences_say(history, text):
     assert mine == pytest.approx(by_differences, abs=0.07 * np.abs(by_differences).max())
 
 
-def test_a_product_of_two_thermometers_carries_the_errors_of_both(history):
-    """The variance by both matrices is the scatter of what noisy readings give."""
+def test_a_product_of_two_thermometers_propagates_the_errors_of_both(history):
+    """The variance from both matrices is the scatter with noisy readings."""
     effect = catalogue.get("product(offset(temperature, a), board)")
     values = {"a": 20.0}
     sd = {"temperature": 0.05, "board": 0.15}
@@ -111,12 +111,12 @@ def test_a_product_of_two_thermometers_carries_the_errors_of_both(history):
     assert np.mean(first) < 0.9 * scatter
 
 
-def test_every_operator_is_tried():
+def test_every_operator_is_tested():
     named = {name for text in CASES for name in OPERATORS if f"{name}(" in text}
     assert named == set(OPERATORS)
 
 
-def test_text_and_tree_are_the_same():
+def test_text_and_tree_convert_without_loss():
     for text in CASES:
         assert parse(text).text() == text
         bound = parse(text).bound(CASES[text][0])
@@ -124,7 +124,7 @@ def test_text_and_tree_are_the_same():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reason"),
     [
         ("__import__('os').system('x')", "not a recorded quantity"),
         ("integral(1 + 1)", "not a recorded quantity"),
@@ -138,12 +138,12 @@ def test_text_and_tree_are_the_same():
         ("lag(", "cannot be read"),
     ],
 )
-def test_what_is_no_formula_is_refused(text, said):
-    with pytest.raises(ConfigurationError, match=said):
+def test_other_texts_than_formulas_are_refused(text, reason):
+    with pytest.raises(ConfigurationError, match=reason):
         catalogue.get(text)
 
 
-def test_units_and_words():
+def test_units_and_sentences():
     effect = catalogue.get("integral(above(temperature, k))")
     assert effect.units()["k"] == "degC"
     assert effect.units()["x0"] == "mm/(K s)"
@@ -161,13 +161,13 @@ def test_a_number_in_a_formula_does_not_split_its_name():
     assert model.with_values({name: 2e-4}).value(name) == 2e-4
 
 
-def test_a_column_that_was_not_recorded_is_named(history):
+def test_a_missing_column_is_named(history):
     effect = catalogue.get('lag(column("pressure"), tau)')
     with pytest.raises(DataError, match=r"no recorded column 'pressure'.*humidity"):
         effect.signal(history, tau=30.0)
 
 
-def test_an_effect_file_is_read_as_it_was_written(tmp_path):
+def test_an_effect_file_round_trip(tmp_path):
     path = tmp_path / "proposal.yaml"
     effect = ModelEffect(
         "lag(above(temperature, k), tau)", {"k": 31.5, "tau": 80.0, "x0": 1e-4}, {"tau": 2.0}
@@ -182,8 +182,8 @@ def test_an_effect_file_is_read_as_it_was_written(tmp_path):
         read_effects(path)
 
 
-def test_a_constant_that_is_not_known_is_not_stated_to_a_tenth_of_a_kelvin():
-    """The tail of a tanh is an exponential: middle, width and size lie on a ridge."""
+def test_an_undetermined_constant_is_rounded():
+    """The tail of a tanh is an exponential, so middle, width and size are on a ridge."""
     effect = catalogue.get("saturation(temperature, k, w)")
     k, w = effect.nonlinear
     width = {"value": 288.2, "sd": None, "unit": "K"}
@@ -193,8 +193,8 @@ def test_a_constant_that_is_not_known_is_not_stated_to_a_tenth_of_a_kelvin():
     assert "tanh((T − about 3.8e+03 °C) / about 2.9e+02 K)" in effect.sentence({"a_c": {}, **far})
 
 
-def test_what_is_known_of_tied_constants_has_true_standard_deviations():
-    """y = r T + a exp(T / w), 300 times: slope and curvature err by what is stated."""
+def test_slope_and_curvature_of_correlated_constants_have_true_sds():
+    """300 draws of y = r T + a exp(T / w)."""
     from scipy.optimize import curve_fit
 
     rng, T, off = np.random.default_rng(5), np.linspace(20.0, 45.0, 60), []
@@ -214,7 +214,7 @@ def test_what_is_known_of_tied_constants_has_true_standard_deviations():
         parts = {"slope": true[1], "curvature": 2.0 * true[2]}
         found = {part: known[part]["c"] for part in parts}
         off.append([(found[p]["value"] - value) / found[p]["sd"] for p, value in parts.items()])
-    # 300 draws know a ratio to 4 %
+    # 300 draws give a ratio to 4 %
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(off), axis=0)), 1.0, atol=0.12)
     assert known["parameters"] == ["w"]
 
@@ -222,7 +222,7 @@ def test_what_is_known_of_tied_constants_has_true_standard_deviations():
 @pytest.mark.parametrize(
     "text", ["rate(saturation(temperature, k, w))", "product(time, above(temperature, k))"]
 )
-def test_what_is_no_function_of_the_temperature_has_no_slope(text):
+def test_other_functions_than_of_temperature_have_no_slope(text):
     names = [name for name, _, _ in parse(text).free()]
     values = {**dict.fromkeys(names, 30.0), "a": 1.0, "rate": 0.0}
     known = known_together(text, values, ("c",), np.ones((len(values),) * 2), (20.0, 30.0, 45.0))

@@ -1,9 +1,10 @@
-"""The heat network against closed-form solutions, and independence of how time is cut."""
+"""The heat network, compared with closed-form solutions and other time steps."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from thermocald.errors import ConfigurationError
 from thermocald.physics.heat import Course, HeatNetwork
@@ -13,7 +14,7 @@ TIMES = np.arange(0.0, 1500.0, 7.3)
 
 
 def test_one_body_pulse_of_power():
-    """A jump in the middle, not at any instant that is asked for."""
+    """The power jumps between two of the output instants."""
     network = HeatNetwork({"a": 150.0}, (("a", "ambient", 0.5),))
     lamp = Course.steps([0.0, 511.11, 2000.0], [5.0, 0.0])
     T = network.solve(TIMES, 22.0, {"a": lamp}, AIR)["a"]
@@ -31,9 +32,9 @@ def two_bodies():
 
 
 def eigen_solution(t, T0, forcing):
-    """dT/dt = A T + f for two bodies, by the eigenvalues of the unsymmetric A."""
+    """Solve dT/dt = A T + f for two bodies by the eigenvalues of the unsymmetric A."""
     A = np.array([[-0.6 / 150, 0.1 / 150], [0.1 / 20, -0.1 / 20]])
-    # A is similar to a symmetric matrix: its modes are real, in whatever type NumPy returns them
+    # A is similar to a symmetric matrix, so its modes are real; NumPy may return them as complex
     rate, vectors = (np.real_if_close(part) for part in np.linalg.eig(A))
     assert np.isrealobj(rate)
     assert np.isrealobj(vectors)
@@ -49,12 +50,13 @@ def test_two_bodies_step():
 
 
 def test_two_bodies_ramp():
-    """The derivative of the answer to a ramp is the answer to a step."""
+    """The derivative of the response to a ramp is the response to a step."""
     ramp = {"ambient": Course.polygon([0.0, 1500.0], [0.0, 1500.0 * 0.02])}
     T = two_bodies().solve(TIMES, 0.0, {}, ramp)
-    from scipy.integrate import quad
 
-    step = lambda s, k: eigen_solution(np.array([s]), np.zeros(2), np.array([0.02 * 0.5 / 150, 0]))[0, k]  # fmt: skip  # noqa: E501, E731
+    def step(s, k):
+        return eigen_solution(np.array([s]), np.zeros(2), np.array([0.02 * 0.5 / 150, 0]))[0, k]
+
     for k, name in enumerate("ab"):
         for i in (10, 100, 205):
             expected = quad(step, 0, TIMES[i], args=(k,), epsabs=1e-11)[0]
@@ -71,7 +73,7 @@ def test_halving_the_step_changes_nothing():
 
 
 def test_energy_is_conserved():
-    """Two bodies alone in the world: what goes in stays in."""
+    """Two isolated bodies keep their heat."""
     network = HeatNetwork({"a": 30.0, "b": 7.0}, (("a", "b", 0.2),))
     T = network.solve(TIMES, [20.0, 60.0], {"b": Course.constant(0.3)}, {})
     energy = 30.0 * T["a"] + 7.0 * T["b"]
@@ -79,14 +81,14 @@ def test_energy_is_conserved():
 
 
 @pytest.mark.parametrize(
-    ("capacities", "links", "says"),
+    ("capacities", "links", "reason"),
     [
         ({"a": 3.0}, (("air", "ambient", 0.1),), "neither 'air' nor 'ambient'"),
         ({}, (), "at least one body"),
     ],
 )
-def test_impossible_networks(capacities, links, says):
-    with pytest.raises(ConfigurationError, match=says):
+def test_impossible_networks(capacities, links, reason):
+    with pytest.raises(ConfigurationError, match=reason):
         HeatNetwork(capacities, links)
 
 

@@ -1,4 +1,4 @@
-"""The rendering mock camera: it sees what its truth says, and fails as hardware fails."""
+"""The rendering mock camera: its frames agree with its truth, and it fails like hardware."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_frame_shows_the_known_drift(camera):
     assert np.sqrt(np.mean((seen.points - expected[seen.targets]) ** 2)) < 0.04
 
 
-def test_same_instant_same_frame():
+def test_equal_instants_give_equal_frames():
     frames = []
     for _ in range(2):
         clock = VirtualClock()
@@ -87,7 +87,7 @@ def test_faults(camera):
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "reason"),
     [
         ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
         ({"programme": "hot"}, r"valid list"),
@@ -95,6 +95,6 @@ def test_faults(camera):
         ({"faults": [{"kind": "bored"}]}, "input should be 'timeout'"),
     ],
 )
-def test_bad_options(options, says):
-    with pytest.raises(ConfigurationError, match=says):
+def test_bad_options(options, reason):
+    with pytest.raises(ConfigurationError, match=reason):
         MockCamera(clock=VirtualClock(), **options)

@@ -1,4 +1,4 @@
-"""Model, camera and programme files: round trip, and one clear error for each way to be wrong."""
+"""Model, camera and programme files: round trips, and a clear error for each fault."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_round_trip(tmp_path):
     assert model.version == 4
 
 
-def test_a_number_outside_the_matrix_has_its_standard_deviation():
+def test_a_number_outside_the_matrix_keeps_its_standard_deviation():
     names = ("thermal_lag.tau", "second_heat_source.c", "interior.c", "interior.A1")
     known = full_model().covariance_of(names)
     assert np.allclose(np.diag(known), [3.6, 1e-14, 1e-8, 0.0], rtol=1e-12, atol=0.0)
@@ -108,7 +108,7 @@ def test_camera_file(tmp_path):
     assert device.network.boundaries == ("ambient",)
 
 
-def test_a_camera_and_its_model_together_take_the_place_of_a_preset_s(tmp_path):
+def test_a_given_camera_and_model_replace_those_of_a_preset(tmp_path):
     sensor = Sensor(1640, 1232, 0.00224)
     write_model(tmp_path / "m.yaml", replace(full_model(), sensor=sensor))
     camera = write(tmp_path / "c.yaml", CAMERA)
@@ -195,19 +195,20 @@ FILES = {
 
 
 @pytest.mark.parametrize(
-    ("kind", "path", "value", "says"), [(kind, *row) for kind, rows in BAD.items() for row in rows]
+    ("kind", "path", "value", "reason"),
+    [(kind, *row) for kind, rows in BAD.items() for row in rows],
 )
-def test_a_file_that_is_wrong_is_named_with_its_key(tmp_path, kind, path, value, says):
+def test_a_fault_is_reported_with_file_and_key(tmp_path, kind, path, value, reason):
     read, right = FILES[kind]
     document = copy.deepcopy(right)
     change(document, path, value)
-    with pytest.raises(ConfigurationError, match=says) as error:
+    with pytest.raises(ConfigurationError, match=reason) as error:
         read(write(tmp_path / "m.yaml", document))
     assert "m.yaml" in str(error.value) or "csv" in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("rows", "says"),
+    ("rows", "reason"),
     [
         ("0,20\n300,21\n1300,22\n", "line 4: a gap of 1000 s"),
         ("0,20\n300,21\n200,22\n", "line 4: time runs backwards"),
@@ -216,14 +217,14 @@ def test_a_file_that_is_wrong_is_named_with_its_key(tmp_path, kind, path, value,
         ("0,20\n300,nan\n900,22\n", "not finite"),
     ],
 )
-def test_logs_with_gaps(tmp_path, rows, says):
+def test_faulty_logs(tmp_path, rows, reason):
     (tmp_path / "log.csv").write_text("time,temperature\n" + rows)
     document = {**PROGRAMME, "ambient": {"log": "log.csv", "largest_gap": 500.0}}
-    with pytest.raises(ConfigurationError, match=says):
+    with pytest.raises(ConfigurationError, match=reason):
         read_programme(write(tmp_path / "p.yaml", document))
 
 
-def test_a_log_is_played_in(tmp_path):
+def test_a_log_drives_a_boundary(tmp_path):
     (tmp_path / "log.csv").write_text("t,air\n100,20\n600,30\n1100,25\n")
     played = {"log": "log.csv", "time": "t", "value": "air"}
     programme = read_programme(write(tmp_path / "p.yaml", {**PROGRAMME, "ambient": played}))

@@ -1,4 +1,4 @@
-"""Recordings: noise as stated, misses and gross errors as asked, readings of instruments."""
+"""Simulated recordings: noise, missing targets and gross errors as given; readings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def simulation(epochs=180, seed=1, effects=(), measuring=None, field=None, **cha
     return Simulation(model, device, test_field, replace(programme, **changes), seed)
 
 
-def test_noise_misses_and_gross_errors_are_as_asked():
+def test_noise_missing_targets_and_gross_errors_are_as_given():
     s = simulation(epochs=300, measuring=Measuring(0.05, 0.1, 0.01, 5.0))
     true = s.image_points(slice(0, 300))
     rows = list(s.observations())
@@ -43,7 +43,7 @@ def test_noise_misses_and_gross_errors_are_as_asked():
     visible = s.model.sensor.contains(true, 5.0).sum()
     assert abs(len(error) / visible - 0.9) < 0.01
     gross = np.abs(error).max(axis=1) > 6 * 0.05
-    # a gross error of 5 px is below 0.3 px in both coordinates in 1 of 400 cases
+    # a gross error with an sd of 5 px is below 0.3 px in both coordinates in 1 of 400 cases
     assert abs(gross.mean() - 0.01) < 0.003
     good = error[~gross]
     assert abs(good.std() / 0.05 - 1) < 0.02
@@ -51,7 +51,7 @@ def test_noise_misses_and_gross_errors_are_as_asked():
     assert all(np.all(o.sigmas == 0.05) for o in rows)
 
 
-def test_defocus_is_in_the_noise_alone():
+def test_defocus_affects_the_noise_only():
     s = simulation(effects=[ModelEffect("defocus", {"factor": 0.1})])
     plain = simulation()
     a, b = list(s.observations()), list(plain.observations())
@@ -63,7 +63,7 @@ def test_defocus_is_in_the_noise_alone():
     np.testing.assert_allclose(ratio[good], s.truth.noise_factor[k], rtol=1e-6)
 
 
-def test_thermometers_are_instruments():
+def test_errors_of_thermometers():
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 5000.0, 1.0)
     T = 20.0 + 0.01 * t
@@ -96,7 +96,7 @@ def test_frames_and_readings_have_their_own_instants():
     assert 0.2 < np.diff(s.frame_times).std() / np.sqrt(2) < 0.4
 
 
-def test_written_and_read_again(tmp_path):
+def test_a_written_recording_is_read(tmp_path):
     s = simulation(epochs=12)
     done = []
     s.write(tmp_path / "r", advance=done.append)
@@ -116,7 +116,7 @@ def test_another_camera_is_refused():
         replace(s, device=replace(s.device, sensor=Sensor(640, 480, 0.005)))
 
 
-def test_nothing_in_sight_is_said():
+def test_a_view_without_targets_is_refused():
     s = simulation()
     away = s.model.exterior.with_values(kappa=0.0, phi=3.0)
     with pytest.raises(GeometryError, match="the camera sees 0 of 147 targets"):

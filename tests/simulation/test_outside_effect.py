@@ -1,4 +1,4 @@
-"""An effect is one file: one from outside is simulated, fitted, discovered and documented."""
+"""An effect from another package is simulated, fitted, discovered and documented."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ print(reference._effect_page())
 
 
 def outside(folder: Path) -> None:
-    """A small distribution on a path: one module, one entry point."""
+    """Write a small distribution: one module, one entry point."""
     (folder / "saturation.py").write_text(OUTSIDE)
     info = folder / "saturation-1.0.dist-info"
     info.mkdir()
@@ -107,7 +107,7 @@ def test_an_effect_from_outside(tmp_path):
     assert "Adds a tanh" in listed
 
 
-def test_a_class_that_is_no_effect_is_refused(tmp_path):
+def test_other_classes_than_effects_are_refused(tmp_path):
     outside(tmp_path)
     (tmp_path / "saturation.py").write_text("class Saturation:\n    pass\n")
     ran = python(
@@ -118,7 +118,7 @@ def test_a_class_that_is_no_effect_is_refused(tmp_path):
 
 
 def test_no_module_outside_the_catalogue_names_an_effect():
-    """Neither as a string nor as a class; modules that cannot reach the catalogue may use words."""
+    """Neither as a string nor as a class; only modules without the catalogue may use words."""
     root = Path(thermocald.__file__).parent
     names = set(catalogue.names())
     classes = {type(catalogue.get(name)).__name__ for name in names}

@@ -1,4 +1,4 @@
-"""The presets against what the reference reports (Elias et al. 2020, sections 4.1 and 4.2)."""
+"""The presets, compared with the reference study (Elias et al. 2020, sections 4.1 and 4.2)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import pytest
 from thermocald.errors import ConfigurationError
 from thermocald.physics.presets import PRESETS, preset_simulation
 
-# preset: principal point px, principal distance mm, where it goes (right, up), as the text has it;
-# share below 1.5 cm %, mean cm, mean of the nine maxima cm: table 7 and text of 4.4
+# preset: change of principal point px and of c mm, direction (right, up), from the text; share
+# below 1.5 cm in %, mean cm, mean of the nine maxima cm, from table 7 and section 4.4
 REFERENCE = {
     "nexus5-cold": (16, 0.007, (1, -1), 67, 1.3, 6.2),
     "nexus5-warm": (8, 0.003, (1, -1), 98, 0.6, 2.9),
@@ -19,15 +19,15 @@ REFERENCE = {
 }
 
 
-def test_all_five():
+def test_all_five_presets_are_here():
     assert set(PRESETS) == set(REFERENCE)
     with pytest.raises(ConfigurationError, match="known are: nexus5-cold"):
         preset_simulation("nexus6")
 
 
 @pytest.mark.parametrize("name", REFERENCE)
-def test_drift_and_errors_in_object_space_are_the_references(name):
-    """Shares within 3 points, means within 0.1 cm, mean maxima within 15 %."""
+def test_drift_and_errors_in_object_space_agree_with_the_reference(name):
+    """Shares agree to 3 points, means to 0.1 cm, mean maxima to 15 %."""
     s = preset_simulation(name, seed=3)
     assert s.programme.epochs == 150
     assert s.programme.interval == 10.0
@@ -55,7 +55,7 @@ def test_drift_and_errors_in_object_space_are_the_references(name):
     assert abs(found.max(axis=0).mean() / maximum - 1) < 0.15
 
 
-def test_rpi_comes_back_along_a_line_but_not_fully():
+def test_the_rpi_returns_along_a_line_but_not_completely():
     s = preset_simulation("rpi-v2.1-heating")
     path = s.truth.iop[:, 1:3] - s.truth.iop[0, 1:3]
     length = np.linalg.norm(path, axis=1)
@@ -63,7 +63,7 @@ def test_rpi_comes_back_along_a_line_but_not_fully():
     along = path[hottest] / length[hottest]
     across = path @ np.array([-along[1], along[0]])
     assert np.abs(across).max() < 1e-3 * length[hottest]
-    # what the temperature alone would leave at the end, and what stays on top of it
+    # the temperature's share at the end, and the permanent part
     T = s.true_history.temperature()
     cooled = (T[-1] - T[0]) / (T.max() - T[0])
     assert 0.02 < length[-1] / length[hottest] - cooled < 0.10
@@ -74,7 +74,7 @@ def test_rpi_comes_back_along_a_line_but_not_fully():
 
 
 def object_errors(s, sets, rng):
-    """Distances cm at 10 m between nine image points' rays of drawn IOP and of the mean IOP."""
+    """Return distances, cm, at 10 m between the rays of drawn IOP and of the mean IOP (sets, 9)."""
     sd = s.truth.iop[:, :3].std(axis=0, ddof=1)
     c = s.model.interior.c
     sensor = s.model.sensor

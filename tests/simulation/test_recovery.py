@@ -1,9 +1,9 @@
-"""Every effect's parameters are found again in a noisy recording of it, within 3 sd.
+"""Every effect's parameters are estimated from a noisy recording within 3 sd.
 
-The recording is written and read as a user's would be: 0.04 px image noise, 2 % of targets missed,
-0.2 % gross errors, a thermometer of 0.04 K noise and 0.0625 K steps read up to 1 s beside the
-frame. The fit is the one users have (`analysis.thermal_model`), which searches the non-linear
-parameters over their whole range; start values are not given to it.
+The recording is written and read as a user's: 0.04 px of image noise, 2 % of targets missing, 0.2 %
+gross errors, a thermometer with 0.04 K of noise and 0.0625 K steps, read up to 1 s before or after
+the frame. The fit is the user's (`analysis.thermal_model`), which searches the whole range of
+non-linear parameters.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from thermocald.thermal.source import series_input
 
 PX = 0.00112
 
-# effect: true values of about a third of a pixel, and what the fit is told beforehand
+# effect: true values of about a third of a pixel, and initial values of the fit
 CASES = {
     "thermal_lag": ({"tau": 84.0}, {"tau": 10.0}),
     "time_offset": ({"d": 12.0}, {"d": 0.0}),
@@ -64,10 +64,10 @@ CASES = {
 
 
 def record(tmp_path, effect, seed=8):
-    """A lamp twice on and off, a processor that works now and then, 180 epochs of 10 s.
+    """Record 180 epochs of 10 s with a lamp twice on and off, and a processor that sometimes works.
 
-    The lens follows both slowly enough that straight lines between readings are its course: where
-    they are not, no estimate from these readings can be right to its standard deviation.
+    The lens follows slowly enough for straight lines between readings. Otherwise no estimate from
+    these readings could be right within its standard deviation.
     """
     field = demonstration_field("plain")
     model = demonstration_model(field).with_effect(effect)
@@ -88,7 +88,7 @@ def test_every_effect_is_here():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_parameters_are_found_again(tmp_path, name):
+def test_parameters_are_recovered(tmp_path, name):
     true, known = CASES[name]
     simulation, recording = record(tmp_path, ModelEffect(name, true))
     series = reduce_series(series_input(recording), strict=False)
@@ -101,7 +101,7 @@ def test_parameters_are_found_again(tmp_path, name):
             continue
         sd = found.sds[key]
         assert 0 < sd < np.inf
-        # an event lies anywhere between two frames: ± half an interval, √12/2 of its sd
+        # an event is anywhere between two frames: ± half an interval, √12/2 of its sd
         limit = np.sqrt(3.0) * sd * (1 + 1e-9) if key == "time" else 3 * sd
         assert abs(found.values[key] - value) <= limit, (key, found.values[key], value, sd)
     for key in ("c", "x0", "y0"):
@@ -109,8 +109,8 @@ def test_parameters_are_found_again(tmp_path, name):
         assert abs(error) < 3 * fitted.model.sd(f"rates.{key}"), key
     assert abs(fitted.fitted["sigma0"] - 1.0) < 0.03 or name == "defocus"
     if name == "thermal_lag":
-        # the thermometer's noise and steps together, from the image points alone: a lag of 8
-        # epochs lets some 180 / 8 independent values of it through, so 3 sd are 45 %
+        # the thermometer's noise with its steps, from the image points alone: a lag of 8 epochs
+        # leaves some 180 / 8 independent values, so 3 sd are 45 %
         noise = fitted.fitted["series"][0].thermometer_sd / np.hypot(0.04, 0.0625 / 12**0.5)
         assert abs(noise - 1) < 0.45
         exact = replace(simulation.model, exterior=simulation.exterior)

@@ -1,4 +1,4 @@
-"""Rendered frames: where the targets are, how fast, and the same on every machine."""
+"""Rendered frames: positions of the targets, and equal frames on every machine."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from thermocald.photogrammetry.camera.camera_model import (
     CameraSpec,
@@ -15,6 +16,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     project,
 )
 from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.markers import locate_markers
 from thermocald.physics import shapes as portable
@@ -32,7 +34,7 @@ CLEAN = Look(noise_dn=0.0, vignetting=0.0)
 
 
 def outline_centroid(field, normals, row, sensor, iop, eop):
-    """The centroid of the projected circle (Green's theorem), by the camera model itself."""
+    """Return centroid and area of the projected circle (Green's theorem), by the camera model."""
     normal = normals[row]
     u = np.cross(normal, [0.3, 0.5, 0.8])
     u /= np.linalg.norm(u)
@@ -47,7 +49,7 @@ def outline_centroid(field, normals, row, sensor, iop, eop):
 
 
 def test_centres_agree_with_the_projected_truth():
-    """No noise: intensity-weighted centroids against the projected outline, 0.01 px RMS."""
+    """Without noise, intensity-weighted centroids agree with the projected outline."""
     field = demonstration_field("plain")
     model = demonstration_model(field)
     iop, eop = model.interior.as_array(), model.exterior.as_array()
@@ -69,7 +71,7 @@ def test_centres_agree_with_the_projected_truth():
 
 
 def test_corners_agree_with_the_projected_truth():
-    """No noise, almost no distortion inside a marker: the corner fit of `markers`, 0.01 px RMS."""
+    """Without noise and distortion, fitted corners agree to 0.01 px RMS."""
     field = demonstration_field("markers")
     iop = InteriorOrientation(c=3.04, x0=0.012, y0=-0.018).as_array()
     eop = corner_view(field, 1330.0).as_array()
@@ -81,10 +83,10 @@ def test_corners_agree_with_the_projected_truth():
 
 
 @pytest.mark.slow
-def test_corners_err_as_stated_wherever_in_a_pixel():
-    """Blurred on the pixel grid, corners would err by 1.16 times their sds, in step with the phase.
+def test_corners_have_true_sds_at_any_position_in_a_pixel():
+    """With blur on the pixel grid, errors would be 1.16 sds and depend on the position.
 
-    6 frames of 190 corners tell the ratio to 2 %.
+    6 frames of 190 corners give the ratio to 2 %.
     """
     field = demonstration_field("markers")
     eop = corner_view(field, 1330.0).as_array()
@@ -109,14 +111,12 @@ def test_blur_noise_vignetting():
     image = Scene(sensor, field, look).render(iop, eop, seed=5).astype(float)
     clean = Scene(sensor, field, Look(noise_dn=0, vignetting=0.3, blur_px=1.2)).render(iop, eop)
     noise = (image - clean)[100:]
-    assert abs(noise.std() - np.hypot(2.5, 0.35)) < 0.1  # and the two roundings
+    assert abs(noise.std() - np.hypot(2.5, 0.35)) < 0.1  # with two roundings
     assert abs(noise.mean()) < 0.04  # 1/64 DN keeps the clean frame off half-way values
     r2 = ((np.arange(641) - 320.0) ** 2)[None] + ((np.arange(481) - 240.0) ** 2)[:, None]
     expected = 200 * (1 - 0.3 * r2 / (320.0**2 + 240.0**2))
     assert np.abs(clean[:250] - expected[:250]).max() < 1.0
-    # the edge of the disc: a normal distribution of the blur
-    from scipy.stats import norm
-
+    # the edge of the disc is a normal distribution function
     plain = Scene(sensor, field, Look(noise_dn=0, vignetting=0, blur_px=1.2)).render(iop, eop)
     cx, cy = project(sensor, iop, eop, field.points)[0]
     row = plain[round(cy), :].astype(float)
@@ -127,7 +127,7 @@ def test_blur_noise_vignetting():
 
 
 def test_out_of_sight():
-    """Behind the camera, beside the image, seen from the back: nothing is drawn, nothing breaks."""
+    """Targets behind the camera, outside the image, or seen from the back are not drawn."""
     field = corner_field("markers", 2, 200.0)
     scene = Scene(SENSOR, field, CLEAN)
     iop = InteriorOrientation(c=3.04).as_array()
@@ -142,7 +142,7 @@ def test_out_of_sight():
 
 
 def test_same_frame_from_the_same_seed():
-    """Bit for bit: these sums were found on x86-64 (AVX2); any other machine must find them too."""
+    """The hash is from x86-64 (AVX2) and must be the same on any machine."""
     field = corner_field("circles", 4, 150.0)
     model = demonstration_model(field)
     sensor = Sensor(820, 616, 0.00448)
@@ -170,18 +170,12 @@ def test_portable_arithmetic_is_right():
     field = corner_field("plain", 3, 200.0)
     iop = np.array([3.04, 0.01, -0.02, -0.004, 5e-4, 1e-5, 1e-4, -2e-4, 3e-4, -2e-4])
     eop = corner_view(field, 1200.0).with_values(kappa=0.4).as_array()
-    np.testing.assert_allclose(
-        portable.project(SENSOR, iop, eop, field.points),
-        project(SENSOR, iop, eop, field.points),
-        rtol=0,
-        atol=1e-9,
-    )
+    image = portable.project(SENSOR, iop, eop, field.points)
+    np.testing.assert_allclose(image, project(SENSOR, iop, eop, field.points), rtol=0, atol=1e-9)
 
 
-def test_a_coded_field_is_measured_from_nothing():
-    """Drawn the way it is read: found by ring codes, measured with the true centres' sigmas."""
-    from thermocald.photogrammetry.frame.measurement import measure
-
+def test_a_coded_field_is_measured_without_a_prior():
+    """Ring codes are found, and centres measured with true sigmas."""
     field = demonstration_field("circles")
     model = demonstration_model(field)
     iop, eop = model.interior.as_array(), model.exterior.as_array()

@@ -1,4 +1,4 @@
-"""`thermocald simulate`, as a user calls it."""
+"""The command `thermocald simulate`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_preset_to_recording_and_json(tmp_path):
     recording = read_recording(tmp_path / "r")
     expected = next(preset_simulation("nexus5-cold", seed=5).observations())
     np.testing.assert_allclose(recording.epochs[0].observations.points, expected.points, atol=1e-5)
-    # the model that was written, run again, gives the same recording
+    # the written model gives the same recording
     again = run("--preset", "nexus5-cold", "--model", tmp_path / "m.yaml", "--out", tmp_path / "s",
                 "--seed", 5)  # fmt: skip
     assert again.exit_code == 0
@@ -42,7 +42,7 @@ def test_preset_to_recording_and_json(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "reason"),
     [
         (["--preset", "nexus6", "--out", "r"], "unknown preset"),
         (["--preset", "nexus5-cold"], "--out is missing"),
@@ -50,12 +50,12 @@ def test_preset_to_recording_and_json(tmp_path):
         (["--model", "none.yaml", "--programme", "p.yaml", "--out", "r"], "cannot be read"),
     ],
 )
-def test_wrong_usage(tmp_path, monkeypatch, arguments, says):
+def test_wrong_usage(tmp_path, monkeypatch, arguments, reason):
     monkeypatch.chdir(tmp_path)
     result = run(*arguments)
     assert isinstance(result.exception, ThermocaldError)
     assert result.exception.exit_status == 2
-    assert says in str(result.exception)
+    assert reason in str(result.exception)
     assert not (tmp_path / "r").exists()
 
 

@@ -1,9 +1,9 @@
 #!/bin/bash
 # Build the guest of the laboratory: kernel, initial RAM disk, root file system. build.sh FOLDER
 #
-# A Debian 12 of the size that systemd, Python and the drivers' libraries need, with v4l2loopback
-# built for its kernel. thermocald itself is not in it: it is copied in at each run, so that a
-# change of the program does not build the guest again. Needs root, apt and a Python package index.
+# A small Debian 12 with systemd, Python, the drivers' libraries, and v4l2loopback built for its
+# kernel. thermocald is copied in at each run, so that a change of the program does not rebuild the
+# guest. Needs root, apt and a Python package index.
 set -euo pipefail
 out=$1
 here=$(cd "$(dirname "$0")" && pwd)
@@ -19,7 +19,7 @@ headers=$(dpkg-query -W -f '${Depends}' linux-headers-amd64 | grep -o 'linux-hea
 version=${headers#linux-headers-}
 say "kernel $version"
 
-# the root file system, while the rest goes on
+# the root file system, in the background
 packages=systemd,systemd-sysv,dbus,udev,kmod,python3,openssh-server,iproute2,procps,e2fsprogs
 packages=$packages,dmsetup,mosquitto
 mmdebstrap --quiet --variant=minbase --components=main --include=$packages --format=directory \
@@ -29,7 +29,7 @@ mmdebstrap --quiet --variant=minbase --components=main --include=$packages --for
     bookworm "$work/root" >"$work/mmdebstrap.log" 2>&1 &
 rootfs=$!
 
-# the libraries, for Debian 12's Python 3.11, likewise
+# the libraries for Debian 12's Python 3.11, likewise
 "$python" - "$checkout/pyproject.toml" >"$work/requirements.txt" <<'X'
 import sys, tomllib
 project = tomllib.load(open(sys.argv[1], "rb"))["project"]
@@ -57,7 +57,7 @@ wait $rootfs
 root=$work/root
 say "root file system"
 
-# the kernel modules that the laboratory uses, with what they need
+# the laboratory's kernel modules with their dependencies
 modules=$root/usr/lib/modules/$version
 mkdir -p "$modules/extra"
 depmod -b "$work/kernel" "$version"
@@ -93,7 +93,7 @@ chroot "$root" systemctl disable -q mosquitto
 chroot "$root" systemctl mask -q apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer \
     e2scrub_all.timer fstrim.timer systemd-timesyncd systemd-pstore >/dev/null 2>&1 || true
 rm -rf "$root"/var/cache/apt/* "$root"/var/lib/apt/lists/*
-# compiled once here instead of slowly in the emulated machine
+# compiled here, because the emulated machine is slow
 chroot "$root" python3 -m compileall -q -j 2 /opt/site >/dev/null 2>&1 || true
 say "configured"
 
@@ -101,7 +101,7 @@ rm -f "$out/root.ext4"
 mke2fs -q -t ext4 -E lazy_itable_init=1 -d "$root" "$out/root.ext4" 1800M
 say "image"
 
-# the initial RAM disk: as much as finds /dev/vda
+# the initial RAM disk, which mounts /dev/vda
 ram=$work/initrd
 mkdir -p "$ram"/{bin,lib,proc,sys,dev,root}
 cp /bin/busybox "$ram/bin/"

@@ -1,4 +1,4 @@
-"""How the epochs of the camera `river` stand: {status: epochs}, without the program."""
+"""Print {status: number of epochs} of the camera `river`, without the program."""
 
 import json
 import sqlite3

@@ -1,7 +1,6 @@
-"""Scenarios of drivers on real kernel drivers, run in the guest: check.py NAME [ARGUMENTS]
+"""Scenarios of drivers with real kernel drivers, run in the guest: check.py NAME [ARGUMENTS]
 
-Each prints one line of JSON: what the driver gave or which error it raised. The judgement is the
-test's, on the host.
+Each prints one line of JSON with the driver's results or errors, which the test on the host checks.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ TRANSIENT = ("BadReading", "DeviceGone", "DeviceTimeout")
 
 
 def outcome(action):
-    """What an action gave, or the error's name and text, and how long it took."""
+    """Run an action; return its result, or the error's name and text, and its time."""
     begin = time.monotonic()
     try:
         value, error, text = action(), None, ""
@@ -77,12 +76,12 @@ def feeder(width, height, pixel_format, fps=10.0):
 
 
 def times(*cases):
-    """{case: frames} of the loopback; a case is format:backend."""
+    """Return {case: frames} of the loopback; a case is format:backend."""
     return {case: written_and_captured(*case.split(":"), 640, 480) for case in cases}
 
 
 def written_and_captured(pixel_format, backend, width, height):
-    """Frames of the loopback, with the instants at which each was really written."""
+    """Return frames of the loopback with the times at which each was written."""
     with (
         feeder(width, height, pixel_format),
         camera("/dev/video40", width, height, pixel_format, backend=backend) as device,
@@ -94,7 +93,7 @@ def written_and_captured(pixel_format, backend, width, height):
             captured.append(
                 {"called": called, "took_s": time.monotonic() - called, **described(frame)}
             )
-            time.sleep(0.35)  # longer than the queue: old frames must not come
+            time.sleep(0.35)  # longer than the queue, so that an old frame would show
     written = {}
     with open(LOG) as log:
         for line in log:
@@ -106,7 +105,7 @@ def written_and_captured(pixel_format, backend, width, height):
 
 
 def stalls(backend):
-    """A feeder that stops, goes on, and dies; then another one."""
+    """Capture from a feeder that stops, goes on and is killed, and from a new one."""
     result = {}
     with feeder(320, 240, "GREY") as process:
         device = camera("/dev/video40", 320, 240, "GREY", timeout_s=1.5, backend=backend)
@@ -116,7 +115,7 @@ def stalls(backend):
         result["stopped"] = outcome(lambda: described(device.capture()))
         process.send_signal(signal.SIGCONT)
         device.close()
-        result["continued"] = until_captured(device)  # OpenCV gives the node back 10 s later
+        result["continued"] = until_captured(device)  # OpenCV releases the node 10 s later
         process.kill()
         process.wait()
         result["killed"] = outcome(lambda: described(device.capture()))
@@ -138,7 +137,7 @@ def write(path, text):
 
 
 def vivid():
-    """Real kernel faults: controls, an error flag, a fatal error, an unplug and a plug."""
+    """Check controls, and the kernel's faults: error flag, fatal error, unplug and plug."""
     result = {}
     device = camera(NODE, 640, 360, "GREY", timeout_s=3.0)
     result["opened"] = outcome(device.open)
@@ -186,7 +185,7 @@ def push(name):
 
 
 def until_open(device):
-    """Open again as the daemon does: until it works, udev makes the node a little later."""
+    """Open repeatedly, like the daemon, until it works; udev makes the node with a delay."""
     deadline = time.monotonic() + 20
     while True:
         last = outcome(device.open)
@@ -196,7 +195,7 @@ def until_open(device):
 
 
 def until_captured(device):
-    """As the daemon does: opened again after each error that may pass; permanent ones end it."""
+    """Open and capture, like the daemon, until there is no transient error."""
     deadline = time.monotonic() + 30
     while True:
         last = outcome(lambda: (device.open(), described(device.capture()))[1])
@@ -211,7 +210,7 @@ def thermometer(name, **options):
 
 
 def repeated(device, count=20):
-    """Values of some readings and the time that each took."""
+    """Return the values and times of some readings."""
     values, took = [], []
     for _ in range(count):
         begin = time.monotonic()
@@ -226,7 +225,7 @@ def swapped(value):
 
 
 def i2c(bus):
-    """The kernel's lm75 over i2c-stub, and our register drivers beside it."""
+    """Read the kernel's lm75 over i2c-stub, and chips by their registers."""
     import smbus2
 
     bus = int(bus)
@@ -249,7 +248,7 @@ def i2c(bus):
             write(f"/sys/bus/i2c/devices/i2c-{bus}/new_device", "tmp75 0x48")
         with thermometer("hwmon", chip="tmp75") as device:
             result["kernel"] = repeated(device)
-            put(0x48, 0, 0xE6F0)  # below freezing point; the kernel reads at most every 0.1 s
+            put(0x48, 0, 0xE6F0)  # below 0 °C; the kernel reads at most every 0.1 s
             time.sleep(1.5)
             result["kernel cold"] = outcome(lambda: dict(device.read().values))
             put(0x48, 0, 0x1910)
@@ -282,7 +281,7 @@ BME280 |= {0xFA: 0x7E, 0xFB: 0xED, 0xFC: 0x00}
 
 
 def kernel(bus):
-    """The kernel's bmp280 (iio) over i2c-stub, and the firmware's thermal zone."""
+    """Read the kernel's bmp280 (iio) over i2c-stub, and the firmware's thermal zone."""
     import smbus2
 
     bus, result = int(bus), {}
@@ -304,7 +303,7 @@ TMP117, CONFIGURATION, ONE_SHOT, READY = 0x4B, 1, 0x0C00, 0x2000
 
 
 def registers(bus):
-    """BME280 and TMP117 by their registers; the latter's conversions are a thread's."""
+    """Read BME280 and TMP117 by their registers; a thread makes the TMP117's conversions."""
     import threading
 
     import smbus2
@@ -336,7 +335,7 @@ def registers(bus):
 
 
 def serial_line(port, count=20):
-    """A real USB serial adapter's tty; the instrument is on the host."""
+    """Read the tty of a real USB serial adapter; the instrument is on the host."""
     options = {"port": port, "pattern": r"T=(?P<temperature>[-+]?\d+\.\d+)", "command": "T?\r\n"}
     with thermometer("serial", timeout_s=2.0, **options) as device:
         return repeated(device, int(count))
@@ -348,7 +347,7 @@ def serial_unplug(port):
 
 
 def ds18b20(*names, count="4"):
-    """Readings of probes on the kernel's 1-wire bus, with what was not believed."""
+    """Return readings of probes on the kernel's 1-wire bus, with reasons for missing ones."""
     options = {"sensors": dict(zip(("field", "air"), names, strict=False)), "timeout_s": 10}
     result = {"readings": []}
     device = thermometer("ds18b20", **options)
@@ -366,7 +365,7 @@ def ds18b20_unplug(name):
 
 
 def unplug(device):
-    """Reads until the adapter is pulled, then until it is back."""
+    """Read until the adapter is pulled, then until it is back."""
     device.open()
     result = {"before": outcome(lambda: dict(device.read().values))}
     write("/run/cable", "pull")
@@ -392,7 +391,7 @@ def unplug(device):
 
 
 def mqtt():
-    """A real broker: delivery, Home Assistant's discovery, the last will of a killed process."""
+    """Publish to a real broker: delivery, discovery messages, the last will of a killed process."""
     import paho.mqtt.client as client_module
 
     subprocess.run(["systemctl", "start", "mosquitto"], check=True)
@@ -436,7 +435,7 @@ def mqtt_publisher():
 
 
 def jsonl_full():
-    """A 1 MB file system that fills up in mid-line."""
+    """Fill a small file system in the middle of a line."""
     subprocess.run("mkdir -p /run/small && mount -t tmpfs -o size=64k none /run/small", shell=True,
                    check=True)  # fmt: skip
     device = open_device("output", "jsonl", {"path": "/run/small/r.jsonl"}, SystemClock())

@@ -1,11 +1,11 @@
-"""Feeds rendered frames into a v4l2loopback device and their temperatures into an I2C register.
+"""Feed rendered frames into a v4l2loopback device and their temperatures into an I2C register.
 
 feed.py DEVICE FRAMES.npy TEMPERATURES.npy LOG --fps F [--hold N] [--format GREY|YUYV|MJPG]
         [--bus B] [--go FILE]
 
-Writes frame n at n/F s: its image and temperature are those of n // hold (counted from FILE's
-appearance), the bars of its number in the top rows. Each line of LOG is: n, CLOCK_MONOTONIC before
-and after the write, temperature.
+Frame n is written at n/F s, with the image and temperature number n // hold (counted from the
+appearance of FILE), and the bars of n in its top rows. Each line of LOG is: n, CLOCK_MONOTONIC
+before and after the write, temperature.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def encode(image, fourcc):
 
 
 def opened(device, width, height, fourcc):
-    """The device as an output; while a reader has it open it takes no format."""
+    """Open the device as an output; retry while a reader has it open, when it accepts no format."""
     deadline = time.monotonic() + 60
     while True:
         out = open(device, "r+b", buffering=0)  # noqa: SIM115 - given to the caller
@@ -60,7 +60,7 @@ def main():
     options.add_argument("--hold", type=int, default=1)
     options.add_argument("--format", default="GREY")
     options.add_argument("--bus", type=int)
-    options.add_argument("--go", help="show the first frame until this file is there")
+    options.add_argument("--go", help="repeat the first frame until this file exists")
     given = options.parse_args()
     frames = np.load(given.frames, mmap_mode="r")
     temperatures = np.load(given.temperatures)

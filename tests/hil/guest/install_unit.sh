@@ -1,5 +1,5 @@
 #!/bin/sh
-# Install the unit that thermocald ships: install_unit.sh FOLDER. Its users and rules come with it.
+# Install thermocald's unit with its users and rules: install_unit.sh FOLDER
 set -eu
 folder=$1
 for group in video dialout plugdev i2c gpio; do
@@ -23,8 +23,7 @@ printf '#!/bin/sh\nexec /usr/bin/python3 -m thermocald "$@"\n' >/opt/thermocald/
 chmod 755 /opt/thermocald/bin/thermocald
 chmod -R a+rX /opt/thermocald /etc/thermocald
 cp "$folder"/thermocald.service /etc/systemd/system/
-# an emulated machine is slow, a test impatient: only the times are the laboratory's, and that a
-# crash says where it was
+# only for the slow emulated machine: other times, and a traceback of crashes
 mkdir -p /etc/systemd/system/thermocald.service.d
 printf '[Service]\nEnvironment=PYTHONFAULTHANDLER=1\nTimeoutStartSec=240\nWatchdogSec=20\nTimeoutAbortSec=5\nRestartSec=1\n' \
     >/etc/systemd/system/thermocald.service.d/times.conf

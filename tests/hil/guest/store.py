@@ -1,4 +1,4 @@
-"""What the daemon's store holds, as one line of JSON: epochs with the numbers on their frames.
+"""Print the content of the daemon's store as a line of JSON, with the numbers on its frames.
 
 store.py [DATABASE]
 """
@@ -16,7 +16,7 @@ HOME = Path("/var/lib/thermocald")
 
 
 def number_on(frame):
-    """The number in the bars of a stored frame, None where there is no frame or no bars."""
+    """Return the number in the bars of a stored frame, or None without a frame."""
     import cv2
     from tests_hil.bars import number_of
 

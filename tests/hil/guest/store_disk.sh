@@ -1,6 +1,6 @@
 #!/bin/sh
 # Mount the store's own disk: store_disk.sh logged|plain
-# logged: every write goes to /dev/vdc too, when it has been flushed (dm-log-writes).
+# logged: flushed writes also go to /dev/vdc (dm-log-writes)
 set -eu
 at=/var/lib/thermocald/store
 device=/dev/vdb

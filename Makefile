@@ -1,20 +1,20 @@
-# Two commands do all the set-up: `make demo` runs the main job, `make test` passes the tests.
+# `make demo` and `make test` set everything up; the first runs the main job, the second the tests
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-# what is installed, with hashes; `make LOCK= setup` takes the newest that pyproject.toml allows
+# locked versions with hashes; `make LOCK= setup` installs the newest that pyproject.toml allows
 LOCK   ?= packaging/lock/development.txt
 export OPENBLAS_NUM_THREADS ?= 1
-# tests start hundreds of processes: none of them compiles what another one has compiled
+# tests start hundreds of processes, which share compiled bytecode
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup demo test quick golden lint test-slow test-lowest bench hil docs pictures lock deb release clean
 
-help: ## this list
+help: ## print this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
 
-setup: $(STAMP) ## the virtual environment in .venv
+setup: $(STAMP) ## make the virtual environment .venv
 
 $(STAMP): pyproject.toml $(LOCK)
 	@echo "== setting up $(VENV)"
@@ -26,11 +26,11 @@ $(STAMP): pyproject.toml $(LOCK)
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@
 
-demo: $(STAMP) ## the main job on a rendered camera, ending with a hidden effect found
+demo: $(STAMP) ## run the main job on a rendered camera, until a hidden effect is found
 	rm -rf build/demo
 	$(BIN)/thermocald demo --out build/demo
 
-lint: $(STAMP) ## ruff, mypy --strict, layers
+lint: $(STAMP) ## run ruff, mypy --strict, and check the layers
 	@echo "== ruff"
 	$(BIN)/ruff check .
 	@echo "== layers"
@@ -39,52 +39,51 @@ lint: $(STAMP) ## ruff, mypy --strict, layers
 	$(BIN)/mypy
 	$(BIN)/mypy tests/api/user_script.py
 
-# Two cores and one process more: tests of the daemon wait for it more than they work. Files in the order of
-# tests/conftest.py.
+# One process more than two cores, because tests of the daemon mostly wait; tests/conftest.py orders the files
 WORKERS := -n 3 --dist loadfile --no-loadscope-reorder
-test: $(STAMP) ## lint and the quick tests, at the same time
+test: $(STAMP) ## run lint and the quick tests in parallel
 	@$(MAKE) --no-print-directory --jobs=2 lint quick
 
 quick: $(STAMP)
 	@echo "== pytest"
 	$(BIN)/python -m pytest -q $(WORKERS)
 
-golden: $(STAMP) ## what users see: every command's text and numbers as they were
+golden: $(STAMP) ## compare every command's text and numbers with the stored ones
 	$(BIN)/python -m tests.golden
 
-test-slow: $(STAMP) ## long statistics and browser tests
+test-slow: $(STAMP) ## run the long statistics and browser tests
 	$(BIN)/python -m pytest -q -m slow $(WORKERS)
 
-test-lowest: ## the quick tests with the lowest versions that pyproject.toml allows
+test-lowest: ## run the quick tests with the lowest versions that pyproject.toml allows
 	.ci/lowest
 
-# audit, daemon, discovery, fleet and scale take longer: each is run by itself
+# audit, daemon, discovery, fleet and scale take longer and are run separately
 BENCHMARKS := adjustment frame front_door gauge montecarlo object_space "prediction --seeds 1" simulation \
   store study thermal_model
-bench: $(STAMP) ## ratios to peers, in one run on one thread, within five minutes
+bench: $(STAMP) ## measure speed, mostly against peers, on one thread within five minutes
 	@failed=; for b in $(BENCHMARKS); do echo "== $$b"; \
 	  $(BIN)/python -m benchmarks.$$b || failed="$$failed $$b"; done; \
 	  test -z "$$failed" || { echo "a bound is missed:$$failed" >&2; exit 1; }
 
-hil: $(STAMP) ## the laboratory: real kernel drivers without hardware (needs root, apt)
+hil: $(STAMP) ## run the laboratory: real kernel drivers without hardware (needs root, apt)
 	tests/hil/run
 
-docs: $(if $(wildcard $(BIN)/mkdocs),,$(STAMP)) ## the documentation as a site in build/site
+docs: $(if $(wildcard $(BIN)/mkdocs),,$(STAMP)) ## build the documentation as a site in build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "build/site/index.html"
 
-pictures: $(STAMP) ## the README's two pictures, in docs/pictures
+pictures: $(STAMP) ## render the README's two pictures in docs/pictures
 	$(BIN)/python docs/_site/pictures.py
 
-lock: $(STAMP) ## resolve the locks again: CI's, the Debian packages', the lowest
+lock: $(STAMP) ## resolve the locks of CI, the Debian packages, and the lowest versions
 	$(BIN)/python -m pip install --quiet uv
 	packaging/lock.sh
 
-deb: $(STAMP) ## the Debian package in dist: RELEASE=bookworm or trixie, ARCH=amd64 or arm64
+deb: $(STAMP) ## build the Debian package in dist: RELEASE=bookworm or trixie, ARCH=amd64 or arm64
 	packaging/deb.sh $(RELEASE) $(ARCH)
 
-release: $(STAMP) ## all that is published in dist, and tests of it
+release: $(STAMP) ## build and test everything that is published, in dist
 	packaging/release.sh
 
-clean: ## remove what was made
+clean: ## remove build and .venv
 	rm -rf build .venv

@@ -1,7 +1,6 @@
 """The commands as data: names, usage, help, arguments and options, read from the program itself.
 
-The manual pages and the shells' completions are written from it, so that neither can differ from
-what `--help` prints.
+Manual pages and shell completions are written from these data, so that they agree with `--help`.
 """
 
 from __future__ import annotations
@@ -29,17 +28,17 @@ class Entry:
 
     term: str
     text: str
-    takes_value: bool  # an option that a word follows
+    takes_value: bool  # an option with a value
 
     @property
     def flags(self) -> list[str]:
-        """Such as ["-o", "--out"]; empty for an argument."""
+        """Return for example ["-o", "--out"]; empty for an argument."""
         words = re.sub(r"<[^>]*>|\[[^]]*\]", " ", self.term).replace(",", " ").split()
         return [word for word in words if word.startswith("-")]
 
     @property
     def choices(self) -> list[str]:
-        """The words it takes, where the help lists them: `<csv|parquet>`."""
+        """Return the values that the help lists, as in `<csv|parquet>`."""
         found = re.search(r"[<\[]([\w.-]+(?:\|[\w.-]+)+)[>\]]", self.term)
         return found[1].split("|") if found else []
 
@@ -57,17 +56,17 @@ class Command:
 
     @property
     def usage(self) -> str:
-        """Such as `thermocald export [OPTIONS] RECORDING_OR_STORE`."""
+        """Return for example `thermocald export [OPTIONS] RECORDING_OR_STORE`."""
         return " ".join(str(self.source.get_usage(self._context)).split()).removeprefix("Usage: ")
 
     @property
     def paragraphs(self) -> list[str]:
-        """The help, paragraph by paragraph; the first sentence says what the command does."""
+        """Return the paragraphs of the help; the first sentence is what the command does."""
         return [" ".join(part.split()) for part in str(self.source.help or "").split("\n\n")]
 
     @property
     def summary(self) -> str:
-        """The first paragraph without its full stop."""
+        """Return the first paragraph without its full stop."""
         return self.paragraphs[0].rstrip(".")
 
     def _entries(self, kind: str) -> list[Entry]:
@@ -80,32 +79,32 @@ class Command:
 
     @cached_property
     def arguments(self) -> list[Entry]:
-        """What stands without a dash."""
+        """Return the arguments, without a dash."""
         return self._entries("argument")
 
     @cached_property
     def options(self) -> list[Entry]:
-        """What begins with a dash."""
+        """Return the options, with a dash."""
         return self._entries("option")
 
     @cached_property
     def children(self) -> list[Command]:
-        """The commands of a group, in the order of `--help`."""
+        """Return the commands of a group, in the order of `--help`."""
         inner = getattr(self.source, "commands", {})
         return [Command((*self.path, n), c) for n, c in inner.items() if not c.hidden]
 
     def walk(self) -> Iterator[Command]:
-        """Itself and all commands below it."""
+        """Yield the command and all commands below it."""
         yield self
         for child in self.children:
             yield from child.walk()
 
 
 def _one_line(text: str) -> str:
-    # typer up to 0.15 escapes the bracket of a default for rich, which is not asked here
+    # typer up to 0.15 escapes the bracket of a default for rich, which is not used here
     return " ".join(text.split()).replace("\\[", "[")
 
 
 def program() -> Command:
-    """The program with all its commands."""
+    """Return the program with all its commands."""
     return Command((NAME,), typer.main.get_command(application()))

@@ -1,9 +1,9 @@
 #!/bin/sh
 # Build the Debian package: packaging/deb.sh [RELEASE [ARCHITECTURE [FOLDER]]]
 #
-# RELEASE is bookworm or trixie, ARCHITECTURE amd64 or arm64; without them, this machine's. Nothing
-# is compiled, so any Debian with debhelper builds for all four. What the release's own modules do
-# not serve comes as wheels with the hashes of packaging/lock/RELEASE.txt.
+# RELEASE is bookworm or trixie, ARCHITECTURE amd64 or arm64; by default, this machine's. Nothing is
+# compiled, so any Debian with debhelper builds all four. Modules that the release does not have come
+# as wheels with the hashes of packaging/lock/RELEASE.txt.
 set -eu
 cd "$(dirname "$0")/.."
 top=$PWD
@@ -17,12 +17,12 @@ lock=$top/packaging/lock/$release
 case $release in
     bookworm) number=12 ;;
     trixie) number=13 ;;
-    *) echo "no lock for $release; there is one for bookworm and trixie" >&2; exit 2 ;;
+    *) echo "$release: no lock; give bookworm or trixie" >&2; exit 2 ;;
 esac
 case $architecture in
     amd64) machine=x86_64 ;;
     arm64) machine=aarch64 ;;
-    *) echo "the package is made for amd64 and arm64, not for $architecture" >&2; exit 2 ;;
+    *) echo "$architecture: not supported; give amd64 or arm64" >&2; exit 2 ;;
 esac
 for tool in dh dpkg-buildpackage; do
     command -v $tool >/dev/null || { echo "$tool is missing: sudo apt-get install debhelper dpkg-dev" >&2; exit 2; }
@@ -40,7 +40,7 @@ tree=$work/thermocald
 rm -rf "$work"
 mkdir -p "$tree/wheels"
 "$python" -m pip wheel --quiet --no-deps --wheel-dir "$tree/wheels" .
-# adbutils is published for amd64 only, and only because of the adb in it, which Debian has itself
+# adbutils is published for amd64 only because it contains adb, which Debian has itself
 awk -v others="$work/others.txt" -v adb="$work/adb.txt" \
     '/^[a-z]/ { out = /^adbutils==/ ? adb : others } { print > out }' "$lock.txt"
 load() { # REQUIREMENTS PLATFORM…

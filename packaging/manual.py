@@ -1,10 +1,10 @@
-"""Manual pages and completions of bash, zsh and fish, made from the commands.
+"""Write manual pages and completions for bash, zsh and fish from the commands.
 
     python packaging/manual.py FOLDER
 
-writes FOLDER/man1/*.1 and FOLDER/{bash,zsh,fish}/. Completions are plain text: pressing Tab starts
-no Python, which on a Raspberry Pi would take seconds. Dates are SOURCE_DATE_EPOCH's, so that the
-same source gives the same bytes.
+writes FOLDER/man1/*.1 and FOLDER/{bash,zsh,fish}/. Completions are plain text, so that pressing Tab
+does not start Python, which takes seconds on a Raspberry Pi. Dates are from SOURCE_DATE_EPOCH, so
+that the same source gives the same bytes.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def _page(command: Command) -> str:
 
 
 def _roff(text: str) -> str:
-    """Text in groff's syntax; no line begins with a control character."""
+    """Escape text for groff; no line begins with a control character."""
     escaped = text.translate(_GROFF)
     return rf"\&{escaped}" if escaped.startswith(".") else escaped
 
 
 def man_page(command: Command, commands: list[Command]) -> str:
-    """One page of section 1; every command has its own."""
+    """Return a command's page of section 1."""
     now = time.gmtime(int(os.environ.get("SOURCE_DATE_EPOCH", time.time())))
     date = time.strftime("%Y-%m-%d", now)
     words = " ".join(command.path)
@@ -107,7 +107,7 @@ def _quoted(text: str) -> str:
 
 
 def bash(commands: list[Command]) -> str:
-    """A completion function for bash: the words of the command so far, files elsewhere."""
+    """Return a completion function for bash: words of the command so far, otherwise files."""
     cases = "\n".join(
         f"        {_quoted(' '.join(c.path[1:]))}) words={_quoted(' '.join(_words(c)))} ;;"
         for c in commands
@@ -144,7 +144,7 @@ complete -o filenames -F _{NAME} {NAME}
 
 
 def zsh(commands: list[Command]) -> str:
-    """A completion function for zsh, with the commands' and options' descriptions."""
+    """Return a completion function for zsh, with descriptions of commands and options."""
 
     def described(word: str, text: str) -> str:
         return _quoted(f"{word}:{text}".replace("\n", " "))
@@ -182,7 +182,7 @@ _{NAME} "$@"
 
 
 def fish(commands: list[Command]) -> str:
-    """Completions for fish: one line for every word."""
+    """Return completions for fish, one line per word."""
     lines = [f"# fish completion for {NAME}, made from its commands"]
     for c in commands:
         seen = [f"__fish_seen_subcommand_from {word}" for word in c.path[1:]]

@@ -1,23 +1,22 @@
 #!/bin/sh
-# Make everything that is published into dist/, and test the artefacts, not the tree.
+# Build everything that is published in dist/, and test the artefacts, not the tree.
 #
-# sdist, wheel and Debian packages are built twice and must be the same to the byte, and the sdist makes
-# the same wheel. The wheel is installed with the locked versions in an environment of its own and passes
-# the sdist's tests there, without the tree. Debian packages are made where debhelper is, and installed,
-# upgraded and purged in a bare Debian where root may make one (.ci/deb). SBOM (CycloneDX) and checksums
-# come last.
+# sdist, wheel and Debian packages are built twice and must be identical, and the sdist must give the same
+# wheel. The wheel is installed with the locked versions in a new environment and passes the sdist's tests
+# there, without the tree. Debian packages need debhelper; they are installed, upgraded and purged in a
+# bare Debian, which needs root (.ci/deb). SBOM (CycloneDX) and checksums come last.
 set -eu
 cd "$(dirname "$0")/.."
 python=$PWD/.venv/bin/python
 [ -z "$(git status --porcelain --untracked-files=no)" ] ||
-    { echo "there are changes that are not committed: what is released is a commit" >&2; exit 1; }
+    { echo "there are uncommitted changes; commit them, since a commit is released" >&2; exit 1; }
 SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
 export SOURCE_DATE_EPOCH
 version=$("$python" -c 'import thermocald; print(thermocald.__version__)')
 work=$PWD/build/release
 rm -rf "$work" dist
 mkdir -p "$work" dist
-same() { # FILE FOLDER: the file of that name there is the same
+same() { # FILE FOLDER: compare the file with that of its name in FOLDER
     cmp "$1" "$2/${1##*/}" || { echo "${1##*/} is not reproducible" >&2; exit 1; }
 }
 
@@ -78,7 +77,7 @@ print(f"   valid, {len(listed)} components, thermocald among them")
 END
 
 echo "== the sdist's tests on the wheel"
-# without the tree beside them, tests can only import what is installed
+# without the tree, tests can only import the installed packages
 rm -rf "$sdist/thermocald" "$sdist/drivers"
 # shellcheck disable=SC2046
 "$work/venv/bin/python" -m pip install --quiet --no-deps \
@@ -103,7 +102,7 @@ if command -v dh >/dev/null; then
     done
 fi
 if [ -n "$packages" ]; then
-    # the last one once more
+    # build the last one again
     packaging/deb.sh $release $architecture "$work/debian" >/dev/null
     same "dist/$(ls "$work/debian")" "$work/debian"
     echo "== Debian packages installed, upgraded, removed"
@@ -112,7 +111,7 @@ if [ -n "$packages" ]; then
     DEBS=dist .ci/deb $(printf '%s\n' $packages | grep -- "-$(dpkg --print-architecture)\$") || status=$?
     case $status in
         0) ;;
-        77) echo "   not here: .ci/deb installs them on a machine with root and a network" ;;
+        77) echo "   skipped: .ci/deb needs root and a network" ;;
         *) exit $status ;;
     esac
 else
@@ -121,6 +120,6 @@ fi
 
 echo "== notes: the changelog's UNRELEASED part"
 sed -n '/^## UNRELEASED/,/^## [^U]/p' CHANGELOG.md | sed '1d;/^## /d' > "dist/NOTES-$version.md"
-[ -s "dist/NOTES-$version.md" ] || echo "   nothing is UNRELEASED" >&2
+[ -s "dist/NOTES-$version.md" ] || echo "   CHANGELOG.md has no UNRELEASED entries" >&2
 (cd dist && sha256sum -- * > SHA256SUMS && sha256sum --quiet --check SHA256SUMS)
 ls -l dist

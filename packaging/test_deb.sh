@@ -1,9 +1,9 @@
 #!/bin/bash
 # Inside a bare Debian: install /share/first.deb, use it, upgrade to second.deb, downgrade, remove, purge.
-# `test_deb.sh NAME depends` only installs what it depends on.
+# `test_deb.sh NAME depends` only installs its dependencies.
 #
-# With ROOT, the Debian of another architecture is there: apt and dpkg run natively from here (Debian 13's;
-# an older dpkg knows its own architecture only), its own programs (maintainer scripts, thermocald) emulated.
+# ROOT is a Debian of another architecture: apt and dpkg run natively (from Debian 13; an older dpkg supports
+# its own architecture only), the programs in ROOT (maintainer scripts, thermocald) emulated.
 set -euo pipefail
 name=${1:-here} ROOT=${ROOT:-}
 inside() { if [ -n "$ROOT" ]; then chroot "$ROOT" "$@"; else "$@"; fi; }
@@ -19,7 +19,7 @@ DPkg::Options { "--root=$ROOT"; "--force-unsafe-io"; };
 END
   for folder in proc dev; do mount --bind /$folder "$ROOT/$folder"; done
   printf '#!/bin/sh\nexec /usr/sbin/chroot %s "$@"\n' "$ROOT" > /tmp/inside
-  # hours of emulation; the bytecode is made when a module is imported, too
+  # it would take hours of emulation, and imports make the bytecode too
   printf '#!/bin/sh\nexit 0\n' > "$ROOT/usr/bin/py3compile"
 fi
 fail() { echo "$name: $*" >&2; exit 1; }
@@ -31,11 +31,11 @@ cd /tmp
 apt-get update -qq || { echo "$name: no package lists, no network?"; exit 77; }
 if [ "${2:-}" = depends ]; then
   apt_get satisfy "$(dpkg-deb --field /share/first.deb Depends)"
-  lap "what it depends on downloaded and installed"
+  lap "dependencies downloaded and installed"
   exit
 fi
 apt_get install --download-only /share/first.deb
-lap "downloaded what it depends on"
+lap "dependencies downloaded"
 
 ready=0
 apt_get install /share/first.deb
@@ -52,12 +52,12 @@ zgrep -q thermocald "$ROOT/usr/share/man/man1/thermocald.1.gz" 2>/dev/null || gr
 inside thermocald check /etc/thermocald/config.yaml >/dev/null
 # the private environment sees what the distribution installs (picamera2, libcamera)
 inside /usr/lib/thermocald/bin/python -c 'import sys, yaml; assert "/usr/lib/python3/dist-packages" in sys.path' ||
-  fail "the system's modules are not seen"
-# into a file: `grep -q` goes away at its line, and a program that still writes then fails
-inside thermocald doctor >/tmp/doctor || [ $? = 1 ] || fail "the doctor fails"
-grep -q 'does not start with the machine' /tmp/doctor || fail "the doctor does not see the service"
+  fail "the system's modules are not found"
+# into a file, because `grep -q` exits at the first match, and a program that still writes would fail
+inside thermocald doctor >/tmp/doctor || [ $? = 1 ] || fail "thermocald doctor fails"
+grep -q 'does not start with the machine' /tmp/doctor || fail "thermocald doctor does not report the service"
 run() { inside su -s /bin/sh thermocald -c "cd /var/lib/thermocald && $1"; }
-if [ -d /share/M1 ]; then # the same to the bit (.ci/arm64), and an emulated minute less
+if [ -d /share/M1 ]; then # identical (.ci/arm64), and saves a minute of emulation
   cp -r /share/M1 "$ROOT/var/lib/thermocald"
 else
   run "thermocald simulate --preset nexus5-cold --out M1 >/dev/null 2>&1"
@@ -65,18 +65,18 @@ else
 fi
 run "thermocald replay M1 --store series.db >/dev/null 2>&1"
 lap "first replayed epochs"
-# the bound is that of a real machine, not of an emulated one
+# the bound is for a real machine, not an emulated one
 echo "$name: from a bare machine to replayed epochs in $ready s, without the download"
 [ -n "$ROOT" ] || [ $ready -le 300 ] || fail "that is more than 5 minutes"
 [ -n "${DEB_SHORT:-}" ] || { run "thermocald demo --epochs 20 --no-discovery --out demo >/dev/null"; lap "demo of 20 epochs"; }
 if [ -z "$ROOT" ] && apt-cache show python3-libcamera >/dev/null 2>&1; then
   apt_get install python3-libcamera
-  /usr/lib/thermocald/bin/python -c 'from libcamera import controls; controls.AnalogueGain' || fail "libcamera is not seen"
-  lap "libcamera seen"
+  /usr/lib/thermocald/bin/python -c 'from libcamera import controls; controls.AnalogueGain' || fail "libcamera is not found"
+  lap "libcamera found"
 fi
 echo "# mine" >> "$ROOT/etc/thermocald/config.yaml"
 run "thermocald export series.db --output first.csv"
-# SQLite's user_version, where the file has it
+# SQLite's user_version, from the header of the file
 schema() { od -An -tu4 --endian=big -j60 -N4 "$ROOT/var/lib/thermocald/$1" | tr -d ' '; }
 old=$(schema series.db)
 
@@ -87,32 +87,32 @@ version=$(dpkg ${ROOT:+--root="$ROOT"} -s thermocald | sed -n 's/^Version: //p')
 grep -q '^# mine' "$ROOT/etc/thermocald/config.yaml" || fail "the upgrade lost the configuration"
 run "test -e M1/epochs.csv" || fail "the upgrade lost data"
 inside thermocald --version >/dev/null
-# its schema is later by one: who reads changes nothing, who writes copies the store first
+# its schema is one version later: reading does not change a store, writing first copies it
 run "thermocald export series.db --output second.csv"
 run "cmp first.csv second.csv" || fail "the store reads differently after the upgrade"
 [ "$(schema series.db)" = "$old" ] || fail "reading changed the store"
 run "thermocald replay M1 --store series.db >/dev/null"
 [ "$(schema series.db)" = $((old + 1)) ] || fail "the store was not brought up to date"
-[ "$(schema series.db.version-$old)" = "$old" ] || fail "no backup was made of the store as it was"
+[ "$(schema series.db.version-$old)" = "$old" ] || fail "the store has no backup"
 lap "schema brought up to date"
 
 apt_get install --allow-downgrades /share/first.deb
 lap "downgraded"
 grep -q '^# mine' "$ROOT/etc/thermocald/config.yaml" || fail "the downgrade lost the configuration"
-# the later store is left alone, with a word of what to do; the backup serves
+# a store of a later version is refused with advice; the backup can be read
 ! run "thermocald export series.db --output third.csv 2>refusal" || fail "a later store was opened"
 run "cat refusal"
-run "grep -q 'update thermocald' refusal && grep -q series.db.version-$old refusal" || fail "it is not said what to do"
+run "grep -q 'update thermocald' refusal && grep -q series.db.version-$old refusal" || fail "the refusal has no advice"
 [ "$(schema series.db)" = $((old + 1)) ] || fail "a later store was changed"
 run "thermocald export series.db.version-$old --output third.csv && cmp first.csv third.csv" ||
-  fail "the backup does not serve"
+  fail "the backup cannot be read"
 lap "backup read"
 
 apt_get remove thermocald
 test ! -e "$ROOT/usr/bin/thermocald" || fail "the command is still there"
 test -e "$ROOT/etc/thermocald/config.yaml" || fail "remove deleted the configuration"
 test -e "$ROOT/var/lib/thermocald/M1/epochs.csv" || fail "remove deleted data"
-[ -z "$(find "$ROOT/usr/lib/thermocald" 2>/dev/null)" ] || fail "files stay behind: $(find "$ROOT/usr/lib/thermocald" | head -n 3)"
+[ -z "$(find "$ROOT/usr/lib/thermocald" 2>/dev/null)" ] || fail "files remain: $(find "$ROOT/usr/lib/thermocald" | head -n 3)"
 lap "removed"
 apt_get purge thermocald
 test ! -e "$ROOT/etc/thermocald" || fail "purge left /etc/thermocald"

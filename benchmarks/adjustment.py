@@ -22,12 +22,8 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from thermocald.photogrammetry.camera.camera_model import (
-    ExteriorOrientation,
-    InteriorOrientation,
-    Sensor,
-    project,
-)
+from tests.photogrammetry.corner_camera import EXTERIOR, INTERIOR, SENSOR, SIGMA_PX
+from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings, adjust
 from thermocald.photogrammetry.epoch.gauss_markov import Problem, solve
 from thermocald.photogrammetry.field.testfield import Observations, TestField
@@ -35,9 +31,6 @@ from thermocald.photogrammetry.series.adjustment import adjust_series
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
 
-SENSOR = Sensor(3280, 2464, 0.00112)
-INTERIOR = InteriorOrientation(3.04, 0.02, -0.03, -5e-3, 4e-4, -1e-5, 3e-4, -2e-4)
-SIGMA_PX = 0.04
 _EPOCHS = 40  # timed singly; only some need a round of data snooping
 
 
@@ -48,19 +41,6 @@ def corner_field() -> TestField:
     planes = [np.c_[a, b, z], np.c_[a, z, b], np.c_[z, a, b], [[0, 0, 0], [330, 0, 0], [0, 330, 0]]]
     points = np.vstack(planes)
     return TestField.build([str(i) for i in range(len(points))], points)
-
-
-def looking_at(centre: list[float], target: list[float]) -> ExteriorOrientation:
-    """Return the exterior orientation of an upright camera at `centre` that looks at `target`."""
-    backward = np.array(centre, dtype=float) - np.array(target, dtype=float)
-    backward /= np.linalg.norm(backward)
-    right = np.cross([0, 0, 1], backward)
-    right /= np.linalg.norm(right)
-    R = np.column_stack([right, np.cross(backward, right), backward])
-    return ExteriorOrientation.from_rotation(R, centre)
-
-
-EXTERIOR = looking_at([950, 900, 800], [150, 180, 160])
 
 
 def observe(field: TestField, rng: np.random.Generator) -> Observations:

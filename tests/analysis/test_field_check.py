@@ -131,7 +131,7 @@ def test_proposed_targets_give_the_promised_precision():
     assert promised < 0.85 * check.precision["epoch"][which] / 0.00112
 
 
-def test_empty_parts_and_an_unsurveyed_print_are_reported():
+def test_empty_parts_an_unsurveyed_print_and_small_targets_are_reported():
     field = _printed("A3", sheets=3)
     check = check_field(CAMERA, field, usual_station(CAMERA, field))
     assert (check.cells == 0).sum() > 0
@@ -142,11 +142,8 @@ def test_empty_parts_and_an_unsurveyed_print_are_reported():
     )
     again = check_field(CAMERA, surveyed, usual_station(CAMERA, surveyed))
     assert not any("testfield survey" in note for note in again.advice)
-
-
-def test_larger_targets_are_advised_for_small_ones():
-    field = replace(corner_field(), diameters=np.full(147, 6.0))
-    check = check_field(CAMERA, field, usual_station(CAMERA, field))
+    small = replace(corner_field(), diameters=np.full(147, 6.0))
+    check = check_field(CAMERA, small, usual_station(CAMERA, small))
     assert any("come nearer or print larger" in note for note in check.advice)
 
 

@@ -70,6 +70,12 @@ def begun(sensor, field, c=3.04, exterior="auto", settings=None, offsets=True):
     return calibrator, RunningSeries(sensor, field, settings, exterior=exterior, offsets=offsets)
 
 
+def refined(scene, calibrator, running, k, exterior=None):
+    """Refine one epoch; return result, columns and truth."""
+    epoch, now = scene.epoch(k, exterior)
+    return *running.refine(calibrator.calibrate(epoch), epoch.observations), now
+
+
 def take(scene, epochs, exterior="auto", settings=None, offsets=True):
     """Return the running series, its results with columns, the single epochs, and the truth."""
     calibrator, running = begun(scene.sensor, scene.field, 3.04, exterior, settings, offsets)
@@ -209,8 +215,7 @@ def test_the_series_begins_again_after_the_camera_was_moved():
     away[[1, 3]] += 0.2, 250.0
     restarted = []
     for k in range(24, 44):
-        epoch, now = scene.epoch(k, away)
-        result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
+        result, columns, now = refined(scene, calibrator, running, k, away)
         assert result.ok
         assert abs(result.values[0] - now[0]) < 0.02
         restarted.append("series_restarted" in columns)
@@ -231,8 +236,7 @@ def test_a_series_that_contradicts_five_epochs_begins_again_and_they_keep_their_
 
     running._adjusted = contradicted
     for k in range(24, 30):
-        epoch, _ = scene.epoch(k)
-        result, columns = running.refine(calibrator.calibrate(epoch), epoch.observations)
+        result, columns, _ = refined(scene, calibrator, running, k)
         assert result.ok
         restarted.append("series_restarted" in columns)
     assert restarted == [False] * 4 + [True, False]
@@ -318,8 +322,7 @@ def test_the_cost_of_an_epoch_does_not_grow_over_months(monkeypatch):
     running._look_at = [k + 3_000_000 for k in running._look_at]
     calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
     for k in range(60, 120):
-        epoch, _ = scene.epoch(k)
-        running.refine(calibrator.calibrate(epoch), epoch.observations)
+        refined(scene, calibrator, running, k)
     assert max(together) == 30
     assert len(together) - early <= 4 * 3
     assert len(running._kept) == 30

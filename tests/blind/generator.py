@@ -18,7 +18,7 @@ import numpy as np
 
 from tests.blind.case import CAMERAS, PROGRAMMES, Case
 from tests.blind.field_motion import moved_field
-from tests.blind.hidden import fresh, hide, left_over, make_camera, true_parameters
+from tests.blind.hidden import bisected, fresh, hide, left_over, make_camera, true_parameters
 from tests.blind.outside import trajectories
 from tests.blind.world import climate, corner_field, image, smooth_unknown
 from tests.recordings import write_recording
@@ -114,13 +114,7 @@ def generate(case: Case) -> tuple[list[Series], dict]:
                 camera.rates = camera.rates * np.clip(
                     case.strength_px / max(leftover(1.0, k), 1e-9), 0.25, 2.0
                 )
-            low, high = 1e-3, 30.0
-            for _ in range(40):
-                middle = np.sqrt(low * high)
-                low, high = (
-                    (middle, high) if leftover(middle, k) < case.strength_px else (low, middle)
-                )
-            size = np.sqrt(low * high)
+            size = bisected(lambda s, k=k: leftover(s, k), case.strength_px, 1e-3, 30.0)
             limit = {"thermal_lag": 900 / e.get("tau", 1), "time_offset": 200 / abs(e.get("d", 1)),
                      "hysteresis": 6 / e.get("half_width", 1)}[e["effect"]]  # fmt: skip
             size = min(size, limit)

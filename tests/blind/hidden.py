@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -210,6 +211,14 @@ def true_parameters(
     for rows, vector, time in moved:
         X[:, rows] += (frames >= time)[:, None, None] * vector
     return p, X, at(noise)
+
+
+def bisected(left: Callable[[float], float], strength: float, low: float, high: float) -> float:
+    """Return the size between `low` and `high` at which `left`(size) is `strength`."""
+    for _ in range(40):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if left(middle) < strength else (low, middle)
+    return float(np.sqrt(low * high))
 
 
 def left_over(

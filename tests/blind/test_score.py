@@ -22,20 +22,10 @@ def test_doubled_thermometer_noise_gives_no_name():
 
 
 @pytest.mark.slow
-def test_hard_recordings():
-    assert summary(run("hard-0.3", [50]))["exact_or_listed"] >= 0.9
-
-
-@pytest.mark.slow
-def test_pairs():
-    assert summary(run("pair-0.3", [50]))["exact_or_listed"] >= 0.9
-
-
-@pytest.mark.slow
-def test_recordings_without_an_effect_give_no_name():
-    assert summary(run("none", [50]))["exact"] == 1.0
-
-
-@pytest.mark.slow
-def test_outside_influences_are_unnamed():
-    assert summary(run("outside-0.3", [50]))["exact"] >= 0.9
+@pytest.mark.parametrize(
+    ("part", "share", "least"),
+    [("hard-0.3", "exact_or_listed", 0.9), ("pair-0.3", "exact_or_listed", 0.9),
+     ("none", "exact", 1.0), ("outside-0.3", "exact", 0.9)],
+)  # fmt: skip
+def test_a_part(part, share, least):
+    assert summary(run(part, [50]))[share] >= least

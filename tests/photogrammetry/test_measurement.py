@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -101,28 +102,24 @@ def test_useless_frames_have_a_status_and_a_reason(frame, word, change):
     assert len(found.observations) == 0
 
 
-def test_another_field_is_detected(frame):
-    other, _ = small_field(bits=12)
-    found = measure(frame, other)
-    assert found.status.word == "other_field"
+MOVED = np.random.default_rng(2).permutation(FIELD.points)
+
+
+@pytest.mark.parametrize(
+    ("field", "word", "reason"),
+    [
+        (small_field(bits=12)[0], "other_field", ""),
+        (replace(FIELD, points=MOVED), "other_field", "not where"),
+        (TestField.build(FIELD.names, FIELD.points, 0.01, FIELD.diameters), "nothing_found",
+         "coded"),
+    ],
+    ids=["other codes", "codes elsewhere", "plain circles"],
+)  # fmt: skip
+def test_another_field_is_detected(frame, field, word, reason):
+    found = measure(frame, field)
+    assert found.status.word == word
+    assert reason in found.status.reason
     assert len(found.observations) == 0
-
-
-def test_the_same_codes_elsewhere_are_another_field(frame):
-    rng = np.random.default_rng(2)
-    moved = TestField.build(
-        FIELD.names, rng.permutation(FIELD.points), 0.01, FIELD.diameters, "circle", FIELD.codes
-    )
-    found = measure(frame, moved)
-    assert found.status.word == "other_field"
-    assert "not where" in found.status.reason
-
-
-def test_plain_circles_alone_are_not_identified(frame):
-    plain = TestField.build(FIELD.names, FIELD.points, 0.01, FIELD.diameters)
-    found = measure(frame, plain)
-    assert found.status.word == "nothing_found"
-    assert "coded" in found.status.reason
 
 
 def test_all_targets_are_measured_after_a_large_drift(frame):

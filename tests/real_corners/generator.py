@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 
 from tests.blind.case import PROGRAMMES
-from tests.blind.hidden import Camera, fresh, hide, left_over, true_parameters
+from tests.blind.hidden import Camera, bisected, fresh, hide, left_over, true_parameters
 from tests.blind.world import climate, image, smooth_unknown
 from tests.recordings import write_recording
 
@@ -175,11 +175,7 @@ def _size(left, e: dict, camera: Camera, strength: float) -> float:
             for _ in range(20):
                 camera.rates *= strength / left(most)
             return float(most)
-        low, high = 1e-3, most
-        for _ in range(40):
-            middle = np.sqrt(low * high)
-            low, high = (middle, high) if left(middle) < strength else (low, middle)
-        return float(np.sqrt(low * high))
+        return bisected(left, strength, 1e-3, most)
     size = 1.0
     for _ in range(30):
         size *= strength / max(left(size), 1e-12)

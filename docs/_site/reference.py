@@ -262,9 +262,9 @@ def _effect_page() -> str:
             others = [f"`{key}`" for key in effect.linear if key not in effect.usual]
             said = f"Coefficients: {', '.join(usual)}"
             parts.append(said + (f"; also {', '.join(others)}." if others else "."))
-        told = [f"{EXPERIMENTS[k]}: it {v}" for k, v in effect.behaviour.items()]
-        if told:
-            parts.append("What tells it from others:\n\n" + "\n".join(f"- {t}" for t in told))
+        behaviour = "\n".join(f"- {EXPERIMENTS[k]}: it {v}" for k, v in effect.behaviour.items())
+        if behaviour:
+            parts.append(f"How it differs from other effects:\n\n{behaviour}")
         parts.append(f"Kind: `{effect.kind}`.")
     return "\n\n".join(parts)
 

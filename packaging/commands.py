@@ -25,7 +25,7 @@ NAME = "thermocald"
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of a help page: an argument or option as it is typed, and what it does."""
+    """One line of a help page: an argument or option as it is typed, and its help."""
 
     term: str
     text: str
@@ -33,13 +33,13 @@ class Entry:
 
     @property
     def flags(self) -> list[str]:
-        """Such as ["-o", "--out"]; empty for an argument."""
+        """The flags, such as ["-o", "--out"]; empty for an argument."""
         words = re.sub(r"<[^>]*>|\[[^]]*\]", " ", self.term).replace(",", " ").split()
         return [word for word in words if word.startswith("-")]
 
     @property
     def choices(self) -> list[str]:
-        """The words it takes, where the help lists them: `<csv|parquet>`."""
+        """The values, if the help lists them, as in `<csv|parquet>`."""
         found = re.search(r"[<\[]([\w.-]+(?:\|[\w.-]+)+)[>\]]", self.term)
         return found[1].split("|") if found else []
 
@@ -57,12 +57,12 @@ class Command:
 
     @property
     def usage(self) -> str:
-        """Such as `thermocald export [OPTIONS] RECORDING_OR_STORE`."""
+        """The usage, such as `thermocald export [OPTIONS] RECORDING_OR_STORE`."""
         return " ".join(str(self.source.get_usage(self._context)).split()).removeprefix("Usage: ")
 
     @property
     def paragraphs(self) -> list[str]:
-        """The help, paragraph by paragraph; the first sentence says what the command does."""
+        """The paragraphs of the help; the first one is the summary."""
         return [" ".join(part.split()) for part in str(self.source.help or "").split("\n\n")]
 
     @property
@@ -80,12 +80,12 @@ class Command:
 
     @cached_property
     def arguments(self) -> list[Entry]:
-        """What stands without a dash."""
+        """The positional arguments."""
         return self._entries("argument")
 
     @cached_property
     def options(self) -> list[Entry]:
-        """What begins with a dash."""
+        """The options."""
         return self._entries("option")
 
     @cached_property
@@ -95,17 +95,17 @@ class Command:
         return [Command((*self.path, n), c) for n, c in inner.items() if not c.hidden]
 
     def walk(self) -> Iterator[Command]:
-        """Itself and all commands below it."""
+        """Yield this command and all commands below it."""
         yield self
         for child in self.children:
             yield from child.walk()
 
 
 def _one_line(text: str) -> str:
-    # typer up to 0.15 escapes the bracket of a default for rich, which is not asked here
+    # typer up to 0.15 escapes the bracket of a default for rich, which is not used here
     return " ".join(text.split()).replace("\\[", "[")
 
 
 def program() -> Command:
-    """The program with all its commands."""
+    """Return the program with all its commands."""
     return Command((NAME,), typer.main.get_command(application()))

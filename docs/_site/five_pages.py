@@ -1,4 +1,4 @@
-"""The page of code: a tick, a series, a discovery, an effect and a driver, as they are today."""
+"""The page of code: a tick, a series, a discovery, an effect and a driver, from the source."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ PAGES = {
         "thermocald_drivers.i2c:Tmp117Thermometer",
     ),
 }
-"""Title: a sentence, and what is shown."""
+"""{title: (introduction, names of the functions and classes to show …)}."""
 
 
 def page() -> str:
-    """Title, sentence and source of each of PAGES."""
+    """Return the title, the introduction and the source of each of PAGES."""
     parts = []
     for title, (sentence, *names) in PAGES.items():
         parts += [f"## {title}", sentence]

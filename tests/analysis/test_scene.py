@@ -254,7 +254,7 @@ def test_replay_follows_a_folder_of_photographs(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "4 of 5 frames follow the reference frame" in done.stdout
-    assert "as it should be" in done.stdout
+    assert "consistent with the model" in done.stdout
     alone = call("replay", photographs, "--model", tmp_path / "camera.yaml")
     assert alone.returncode == 2
     assert "go together" in alone.stderr

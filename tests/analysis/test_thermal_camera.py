@@ -134,7 +134,7 @@ def test_outside_the_validity_it_warns_and_widens():
 
 def test_far_outside_it_is_refused():
     camera = ThermalCamera(thermal_model())
-    with pytest.raises(UsageError, match="ask for extrapolation by name"):
+    with pytest.raises(UsageError, match="set `extrapolate`"):
         camera.at(-20.0)
     with pytest.warns(ExtrapolationWarning):
         assert camera.at(-20.0, extrapolate=True).sd["c"] > 40 * 2e-4 * 0.99

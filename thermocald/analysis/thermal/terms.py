@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from thermocald.thermal.hypothesis import Fit, Unknowns
     from thermocald.thermal.series import ReducedSeries
 
-_EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what its search may find by chance
+_EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what a search finds by chance
 
 
 def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
-    """An effect as a term to add to a fitted hypothesis.
+    """Return an effect as a term to add to a fitted hypothesis.
 
-    search: its non-linear parameters are looked for over their whole range, but for those that
-    `fitter.held` names; the time of an event always is, in each series.
+    search: search its non-linear parameters over their whole range, except those in `fitter.held`;
+    the time of an event is always searched, in each series.
     """
     kind = catalogue.get(effect.name)
     given = tuple(n for n in kind.linear if n in effect.values) or kind.usual
@@ -54,13 +54,13 @@ def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: boo
 
 
 def event_worth(series: ReducedSeries, coefficients: int) -> float:
-    """χ² that an event has to explain: its coefficients and time, and every time was a trial."""
+    """Return the χ² that an event has to explain, given its coefficients and the times tried."""
     n = max(int((series.n > 0).sum()), 2)
     return float((coefficients + 2) * np.log(n) + _EVENT_MARGIN)
 
 
 def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...]:
-    """The terms of a fit without events that explain no more than chance alongside the others."""
+    """Return a fit's terms without events that explain no more than chance beside the others."""
     terms = list(fit.terms)
     for block in fit.blocks:
         if block.term < 0 or not terms[block.term].kind.is_event or block.series is None:
@@ -76,7 +76,7 @@ def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...
 
 
 def unknowns_of(fit: Fit, scale: Array) -> Unknowns:
-    """All numbers that have a standard deviation in the fit, the rates first.
+    """Return all parameters that have a standard deviation in the fit, the rates first.
 
     scale (19,): px per unit of the columns.
     """

@@ -43,6 +43,7 @@ def test_steady_is_the_end_of_a_long_history(T):
     camera = ThermalCamera(thermal_model(*LISTED))
     now = camera.at(T)
     along = camera.along([0.0, 5e4, 1e5], [T, T, T])
+    assert along[-1].name == camera.model.camera
     np.testing.assert_allclose(along.values[-1], now.values, rtol=0, atol=1e-14)
     np.testing.assert_allclose(along.covariance[-1], now.covariance, rtol=1e-6, atol=1e-22)
 

@@ -17,6 +17,7 @@ it raises UsageError unless extrapolation is requested explicitly.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -39,8 +40,6 @@ from thermocald.physics.model_file import model_document, read_model, write_mode
 from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
@@ -68,7 +67,8 @@ def seconds(times: ArrayLike) -> Array:
 class Along:
     """The camera along a history; indexing gives a Camera.
 
-    times (E,) s, temperatures (E,) °C; values (E, 10); covariance (E, 10, 10); extrapolated (E,) K.
+    times (E,) s, temperatures (E,) °C; values (E, 10); covariance (E, 10, 10); extrapolated (E,) K;
+    camera: its name.
     """
 
     sensor: Sensor
@@ -77,6 +77,7 @@ class Along:
     values: Array
     covariance: Array
     extrapolated: Array
+    camera: str = "camera"
 
     def __len__(self) -> int:
         return len(self.times)
@@ -88,6 +89,7 @@ class Along:
             self.values[i],
             self.covariance[i],
             float(self.extrapolated[i]),
+            self.camera,
         )
 
     @property
@@ -297,7 +299,9 @@ class ThermalCamera(Result):
         ((3, 10), (3, 10))
         """
         t = seconds(times)
-        columns = temperatures if isinstance(temperatures, dict) else {"temperature": temperatures}
+        columns = (
+            temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
+        )
         readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
         instants = t if at is None else seconds(at)
         begin = float(min(t[0], instants[0]))
@@ -328,6 +332,7 @@ class ThermalCamera(Result):
             np.concatenate(values),
             np.concatenate(covariance),
             outside,
+            self.model.camera,
         )
 
     def _linear(self, history: History, drive: Array) -> Array:

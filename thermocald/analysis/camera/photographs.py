@@ -337,7 +337,7 @@ def images_of(given: Sequence[Path]) -> list[Path]:
 
 
 def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraSpec:
-    """Return a camera without a camera file; its image size is that of most photographs.
+    """Return a camera for photographs without a camera file, with the image size of most of them.
 
     pixel_pitch mm: None stands for 1 µm. Raises ImageError if no photograph can be read.
     """

@@ -60,8 +60,8 @@ def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     if away > _FARTHEST * extent > 0:
         unit = UNITS[control.unit]
         raise ConfigurationError(
-            f"{path}: lies {away / unit:.0f} {control.unit} from control points that extend over "
-            f"{extent / unit:.0f} {control.unit}: both need the same coordinates and unit"
+            f"{path}: is {away / unit:.0f} {control.unit} away from control points that extend "
+            f"over {extent / unit:.0f} {control.unit}: both need the same coordinates and unit"
         )
     return surface
 

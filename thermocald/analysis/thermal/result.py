@@ -231,7 +231,7 @@ def _assess(
     image noise relative to that at T₀, None if it does not grow.
     """
     averaged = float(np.sqrt(np.median(s.source.per_row)))
-    # the RMS is without a constant per target, which removes none of the thermometer's noise
+    # only a constant per target is removed from the residuals: the thermometer's noise remains
     drift = s.columns[..., :10] @ (model.rate_vector * s.scale[:10])
     left = np.hypot(sigma / averaged, reading_sd * np.sqrt(np.mean(drift**2)))
     if noise is not None:

@@ -218,8 +218,8 @@ class ThermalCamera(Result):
             return ""
         return (
             f"the model misses an effect: it left {verdict['misfit_px']:.3f} px in its own series. "
-            "Standard deviations hold what it left there, not what it leaves elsewhere; thermocald "
-            "discover looks for the effect"
+            "Standard deviations include this misfit, but not a larger one in other conditions; "
+            "run thermocald discover to find the effect"
         )
 
     @property

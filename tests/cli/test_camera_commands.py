@@ -216,7 +216,7 @@ def test_the_logger_tells_the_temperature_of_photographs(tmp_path):
 @pytest.mark.parametrize(
     ("inputs", "said"),
     [
-        (("20=a.json", "20.3=b.json"), "two temperatures at least"),
+        (("20=a.json", "20.3=b.json"), "at least two temperatures"),
         (("warm=a.json", "50=b.json"), "'warm' is not a temperature"),
         (("20=a.json", "50=free.json"), "calibrate both with the same --free"),
         (("20=a.json", "M1"), "fit series and calibrations apart"),

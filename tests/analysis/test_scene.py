@@ -304,7 +304,7 @@ def test_what_does_not_move_is_a_recording(tmp_path):
         tracks.append((rows, at[rows]))
     tracks[7] = None
     log = TemperatureLog(times, {"housing": T})
-    kept = write_scene(tmp_path / "R", "bank", states[0], log, times[::4], corners, tracks)
+    kept = write_scene(tmp_path / "R", states[0], log, times[::4], corners, tracks)
     series = tc.open(tmp_path / "R")
     epochs = series.calibrate(exterior="series")
     assert (kept, len(series), len(series.testfield), int(epochs.ok.sum())) == (135, 40, 135, 39)
@@ -316,7 +316,7 @@ def test_what_does_not_move_is_a_recording(tmp_path):
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 1.1
     short = [None if t is None else (t[0][:11], t[1][:11]) for t in tracks]
     with pytest.raises(DataError, match="11 features"):
-        write_scene(tmp_path / "S", "bank", states[0], log, times[::4], corners, short)
+        write_scene(tmp_path / "S", states[0], log, times[::4], corners, short)
     assert not (tmp_path / "S").exists()
 
 

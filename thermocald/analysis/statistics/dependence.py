@@ -96,7 +96,7 @@ def _models(longest: float) -> tuple[Array, Array, Array, Array]:
     memories = np.geomspace(_SHORTEST, longest, _MEMORIES)
     tau, coloured = grid(memories, _COLOURED)
     rest = 1.0 - _WHITE - sum(weight for *_, weight in _LIKELY)
-    fading = np.maximum(tau, _SHORTEST) ** -0.3  # the longer, the rarer
+    fading = np.maximum(tau, _SHORTEST) ** -0.3  # longer memories are less probable
     weight = np.where(tau > 0, rest * fading / fading[1:].sum(), _WHITE)
     tau = np.append(tau, [m for _, m, _ in _LIKELY])
     coloured = np.append(coloured, [a for a, *_ in _LIKELY])

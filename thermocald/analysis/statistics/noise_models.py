@@ -49,9 +49,9 @@ _COLOURED = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
 
 
 _FLICKER = (1.0, 1.3, 1.6)  # exponents of 1/f
-_MEMORIES = 0.4 * 3.0 ** np.arange(10)  # epochs, of the parts of flicker noise
+_MEMORIES = 0.4 * 3.0 ** np.arange(10)  # of the parts of flicker noise, in epochs
 
-_GAP = 3.0  # an interval longer than so many usual ones is a gap and ends a stretch
+_GAP = 3.0  # an interval that is longer by this factor than usual is a gap, which ends a stretch
 _TYPICAL_PHI = 0.97
 
 
@@ -228,7 +228,7 @@ def largest_p_value(p: Array, deviance: Array) -> float:
 
 
 _LEAST_VALUES = 8
-_FIRST_BAND = 4  # low frequencies of the first band; the next have four times as many
+_FIRST_BAND = 4  # low frequencies of the first band; each further one has four times as many
 _WIDENING = 4
 _LEAST_FAST = 4
 _JUMP = 6.0  # sds of the increments, which noise does not reach

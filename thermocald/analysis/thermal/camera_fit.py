@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
-from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.prediction_test import NORMAL_95, predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import DataError
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.physics.model import ModelEffect, ThermalModel
     from thermocald.thermal.series import ReducedSeries
-
-
-_NORMAL_95 = 1.959964
 
 
 def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
@@ -163,7 +160,7 @@ def shrunk_to_type(
     wider = np.ones(len(names))
     for i in np.flatnonzero(sd > 0):
         value, low, _ = new.interval(np.eye(len(names))[i])
-        wider[i] = (value - low) / (_NORMAL_95 * sd[i])
+        wider[i] = (value - low) / (NORMAL_95 * sd[i])
     return _with_values(
         model, names, new.values, new.covariance * np.outer(wider, wider), str(kind.camera)
     )

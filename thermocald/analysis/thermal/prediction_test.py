@@ -187,7 +187,7 @@ def _find_event(
     return replace(effect, values={**effect.values, **values, candidate.name: time})
 
 
-_BAND = 1.959964  # standard deviations of a 95 % band
+NORMAL_95 = 1.959964  # standard deviations of a 95 % band
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +252,7 @@ def predicted_error(
     coverage = float("nan")
     if not model.misses_an_effect:
         bands = floor + _variance(A, _parameters(series, model))
-        coverage = float(np.mean(np.abs(residuals[used]) <= _BAND * np.sqrt(bands[used])))
+        coverage = float(np.mean(np.abs(residuals[used]) <= NORMAL_95 * np.sqrt(bands[used])))
     scale = source.sensor.pixel_pitch / model.interior.c * 10_000.0
     floor_px = float(np.sqrt(np.mean(floor[used])))
     return PredictedError(source.series or source.name, rms, floor_px, coverage, rms * scale)

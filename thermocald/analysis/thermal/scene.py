@@ -430,7 +430,7 @@ def follow_scene(
             count[k], locked = int(follow.sum()), found.locked
         advance(1)
     if recording is not None:
-        write_scene(recording, thermal.model.camera, along[0], log, times, points, tracks)
+        write_scene(recording, along[0], log, times, points, tracks)
     interior = InteriorOrientation.from_array(along.values[0])
     unsure = since[:, [2, 1, 0, 0]] / [interior.c, interior.c, np.inf, 1.0]
     return SceneCourse(

@@ -43,7 +43,6 @@ Track = tuple["NDArray[np.int64]", "Array"]
 
 def write_scene(
     path: Path,
-    name: str,
     camera: Camera,
     log: TemperatureLog,
     times: Array,
@@ -74,6 +73,7 @@ def write_scene(
     field = TestField.build(
         [f"feature{row}" for row in still], rays / -rays[:, 2:] * depths[:, None], across
     )
+    name = camera.name
     head = Head(
         name, name, float(np.median(np.diff(times))) if len(times) > 1 else 1.0,
         CameraSpec(name, camera.sensor, camera.interior.c, camera.interior),

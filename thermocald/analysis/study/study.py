@@ -55,9 +55,10 @@ class CameraStudy:
     """The study of one camera (label) from its series.
 
     iop (10,): mean over the series; sds (10,): standard deviations over time, pooled over the
-    series, 0 if held; correlations: within the adjustments, None if no epoch has a covariance
-    matrix; over_time (10, 10): correlations of the parameters over the epochs; trajectories: the
-    effect of the camera's own drift in object space, empty if it cannot be computed.
+    series that estimate a parameter, 0 if none does; correlations: within the adjustments, None if
+    no epoch has a covariance matrix; over_time (10, 10): correlations of the parameters over the
+    epochs; trajectories: the effect of the camera's own drift in object space, empty if it cannot
+    be computed.
     """
 
     label: str
@@ -112,13 +113,13 @@ def study_camera(
     notes: list[str] = []
     studies = tuple(study_series(one, settings) for one in series)
     iop = np.mean([one.mean for one in series], axis=0)
-    squares, degrees = np.zeros(10), 0
+    squares, degrees = np.zeros(10), np.zeros(10)
     for one in series:
-        if len(one) > 1:
-            for name in one.free:
-                squares[IOP_NAMES.index(name)] += np.var(one.column(name)[0]) * len(one)
-            degrees += len(one) - 1
-    sds = np.sqrt(squares / max(degrees, 1))
+        for name in one.free:
+            k = IOP_NAMES.index(name)
+            squares[k] += np.var(one.column(name)[0]) * len(one)
+            degrees[k] += len(one) - 1
+    sds = np.sqrt(squares / np.maximum(degrees, 1))
     correlations = median_correlations([one.correlations for one in series])
     if correlations is None:
         notes.append(

@@ -89,7 +89,7 @@ def read_calibration(path: Path, temperature: float | None = None) -> Calibratio
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:
         raise ConfigurationError(f"{path}: cannot be read: {cause}") from cause
-    if document.get("format") != FORMAT:
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
         found = camera_files.read(path)
         if found.covariance is None:
             raise ConfigurationError(f"{path}: the camera has no covariance: it cannot be weighted")

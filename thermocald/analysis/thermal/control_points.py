@@ -206,7 +206,7 @@ def _from_json(path: Path) -> ControlPoints:
         raise DataError(
             f"{path}: is not valid JSON of control points: {error} is missing"
         ) from error
-    except (TypeError, ValueError, IndexError) as error:
+    except (AttributeError, TypeError, ValueError, IndexError) as error:
         raise DataError(f"{path}: is not valid JSON of control points: {error}") from error
     raise DataError(f"{path}: is neither pyorc's camera configuration (gcps) nor GeoJSON")
 

@@ -64,12 +64,11 @@ _ONE_PLANE = (
 class FieldCheck:
     """The result of the check of a test field.
 
-    sigma_px: of an image coordinate; visible: rows of the targets; hidden: {target: why it is not
-    visible}; sizes: smaller diameter of each visible circle, px; cells: targets per part of the
-    image (rows, columns); coverage: fraction of the image inside the targets' hull; depth_relief:
-    range of depth over mean depth; distance: mean depth mm; flatness: range of the targets'
-    distances from their best plane, over `distance`; precision: as `precision` returns; weak: why
-    an image would be too weak for a result, empty if it would not.
+    sigma_px: of an image coordinate; visible: rows of the targets; hidden: {target: reason}; sizes:
+    smaller diameter of each visible circle, px; cells: targets per part of the image (rows,
+    columns); coverage: fraction of the image inside the targets' hull; depth_relief: range of depth
+    over mean depth; distance: mean depth mm; flatness: extent of the targets across their best
+    plane, over `distance`; precision: as `precision` returns; weak: why an image would be too weak.
     """
 
     camera: CameraModel
@@ -213,10 +212,7 @@ def usual_station(camera: CameraModel, field: TestField) -> ExteriorOrientation:
 
 
 def station_at(place: Array, target: Array, roll: float = 0.0) -> ExteriorOrientation:
-    """Return the orientation of a camera at `place` that looks at `target` (3,) mm, rolled by rad.
-
-    Raises GeometryError if both are the same point.
-    """
+    """Return the orientation of a camera at `place` looking at `target` (3,) mm, rolled by rad."""
     backward = np.asarray(place, dtype=float) - target
     length = float(np.linalg.norm(backward))
     if not length > 0:
@@ -238,10 +234,7 @@ def _extent(field: TestField) -> float:
 
 
 def _front(field: TestField) -> Array:
-    """Return the direction (3,) from which the field is seen best.
-
-    The mean of its normals, each oriented towards the side of the rest of the field.
-    """
+    """Return the direction (3,) that the field faces: its mean normal, oriented to its inside."""
     normals = field_normals(field)
     known = np.isfinite(normals[:, 0])
     if not known.any():
@@ -443,10 +436,7 @@ def _remarks(check: FieldCheck) -> list[str]:
 def _place_in_parts(
     check: FieldCheck, parts: NDArray[np.int64], counts: tuple[int, int], depth: float
 ) -> Array:
-    """Return object points (n, 3) mm at a depth that appear in the centres of parts of the image.
-
-    parts (n, 2): columns and rows; counts: how many columns and rows there are.
-    """
+    """Return points (n, 3) mm at a depth in the centres of image parts (column, row)."""
     sensor = check.camera.sensor
     middles = (parts + 0.5) / counts * (sensor.width, sensor.height) - 0.5
     rays = check.camera.rays(middles)
@@ -457,10 +447,7 @@ def _place_in_parts(
 
 
 def _extend_field(check: FieldCheck, parts: NDArray[np.int64], points: Array) -> Array:
-    """Return object points (n, 3) mm that appear in parts of the image.
-
-    They are on the field's plane if it is one and is in view there, or else at its mean depth.
-    """
+    """Return points (n, 3) mm in parts of the image: on a plane field in view, or at mean depth."""
     placed = _place_in_parts(check, parts, CELLS, check.distance)
     if check.flatness >= _FLAT:
         return placed

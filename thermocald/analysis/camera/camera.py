@@ -1,9 +1,9 @@
 """A camera at one time: interior orientation with covariance, and its use.
 
-Also the difference of two cameras: in their parameters, and in the image, as the shift of fixed
-directions over a grid of the whole image. The shift is given as it is, and after the rotation that
-minimises it: the part that no exterior orientation absorbs (mrcal calls it the projection
-difference). The cameras count as independent of each other.
+Also the difference of two cameras: in their parameters, and in the image, as the shifts of fixed
+directions over a grid of the whole image, before and after the rotation that minimises them: the
+latter no exterior orientation absorbs (mrcal calls it the projection difference). The cameras count
+as independent of each other.
 """
 
 from __future__ import annotations
@@ -144,8 +144,7 @@ class Camera(Result):
         """Return the pose of this camera from control points, with its covariance as prior.
 
         snooping_alpha: error probability of a single test for gross errors, 0 for none. The
-        covariance (16, 16) of the result is that of camera and pose jointly; its status and reason
-        say why there is no pose.
+        covariance (16, 16) of the result is joint; its status and reason explain a missing pose.
         """
         from thermocald.photogrammetry.epoch.measuring import resect
 

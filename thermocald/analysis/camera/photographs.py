@@ -50,11 +50,10 @@ _ENOUGH_TARGETS = 20  # for residuals that the photograph's own pose does not ab
 
 @dataclass(frozen=True, eq=False)
 class PhotographResult:
-    """A photograph with its pose.
+    """A photograph with its pose; without one, status is not `ok` and has a reason.
 
-    status: `ok`, or without a pose another word, with a reason; points (n, 2) px: its image points;
-    residuals (n, 2) px: measured minus adjusted; used (n,): points that took part; all three are
-    empty without a pose.
+    points (n, 2) px: its image points; residuals (n, 2) px: measured minus adjusted; used (n,):
+    points that took part; all three are empty without a pose.
     """
 
     JSON: ClassVar = {
@@ -337,9 +336,9 @@ def images_of(given: Sequence[Path]) -> list[Path]:
 
 
 def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraSpec:
-    """Return a camera for photographs without a camera file, with the image size of most of them.
+    """Return a camera for photographs without a camera file; pitch None stands for 1 µm.
 
-    pixel_pitch mm: None stands for 1 µm. Raises ImageError if no photograph can be read.
+    Its image size is that of most photographs. Raises ImageError if none can be read.
     """
     errors: list[ImageError] = []
     sizes: Counter[tuple[int, ...]] = Counter()

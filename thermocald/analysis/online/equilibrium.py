@@ -2,8 +2,7 @@
 
 The interior orientation of a static camera, given its exterior orientation, is determined to
 hundredths of a pixel in every epoch. Its drift per minute is the slope over the last minutes; the
-time to steady comes from an exponential approach, averaged over the time constants that the data
-allow.
+time to steady comes from an exponential approach, averaged over the plausible time constants.
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ _WORST_MISFIT = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Equilibrium:
-    """The state of a camera that warms up or cools down.
-
-    drift, sd_drift: px/min of (c, x0, y0) together; ready_in, sd_ready_in: s, NaN if unknown.
-    """
+    """A thermal state; drift px/min of (c, x0, y0) together, ready_in s, NaN if unknown."""
 
     state: State
     drift: float = float("nan")

@@ -35,10 +35,9 @@ _SENTENCES = {
 def given_exterior(values: Array, covariance: Array, unit: float) -> tuple[Array, Array, Array]:
     """Condition (c, x0, y0) of an epoch on its exterior orientation.
 
-    values (16,), covariance (16, 16) of the epoch's noise; unit: mm of the unit of the results, the
-    pixel pitch. Returns values (3,), gain (3, 6) and sds (3,) as `EquilibriumWatch.add` takes them:
-    (c, x0, y0) for an exterior orientation e are values + gain e. Errors of the test field are the
-    same in both orientations and cancel.
+    values (16,), covariance (16, 16) of the epoch's noise; unit: of the results in mm, the pixel
+    pitch. Returns values (3,), gain (3, 6) and sds (3,) as `EquilibriumWatch.add` takes them.
+    Errors of the test field are the same in both orientations and cancel.
     """
     block = covariance[10:, 10:]
     cross = covariance[_IOP, 10:]
@@ -138,8 +137,7 @@ class OnlineObserver:
     def _watch_targets(self, calibrated: CalibratedEpoch, adjusted: Adjustment) -> None:
         """Report a target that is rejected in several epochs in a row.
 
-        A rejection counts if the epoch's own adjustment makes it and that in the series does not
-        use the target.
+        The epoch's own adjustment must reject it, and that in the series must not use it.
         """
         taken = np.isfinite(adjusted.residuals).all(axis=1)
         used = set(adjusted.targets[taken].tolist()) - set(adjusted.rejected)

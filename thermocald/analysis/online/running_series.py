@@ -70,8 +70,8 @@ _ESTIMATED = PARAMETER_NAMES[PRINCIPAL]
 class _Kept:
     """A stored epoch.
 
-    grid: its observations; time s; temperature °C; alone (16,): values of its own adjustment;
-    reported (16,): values that were reported, None if these are the same.
+    grid: its observations; time s; temperature °C; alone (16,): its own values; reported (16,):
+    those that were reported, None if the same.
     """
 
     grid: ObservationGrid
@@ -316,10 +316,7 @@ class RunningSeries:
         return columns
 
     def _elsewhere(self, alone: Adjustment) -> bool:
-        """Return whether the targets appear elsewhere in the image than in the last epoch.
-
-        The camera was then turned, by far more than a knock that movements of the mount describe.
-        """
+        """Return whether the targets have moved further in the image than a mount can move them."""
         if not self._kept:
             return False
         points = self._field.points[alone.targets]
@@ -330,10 +327,7 @@ class RunningSeries:
         return bool(np.median(np.abs(here - there)) > _TURNED_PX)
 
     def _adjust_newest(self) -> tuple[_Epoch | None, _Epoch]:
-        """Return the newest epoch's own result, None if its series does not change it.
-
-        Also returns its result in the series.
-        """
+        """Return the newest epoch's own result, None if unchanged, and that in its series."""
         whole, newest = None, self._without_wrong(self._kept[-1].grid)
         more = (newest.observed[0] & ~self._shown).any()  # targets that no earlier epoch showed
         if self._series is not None and not more and self.epochs < self._look_at[1]:
@@ -428,10 +422,7 @@ class RunningSeries:
         return grid.reject(np.broadcast_to(self._wrong, grid.observed.shape))
 
     def _own_looks(self) -> tuple[int, int]:
-        """Return the last and the next epoch at which all are adjusted with their own orientation.
-
-        They are the same however often the program is restarted.
-        """
+        """Return the last and next epoch of `_adjust_each`, the same ones after a restart."""
         if len(self._kept) == self._kept.maxlen:
             return self.epochs, self._again(_OFTEN)
         last = following = 1

@@ -87,10 +87,9 @@ class Epochs(Result):
     also attributes: `epochs.c`, `epochs.sd_c`.
 
     drifts: the changes of the parameters and their significance; left_out: targets found to move by
-    themselves; field_movements: boards and targets that moved, for which the observations are
-    corrected; adjustment: of the series, None for epochs as stored; groups: {name: rows of the test
-    field} of targets on one board; without: a function that returns the epochs without some targets
-    (rows), quickly or in full.
+    themselves; field_movements: of boards and targets, for which observations are corrected;
+    adjustment: of the series, None for epochs as stored; groups: {name: rows of the test field} of
+    targets on a board; without: returns the epochs without some targets (rows), quickly or fully.
 
     >>> epochs = tc.open("M1").calibrate()
     >>> bool((epochs.sd_c[epochs.ok] > 0).all())
@@ -342,10 +341,7 @@ class Epochs(Result):
         return out
 
     def _hang_on_c(self) -> dict[str, float] | None:
-        """Return the relative sd of c and the largest error of a change that it causes, in sds.
-
-        None if the error is small.
-        """
+        """Return c's relative sd and the largest error of a change by it, in sds; None if small."""
         if not self.drifts or not self.level_sd[0] > 0:
             return None
         share = float(self.level_sd[0] / np.nanmedian(self.values[self.ok, 0]))

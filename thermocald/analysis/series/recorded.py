@@ -146,8 +146,7 @@ def replay_into(
     Returns the epochs with their drifts. jobs: processes; the stored epochs of an interrupted block
     are calibrated again, so that the block's other epochs are the same as without the interruption.
 
-    Raises StoreError; DataError if the store's series of this name is of another recording;
-    UsageError if it was calibrated with other parameters.
+    Raises StoreError; DataError if the store's series of this name is of another recording.
     """
     # not durable: a replay can be repeated after a power cut; the end of the process loses nothing
     with Store.open(path, "append", durable=False) as store:

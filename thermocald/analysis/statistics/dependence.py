@@ -16,18 +16,16 @@ A short series does not decide between models, so their prior weights matter. Th
 simulation such that errors are about as large as the standard deviations. Over 150 epochs of a
 warm-up, or of heating and cooling, their ratio is 0.9 for white noise, 0.9 to 1.0 for phi = 0.9,
 1.0 to 1.2 for phi = 0.97 on white noise of equal size; in all cases tried with phi up to 0.97 it is
-between 0.65 and 1.35. If the memory of the noise exceeds a seventh of the series, the standard
-deviation is an order of magnitude (1.3 to 1.5 for phi = 0.99); if that is likely, `too_short` is
-set.
+between 0.65 and 1.35. If the memory exceeds a seventh of the series, the standard deviation is an
+order of magnitude (1.3 to 1.5 for phi = 0.99); if that is likely, `too_short` is set.
 
 The reference (section 4.1) tests whether a parameter varies more than its standard deviations
 explain: it compares the two-sided moving variance over n consecutive measurements with the moving
 average of their squared standard deviations by an F-test at each epoch, and states the fraction of
 epochs at which it succeeds. Neighbouring windows share n-1 of n measurements, so these tests are
 not independent and their fraction has no p-value; `noise_models` gives one for the whole series.
-For the correlations of the interior orientation the reference (section 4.3) uses the median of
-every coefficient over all epochs and both series, and calls their scatter the noise of the
-coefficients.
+For the correlations of the interior orientation it uses the median of every coefficient over all
+epochs and both series, and calls their scatter the noise of the coefficients (section 4.3).
 
 Sources: Whittle (1953), Estimation and information in stationary time series; Harville (1974),
 Biometrika 61, 383-385, for the restricted likelihood; Pyper & Peterman (1998), Can. J. Fish. Aquat.
@@ -374,8 +372,7 @@ def moving_f_test(
     of a window have the sum of its redundancies as degrees of freedom. Returns, each (m,), the
     epochs at window centres; the ratios of the moving variance to the moving mean of the squared
     standard deviations; the critical ratios, above which the variance is significantly greater; the
-    degrees of freedom of the mean squared standard deviations. Raises ValueError for an even
-    window or one below 3.
+    degrees of freedom of the mean squared standard deviations.
     """
     from scipy.stats import f
 

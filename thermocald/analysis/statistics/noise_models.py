@@ -96,10 +96,9 @@ class Frequencies:
     """The frequencies of a series with gaps, lowest first, pooled at the high ones.
 
     pieces: rows of each stretch without a gap; contrasts (K - 1, K): orthonormal combinations of
-    the stretches' scaled means; pauses (K, K): from the end of one stretch to the beginning of
-    another, in intervals; order: of the coefficients by frequency; starts (m,): the first
-    coefficient of each pool; count (m,): coefficients of each pool; mean (m,): its mean frequency,
-    rad, 0 for a contrast.
+    the stretches' scaled means; pauses (K, K): between the end of one and the beginning of another,
+    in intervals; order: of the coefficients by frequency; starts, count (m,): first coefficient and
+    size of each pool; mean (m,): its mean frequency, rad, 0 for a contrast.
     """
 
     pieces: tuple[slice, ...]
@@ -191,10 +190,9 @@ def _pieces(n: int, times: Array | None) -> tuple[tuple[slice, ...], Array]:
 
 
 def cosines(y: Array) -> Array:
-    """Return the orthonormal cosine coefficients of a series (n,) about its mean.
+    """Return the orthonormal cosine coefficients of a series (n,), without the constant one.
 
-    There are n - 1 without the constant one, or fewer if a long series is cut to a length with
-    small factors.
+    There are n - 1, or fewer if a long series is cut to a length with small factors.
     """
     from scipy.fft import dct
 
@@ -375,10 +373,9 @@ def _slow_against_fast(
 
 
 def _without_trend(power: Array, first: Array, trend: Array, band: int) -> Array:
-    """Return the power beyond a band without the leakage of a trend.
+    """Return the power beyond a band without a trend's leakage; first (k,): single frequencies.
 
-    first (k,): coefficients of single frequencies. Cosines end flat, a drift need not: a line and a
-    parabola are removed.
+    Cosines end flat, but a drift need not: a line and a parabola are removed.
     """
     power, high = power[band:].copy(), first[band:]
     if len(high) > 2:

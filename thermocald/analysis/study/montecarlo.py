@@ -238,10 +238,7 @@ def _simulate(
 def plane_errors(
     sensor: Sensor, iop: Array, sets: Array, points: Array, distance_mm: float
 ) -> Array:
-    """Return errors (n, k, 2) mm of image points (k, 2) px for sets (n, 10) of IOP.
-
-    Relative to `iop` (10,); NaN for a set without rays.
-    """
+    """Return errors (n, k, 2) mm of image points (k, 2) px for sets (n, 10); NaN without rays."""
     dx, dy, ok = _PlaneErrors(sensor, iop, points, distance_mm)(sets)
     errors = np.stack([dx.T, dy.T], axis=-1)
     errors[~ok] = np.nan

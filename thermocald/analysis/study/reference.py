@@ -120,10 +120,7 @@ class Comparison:
 def reference_studies(
     settings: StudySettings, advance: Callable[[int], None] = lambda _: None
 ) -> list[CameraStudy]:
-    """Study every preset: simulate two series into recordings, read and adjust them.
-
-    The f-number is each camera's own. advance: called after every series.
-    """
+    """Study every preset with its own f-number, from two series simulated, read and adjusted."""
     studies = []
     for preset in QUOTED:
         measured = []

@@ -44,9 +44,8 @@ if TYPE_CHECKING:
 class Deviation:
     """The change of a parameter over a series.
 
-    change: last minus first value, with sd_change; largest: signed, largest difference from the
-    first value; range: largest minus smallest value. Both distinguish a camera that returned from
-    one that never changed; noise alone makes them a few standard deviations, too.
+    change: last minus first value; largest: signed, from the first value; range: largest minus
+    smallest value. The latter two, some sds from noise alone, reveal a camera that returned.
     """
 
     first: float
@@ -158,10 +157,9 @@ class StudySettings:
 class Significance:
     """The moving F-test of one parameter in summary, and the drift test of the whole series.
 
-    success_ratio: over `tests` epochs; left_out: epochs without a window; degrees_variance,
-    degrees_sd: degrees of freedom of the variance and (median) of the mean squared sd; critical:
-    median; course (k, 2): time s and ratio of the variances, thinned for drawing; drift: None if it
-    cannot be tested.
+    success_ratio: over `tests` epochs; left_out: epochs without a window; degrees of freedom of the
+    variance and (median) of the mean squared sd; critical: median; course (k, 2): time s and ratio
+    of the variances, thinned for drawing; drift: None if it cannot be tested.
     """
 
     JSON: ClassVar = {"critical": "critical_ratio", "course": "", "drift": "drift_test"}
@@ -179,10 +177,7 @@ class Significance:
 
 @dataclass(frozen=True, eq=False)
 class ChannelStudy:
-    """The dependence of every free parameter and of sigma0 on one thermometer.
-
-    Without dependences, `reason` says why.
-    """
+    """The dependence of free parameters and sigma0 on a thermometer, or the `reason` for none."""
 
     thermometer: Thermometer
     dependences: Mapping[str, Dependence]

@@ -3,8 +3,7 @@
 Each calibration gives an interior orientation with its covariance; together they give the interior
 orientation at T₀ and the rates of c, x0, y0 by generalised least squares (Koch, Parameter
 Estimation and Hypothesis Testing in Linear Models, 3.2). Parameters without a rate (distortion,
-affinity) are constant, or the distortion follows the angle; the test of the sum of squares shows
-whether that holds.
+affinity) are constant, or the distortion follows the angle; the sum of squares tests that.
 """
 
 from __future__ import annotations
@@ -47,10 +46,9 @@ _LEAST_SPAN_K = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibration: a camera and the covariance (10, 10) of its interior orientation.
+    """A calibration: a camera with the covariance (10, 10) of its interior orientation.
 
-    moments: when its photographs were taken, as the camera wrote it; temperature: °C, None if
-    unknown.
+    moments: of its photographs, as the camera wrote them; temperature: °C, None if unknown.
     """
 
     path: Path
@@ -81,10 +79,7 @@ def is_calibration(path: Path) -> bool:
 
 
 def read_calibration(path: Path, temperature: float | None = None) -> Calibration:
-    """Read what `calibrate` wrote with `--json` or `--camera-out`.
-
-    Raises ConfigurationError naming the file.
-    """
+    """Read what `calibrate` wrote (`--json`, `--camera-out`). ConfigurationError names the file."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:

@@ -66,11 +66,10 @@ class ControlPoints:
 
     @classmethod
     def read(cls, path: Path, unit: str) -> ControlPoints:
-        """Read control points from a CSV, GeoJSON or pyorc's JSON (both in metres).
+        """Read control points from a CSV in a unit, mm or m, or from GeoJSON or pyorc's JSON in m.
 
         The CSV has target, X, Y, Z, sX, sY, sZ, optionally image points x, y, sx, sy (px), and
-        kind, code and diameter as in a test field. unit: of its coordinates, mm or m. Raises
-        DataError naming the file, line and column.
+        kind, code and diameter as in a test field. Raises DataError naming file, line and column.
         """
         if path.suffix.lower() in (".json", ".geojson"):
             return _from_json(path)
@@ -83,8 +82,7 @@ class ControlPoints:
     ) -> ControlPoints:  # fmt: skip
         """Build control points from coordinates (n, 3) in a unit, with standard deviations.
 
-        seen: image points and their standard deviations, (n, 2) px each, NaN for a point not seen;
-        looks: kinds, codes and diameters as in `TestField.build`. Raises DataError.
+        seen: image points and their standard deviations, (n, 2) px each, NaN for a point not seen.
         """
         scale = UNITS[unit]
         if not names:

@@ -9,8 +9,7 @@ from a file or from standard input.
 Frames of a camera in use are resampled to what it would have seen at T₀, so that a program with a
 single calibration processes those of a cold morning and of a hot day alike. The JPEG has EXIF; its
 comment holds, as JSON, the camera at T₀ in OpenCV's terms and the pose, with standard deviations.
-The camera's standard deviations are those of the frame's own camera, since its errors enter the
-resampled frame unchanged.
+The camera's are those of the frame's own camera, whose errors enter the resampled frame unchanged.
 """
 
 from __future__ import annotations
@@ -65,10 +64,7 @@ _SAMPLE = 997  # points of an image at which the size of the correction is compu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corrected:
-    """Corrected image points: points (n, 2) px and sds (n, 2) px of the correction.
-
-    temperature (n,) °C; extrapolated (n,) K outside the temperatures of the fit.
-    """
+    """Corrected image points (n, 2) px with sds (n, 2) px; extrapolated (n,) K beyond the fit."""
 
     points: Array
     sds: Array
@@ -118,8 +114,8 @@ def require_inside(log: TemperatureLog, times: Array) -> None:
 class ImageCorrection:
     """The correction of one image: maps, and the values (10,) of its camera to resample it with.
 
-    temperature °C: of the image; rms_px, largest_px: shift of the image points; left_over_px: RMS
-    sd of the correction, all over a sample of points; extrapolated K.
+    temperature °C; rms_px, largest_px: shift of a sample of points; left_over_px: its RMS sd;
+    extrapolated K.
     """
 
     JSON: ClassVar = {
@@ -257,8 +253,8 @@ _CHUNK = 1 << 22  # bytes read at once: a year of rows need not fit into memory
 class RowBlock:
     """A block of rows of a CSV.
 
-    lines (n): line numbers, 1 for the header's; rows: fields as text; times (n,) s UTC; values
-    (n, k): the requested further columns; refused: (line, reason) of rows that cannot be used.
+    lines (n): numbers, the header's is 1; rows: fields as text; times (n,) s UTC; values (n, k):
+    the other requested columns; refused: (line, reason) of unusable rows.
     """
 
     header: list[str]

@@ -8,8 +8,7 @@ no row has the status `ok`, so that a study or a fit does not take a prediction 
 
     predicted      interior orientation only: there are no control points
     resected       also the pose from the control points, with the predicted camera as prior
-    last_pose      control points hidden or too few: the last pose, its covariance widened by the
-                   mount's possible movement
+    last_pose      control points hidden or too few: the last pose, with the mount's possible motion
     outside_range  beyond the temperatures of the fit: predicted with widened covariance, or not at
                    all if too far
     no_temperature the last reading is too old, or there is none
@@ -224,10 +223,7 @@ class GaugeCalibrator:
     def _measured(
         self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None
     ) -> tuple[Epoch, Observations | None, str]:
-        """Measure the control points of an epoch.
-
-        Returns the epoch with them, the observations, and why there are none.
-        """
+        """Return an epoch with its control points, these alone, and why there are none."""
         self.movement = None
         if self._finder is None or epoch.observations is not None:
             return epoch, epoch.observations, "no control point is seen"

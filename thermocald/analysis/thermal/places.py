@@ -87,7 +87,7 @@ def _read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     kind, way = ("plane", "normal") if "plane" in document else ("line", "direction")
     parts = document[kind]
     if not isinstance(parts, dict) or set(parts) != {"point", way}:
-        raise ConfigurationError(f"{path}, {kind}: must have point: [X, Y, Z] and {way}: [a, b, c]")
+        raise ConfigurationError(f"{path}, {kind}: needs point: [X, Y, Z] and {way}: [a, b, c]")
     point = scale * _vector(path, parts, "point") - control.origin
     along = _vector(path, parts, way)
     size = float(np.linalg.norm(along))
@@ -100,9 +100,7 @@ def _read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
 
 def _profile(path: Path, given: Any) -> Array:
     if not isinstance(given, list) or len(given) < 2:
-        raise ConfigurationError(
-            f"{path}, profile: must have at least two points [X, Y, Z], in order"
-        )
+        raise ConfigurationError(f"{path}, profile: needs at least two points [X, Y, Z], in order")
     points = np.array([_vector(path, {"profile": point}, "profile") for point in given])
     if not np.linalg.norm(np.diff(points, axis=0), axis=1).all():
         raise ConfigurationError(f"{path}, profile: the same point is given twice in a row")

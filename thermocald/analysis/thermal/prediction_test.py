@@ -7,9 +7,9 @@ residuals of the image points are compared with the noise floor: image noise, an
 prediction from the thermometer's noise and reading times. The 95 % bands also include the model's
 own uncertainty; for a model that misses an effect no band is stated.
 
-The 22 parameters of an epoch are the camera's 16, three scales of the field's coordinates, and a
-displacement in mm. Their derivatives by the model's parameters and by the readings are computed for
-every epoch. An amplitude keeps its size, an event its own height and time.
+The 22 parameters of an epoch, with derivatives by the model's parameters and by the readings, are
+the camera's 16, three scales of the field's coordinates, and a displacement in mm. An amplitude
+keeps its size, an event its own height and time.
 """
 
 from __future__ import annotations
@@ -194,9 +194,8 @@ NORMAL_95 = 1.959964  # standard deviations of a 95 % band
 class PredictedError:
     """The errors of the prediction of one series.
 
-    rms_px: of measured minus predicted image points; floor_px: the RMS expected from noise alone;
-    coverage: fraction of the coordinates inside their 95 % bands, NaN if the model misses an effect
-    and no band is stated; object_mm: the RMS on a plane at 10 m.
+    rms_px: of measured minus predicted image points; floor_px: expected from noise alone; coverage:
+    fraction of coordinates in their 95 % bands, NaN if none is stated; object_mm: RMS at 10 m.
     """
 
     name: str
@@ -211,8 +210,7 @@ def predicted_error(
 ) -> PredictedError:
     """Predict a series and compare it with the measured points; thermometer_sd K: of a reading.
 
-    Raises ConfigurationError for another camera, DataError if the model's reference thermometer is
-    missing.
+    Raises ConfigurationError for another camera, DataError without its reference thermometer.
     """
     source = series.source
     if source.sensor != model.sensor or source.camera != model.camera:
@@ -293,10 +291,10 @@ def _variance(A: Array, covariance: Array) -> Array:
 
 
 def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: float) -> Array:
-    """Return the covariance (E, 22, 22) of the epochs' parameters from the thermometers.
+    """Return the covariance (E, 22, 22) from the thermometers, relative to the series' mean.
 
-    Relative to the series' mean. It contains the readings' errors, propagated through each effect's
-    operator, and what the reading times leave unresolved.
+    Contains the readings' errors, propagated through each effect's operator, and what their times
+    leave unresolved.
     """
     history = series.readings_history
     jump = series.thermometers[history.reference].slope_jump(history.times)
@@ -336,10 +334,7 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
 
 
 def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
-    """Return the covariance (E, 22, 22) of the epochs' parameters from those of the model's drift.
-
-    The level is estimated from the series itself.
-    """
+    """Return the covariance (E, 22, 22) from the model's drift; the level is the series' own."""
     history = series.readings_history
     if model.covariance is None:
         return np.zeros((len(history.times), 22, 22))

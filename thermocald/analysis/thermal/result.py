@@ -3,9 +3,8 @@
 The model's residuals are tested against noise that is estimated without the model: image noise from
 the residuals of a free camera per epoch, thermometer noise from the roughness of the readings.
 Smooth trajectories beyond that noise mean that the model lacks an effect. They show this effect as
-far as the fit has not absorbed it. They are treated as a random time series with the power that
-they have in each order of cosines, and propagated into the covariance of the unknowns and of the
-interior orientation that the model predicts.
+far as the fit has not absorbed it; as a random time series with the power that they have in each
+order of cosines they enter the covariance of the unknowns and of the predicted orientation.
 """
 
 from __future__ import annotations
@@ -60,10 +59,9 @@ def examine_rest(
     """Test the smooth misfit of the model in every series; short series are tested jointly.
 
     free: columns of the interior orientation that absorb the misfit. Returns a verdict: whether an
-    effect is missing (None if a series could not be tested and no other lacks an effect), the RMS
-    px and the significance of the misfit in the worst series. Also returns what the misfit adds to
-    the covariance of the fit's unknowns (K + L, K + L) and of the interior orientation (10, 10),
-    px-scaled.
+    effect is missing (None if a series could not be tested and no other lacks one), RMS px and
+    significance of the misfit in the worst series; and what the misfit adds to the covariances of
+    the fit's unknowns (K + L, K + L) and of the interior orientation (10, 10), px-scaled.
     """
     size = len(fit.covariance)
     unknowns, parameters = np.zeros((size, size)), np.zeros((len(free), len(free)))
@@ -128,20 +126,17 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
     return total
 
 
-_SELDOM = (
-    0.05  # fraction of the reading interval by which curvature between readings biases a delay
-)
+_SELDOM = 0.05  # bias of a delay by curvature between readings, over their interval
 _INTERIOR = [COLUMNS.index(n) for n in IOP_NAMES]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
 
 @dataclass(frozen=True, slots=True)
 class SeriesFit:
-    """The fit of one series.
+    """The fit of one series, with the RMS of its image residuals.
 
-    rms_px: RMS of the image residuals; thermometer_sd: K; means: the number of epoch means that a
-    long series was fitted on, and that the RMS refers to, else None; noise_px: the RMS expected
-    from the noise of image and thermometer.
+    thermometer_sd: K; means: the number of epoch means of a long series, to which fit and RMS
+    refer, else None; noise_px: the RMS expected from the noise of image and thermometer.
     """
 
     JSON: ClassVar = {"left_over": "left_over_in_noise"}
@@ -257,9 +252,8 @@ def fitted_camera(
 ) -> ThermalCamera:
     """Build the thermal camera of a fit; its events and phases are those of the first series.
 
-    series: the original ones, not averaged in blocks; growth, moved: the effects on noise and
-    targets, which are estimated outside the fit; distortion_sigmas: how significantly the data show
-    what the distortion follows, None if that was given.
+    series: not averaged in blocks; growth, moved: effects on noise and targets, from outside the
+    fit; distortion_sigmas: significance of what the distortion follows, None if that was given.
     """
     numbers = unknowns_of(fit, series[0].scale)
     starts = [
@@ -358,10 +352,9 @@ def _tied_constants(model: ThermalModel) -> list[dict[str, Any]]:
 
 
 def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
-    """Return the normal matrix of the interior orientation at T₀ and the fit's unknowns, px-scaled.
+    """Return the normal matrix of interior (10), unknowns (K + L) and exteriors (6 each), px.
 
-    Rows: interior orientation (10), unknowns (K + L), exterior orientations (6 per series). The
-    thermometers' errors are eliminated.
+    The interior orientation is that at T₀; the thermometers' errors are eliminated.
     """
     n, K, size = len(_INTERIOR), len(fit.coefficients), len(fit.covariance)
     M = np.zeros((n + size + 6 * len(fitter.series),) * 2)
@@ -385,7 +378,6 @@ def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
 
 
 def _span(series: Sequence[ReducedSeries], channel: str) -> tuple[float, float]:
-    """Return the range of a channel's readings, °C, rounded outwards to 0.1 K."""
     values = [s.source.readings[channel] for s in series if channel in s.source.readings]
     both = np.concatenate(values)
     low, high = float(np.nanmin(both)), float(np.nanmax(both))

@@ -207,8 +207,7 @@ class SceneCourse(Result):
     def per_kelvin(self) -> tuple[Array, Array]:
         """Slopes (4,) of `values` against the temperature, and their standard deviations.
 
-        The standard deviations follow from the larger of stated and observed scatter. NaN for fewer
-        than four frames, or if the temperature changed by less than 1 K.
+        From the larger of stated and observed scatter; NaN for under four frames or 1 K.
         """
         T = self.temperatures[self.seen]
         slopes, sds = np.full(4, np.nan), np.full(4, np.nan)
@@ -226,10 +225,7 @@ class SceneCourse(Result):
 
     @cached_property
     def model_misses(self) -> bool:
-        """True if the principal distance changes by more than the prediction's uncertainty.
-
-        A change with the temperature is tested, then any other systematic change.
-        """
+        """True if c changes with temperature, or in another systematic way, beyond its sds."""
         slope, sd = (v[3] for v in self.per_kelvin)
         change = float(np.ptp(self.temperatures[self.seen])) if self.seen.any() else 0.0
         own = float(np.nanmax(self.unsure[:, 3], initial=0.0)) / max(change, 1e-9)
@@ -245,8 +241,7 @@ class SceneCourse(Result):
         """Test whether c changes with temperature, its square, time, or since the reference frame.
 
         The noise is estimated from the residuals. Four parameters describe all frames together, so
-        that the effect does not count as noise: a second-order effect too small to be seen in any
-        one frame is found.
+        that the effect is no noise: one of second order is found that no single frame shows.
         """
         T, hours = self.temperatures[rows] - self.temperatures[0], self.times[rows] - self.times[0]
         A = np.column_stack([np.ones(len(T)), T, T**2, hours])
@@ -266,10 +261,7 @@ class SceneCourse(Result):
         return explained / rank > _f_bound(rank, factor, free)
 
     def _has_course(self, rows: NDArray[np.int64]) -> bool:
-        """Test whether c changes systematically.
-
-        The noise is estimated from how frames differ from the mean of their two neighbours.
-        """
+        """Test whether c changes systematically; noise: differences from both neighbours' mean."""
         y, noise, known = self._beside(rows)
         v = self.covariance[rows, 3, 3]
         bends = np.diff(y, 2) ** 2 / (v[2:] + 4.0 * v[1:-1] + v[:-2])
@@ -289,8 +281,7 @@ class SceneCourse(Result):
     def movements(self) -> list[tuple[int, Array, Array]]:
         """Frames in which the camera has moved since the frame before: turn (3,) rad, covariance.
 
-        The next frame, if there is one, must confirm it. The slow movement of a mount that follows
-        the temperature does not count.
+        The next frame, if any, must confirm it. A mount's slow thermal movement does not count.
         """
         rows = np.flatnonzero(self.seen)
         values = np.vstack([np.zeros(3), self.values[rows, :3]])

@@ -67,8 +67,7 @@ def seconds(times: ArrayLike) -> Array:
 class Along:
     """The camera along a history; indexing gives a Camera.
 
-    times (E,) s, temperatures (E,) °C; values (E, 10); covariance (E, 10, 10); extrapolated (E,) K;
-    camera: its name.
+    times (E,) s, temperatures (E,) °C; values (E, 10); covariance (E, 10, 10); extrapolated (E,) K.
     """
 
     sensor: Sensor
@@ -355,8 +354,7 @@ class ThermalCamera(Result):
     ) -> Array:
         """Return the covariance (E, 10, 10) of the orientations that follow from `linear` (E, 10).
 
-        driven: {(parameter of a drive, ±1): drive (E,) with the parameter moved by a step}, if the
-        caller has computed it.
+        driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if at all.
         """
         J = np.zeros((*linear.shape, len(self.parameters)))
         for i, name in enumerate(self.parameters):
@@ -402,10 +400,9 @@ class ThermalCamera(Result):
         return steady_camera(self.model, self.parameters, None)
 
     def steady_polynomials(self) -> tuple[Array, Array, Array]:
-        """Return the steady camera's parameters as polynomials in T - T0: three arrays (10,).
+        """Return the steady camera's linear parameters as polynomials in T - T0: arrays (10,).
 
-        They are those before the distortion follows c. Raises UsageError for a model that needs
-        more than one thermometer.
+        Raises UsageError for a model that needs more than one thermometer.
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
@@ -417,10 +414,7 @@ class ThermalCamera(Result):
 
 
 def _noise_share(times: Array, at: Array) -> Array:
-    """Return the variance (E,) of a temperature interpolated between readings at times (R,).
-
-    In units of one reading's variance.
-    """
+    """Return the variance (E,) of interpolated readings of times (R,), over that of a reading."""
     if len(times) < 2:
         return np.ones(len(at))
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
@@ -557,8 +551,7 @@ class LiveCamera:
     def maps(self, to: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the maps x, y (H, W) px for `cv2.remap` that `correct` uses now.
 
-        They are the same objects until an image point has moved by more than 0.05 px. Raises
-        UsageError before the first reading.
+        They are the same objects until an image point has moved by more than 0.05 px.
         """
         if self._now is None:
             raise UsageError("there is no reading yet: call update(time, temperature) first")

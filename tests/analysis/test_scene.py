@@ -16,10 +16,10 @@ from tests.analysis.test_gauge import RATES, SD_RATE, START, thermal_camera
 from tests.commands import call
 from thermocald.analysis.thermal.scene import (
     SceneCourse,
-    common_movement,
-    features,
+    detect_features,
+    estimate_movement,
     follow_scene,
-    followed,
+    track_features,
 )
 from thermocald.analysis.thermal.scene_recording import write_scene
 from thermocald.errors import DataError
@@ -77,12 +77,12 @@ def test_turn_and_principal_distance_have_true_sds():
     for seed in range(40):
         bank, thermal = Bank(seed), camera()
         reference = bank.frame(bank.cold)
-        points = features(reference)
+        points = detect_features(reference)
         now = thermal.at(20.0 + bank.rng.uniform(-15, 15))
         turn = bank.rng.normal(0, 1e-3, 3)
         frame = bank.frame(now, turn, bank.rng.uniform(0.8, 1.1))
-        rows, moved = followed(reference, points, frame)
-        found = common_movement(bank.cold, now, points[rows], moved)
+        rows, moved = track_features(reference, points, frame)
+        found = estimate_movement(bank.cold, now, points[rows], moved)
         ratio.append((found.values - [*turn, 0.0]) / np.sqrt(np.diag(found.covariance)))
     rms = np.sqrt(np.mean(np.square(ratio), axis=0))
     assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.15), rms
@@ -276,7 +276,7 @@ def test_a_frame_of_night_and_one_of_elsewhere_have_no_movement(tmp_path):
 
 def test_nothing_to_follow_is_said(tmp_path):
     with pytest.raises(DataError, match="features"):
-        features(np.full((HEIGHT, WIDTH), 90, np.uint8))
+        detect_features(np.full((HEIGHT, WIDTH), 90, np.uint8))
     with pytest.raises(DataError, match="at least one more"):
         follow_scene(camera(), TemperatureLog(np.array([START]), {}), [])
 

@@ -32,7 +32,9 @@ _SENTENCES = {
 }
 
 
-def given_exterior(values: Array, covariance: Array, unit: float) -> tuple[Array, Array, Array]:
+def condition_on_exterior(
+    values: Array, covariance: Array, unit: float
+) -> tuple[Array, Array, Array]:
     """Condition (c, x0, y0) of an epoch on its exterior orientation.
 
     values (16,), covariance (16, 16) of the epoch's noise; unit: of the results in mm, the pixel
@@ -95,7 +97,7 @@ class OnlineObserver:
             self._tell(event, _SENTENCES[event], epoch.frame_time, epoch.number)
             self.watch.clear()
         if innovation.change != "outlier":
-            given = given_exterior(adjustment.values, errors[0], self._pitch)
+            given = condition_on_exterior(adjustment.values, errors[0], self._pitch)
             self.watch.add(epoch.frame_time, *given)
         self._equilibrium = self.watch.assess(self.filter.values()[10:])
         columns = {

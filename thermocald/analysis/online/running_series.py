@@ -407,9 +407,9 @@ class RunningSeries:
         self._look_at[1] = self._again(share)
         if len(kept) < FEWEST_EPOCHS:
             return row
-        from thermocald.analysis.series.adjusted import still_field  # late: it takes 2 MB
+        from thermocald.analysis.series.adjusted import correct_field  # late: it takes 2 MB
 
-        moved, still = still_field(
+        moved, still = correct_field(
             self._sensor, self._field, grid, series.sample, start,
             np.array([k.number for k in kept]), time,
         )  # fmt: skip

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from thermocald.store.recording.head import Head
 
 
-def still_field(
+def correct_field(
     sensor: Sensor, testfield: TestField, grid: ObservationGrid, result: SeriesAdjustment,
     camera: Array, numbers: NDArray[np.int64], time_s: Array,
 ) -> tuple[tuple[FieldMovement, ...], ObservationGrid]:  # fmt: skip
@@ -138,7 +138,7 @@ def table_of_series(
         return left_out()
     if in_blocks:
         return found
-    moved, still = still_field(
+    moved, still = correct_field(
         head.camera.sensor, testfield, grid, found.adjustment, start, apart.number,
         apart.frame_time,
     )  # fmt: skip

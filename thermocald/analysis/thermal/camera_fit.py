@@ -99,7 +99,7 @@ def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> Therma
         if f"{e.name}.{key}" not in priors
     ]
     fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors, kind.distortion)
-    model = shrunk_to_type(fitted.model, kind, priors)
+    model = shrink_to_type(fitted.model, kind, priors)
     names = [n for n in _names(kind) if not n.startswith("interior.") and kind.sd(n) > 0]
     weights = {n: min(1.0, (model.sd(n) / kind.sd(n)) ** 2) for n in names}
     about = {"name": kind.camera, "cameras": len(kind.fitted_on), "weights": weights}
@@ -114,7 +114,7 @@ def require_type(kind: ThermalModel) -> None:
         raise DataError(f"{kind.name or kind.camera} is not a type model (`fit --type` writes one)")
 
 
-def shrunk_to_type(
+def shrink_to_type(
     model: ThermalModel,
     kind: ThermalModel,
     priors: Mapping[str, tuple[float, float]] | None = None,

@@ -44,7 +44,7 @@ _SHOWN = 13.8  # χ² with two degrees of freedom, 0.1 %: below it C1 and C2 kee
 _ITERATIONS = 8
 
 
-def series_means(
+def average_residuals(
     series: ReducedSeries, prediction: Prediction
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return the weighted mean of measured minus predicted image points (T, 2) px.
@@ -64,13 +64,13 @@ def series_means(
     points = series.source.grid.points
     for part in chunks(*points.shape[:2]):
         w = use[part]
-        left = np.where(w > 0, points[part] - projected(series, prediction, part), 0.0)
+        left = np.where(w > 0, points[part] - project_targets(series, prediction, part), 0.0)
         total += np.einsum("etc,etc->tc", w, left)
         weight += w.sum(axis=0)
     return total / np.where(weight > 0, weight, 1.0), weight, moved
 
 
-def projected(series: ReducedSeries, prediction: Prediction, part: slice) -> Array:
+def project_targets(series: ReducedSeries, prediction: Prediction, part: slice) -> Array:
     """Return the model's image points (e, T, 2) px of some epochs."""
     still = series.source.field.points
     points = prediction.points(still, part) if prediction.moves_points else still
@@ -109,7 +109,7 @@ def estimate_level(
         for k, (s, m) in enumerate(zip(series, models, strict=True)):
             now = placed(m, k)
             prediction = now.predict(s.history, s.source.field)
-            mean, weight, _ = series_means(s, prediction)
+            mean, weight, _ = average_residuals(s, prediction)
             at = linearise(s.source.sensor, s.source.field, prediction.iop.mean(axis=0), eops[k])
             columns = np.concatenate([np.arange(n), n + 6 * k + np.arange(6)])
             A = at.A[:, :, 10 - n :]
@@ -161,7 +161,7 @@ class Moved:
         return ModelEffect(listed.name, {**listed.values, **vector, **time})
 
 
-def moved_targets(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
+def estimate_step(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
     """Estimate the step of some targets by one vector; others: the series reduced without them.
 
     A direction that the rays do not determine stays 0 and has no variance.

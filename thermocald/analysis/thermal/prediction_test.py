@@ -19,7 +19,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.thermal.level import estimate_level, moved_targets, projected, series_means
+from thermocald.analysis.thermal.level import (
+    average_residuals,
+    estimate_level,
+    estimate_step,
+    project_targets,
+)
 from thermocald.analysis.thermal.terms import event_worth
 from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.errors import ConfigurationError, DataError
@@ -96,7 +101,7 @@ def _weights(
 _ROUNDS = 3  # phases and events depend on each other
 
 
-def with_own(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
+def fit_own_effects(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
     """Return the model with the phases and events of a series with the model's T₀ and reference."""
     listed = {e.name: e for e in model.effects if catalogue.get(e.name).seen_in == "trajectory"}
     own = [e for e in listed if Term(e).is_separate]
@@ -225,18 +230,15 @@ def predicted_error(
     model = _of_series(model, series, rows)
     history = series.readings_history
     prediction = model.predict(history, source.field)
-    mean, _, _ = series_means(series, prediction)
-    whole = slice(0, len(history.times))
+    mean, _, _ = average_residuals(series, prediction)
     weights = series.weights[..., :2]
-    points = source.grid.points
     used = weights > 0
+    whole = slice(0, len(history.times))
+    residuals = source.grid.points - project_targets(series, prediction, whole)
     if len(rows):
         # the step of a moved target is no gross error
-        used[:, rows] = (source.grid.weights[:, rows, :2] > 0) & (
-            np.abs(np.nan_to_num(points[:, rows] - projected(series, prediction, whole)[:, rows]
-                                 - mean[rows])) < 1.0
-        )  # fmt: skip
-    residuals = points - projected(series, prediction, whole)
+        near = np.abs(np.nan_to_num(residuals[:, rows] - mean[rows])) < 1.0
+        used[:, rows] = (source.grid.weights[:, rows, :2] > 0) & near
     residuals = np.where(used, residuals, 0.0)
     residuals = residuals - residuals.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
     # ∂ image points / ∂ parameters (T, 2, 22): camera, scales of the field, a displacement
@@ -272,9 +274,9 @@ def _as_fitted(model: ThermalModel, series: ReducedSeries) -> ReducedSeries:
 def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int64]) -> ThermalModel:
     """Return the model with the series' exterior orientation, phases and events."""
     others = without_targets(series, rows) if len(rows) else series
-    model = with_own(model, others)
+    model = fit_own_effects(model, others)
     if len(rows):
-        moved = moved_targets(others, rows)
+        moved = estimate_step(others, rows)
         effects = tuple(
             moved.effect(e) if catalogue.get(e.name).seen_in == "targets" else e
             for e in model.effects

@@ -16,8 +16,13 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from thermocald.analysis.series.course import carried_by_c
-from thermocald.analysis.thermal.level import AFFINITY_SD, estimate_level, projected, series_means
-from thermocald.analysis.thermal.terms import unknowns_of
+from thermocald.analysis.thermal.level import (
+    AFFINITY_SD,
+    average_residuals,
+    estimate_level,
+    project_targets,
+)
+from thermocald.analysis.thermal.terms import list_unknowns
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -241,7 +246,7 @@ def _assess(
     )
 
 
-def fitted_camera(
+def build_camera(
     fitter: HypothesisFitter,
     fit: Fit,
     series: Sequence[ReducedSeries],
@@ -255,7 +260,7 @@ def fitted_camera(
     series: not averaged in blocks; growth, moved: effects on noise and targets, from outside the
     fit; distortion_sigmas: significance of what the distortion follows, None if that was given.
     """
-    numbers = unknowns_of(fit, series[0].scale)
+    numbers = list_unknowns(fit, series[0].scale)
     starts = [
         ThermalModel(
             s.source.camera,
@@ -387,11 +392,11 @@ def _span(series: Sequence[ReducedSeries], channel: str) -> tuple[float, float]:
 def _rms(series: ReducedSeries, model: ThermalModel) -> float:
     """Return the RMS px of measured minus predicted image points, less a constant per target."""
     prediction = model.predict(series.readings_history, series.source.field)
-    mean, _, moved = series_means(series, prediction)
+    mean, _, moved = average_residuals(series, prediction)
     points, weights = series.source.grid.points, series.weights[..., :2]
     total, count = 0.0, 0
     for part in chunks(*points.shape[:2]):
-        left = points[part] - projected(series, prediction, part) - mean
+        left = points[part] - project_targets(series, prediction, part) - mean
         use = (weights[part] > 0) & ~moved[:, None]
         total += float(np.sum(np.where(use, left, 0.0) ** 2))
         count += int(use.sum())

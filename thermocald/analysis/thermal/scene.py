@@ -80,7 +80,7 @@ class SceneMovement:
     follow: NDArray[np.bool_]
 
 
-def features(reference: NDArray[Any]) -> NDArray[np.float32]:
+def detect_features(reference: NDArray[Any]) -> NDArray[np.float32]:
     """Detect features (F, 2) px in a reference frame (H, W). Raises DataError for too few."""
     corners = cv2.goodFeaturesToTrack(
         _eight_bit(reference), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
@@ -96,7 +96,7 @@ def features(reference: NDArray[Any]) -> NDArray[np.float32]:
     return points
 
 
-def followed(
+def track_features(
     reference: NDArray[Any], points: NDArray[np.float32], image: NDArray[Any]
 ) -> tuple[NDArray[np.int64], Array]:
     """Track features (F, 2) px; return the rows of those found again and their shifts (n, 2) px."""
@@ -113,7 +113,7 @@ def followed(
     return rows, (there - points)[rows].astype(float)
 
 
-def common_movement(
+def estimate_movement(
     then: Camera, now: Camera, points: Array, moved: Array, seed: int = 0
 ) -> SceneMovement | None:
     """Estimate the movement that features share beyond the prediction; None if too few share it.
@@ -392,7 +392,7 @@ def follow_scene(
         log.times, log.channels, times, extrapolate, float(along.temperatures[0]),
         thermal.reading_sd,
     ).sd  # fmt: skip
-    corners = features(reference)
+    corners = detect_features(reference)
     E = len(frames)
     values, covariance = np.full((E, 4), np.nan), np.full((E, 4, 4), np.nan)
     locked = np.zeros(4)
@@ -409,8 +409,8 @@ def follow_scene(
             status = inspect_frame(image, (reference.shape[1], reference.shape[0]))
             reasons[k] = status.reason
             if status.ok:
-                rows, moved = followed(reference, corners, image)
-                found = common_movement(along[0], along[k], points[rows], moved, k)
+                rows, moved = track_features(reference, corners, image)
+                found = estimate_movement(along[0], along[k], points[rows], moved, k)
                 reasons[k] = "" if found else "too few features have a common movement"
         except ImageError as error:
             reasons[k] = str(error)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what a search finds by chance
 
 
-def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
+def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
     """Return an effect as a term to add to a fitted hypothesis.
 
     search: search its non-linear parameters over their whole range, except those in `fitter.held`;
@@ -75,7 +75,7 @@ def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...
     return tuple(terms)
 
 
-def unknowns_of(fit: Fit, scale: Array) -> Unknowns:
+def list_unknowns(fit: Fit, scale: Array) -> Unknowns:
     """Return all parameters that have a standard deviation in the fit, the rates first.
 
     scale (19,): px per unit of the columns.

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.thermal.level import moved_targets
-from thermocald.analysis.thermal.result import fitted_camera
-from thermocald.analysis.thermal.terms import term_of, without_chance_events
+from thermocald.analysis.thermal.level import estimate_step
+from thermocald.analysis.thermal.result import build_camera
+from thermocald.analysis.thermal.terms import make_term, without_chance_events
 from thermocald.errors import DataError
 from thermocald.physics import catalogue
 from thermocald.thermal.fit import HypothesisFitter, choose_distortion
@@ -78,8 +78,8 @@ def fit_thermal_model(
         growth = estimate_noise_slope(others)
         others = [reweight(s, n) for s, n in zip(others, growth.noise, strict=True)]
     fitter, fit = _fit_hypothesis(others, listed, search, frozenset(fixed), dict(priors or {}))
-    moved = [moved_targets(s, np.array(rows)) for s in others] if rows else []
-    return fitted_camera(fitter, fit, others, listed, growth, moved, sure)
+    moved = [estimate_step(s, np.array(rows)) for s in others] if rows else []
+    return build_camera(fitter, fit, others, listed, growth, moved, sure)
 
 
 def targets_of(listed: Sequence[ModelEffect]) -> tuple[str, ...]:
@@ -105,7 +105,7 @@ def _fit_hypothesis(
     fit = fitter.fit(())
     for effect in listed:
         if catalogue.get(effect.name).seen_in == "trajectory":
-            fit = fitter.fit((*fit.terms, term_of(fitter, fit, effect, search)))
+            fit = fitter.fit((*fit.terms, make_term(fitter, fit, effect, search)))
     fit = fitter.refine(fit, max_iterations=20)
     terms = without_chance_events(fitter, fit)
     if terms != fit.terms:

@@ -234,7 +234,7 @@ def _extent(field: TestField) -> float:
 
 
 def _front(field: TestField) -> Array:
-    """Return the direction (3,) that the field faces: its mean normal, oriented to its inside."""
+    """Return the direction (3,) that the field faces: its mean normal, towards its inside."""
     normals = field_normals(field)
     known = np.isfinite(normals[:, 0])
     if not known.any():

@@ -338,7 +338,7 @@ class RunningSeries:
             whole = self._series.epoch(row)
             if not self._offsets:
                 return None, whole
-            if self._each is None and (last := self._own_looks()[0]) < self.epochs:
+            if self._each is None and (last := self._own_schedule()[0]) < self.epochs:
                 self._each = self._adjust_each(last)  # after a restart of the program
             due = self._each is None or self.epochs >= self._look_at[0]
             if due or whole.status in _AGAINST:
@@ -372,7 +372,7 @@ class RunningSeries:
         full = len(self._kept) == self._kept.maxlen
         return self.epochs + max(int((_SELDOM if full else share) * len(self._kept)), 1)
 
-    def _laid_out(self) -> tuple[list[_Kept], ObservationGrid, Array, int]:
+    def _lay_out(self) -> tuple[list[_Kept], ObservationGrid, Array, int]:
         """Return stored epochs by number, observations, initial values, and the newest's row."""
         newest, kept = self._kept[-1], sorted(self._kept, key=lambda k: k.number)
         grid = ObservationGrid(
@@ -384,7 +384,7 @@ class RunningSeries:
 
     def _adjust_all(self) -> int:
         """Adjust the stored epochs as `replay` does; return the row of the newest."""
-        kept, grid, start, row = self._laid_out()
+        kept, grid, start, row = self._lay_out()
         # times as if the clock had never been set back
         time = np.array([k.time for k in kept])
         steps = np.diff(time)
@@ -421,7 +421,7 @@ class RunningSeries:
         """Return observations without the targets that the field has misplaced."""
         return grid.reject(np.broadcast_to(self._wrong, grid.observed.shape))
 
-    def _own_looks(self) -> tuple[int, int]:
+    def _own_schedule(self) -> tuple[int, int]:
         """Return the last and next epoch of `_adjust_each`, the same ones after a restart."""
         if len(self._kept) == self._kept.maxlen:
             return self.epochs, self._again(_OFTEN)
@@ -433,7 +433,7 @@ class RunningSeries:
     def _adjust_each(self, first: int | None = None) -> _Together:
         """Adjust the stored epochs, or the first ones, each with an orientation of its own."""
         assert self._series is not None
-        kept, grid, start, _ = self._laid_out()
+        kept, grid, start, _ = self._lay_out()
         each = self._series
         if self._binds or first is not None:
             grid = taken_off(self._without_wrong(grid), each.moved).reject(self._gross())
@@ -451,7 +451,7 @@ class RunningSeries:
             if ok and then.reported is not None
         ]
         self._level = np.median(change, axis=0) if change else np.zeros(16)
-        self._look_at[0] = self._own_looks()[1]
+        self._look_at[0] = self._own_schedule()[1]
         return each
 
     def _together(

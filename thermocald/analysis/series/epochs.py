@@ -341,7 +341,7 @@ class Epochs(Result):
         return out
 
     def _hang_on_c(self) -> dict[str, float] | None:
-        """Return c's relative sd and the largest error of a change by it, in sds; None if small."""
+        """Return c's relative sd, and the largest error of a change due to it, in sds, or None."""
         if not self.drifts or not self.level_sd[0] > 0:
             return None
         share = float(self.level_sd[0] / np.nanmedian(self.values[self.ok, 0]))
@@ -471,8 +471,7 @@ def unit_of(column: str) -> str:
 def _held_affinity(adjustment: SeriesAdjustment) -> dict[str, Any] | None:
     """Return the parameter whose level a held affinity shifts most; None if by less than one sd.
 
-    The affinity is the one that the targets show, given with its difference and sd, or else
-    `AFFINITY`.
+    The affinity is that which the targets show, with its difference and sd, or else `AFFINITY`.
     """
     held = adjustment.affinity
     if held is None or not held.names:

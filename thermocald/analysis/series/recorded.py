@@ -56,8 +56,7 @@ def recorded_table(
 
     Frames without observations are measured. If a series with observations is too long to be
     adjusted at once, only some epochs are calibrated one by one. advance: receives the number of
-    epochs done; jobs: processes, any number gives the same result bit for bit. Raises DataError if
-    no epoch has a result.
+    epochs done; jobs: processes, without effect on any bit. Raises DataError without a result.
     """
     recording.head.require_calibrated(str(recording.path))
     adjusted = SeriesSettings.of(settings, exterior)

@@ -50,8 +50,7 @@ class Shrunk:
         """Return value, low and high of direction·θ at a confidence level; direction (k,).
 
         The interval is that of a mixture over factors of Σ, distributed as freedom / χ². A factor
-        changes the value as well as its variance, since a Σ that is too small by chance shrinks too
-        much.
+        changes the value, not only its variance: a Σ too small by chance shrinks too much.
         """
         from scipy.optimize import brentq
         from scipy.special import chdtri, ndtr

@@ -57,8 +57,7 @@ class CameraStudy:
     iop (10,): mean over the series; sds (10,): standard deviations over time, pooled over the
     series that estimate a parameter, 0 if none does; correlations: within the adjustments, None if
     no epoch has a covariance matrix; over_time (10, 10): correlations of the parameters over the
-    epochs; trajectories: the effect of the camera's own drift in object space, empty if it cannot
-    be computed.
+    epochs; trajectories: the camera's own drift in object space, empty if it cannot be computed.
     """
 
     label: str

@@ -69,8 +69,7 @@ _USUAL = {
 class Pose:
     """A resected pose, with which later frames are compared.
 
-    time s; predicted: the camera at that time; eop (6,) with covariance (6, 6); seen: the control
-    points used.
+    time s; predicted: the camera then; eop (6,) with covariance (6, 6); seen: control points used.
     """
 
     time: float

@@ -254,8 +254,7 @@ def measure_places(
     """Measure the places of image points on a surface, each at its own time.
 
     when: s UTC, the control points' time; rows: the image points, with values (n, 4) x, y and their
-    standard deviations, px. Raises DataError if there is no pose or no temperature, GeometryError
-    for rays that miss the surface.
+    sds, px. Raises DataError without a pose or temperature, GeometryError for rays that miss.
     """
     observed = np.concatenate([b.values for b in rows])
     times = np.concatenate([b.times for b in rows])

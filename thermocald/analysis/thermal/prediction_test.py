@@ -25,7 +25,7 @@ from thermocald.analysis.thermal.level import (
     estimate_step,
     project_targets,
 )
-from thermocald.analysis.thermal.terms import event_worth
+from thermocald.analysis.thermal.terms import event_threshold
 from thermocald.analysis.thermal.thermal_model import targets_of
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
@@ -184,7 +184,7 @@ def _find_event(
     gain = np.einsum("gi,gi->g", rest, heights)
     best = int(np.argmax(gain))
     series = fitter.series[0]
-    if gain[best] <= event_worth(series, len(linear)):
+    if gain[best] <= event_threshold(series, len(linear)):
         return _without_event(effect)
     units = series.scale[[COLUMNS.index(p) for p in candidate.parameters]]
     values = dict(zip(linear, (heights[best] / units).tolist(), strict=True))

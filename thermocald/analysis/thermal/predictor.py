@@ -3,8 +3,7 @@
 The temperatures before the first reading and within a gap are unknown, but effects with a memory
 depend on them. A second camera is therefore predicted that was warmer during the unknown time, by
 one standard deviation of the change of temperature in such a time. The difference between the two
-cameras is one standard deviation of what is unknown. It fades with the memory, whatever effects the
-model has.
+cameras is one standard deviation of what is unknown. It fades as the memories of the effects do.
 """
 
 from __future__ import annotations

@@ -207,7 +207,7 @@ class SceneCourse(Result):
     def per_kelvin(self) -> tuple[Array, Array]:
         """Slopes (4,) of `values` against the temperature, and their standard deviations.
 
-        From the larger of stated and observed scatter; NaN for under four frames or 1 K.
+        From the larger of stated and observed scatter; NaN below four frames or 1 K of change.
         """
         T = self.temperatures[self.seen]
         slopes, sds = np.full(4, np.nan), np.full(4, np.nan)
@@ -241,7 +241,7 @@ class SceneCourse(Result):
         """Test whether c changes with temperature, its square, time, or since the reference frame.
 
         The noise is estimated from the residuals. Four parameters describe all frames together, so
-        that the effect is no noise: one of second order is found that no single frame shows.
+        that the effect does not count as noise: one that no single frame shows is found.
         """
         T, hours = self.temperatures[rows] - self.temperatures[0], self.times[rows] - self.times[0]
         A = np.column_stack([np.ones(len(T)), T, T**2, hours])

@@ -43,9 +43,9 @@ def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: b
         fresh: list[tuple[tuple[str, Any], ...] | None] = []
         for s, gains in enumerate(found.events):
             best = int(np.argmax(gains))
-            worth = event_worth(fitter.series[s], found.coefficients)
+            least = event_threshold(fitter.series[s], found.coefficients)
             time = float(fitter.series[s].times[best + 1])
-            fresh.append(((candidate.name, time),) if gains[best] > worth else None)
+            fresh.append(((candidate.name, time),) if gains[best] > least else None)
         return Term(effect.name, candidate.parameters, candidate.fixed, tuple(fresh))
     if search and candidate.name:
         found = Scanner(fitter).scan(candidate, fit)
@@ -53,7 +53,7 @@ def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: b
     return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))
 
 
-def event_worth(series: ReducedSeries, coefficients: int) -> float:
+def event_threshold(series: ReducedSeries, coefficients: int) -> float:
     """Return the χ² that an event has to explain, given its coefficients and the times tried."""
     n = max(int((series.n > 0).sum()), 2)
     return float((coefficients + 2) * np.log(n) + _EVENT_MARGIN)
@@ -68,7 +68,7 @@ def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...
         place = slice(block.start, block.stop)
         heights, cofactor = fit.coefficients[place], fit.covariance[place, place]
         gain = float(heights @ np.linalg.solve(cofactor, heights))
-        if gain <= event_worth(fitter.series[block.series], len(heights)):
+        if gain <= event_threshold(fitter.series[block.series], len(heights)):
             fresh = list(terms[block.term].fresh)
             fresh[block.series] = None
             terms[block.term] = replace(terms[block.term], fresh=tuple(fresh))

@@ -10,8 +10,8 @@ lags and self-heating have settled, a play is in its middle, nothing creeps, sli
 a history, effects act as they do in a fit.
 
 Outside the temperatures that the model was fitted on, a prediction comes with a warning, and its
-standard deviation is widened by the whole drift beyond the range. Further away than half the range,
-it raises UsageError unless extrapolation is requested explicitly.
+standard deviation is widened by the whole drift beyond the range. More than half the range away, it
+raises UsageError unless extrapolation is requested explicitly.
 """
 
 from __future__ import annotations
@@ -354,7 +354,7 @@ class ThermalCamera(Result):
     ) -> Array:
         """Return the covariance (E, 10, 10) of the orientations that follow from `linear` (E, 10).
 
-        driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if at all.
+        driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
         """
         J = np.zeros((*linear.shape, len(self.parameters)))
         for i, name in enumerate(self.parameters):
@@ -414,7 +414,7 @@ class ThermalCamera(Result):
 
 
 def _noise_share(times: Array, at: Array) -> Array:
-    """Return the variance (E,) of interpolated readings of times (R,), over that of a reading."""
+    """Return the variance (E,) of an interpolated reading over that of a reading; times (R,)."""
     if len(times) < 2:
         return np.ones(len(at))
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)

@@ -150,6 +150,18 @@ def test_fahrenheit_is_refused(T):
         camera.along([0.0, 10.0, 20.0], [T - 1, T, T + 1])
 
 
+def test_readings_that_are_none_are_refused():
+    camera = ThermalCamera(thermal_model(*LISTED))
+    with pytest.raises(UsageError, match="NaN"):
+        camera.at(float("nan"))
+    for times, temperatures, at in (([], [], None), ([0.0, 1.0], [25.0], None), ([0], [25], [])):
+        with pytest.raises(UsageError, match="for each of its times"):
+            camera.along(times, temperatures, at)
+    with pytest.raises(UsageError, match="no reading"):
+        camera.live().update(0.0, {})
+    assert camera.live().update(0.0, np.float32(25.0)).temperature == 25.0
+
+
 def test_another_camera_a_crop_a_binning():
     camera = ThermalCamera(thermal_model())
     with pytest.raises(ConfigurationError, match="belongs to one camera"):

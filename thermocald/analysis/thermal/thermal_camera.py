@@ -261,6 +261,8 @@ class ThermalCamera(Result):
         (unless `extrapolate`), also for a temperature that looks like Fahrenheit.
         """
         T = float(temperature)
+        if math.isnan(T):
+            raise UsageError("the temperature is NaN: give one in °C")
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
             beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
@@ -291,7 +293,7 @@ class ThermalCamera(Result):
         begins with the first time. relative_to °C: the covariance is that of the difference from
         the steady camera at this temperature; temperature_sd K: of a reading, is propagated into
         the covariance (as if no effect had a memory, which would average it). Raises UsageError far
-        outside the model's validity (unless `extrapolate`).
+        outside the model's validity (unless `extrapolate`), and for lengths that differ.
 
         >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
         >>> along.values.shape, along.sd.shape
@@ -303,6 +305,12 @@ class ThermalCamera(Result):
         )
         readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
         instants = t if at is None else seconds(at)
+        sizes = ", ".join(f"{len(c)} of {name}" for name, c in readings.items())
+        if not len(t) or not len(instants) or any(len(c) != len(t) for c in readings.values()):
+            raise UsageError(
+                f"{len(t)} times, {sizes}, at {len(instants)} times: a log needs a temperature for "
+                "each of its times, and at least one time"
+            )
         begin = float(min(t[0], instants[0]))
         reference = next(iter(readings))
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
@@ -566,10 +574,10 @@ class LiveCamera:
     ) -> tuple[float, tuple[float, ...]]:
         """Return the time s and the readings °C; a failed one is the last of its channel."""
         t = float(time) if isinstance(time, float | int) else float(seconds(time))
-        given = temperature
-        if isinstance(given, float | int):
-            given = {"temperature": given}
+        given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
         names, row = tuple(given), tuple(float(v) for v in given.values())
+        if not row:
+            raise UsageError("there is no reading: give a temperature, or {channel: °C}")
         if self._times:
             if t <= self._times[-1]:
                 raise UsageError(f"time {t} is not later than the last reading, {self._times[-1]}")

@@ -211,7 +211,7 @@ def test_a_camera_at_a_temperature(camera, tmp_path):
                  "m.cameramodel", "cam.json", "cam.ior"):  # fmt: skip
         assert now.write(tmp_path / name)
         assert (tmp_path / name).stat().st_size > 100
-    with pytest.raises(UsageError, match="say which format"):
+    with pytest.raises(UsageError, match="does not tell the format"):
         now.write(tmp_path / "camera.yaml")
 
 

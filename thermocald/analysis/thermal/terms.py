@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from thermocald.thermal.hypothesis import Fit, Unknowns
     from thermocald.thermal.series import ReducedSeries
 
-_EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what its search may find by chance
+_EVENT_MARGIN = 16.0  # χ² that an event has to explain beyond what a search finds by chance
 
 
-def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
-    """An effect as a term to add to a fitted hypothesis.
+def make_term(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: bool) -> Term:
+    """Return an effect as a term to add to a fitted hypothesis.
 
-    search: its non-linear parameters are looked for over their whole range, but for those that
-    `fitter.held` names; the time of an event always is, in each series.
+    search: search its non-linear parameters over their whole range, except those in `fitter.held`;
+    the time of an event is always searched, in each series.
     """
     kind = catalogue.get(effect.name)
     given = tuple(n for n in kind.linear if n in effect.values) or kind.usual
@@ -43,9 +43,9 @@ def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: boo
         fresh: list[tuple[tuple[str, Any], ...] | None] = []
         for s, gains in enumerate(found.events):
             best = int(np.argmax(gains))
-            worth = event_worth(fitter.series[s], found.coefficients)
+            least = event_threshold(fitter.series[s], found.coefficients)
             time = float(fitter.series[s].times[best + 1])
-            fresh.append(((candidate.name, time),) if gains[best] > worth else None)
+            fresh.append(((candidate.name, time),) if gains[best] > least else None)
         return Term(effect.name, candidate.parameters, candidate.fixed, tuple(fresh))
     if search and candidate.name:
         found = Scanner(fitter).scan(candidate, fit)
@@ -53,14 +53,14 @@ def term_of(fitter: HypothesisFitter, fit: Fit, effect: ModelEffect, search: boo
     return Term(effect.name, candidate.parameters, (*text.items(), *numbers.items()))
 
 
-def event_worth(series: ReducedSeries, coefficients: int) -> float:
-    """χ² that an event has to explain: its coefficients and time, and every time was a trial."""
+def event_threshold(series: ReducedSeries, coefficients: int) -> float:
+    """Return the χ² that an event has to explain, given its coefficients and the times tried."""
     n = max(int((series.n > 0).sum()), 2)
     return float((coefficients + 2) * np.log(n) + _EVENT_MARGIN)
 
 
 def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...]:
-    """The terms of a fit without events that explain no more than chance alongside the others."""
+    """Return a fit's terms without events that explain no more than chance beside the others."""
     terms = list(fit.terms)
     for block in fit.blocks:
         if block.term < 0 or not terms[block.term].kind.is_event or block.series is None:
@@ -68,15 +68,15 @@ def without_chance_events(fitter: HypothesisFitter, fit: Fit) -> tuple[Term, ...
         place = slice(block.start, block.stop)
         heights, cofactor = fit.coefficients[place], fit.covariance[place, place]
         gain = float(heights @ np.linalg.solve(cofactor, heights))
-        if gain <= event_worth(fitter.series[block.series], len(heights)):
+        if gain <= event_threshold(fitter.series[block.series], len(heights)):
             fresh = list(terms[block.term].fresh)
             fresh[block.series] = None
             terms[block.term] = replace(terms[block.term], fresh=tuple(fresh))
     return tuple(terms)
 
 
-def unknowns_of(fit: Fit, scale: Array) -> Unknowns:
-    """All numbers that have a standard deviation in the fit, the rates first.
+def list_unknowns(fit: Fit, scale: Array) -> Unknowns:
+    """Return all parameters that have a standard deviation in the fit, the rates first.
 
     scale (19,): px per unit of the columns.
     """

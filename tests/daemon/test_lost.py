@@ -144,7 +144,7 @@ def test_an_alert_says_so_and_takes_it_back():
     ]
     alerts = [(r["epoch"], a.state, a.text) for r in rows for a in output.changes(r, "cam")]
     assert [(n, state) for n, state, _ in alerts] == [(2, "out"), (3, "in"), (4, "out"), (5, "in")]
-    assert alerts[2][2] == "cam: 3 epochs were taken and not kept (limit 1)"
+    assert alerts[2][2] == "cam: 3 epochs were taken but not stored (limit 1)"
 
 
 @pytest.mark.parametrize("table", ["epochs.csv", "observations.csv"])

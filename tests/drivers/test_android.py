@@ -157,7 +157,7 @@ REFUSED = {
         {"shoot": lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])}, SOON,
         errors.BadReading, "partial photograph, IMG_1"),
     "two": ({"shoot": shoot(count=2)}, {}, errors.BadReading, "2 new photographs"),
-    "none": ({"shoot": None}, SOON, errors.DeviceTimeout, "is the trigger right"),
+    "none": ({"shoot": None}, SOON, errors.DeviceTimeout, "the camera app is open"),
     "smaller": (
         {"shoot": shoot(size=(48, 32))}, {}, errors.WrongDevice, "has 48×32 px, not 96×64"),
     "broken off": ({"cut_transfer": True}, {}, errors.DeviceGone, "broke off"),
@@ -355,7 +355,7 @@ def test_a_unit_that_was_certain_once_is_kept(server, phone, source, numbers, ce
 def test_a_zone_of_unknown_unit_asks_for_the_option(server, phone):
     phone.zones = "tsens_tz_sensor5 45\n"
     sensors = {"soc": "zone:tsens_tz_sensor5"}
-    asked = r"unit of 45 is not known; write units: \{soc: degC\}"
+    asked = r"unit of 45 is unknown; set units: \{soc: degC\}"
     device = thermometer(server, sensors=sensors)
     with device, pytest.raises(errors.BadReading, match=asked):
         device.read()

@@ -43,7 +43,7 @@ READ = [
     ("iio", "adc", {"in_temp_raw": "731"}, {}, "scale"),
     ("zone", "cpu-thermal", "48312", {}, {"temperature": 48.312}),
     ("zone", "gpu-thermal", "-274000", {}, "outside"),  # THERMAL_TEMP_INVALID
-    ("zone", "camera-therm-usr", "-40000", {}, "not fitted"),
+    ("zone", "camera-therm-usr", "-40000", {}, "absent sensor"),
     ("zone", "soc", "310", {"unit": "tenths"}, {"temperature": 31.0}),
 ]  # fmt: skip
 
@@ -106,7 +106,7 @@ def test_a_number_handed_on_to_another_chip_is_noticed(sysfs):
 def test_two_chips_of_one_name_need_the_address(sysfs):
     sysfs.hwmon(0, "lm75", "1-0048", temp1_input="21000")
     sysfs.hwmon(1, "lm75", "1-0049", temp1_input="22000")
-    with pytest.raises(WrongDevice, match="write chip: 1-0048, 1-0049"):
+    with pytest.raises(WrongDevice, match="set chip: 1-0048, 1-0049"):
         thermometer("hwmon", sysfs, chip="lm75").open()
     with thermometer("hwmon", sysfs, chip="1-0049") as device:
         assert device.read().values == {"temperature": 22.0}

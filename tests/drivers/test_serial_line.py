@@ -124,7 +124,7 @@ def test_echo_and_garbage_before_the_answer_are_skipped(instrument, before):
 @pytest.mark.parametrize(
     ("answer", "error", "said"),
     [
-        *((rubbish, errors.BadReading, "is 9600 Bd 8N1 right")
+        *((rubbish, errors.BadReading, "check 9600 Bd 8N1")
           for rubbish in (b"\xf8\x80\x00\xfe" * 20, b"\xf8\x80\r\n" * 20, b"T=\r\n")),
         (b"T=20.", errors.BadReading, r"'T=20\.'"),
         (b"", errors.DeviceTimeout, r"silent for 0\.4 s"),

@@ -189,13 +189,13 @@ def test_after_a_plug_the_same_values_are_set_again(focusing):
 
 def test_an_automatic_mode_that_cannot_be_switched_off(focusing):
     focusing.obeys = lambda control, value: 1 if control == AUTO_FOCUS else value
-    with pytest.raises(errors.WrongDevice, match="to let it change, write focus: auto"):
+    with pytest.raises(errors.WrongDevice, match="to let it change, set focus: auto"):
         camera(focusing).open()
     with camera(focusing, focus="auto") as device:
         focusing.controls[FOCUS][4] = 60
         frame = device.capture()
         assert device.warnings() == [
-            "focus: auto lets the camera change it; every change is another camera"
+            "focus: auto lets the camera change this setting, and with it the calibration"
         ]
     assert (frame.settings["focus_auto"], frame.settings["focus"]) == (1.0, 60.0)
 
@@ -339,7 +339,7 @@ def test_by_serial_number(kernel, tmp_path):
     with device:
         device.capture()
     (by_id / "usb-046d_HD_Pro_Webcam_C920_18A3F-video-index0").symlink_to(kernel.path)
-    with pytest.raises(errors.WrongDevice, match="several fit"):
+    with pytest.raises(errors.WrongDevice, match="several match"):
         device.open()
 
 

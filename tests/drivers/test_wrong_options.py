@@ -41,7 +41,7 @@ WRONG = {
     **{("thermometer", chip): ({}, [({"address": 0x50}, "0x50 is not an address of a")])
        for chip in ("bme280", "lm75", "mcp9808", "sht3x", "tmp117")},
     ("thermometer", "thermal_zone"): ({}, [
-        ({"zone": "pm8150b-vbat-lvl0"}, "write unit: thousandths")]),
+        ({"zone": "pm8150b-vbat-lvl0"}, "set unit: thousandths")]),
     ("thermometer", "serial"): ({"port": "/dev/null"}, [
         ({}, "either instrument"), ({"pattern": "("}, "pattern"),
         ({"pattern": r"\d+"}, "name the value"),

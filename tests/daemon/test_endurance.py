@@ -127,7 +127,7 @@ def test_a_day_of_epochs_on_a_disk_of_50_mb_loses_no_result(daemon, replayed, tm
         [sys.executable, "-c", run],
         cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=True,
     )  # fmt: skip
-    assert "observations no more" in done.stderr
+    assert "observations no longer" in done.stderr
     with Store.open(daemon.store) as store:
         assert store.examine().damaged == ()
         series = store.find_series()

@@ -151,13 +151,13 @@ def test_a_full_disk_loses_frames_then_observations_but_no_result(daemon, device
     daemon.until(lambda: "no frames are kept" in daemon.log())
     free = shutil.disk_usage(disk).free
     (disk / "more").write_bytes(b"\0" * (free - 14_000_000))  # 16 MB are kept for results
-    daemon.until(lambda: "observations no more" in daemon.log())
+    daemon.until(lambda: "observations no longer" in daemon.log())
     free = shutil.disk_usage(disk).free
     (disk / "rest").write_bytes(b"\0" * (free - 200_000))
     daemon.more(4)
     for name in ("rest", "more", "filler"):
         (disk / name).unlink()
-    daemon.until(lambda: "observations are kept again" in daemon.log())
+    daemon.until(lambda: "observations are stored again" in daemon.log())
     again = len(daemon.results())
     daemon.until(lambda: any(r["stored"] and r["status"] == "ok" for r in daemon.results()[again:]))
     assert daemon.stop() == 0
@@ -181,7 +181,7 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
     daemon.more(2)
     daemon.config.write_text(good.replace("period_s", "perriod_s"))
     daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: "was not read again" in daemon.log())
+    daemon.until(lambda: "cannot be reloaded" in daemon.log())
     assert "is 'period_s' meant?" in daemon.log()
     daemon.more(2)
     daemon.config.write_text(good.replace("name: rpi", "name: other"))

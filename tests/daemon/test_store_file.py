@@ -344,7 +344,7 @@ def test_an_unmounted_card_is_waited_for_and_nothing_is_begun_in_its_place(card)
         assert guard.waiting == number - 3
     status = guard.status()
     assert (status["state"], guard.lost) == ("out", 0)
-    assert "not mounted any more" in status["why"]
+    assert "no longer mounted" in status["why"]
     assert [guard.told[number] for number in (4, 5, 6)] == [False] * 3
     assert list(path.parent.iterdir()) == []
     card("a")
@@ -428,7 +428,7 @@ def test_a_running_daemon_whose_card_is_unmounted_and_mounted_again(card, daemon
     daemon.run(**sections, frames=frames)
     daemon.more(4)
     card(None)
-    daemon.until(lambda: "not mounted any more" in daemon.log())
+    daemon.until(lambda: "no longer mounted" in daemon.log())
     daemon.until(lambda: not daemon.results()[-1]["stored"])
     daemon.until(lambda: daemon.status().get("store", {}).get("state") == "out")
     assert {p.name for p in folder.iterdir()} == {"thermocald.db.live"}

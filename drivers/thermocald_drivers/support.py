@@ -87,7 +87,7 @@ def or_auto(low: float, high: float) -> AfterValidator:
 def automatic_warnings(options: Mapping[str, Any]) -> list[str]:
     """Return a warning for each option that leaves its setting to the camera."""
     return [
-        f"{name}: auto lets the camera change this setting, and with it the calibration"
+        f"{name}: auto lets the camera change it; every change alters the calibration"
         for name, value in options.items()
         if value == AUTO
     ]

@@ -195,7 +195,7 @@ def test_an_automatic_mode_that_cannot_be_switched_off(focusing):
         focusing.controls[FOCUS][4] = 60
         frame = device.capture()
         assert device.warnings() == [
-            "focus: auto lets the camera change this setting, and with it the calibration"
+            "focus: auto lets the camera change it; every change alters the calibration"
         ]
     assert (frame.settings["focus_auto"], frame.settings["focus"]) == (1.0, 60.0)
 

@@ -1,9 +1,9 @@
 """The heating programme of `relay` and `android_load`, and the driver `android_load`.
 
-At the limit, and at the end of the programme, heating stops until the device is opened again. Both
-drivers have these options:
+At the limit, and at the end of the programme, heating stops until the configuration is reloaded.
+Both drivers have these options:
 
-    limit_c: 60                   # at or above it: off until the device is opened again
+    limit_c: 60                   # at or above it: off until the configuration is reloaded
     unknown_s: 60                 # without a temperature for this long: off
     programme:                    # steps in order; hold_c: null is "do not heat"
       - {seconds: 600, hold_c: null}
@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceError
+from thermocald.errors import ConfigurationError, DeviceError, PermanentDeviceError
 from thermocald.hal import DriverOptions, HeatingStep, Output
 from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, battery
 
@@ -81,11 +81,14 @@ class HeatingOutput(Output):
         self._started = self.clock.monotonic()
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        """Switch the heating by the programme; BadReading once, when the limit is reached."""
+        """Switch the heating by the programme; PermanentDeviceError when the limit is reached."""
         temperature_c, was_tripped = self.measure(result), self.tripped
         self.switch(self._decide(self.clock.monotonic() - self._started, temperature_c))
         if self.tripped and not was_tripped:
-            raise BadReading(f"{self.where}: off until it is opened again, {self.tripped}")
+            # permanent: after a retry, the programme would start again
+            raise PermanentDeviceError(
+                f"{self.where}: heating is off, {self.tripped}; reload the configuration to heat"
+            )
 
     def measure(self, result: Mapping[str, Any]) -> float | None:
         """Return the temperature °C at an epoch; None if it is unknown."""

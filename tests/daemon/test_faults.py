@@ -199,6 +199,26 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
     assert daemon.events().count("reload_failed") == 1
 
 
+def test_a_reload_opens_a_failed_device_also_without_a_change(daemon, devices, recording, tmp_path):
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "recording.yaml").write_text("[")
+    sections = devices()
+    air = {"name": "air", "driver": "replay", "recording": "./broken", "loop": True}
+    sections["thermometers"].append({**air, "period_s": 0.2})
+    daemon.run(**sections)
+
+    def state() -> str:
+        return daemon.status().get("thermometers", {}).get("air", {}).get("device", "")
+
+    daemon.until(lambda: state() == "failed")
+    shutil.rmtree(broken)
+    shutil.copytree(recording, broken)
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: state() == "open")
+    assert daemon.stop() == 0
+
+
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
 def test_garbage_frames_are_epochs_with_a_reason(daemon, recording, tmp_path, count):
     rng = np.random.default_rng(1)

@@ -398,7 +398,7 @@ def test_warm_up_by_load_which_the_limit_stops_for_good(server, phone):
         output.emit({})
         assert phone.load
         heat(phone, 42.0)
-        with pytest.raises(errors.BadReading, match=r"battery 42\.00 °C reached the limit"):
+        with pytest.raises(errors.PermanentDeviceError, match=r"42\.00 °C reached the limit"):
             output.emit({})
         assert not phone.load
         heat(phone, 20.0)

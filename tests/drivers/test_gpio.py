@@ -9,8 +9,9 @@ import gpiozero
 import pytest
 from gpiozero.pins.mock import MockFactory
 
-from thermocald.errors import BadReading, DeviceDenied, DeviceNotFound
-from thermocald.hal import VirtualClock, open_device
+from thermocald.acquisition.device_loop import OutputLoop
+from thermocald.errors import DeviceDenied, DeviceNotFound, PermanentDeviceError
+from thermocald.hal import SystemClock, VirtualClock, open_device
 
 PROGRAMME = [
     {"seconds": 100, "hold_c": None},
@@ -78,7 +79,7 @@ def test_when_the_lamp_is_on(pins, clock, case):
         for seconds, temperature, expected in steps:
             clock.sleep_until(seconds)
             if isinstance(expected, str):
-                with pytest.raises(BadReading, match=expected):
+                with pytest.raises(PermanentDeviceError, match=expected):
                     lamp.emit({"temperature": temperature})
                 expected = 0
             else:
@@ -97,6 +98,27 @@ def test_no_result_for_long_stops_the_lamp(pins, clock):
         assert not pins.pin(27).state
         lamp.emit({"temperature": 20.0})  # and heats again with the next result
         assert pins.pin(27).state
+
+
+def test_the_daemon_does_not_reopen_a_relay_at_its_limit(pins):
+    """Opening it again would reset the limit and start the programme from its beginning."""
+    programme = [{"seconds": 1000, "hold_c": 45.0}]
+    pin, events = pins.pin(27), []
+    loop = OutputLoop("lamp", relay(SystemClock(), programme=programme), SystemClock(),
+                      lambda utc, kind, text: events.append(kind))  # fmt: skip
+    loop.start()
+    for temperature, condition in ((20.0, lambda: pin.state), (60.0, lambda: events)):
+        loop.put({"temperature": temperature})
+        deadline = time.monotonic() + 5.0
+        while not condition() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert condition()
+    for _ in range(3):
+        loop.put({"temperature": 20.0})
+    assert loop.stop(5.0)
+    assert not pin.state
+    assert (events, loop.link.state) == (["device_failed"], "failed")
+    assert "reached the limit" in loop.link.why
 
 
 def test_closing_switches_off(pins, clock):

@@ -335,7 +335,7 @@ class Service:
         if config.store != self.config.store:
             log.warning("store: a change takes effect after a restart; the old store is still used")
             config = config.model_copy(update={"store": self.config.store})
-        if config == self.config:
+        if config == self.config and not self._station.failed:
             return "the configuration has not changed"
         Station(config, self._runtime)  # raises for a fault before the old one is stopped
         if not self._station.stop(_GRACE_S):

@@ -103,6 +103,13 @@ class Station:
         return [f"{name} hangs" for name, busy_s in busy if busy_s > self.runtime.hang_after_s]
 
     @property
+    def failed(self) -> bool:
+        """Whether a device failed, which this station does not open again."""
+        links = [*self.thermometers.links.values(), *(output.link for output in self.outputs)]
+        links += [camera.link for camera in self.cameras]
+        return any(link.state == "failed" for link in links)
+
+    @property
     def finished(self) -> bool:
         """Whether no camera will take another epoch and all epochs are stored."""
         return bool(self.cameras) and all(

@@ -264,10 +264,10 @@ class AndroidCamera(AdbPhone, Camera):
 
     def _exposure_start(self, tags: Mapping[str, Any], triggered: float) -> float:
         """Return the start of the exposure, s UTC on this machine's clock."""
-        exif = exposure_start(tags, self._zone)
-        if exif is None:
+        stated = exposure_start(tags, self._zone)
+        if stated is None:
             return triggered
-        utc, resolution_s = exif
+        utc, resolution_s = stated
         start = utc - self._offset
         if abs(start - triggered) > CLOCKS_DIFFER_S:
             return triggered

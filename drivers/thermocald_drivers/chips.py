@@ -185,7 +185,8 @@ def is_idle(name: str, celsius: float) -> bool:
     name: the kernel's. For a chip that is not in the table, any unlikely temperature counts as
     idle.
     """
-    idle = idle_celsius(name) if _chip(name) else (*UNLIKELY_C, *ALL_ONES_C)
+    chip = _chip(name)
+    idle = (*UNLIKELY_C, *ALL_ONES_C) if chip is None else chip.celsius
     return any(abs(celsius - one) < 1e-3 for one in (*ANY_C, *idle))
 
 

@@ -322,8 +322,8 @@ class ThermalZoneThermometer(_KernelThermometer):
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
         """List the devices as stanzas, for `thermocald devices`."""
-        return [found for found in super().attached(sysfs) if is_temperature(
-            str(found.options["zone"]))]  # fmt: skip
+        zones = super().attached(sysfs)
+        return [found for found in zones if is_temperature(str(found.options["zone"]))]
 
     @classmethod
     def _inputs(cls, folder: Path) -> dict[str, str]:

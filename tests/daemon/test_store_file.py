@@ -119,7 +119,7 @@ from thermocald.errors import StoreError
 sys.setswitchinterval(0.0005)
 path = Path(sys.argv[1])
 guard, end = StoreGuard(path, durable=False), time.monotonic() + 1.5
-series = guard.all_series()[0]
+series = guard.store.all_series()[0]
 
 def read(epochs):
     while time.monotonic() < end:
@@ -283,7 +283,7 @@ def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemo
 )  # fmt: skip
 def test_a_row_that_no_store_takes_is_lost_and_holds_up_none(guard, path, what):
     epoch = replace(small_epoch(4), **what)
-    assert not guard.append(Row(guard.all_series()[0], epoch, None, {}, True))
+    assert not guard.append(Row(guard.store.all_series()[0], epoch, None, {}, True))
     assert (guard.waiting, guard.lost) == (0, 1)
     guard.keep(5)
     assert guard.told[5]

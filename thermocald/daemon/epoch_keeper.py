@@ -61,9 +61,7 @@ class EpochKeeper:
         self._on_kept = on_kept
         self._identity = identity
         self._start = start
-        name = (plan.name, plan.series)
-        found = (s for s in guard.all_series() if (s.camera, s.name) == name)
-        self._series: StoredSeries | None = next(found, None)
+        self._series = guard.find(plan.name, plan.series)
         if self._series is not None:
             check_series(plan, self._series.testfield)
         self._backlog: list[Epoch] = []

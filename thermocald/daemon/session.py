@@ -136,17 +136,15 @@ class Sessions:
                 f"camera {session.camera!r} takes series {session.series!r} all the time, by its "
                 "configuration; choose another --series"
             )
-        for one in self._guard.all_series():
-            if (one.camera, one.name) != (session.camera, session.series):
-                continue
-            if session.start not in ("", one.start):
+        if (stored := self._guard.find(session.camera, session.series)) is not None:
+            if session.start not in ("", stored.start):
                 raise UsageError(
-                    f"series {one.name!r} was begun with --start {one.start!r}; give this --start, "
-                    "or choose another --series"
+                    f"series {stored.name!r} was begun with --start {stored.start!r}; give this "
+                    "--start, or choose another --series"
                 )
-            if (taken := self._guard.last_epoch(one)) >= session.epochs:
+            if (taken := self._guard.last_epoch(stored)) >= session.epochs:
                 raise DataError(
-                    f"series {one.name!r} has {taken} epochs already; choose another --series"
+                    f"series {stored.name!r} has {taken} epochs already; choose another --series"
                 )
         if session.programme:
             for other in self._active.values():

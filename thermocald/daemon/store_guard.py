@@ -289,8 +289,7 @@ class StoreGuard:
                 self._series_store = self.store
                 self._series.clear()
             if key not in self._series:
-                found = {(s.camera, s.name): s for s in self.store.all_series()}
-                self._series[key] = found.get(key) or self.store.create_series(
+                self._series[key] = self.find(*key) or self.store.create_series(
                     wanted.head,
                     wanted.testfield,
                     start=wanted.start,
@@ -312,10 +311,11 @@ class StoreGuard:
         with self._lock:
             return self.store.last_epoch(series) or 0
 
-    def all_series(self) -> list[StoredSeries]:
-        """Return all series in the order of their creation."""
+    def find(self, camera: str, name: str) -> StoredSeries | None:
+        """Return a camera's series of this name, None if there is none."""
         with self._lock:
-            return self.store.all_series()
+            found = (s for s in self.store.all_series() if (s.camera, s.name) == (camera, name))
+            return next(found, None)
 
     def stored_events(self) -> list[Event]:
         """Return all events in the store, oldest first."""

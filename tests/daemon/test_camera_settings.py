@@ -1,4 +1,4 @@
-"""What a camera's frames report of focus and exposure reaches the store and the status."""
+"""The focus and exposure that frames report reach the store and the status."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def test_the_led_tells_whether_there_are_results(pins):
 
 # (s, °C, whether the lamp is on after it)
 HEATED = {
-    # off at the upper edge of the hysteresis, on at the lower; off before, between and after
+    # off above the hysteresis, on below it; off before and after the programme
     "the programme": ({}, [(10, 20.0, 0), (110, 20.0, 1), (200, 44.9, 1), (300, 45.5, 0),
                            (310, 45.0, 0), (320, 44.5, 1), (1150, 20.0, 0), (5000, 20.0, 0)]),
     "the limit is for good": ({}, [(200, 20.0, 1), (200, 60.0, "60.00 °C reached the limit 60 °C"),
@@ -147,7 +147,7 @@ def test_a_machine_without_pins(monkeypatch, clock):
 
 
 def test_permission_denied(pins, monkeypatch, clock):
-    """The kernel refuses /dev/gpiochip0 to whom is not in the group."""
+    """The kernel denies /dev/gpiochip0 to a user outside the group."""
 
     def refused(*_args):
         raise PermissionError(errno.EACCES, "Permission denied", "/dev/gpiochip0")

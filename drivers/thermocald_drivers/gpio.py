@@ -76,7 +76,7 @@ def _pin(kind: str, options: PinOptions) -> Any:
     except (gpiozero.PinInvalidPin, gpiozero.PinError) as error:
         raise DeviceNotFound(f"GPIO {pin}: {error}") from error
     except OSError as error:
-        hint = "is the user in the group gpio?"
+        hint = "check that the user is in the group gpio"
         raise support.fault(error, f"GPIO {pin}", seen=False, hint=hint) from error
 
 

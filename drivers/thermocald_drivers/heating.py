@@ -87,7 +87,8 @@ class HeatingOutput(Output):
         if self.tripped and not was_tripped:
             # permanent: after a retry, the programme would start again
             raise PermanentDeviceError(
-                f"{self.where}: heating is off, {self.tripped}; reload the configuration to heat"
+                f"{self.where}: heating is off, {self.tripped}; reload the configuration to heat "
+                "again"
             )
 
     def measure(self, result: Mapping[str, Any]) -> float | None:

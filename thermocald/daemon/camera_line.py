@@ -315,7 +315,10 @@ class CameraLine:
     def check(self) -> None:
         """Check the next frame without storing it; `checked` then holds the result."""
         if not isinstance(self.plan.calibrator, Calibrator):
-            raise ConfigurationError(f"camera {self.plan.name!r}: a session needs its `testfield`")
+            raise ConfigurationError(
+                f"camera {self.plan.name!r}: the check needs its `testfield`; set it, or give "
+                "--no-check"
+            )
         self.checked = None
         self._replace(None, checking=True)
 

@@ -121,6 +121,7 @@ def _stored(config: Config, session: Session) -> int:
 
 def _check(config: Config, say: Callable[[str], None]) -> None:
     """Check one reading of each thermometer and one frame; raises DataError if the check fails."""
+    from thermocald.acquisition.calibrator import Calibrator
     from thermocald.acquisition.pipeline import check_frame
     from thermocald.daemon.plan import plan_cameras
     from thermocald.hal import SystemClock, open_device
@@ -131,8 +132,10 @@ def _check(config: Config, say: Callable[[str], None]) -> None:
             values = thermometer.read().values
         say(f"{one.name}: " + ", ".join(f"{k} {v:.2f} °C" for k, v in values.items()))
     plan = plan_cameras(config, clock)[0]
-    if plan.calibrator is None:
-        raise ConfigurationError(f"camera {plan.name!r}: a session needs its `testfield`")
+    if not isinstance(plan.calibrator, Calibrator):
+        raise ConfigurationError(
+            f"camera {plan.name!r}: the check needs its `testfield`; set it, or give --no-check"
+        )
     with plan.camera as camera:
         frame = camera.capture()
     found, why = check_frame(plan.name, plan.calibrator, frame)

@@ -362,7 +362,7 @@ class StoreGuard:
         self._events.append(Event(time.time(), "epoch_lost", why))
 
     def reading(self, reading: LoggedReading) -> None:
-        """Store a reading that belongs to no epoch, with the next `flush`; do not wait."""
+        """Queue a reading that belongs to no epoch, for the next `flush`."""
         self._readings.append(reading)
 
     def flush(self) -> None:

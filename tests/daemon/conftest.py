@@ -264,7 +264,7 @@ def preloaded(tmp_path_factory):
     """A forker of daemons with all C files beside this one preloaded; a variable activates each."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
-        pytest.skip("no C compiler: what the system tells a process cannot be changed")
+        pytest.skip("no C compiler for the libraries that simulate the system")
     folder, built = tmp_path_factory.mktemp("preloaded"), []
     for source in sorted(Path(__file__).parent.glob("*.c")):
         built.append(str(folder / f"{source.stem}.so"))

@@ -246,7 +246,7 @@ def ext4(loop_disk):
     device = Path(tool("findmnt", "-no", "SOURCE", folder).stdout.strip()).name
     trigger = Path(f"/sys/fs/ext4/{device}/trigger_fs_error")
     if not trigger.exists() or not shutil.which("e2fsck"):
-        pytest.skip("this kernel cannot be asked for an error of a file system")
+        pytest.skip("this kernel cannot simulate a file system error")
 
     def mended() -> None:
         # open files keep the broken disk mounted: its image is checked and mounted elsewhere

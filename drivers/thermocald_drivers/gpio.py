@@ -15,10 +15,10 @@
 
 The LED is steady while epochs have results and blinks while they have none.
 
-The relay is fail-safe. It is off before the first result and after the last step, at or above the
-limit (until it is reopened), without a temperature for `unknown_s`, without a result for
-`watchdog_s`, and while closed. The kernel releases the pins of a process that crashes: wire the
-relay so that a released pin switches it off. See `heating` for the programme.
+The relay is fail-safe. It is off before the first result and after the last step, once the limit
+was reached (until the configuration is reloaded), without a temperature for `unknown_s`, without a
+result for `watchdog_s`, and while closed. The kernel releases the pins of a process that crashes:
+wire the relay so that a released pin switches it off. See `heating` for the programme.
 """
 
 from __future__ import annotations
@@ -139,7 +139,6 @@ class RelayOutput(HeatingOutput):
 
     def measure(self, result: Mapping[str, Any]) -> float | None:
         self._stop_watchdog()
-        self.opened()
         value = result.get(self.channel)
         return float(value) if isinstance(value, int | float) else None
 

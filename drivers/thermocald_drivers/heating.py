@@ -1,7 +1,7 @@
 """The heating programme of `relay` and `android_load`, and the driver `android_load`.
 
-At the limit, and at the end of the programme, heating stops until the configuration is reloaded.
-Both drivers have these options:
+At the limit, and at the end of the programme, heating stops until the configuration is reloaded. A
+device that goes away and comes back continues its programme. Both drivers have these options:
 
     limit_c: 60                   # at or above it: off until the configuration is reloaded
     unknown_s: 60                 # without a temperature for this long: off
@@ -73,19 +73,26 @@ class HeatingOutput(Output):
     channel: str
     """The name of the limited temperature, for messages."""
 
+    heating = False
+    tripped = ""
+    _known_at = 0.0
+    _started: float | None = None
+    _reported = False
+
     def begin(self) -> None:
-        """Start the programme from its beginning, with the heating off and the limit reset."""
+        """Start the programme at the first opening; continue it, with the heating off, later."""
         self.heating = False
-        self.tripped = ""
-        self._known_at = 0.0
-        self._started = self.clock.monotonic()
+        if self._started is None:
+            self._started = self.clock.monotonic()
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        """Switch the heating by the programme; PermanentDeviceError when the limit is reached."""
-        temperature_c, was_tripped = self.measure(result), self.tripped
+        """Switch the heating by the programme; PermanentDeviceError once at the limit."""
+        self.opened()
+        assert self._started is not None
+        temperature_c = self.measure(result)
         self.switch(self._decide(self.clock.monotonic() - self._started, temperature_c))
-        if self.tripped and not was_tripped:
-            # permanent: after a retry, the programme would start again
+        if self.tripped and not self._reported:
+            self._reported = True
             raise PermanentDeviceError(
                 f"{self.where}: heating is off, {self.tripped}; reload the configuration to heat "
                 "again"

@@ -10,7 +10,7 @@ import pytest
 from gpiozero.pins.mock import MockFactory
 
 from thermocald.acquisition.device_loop import OutputLoop
-from thermocald.errors import DeviceDenied, DeviceNotFound, PermanentDeviceError
+from thermocald.errors import DeviceDenied, DeviceNotFound, DeviceTimeout, PermanentDeviceError
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
 PROGRAMME = [
@@ -119,6 +119,27 @@ def test_the_daemon_does_not_reopen_a_relay_at_its_limit(pins):
     assert not pin.state
     assert (events, loop.link.state) == (["device_failed"], "failed")
     assert "reached the limit" in loop.link.why
+
+
+def test_opening_again_neither_restarts_the_programme_nor_resets_the_limit(pins, clock):
+    lamp, pin = relay(clock), pins.pin(27)
+    for seconds, heating in ((200, 1), (1150, 0)):  # the programme ends at 1100
+        with lamp:
+            clock.sleep_until(seconds)
+            lamp.emit({"temperature": 20.0})
+            assert pin.state == heating
+    lamp = relay(clock, programme=[{"seconds": 5000, "hold_c": 45.0}])
+    switch = lamp.switch
+
+    def fail(heat: bool) -> None:
+        raise DeviceTimeout("no answer")
+
+    lamp.switch = fail
+    with lamp, pytest.raises(DeviceTimeout):
+        lamp.emit({"temperature": 60.0})
+    lamp.switch = switch
+    with lamp, pytest.raises(PermanentDeviceError, match="reached the limit"):
+        lamp.emit({"temperature": 20.0})
 
 
 def test_closing_switches_off(pins, clock):

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+import thermocald as tc
 from benchmarks.thermal_model import undistorting
 from thermocald.analysis.camera.undistortion import ideal_points
 from thermocald.analysis.thermal.predictions import warm_up
@@ -216,3 +217,14 @@ def test_load(tmp_path):
     a, b = ThermalCamera.load(tmp_path / "m.yaml").at(30.0), ThermalCamera(thermal_model(*LISTED))
     np.testing.assert_array_equal(a.values, b.at(30.0).values)
     np.testing.assert_allclose(a.covariance, b.at(30.0).covariance, rtol=1e-12, atol=0)
+
+
+def test_a_formula_with_a_decimal_point_is_predicted_along_a_log(tmp_path):
+    series = tc.simulate("rpi-v2.1-heating", seed=1, epochs=60)
+    camera = tc.fit(series, effects=["above(temperature, 30.5):c"])
+    log = np.arange(0, 100, 10.0), np.linspace(25, 40, 10)
+    along = camera.along(*log)
+    assert (along.sd[:, 0] > 0).all()
+    camera.save(tmp_path / "camera.yaml")
+    again = tc.load_camera(tmp_path / "camera.yaml").along(*log)
+    np.testing.assert_allclose(again.values, along.values, rtol=1e-9)

@@ -64,7 +64,7 @@ def derivatives(
     """Return ∂ epoch's parameters / ∂ model's parameters (E, 22, q), by central differences."""
     found = []
     for name in names:
-        group, key = name.split(".", 1)
+        group, key = name.rsplit(".", 1)
         value = model.value(name)
         step = 1e-3 * max(abs(value), 1e-6)
         if group != "rates" and (searched := catalogue.get(group).nonlinear.get(key)):

@@ -366,7 +366,7 @@ class ThermalCamera(Result):
         """
         J = np.zeros((*linear.shape, len(self.parameters)))
         for i, name in enumerate(self.parameters):
-            group, key = name.split(".", 1)
+            group, key = name.rsplit(".", 1)  # a formula may contain dots
             if group == "interior":
                 J[:, IOP_NAMES.index(key), i] = 1.0
             elif group == "rates":

@@ -85,7 +85,8 @@ class Camera(Result):
         (1, 2)
         """
         six = pose.as_array() if isinstance(pose, ExteriorOrientation) else pose
-        return project(self.sensor, self.values, np.asarray(six, dtype=float), points)
+        pose_values = _numbers(six, 6, "the pose")
+        return project(self.sensor, self.values, pose_values, _numbers(points, 3, "object points"))
 
     def rays(self, image_points: ArrayLike) -> Array:
         """Return the unit directions (n, 3) in the camera frame of image points (n, 2) px.
@@ -95,7 +96,7 @@ class Camera(Result):
         >>> tc.load_camera("camera.yaml").at(35.0).rays([[100.0, 100.0]]).shape
         (1, 3)
         """
-        return self.model.rays(image_points)
+        return self.model.rays(_numbers(image_points, 2))
 
     def undistort(self, image_points: ArrayLike, to: InteriorOrientation | None = None) -> Array:
         """Return image points (n, 2) px as a camera without distortion would have seen them.
@@ -109,16 +110,17 @@ class Camera(Result):
         target = to or InteriorOrientation(self.interior.c)
         (x, y), pitch = self.sensor.centre, self.sensor.pixel_pitch
         scale, shift = target.c / pitch, (x + target.x0 / pitch, y - target.y0 / pitch)
-        return ideal_points(self.sensor, self.values, image_points, (scale, -scale), shift)
+        points = _numbers(image_points, 2)
+        return ideal_points(self.sensor, self.values, points, (scale, -scale), shift)
 
     def as_seen_by(self, image_points: ArrayLike, other: InteriorOrientation) -> Array:
         """Return image points (n, 2) px as this camera would have seen them with another IOP."""
-        seen = directions(self.sensor, self.values, image_points)
+        seen = directions(self.sensor, self.values, _numbers(image_points, 2))
         return project(self.sensor, other.as_array(), np.zeros(6), seen)
 
     def point_covariance(self, image_points: ArrayLike) -> Array:
         """Return the covariance (n, 2, 2) px² of a fixed direction's image point from the IOP's."""
-        seen = directions(self.sensor, self.values, image_points)
+        seen = directions(self.sensor, self.values, _numbers(image_points, 2))
         J = partials(self.sensor, self.values, np.zeros(6), seen)[1][..., :10]
         result: Array = np.einsum("ncp,pq,ndq->ncd", J, self.covariance, J)
         return result
@@ -132,6 +134,8 @@ class Camera(Result):
         >>> tc.load_camera("camera.yaml").at(35.0).object_error(10_000.0).shape
         (9,)
         """
+        if not distance_mm > 0:
+            raise UsageError(f"distance_mm is {distance_mm}; it must be above 0")
         points = image_grid(self.sensor) if image_points is None else image_points
         covariance = self.point_covariance(points) * self.sensor.pixel_pitch**2
         variance = np.trace(covariance, axis1=1, axis2=2)
@@ -247,6 +251,17 @@ class Camera(Result):
         axis.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="x, px", ylabel="y, px")
         axis.set_title(self.lines()[0])
         return figure
+
+
+def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Array:
+    """Return an array (..., columns) of numbers. Raises UsageError for anything else."""
+    try:
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.ndim == 0 or found.shape[-1] != columns:
+        raise UsageError(f"{name}: must be an array (n, {columns}) of numbers")
+    return found
 
 
 def _format_of(path: Path) -> str:

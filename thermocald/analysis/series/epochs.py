@@ -20,7 +20,7 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import calibrated_epochs
 from thermocald.analysis.series.course import Course, carried_by_c, table_of
-from thermocald.errors import DataError, DriverMissing
+from thermocald.errors import DataError, DriverMissing, UsageError
 from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.numbers import parameter_label, with_sd
@@ -355,6 +355,8 @@ class Epochs(Result):
 
         against: `time` or `temperature`. Needs matplotlib (extra `report`).
         """
+        if against not in ("time", "temperature"):
+            raise UsageError(f"against is {against!r}; it must be time or temperature")
         ok = self.ok
         x = self.temperature[ok] if against == "temperature" else self.time[ok].astype(object)
         figure, axes = new_figure(len(_DRAWN))

@@ -190,6 +190,8 @@ class ThermalCamera(Result):
                 f"the model is of camera {self.model.camera}, the images are of {camera}; a "
                 "thermal model belongs to one camera"
             )
+        if width <= 0 or height <= 0:
+            raise ConfigurationError(f"image size {width}×{height} px is impossible")
         factor = mine.width / width
         if abs(mine.height / height - factor) > 1e-9 * factor:
             raise ConfigurationError(
@@ -260,9 +262,12 @@ class ThermalCamera(Result):
         a model that uses them. Warns outside the model's validity; raises UsageError far outside it
         (unless `extrapolate`), also for a temperature that looks like Fahrenheit.
         """
-        T = float(temperature)
+        try:
+            T = float(temperature)
+        except (TypeError, ValueError):
+            T = math.nan
         if math.isnan(T):
-            raise UsageError("the temperature is NaN: give one in °C")
+            raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
             beyond = float(self.validity.check(np.array([T]), extrapolate)[0])

@@ -57,7 +57,7 @@ def test_a_refused_row_is_lost_for_everybody(guard, path, tmp_path, refusal):  #
     assert "an epoch was lost" in why
     others = {"cameras": {}, "thermometers": {}, "outputs": {}, "clock": {"trusted": True},
               "frames": {"paused": ""}}  # fmt: skip
-    assert any("1 epochs are lost" in text for text in status_warnings(document | others))
+    assert any("1 epoch lost" in text for text in status_warnings(document | others))
     (event,) = [e for e in guard.stored_events() if e.kind == "epoch_lost"]
     assert "epoch" in event.text
     # an hour later the page is healthy again; the count stays
@@ -76,9 +76,9 @@ def test_the_exit_status_of_status_says_so(guard, tmp_path, monkeypatch, capsys)
         "utc": 1.0, "started": 0.0, "pid": 1, "version": "0",
     }  # fmt: skip
     monkeypatch.setattr("thermocald.cli.run.read_status", lambda *_: document)
-    with pytest.raises(DataError, match="1 epochs were lost"):
+    with pytest.raises(DataError, match="1 epoch lost"):
         status()
-    assert "1 epochs are lost" in capsys.readouterr().out
+    assert "1 epoch lost" in capsys.readouterr().out
 
 
 def test_the_exit_status_of_run_says_so(tmp_path):
@@ -90,7 +90,7 @@ def test_the_exit_status_of_run_says_so(tmp_path):
     refuse(tmp_path / "t.db", "BEFORE INSERT ON epoch WHEN NEW.number = 7")
     done = call(*run, folder=tmp_path)
     assert done.returncode == 1
-    assert "1 epochs were lost: epoch 7 of rpi" in done.stderr
+    assert "1 epoch lost: epoch 7 of rpi" in done.stderr
     assert stored_numbers(tmp_path / "t.db") == [n for n in range(1, 21) if n != 7]
 
 

@@ -130,7 +130,7 @@ def test_what_waits_when_it_is_ended_there_is_counted(daemon, place):
     place.empty()
     numbers, _ = daemon.stored()
     lost = daemon.log().count("an epoch is lost: ")
-    assert f"error: {lost} epochs were lost" in daemon.log()
+    assert f"error: {lost} epochs lost" in daemon.log()
     assert lost > 0
     assert len(numbers) + lost >= taken
 

@@ -35,6 +35,7 @@ from thermocald.daemon.systemd import notify, watchdog_interval_s
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import option_names
 from thermocald.names import WITH_VALUES
+from thermocald.numbers import counted
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
@@ -199,7 +200,9 @@ class Service:
     def lost(self) -> str:
         """The number of epochs that were taken but not stored and the last reason, or ""."""
         store = self._guard.status()
-        return f"{store['lost']} epochs were lost: {store['lost_why']}" if store["lost"] else ""
+        return (
+            f"{counted(store['lost'], 'epoch')} lost: {store['lost_why']}" if store["lost"] else ""
+        )
 
     @property
     def failed(self) -> str:

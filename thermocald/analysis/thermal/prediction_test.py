@@ -25,8 +25,7 @@ from thermocald.analysis.thermal.level import (
     estimate_step,
     project_targets,
 )
-from thermocald.analysis.thermal.terms import event_threshold
-from thermocald.analysis.thermal.thermal_model import targets_of
+from thermocald.analysis.thermal.thermal_model import event_threshold, targets_of
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,

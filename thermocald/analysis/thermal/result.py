@@ -22,7 +22,6 @@ from thermocald.analysis.thermal.level import (
     estimate_level,
     project_targets,
 )
-from thermocald.analysis.thermal.terms import list_unknowns
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -35,6 +34,7 @@ from thermocald.photogrammetry.series.normals import chunks
 from thermocald.physics import catalogue
 from thermocald.physics.formula import is_formula, known_together
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
+from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.movement import detect_tremble
 from thermocald.thermal.scan import examine
 from thermocald.thermal.series import COLUMNS
@@ -260,7 +260,7 @@ def build_camera(
     series: not averaged in blocks; growth, moved: effects on noise and targets, from outside the
     fit; distortion_sigmas: significance of what the distortion follows, None if that was given.
     """
-    numbers = list_unknowns(fit, series[0].scale)
+    numbers = _list_unknowns(fit, series[0].scale)
     starts = [
         ThermalModel(
             s.source.camera,
@@ -415,3 +415,23 @@ def _with_sds(effect: ModelEffect, sd: dict[str, float], series: ReducedSeries) 
             # a time between two frames: uniform over the interval
             found[key] = float(np.median(np.diff(series.times)) / np.sqrt(12.0))
     return ModelEffect(effect.name, effect.values, found)
+
+
+def _list_unknowns(fit: Fit, scale: Array) -> Unknowns:
+    """Return all parameters that have a standard deviation in the fit, the rates first.
+
+    scale (19,): px per unit of the columns.
+    """
+    rates = coefficients_of(fit, fit.blocks[:1], scale)
+    found = {f"rates.{name}": number for name, number in rates.items()}
+    for number, term in enumerate(fit.terms):
+        for place, (i, key) in enumerate(fit.searched, len(fit.coefficients)):
+            if i == number:
+                row = np.eye(1, len(fit.covariance), place)[0]
+                found[f"{term.effect}.{key}"] = float(dict(term.nonlinear)[key]), row
+        names = {term.kind.column(n): n for n in term.kind.linear}
+        blocks = [b for b in fit.blocks if b.term == number]
+        for key, one in coefficients_of(fit, blocks, scale).items():
+            column, at, k = key.partition("@")
+            found[f"{term.effect}.{names.get(column, column)}{at}{k}"] = one
+    return found

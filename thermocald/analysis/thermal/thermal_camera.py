@@ -29,12 +29,12 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera
+from thermocald.arrays import seconds
 from thermocald.errors import ConfigurationError, UsageError
 from thermocald.figures import BAND
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
-from thermocald.physics.effect import Prediction
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
 from thermocald.result import Result, jsonable, new_figure
@@ -53,14 +53,6 @@ _STEP = 1e-3  # relative step of a parameter for its derivative
 _REMEMBERED = 6  # readings that the present effects follow from, besides two of each channel
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
 _VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
-
-
-def seconds(times: ArrayLike) -> Array:
-    """Return times in s; datetime64 and pandas times count from 1970-01-01 UTC."""
-    given = np.asarray(times)
-    if np.issubdtype(given.dtype, np.datetime64):
-        given = given.astype("datetime64[us]").astype(np.int64) * 1e-6
-    return np.asarray(given, dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,7 +345,7 @@ class ThermalCamera(Result):
         linear: Array = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
         for effect in model.effects:
             if not catalogue.get(effect.name).is_drive:
-                linear = linear + _influence(model, effect.name, history)
+                linear = linear + model.influence(effect.name, history)
         return linear
 
     def _propagate(
@@ -377,7 +369,7 @@ class ThermalCamera(Result):
             elif group == "rates":
                 J[:, IOP_NAMES.index(key), i] = drive - self.model.T0
             elif not catalogue.get(group).is_drive:
-                up, down = (_influence(self._moved(name, s), group, history) for s in (1.0, -1.0))
+                up, down = (self._moved(name, s).influence(group, history) for s in (1.0, -1.0))
                 J[:, :, i] = (up - down) / (2.0 * self._step(name))
             else:
                 if driven is None:
@@ -447,22 +439,6 @@ def load_camera(path: Path | str) -> ThermalCamera:
     return ThermalCamera.load(Path(path).expanduser())
 
 
-def _influence(model: ThermalModel, name: str, history: History) -> Array:
-    """Return what an effect of a model adds to the interior orientation, (E, 10)."""
-    effect = next(e for e in model.effects if e.name == name)
-    prediction = Prediction.none(len(history.times))
-    catalogue.get(name).influence(history, effect.values, prediction)
-    return prediction.iop
-
-
-def _followers(model: ThermalModel) -> list[Any]:
-    """Return one follower per drive of a model, in order; None for a drive that needs all readings.
-
-    Called one after the other, they give the temperature that the rates follow.
-    """
-    return [catalogue.get(name).follower(values) for name, values in model.drives]
-
-
 def _push(followers: list[Any], time: float, value: float) -> Array:
     """Pass a reading °C through the followers; return the temperature that drives now, (1,) °C."""
     for one in followers:
@@ -489,8 +465,8 @@ class LiveCamera:
     def __init__(self, thermal: ThermalCamera) -> None:
         self.thermal = thermal
         model = thermal.model
-        self._drive = _followers(model)
-        self.keeps_all = None in self._drive or not _is_of_now(model)
+        self._drive = model.followers()
+        self.keeps_all = None in self._drive or not model.is_of_now
         self._times: list[float] = []
         self._rows: list[tuple[float, ...]] = []
         self._channels: tuple[str, ...] = ()
@@ -498,7 +474,7 @@ class LiveCamera:
         self._maps: Maps | None = None
         drives = {name for name, _ in model.drives}
         self._moved = {
-            (name, sign): _followers(thermal._moved(name, sign))
+            (name, sign): thermal._moved(name, sign).followers()
             for name in thermal.parameters
             for sign in (1.0, -1.0)
             if name.split(".")[0] in drives
@@ -606,17 +582,3 @@ class LiveCamera:
             needed = sorted({0, *extremes, last - 2, last - 1, last})
             self._times = [self._times[i] for i in needed]
             self._rows = [self._rows[i] for i in needed]
-
-
-def _is_of_now(model: ThermalModel) -> bool:
-    """Return whether the first, the extreme and the last readings determine the effects.
-
-    They do not where a drive that looks ahead comes before another: it changes its own past values.
-    """
-    for name, values in model.drives[:-1]:
-        delay = catalogue.get(name).delay
-        if delay and float(values[delay]) < 0:
-            return False
-    kinds = [catalogue.get(e.name) for e in model.effects]
-    signals = [kind for kind in kinds if not kind.is_drive]
-    return all(kind.of_now or not set(kind.linear) & set(IOP_NAMES) for kind in signals)

@@ -153,7 +153,7 @@ def test_fahrenheit_is_refused(T):
 
 def test_readings_that_are_none_are_refused():
     camera = ThermalCamera(thermal_model(*LISTED))
-    with pytest.raises(UsageError, match="NaN"):
+    with pytest.raises(UsageError, match="temperature is nan: give one number"):
         camera.at(float("nan"))
     for times, temperatures, at in (([], [], None), ([0.0, 1.0], [25.0], None), ([0], [25], [])):
         with pytest.raises(UsageError, match="for each of its times"):

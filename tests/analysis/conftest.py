@@ -66,5 +66,5 @@ class WarmUp:
 
 @pytest.fixture
 def warm_up() -> type[WarmUp]:
-    """Builds series of a camera that warms up; its fields say how."""
+    """Return a builder of series of a camera that warms up; its fields say how."""
     return WarmUp

@@ -246,7 +246,7 @@ def test_a_moved_camera_is_reported_with_time_turn_and_shift():
         if events:
             found += events[0] == 32
             assert "turned by 0.0" in told[0][1]
-            assert "looks alike" not in told[0][1]
+            assert "looks the same" not in told[0][1]
     assert found == 10
 
 
@@ -258,7 +258,7 @@ def test_what_a_model_lacks_is_told_from_a_knock():
     gauge = GaugeCalibrator(thermal_camera(), world.field)
     _, told = followed(gauge, [world.epoch(k, 20.0 + 0.5 * k) for k in range(1, 50)])
     assert {kind for kind, _ in told} == {"camera_moved"}
-    assert all("a model that lacks an effect looks alike" in text for _, text in told)
+    assert all("a missing effect looks the same" in text for _, text in told)
 
 
 @pytest.mark.slow

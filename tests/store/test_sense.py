@@ -206,7 +206,7 @@ DOUBTS = {
         lambda p: change(p, "epochs.csv", frame_time=scaled(1 / 86400),
                          temperature_time=scaled(1 / 86400)), "every 0.000116 s"),
     "a name that no store keeps": (
-        lambda p: head(p, "{name: rpi", "{name: a/rpi"), "no store can keep it"),
+        lambda p: head(p, "{name: rpi", "{name: a/rpi"), "no store accepts it"),
     "an hour as the interval": (
         lambda p: head(p, "interval: 10.0", "interval: 3600"), "every 10 s"),
     "an epoch twice": (repeat_epoch, "1 epochs hold the image points of another one: epoch 18"),

@@ -257,7 +257,7 @@ def test_width_and_height_exchanged_in_the_middle_of_the_image(recording):
     header, *rows = file.read_text().splitlines()
     kept = [r for r in rows if float(r.split(",")[2]) < 2460]
     file.write_text("\n".join([header, *kept]) + "\n")
-    assert call("check", recording).stdout.startswith(f"{recording}: a sound recording")
+    assert call("check", recording).stdout.startswith(f"{recording}: a valid recording")
     head(recording, SIZE, "width: 2464, height: 3280")
     checked, replayed = call("check", recording), call("replay", recording)
     for text in (checked.stdout, replayed.stderr):

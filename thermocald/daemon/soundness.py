@@ -174,7 +174,7 @@ def _examine_recording(path: Path) -> dict[str, Any]:
         *strange_photographs([e.frame for e in recording.epochs if e.frame is not None]),
         *calibration_doubts(recording),
     ]
-    sort = "a doubtful" if doubts else "a sound"
+    sort = "a doubtful" if doubts else "a valid"
     lines = [
         f"{path}: {sort} recording of camera {recording.camera.name}, series {recording.series}",
         f"  {len(columns)} epochs, {frames} frames, {len(recording.testfield)} targets",
@@ -231,7 +231,7 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
     from thermocald.hal import SystemClock, open_device, option_names
 
     config = load_config(path, option_names)
-    lines = [f"{path}: a sound configuration"]
+    lines = [f"{path}: a valid configuration"]
     for key, place in (("store.path", config.store.path), ("frames.folder", config.frames.folder)):
         if _is_system(place):
             raise ConfigurationError(f"{path}: {key}: {place}: nothing can be stored there")
@@ -272,7 +272,7 @@ def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
             {"camera": s.camera, "series": s.name, "last_epoch": store.last_epoch(s)}
             for s in store.all_series()
         ]
-    state = "a damaged store" if found.damaged else "a sound store"
+    state = "a damaged store" if found.damaged else "an intact store"
     lines = [f"{path}: {state} of {len(series)} series, {found.epochs} epochs"]
     lines += [f"  {s['camera']}/{s['series']}: up to epoch {s['last_epoch']}" for s in series]
     lines += [f"  {gap.text}" for gap in found.gaps[:_SHOWN]]

@@ -274,7 +274,7 @@ def _movement(d: Discovery) -> Figure:
             if len(drawn) > 1
             else "; no effect was found that another recording would show."
         )
-        + f" The noise of the readings, {reading_sd:.3f} K, gives up to {of_readings:.3f} px of it.",
+        + f" Up to {of_readings:.3f} px of it is the noise of the readings, {reading_sd:.3f} K.",
         panels,
         columns=2,
     )

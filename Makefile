@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml $(LOCK)
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@
 
-demo: $(STAMP) ## run the main job on a rendered camera, until a hidden effect is found
+demo: $(STAMP) ## the whole program on a rendered camera, until it has found a hidden effect
 	rm -rf build/demo
 	$(BIN)/thermocald demo --out build/demo
 

@@ -1,4 +1,4 @@
-"""Microchip TC74, ±2 °C, 1 K, on SMBus: the worked example of drivers/README.md.
+"""Microchip TC74 thermometer, ±2 °C, resolution 1 K, on SMBus: the example of drivers/README.md.
 
     thermometers:
       - {name: box, driver: tc74, bus: 1, address: 0x4d}
@@ -22,17 +22,17 @@ class Tc74Options(DriverOptions):  # one field per key of the stanza, except nam
 
 
 class Tc74Thermometer(Thermometer):
-    """One chip."""
+    """A TC74 chip."""
 
     device_classes = ("char-i2c",)
     Options = Tc74Options
     where = "TC74"
 
     def open(self) -> None:
-        import smbus2  # the library is imported when the device is opened
+        import smbus2  # a device's library is imported when the device is opened
 
         try:
-            self.handle = smbus2.SMBus(self.options.bus)  # which `close` of a Device closes
+            self.handle = smbus2.SMBus(self.options.bus)  # `Device.close` closes it
             self.handle.read_byte_data(self.options.address, 1)
         except OSError as error:
             self.close()

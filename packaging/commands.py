@@ -24,7 +24,7 @@ NAME = "thermocald"
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of a help page: an argument or option as it is typed, and what it does."""
+    """One line of a help page: an argument or option as it is typed, and its help."""
 
     term: str
     text: str
@@ -32,13 +32,13 @@ class Entry:
 
     @property
     def flags(self) -> list[str]:
-        """Return for example ["-o", "--out"]; empty for an argument."""
+        """The flags, such as ["-o", "--out"]; empty for an argument."""
         words = re.sub(r"<[^>]*>|\[[^]]*\]", " ", self.term).replace(",", " ").split()
         return [word for word in words if word.startswith("-")]
 
     @property
     def choices(self) -> list[str]:
-        """Return the values that the help lists, as in `<csv|parquet>`."""
+        """The values, if the help lists them, as in `<csv|parquet>`."""
         found = re.search(r"[<\[]([\w.-]+(?:\|[\w.-]+)+)[>\]]", self.term)
         return found[1].split("|") if found else []
 
@@ -56,12 +56,12 @@ class Command:
 
     @property
     def usage(self) -> str:
-        """Return for example `thermocald export [OPTIONS] RECORDING_OR_STORE`."""
+        """The usage, such as `thermocald export [OPTIONS] RECORDING_OR_STORE`."""
         return " ".join(str(self.source.get_usage(self._context)).split()).removeprefix("Usage: ")
 
     @property
     def paragraphs(self) -> list[str]:
-        """Return the paragraphs of the help; the first sentence is what the command does."""
+        """The paragraphs of the help; the first one is the summary."""
         return [" ".join(part.split()) for part in str(self.source.help or "").split("\n\n")]
 
     @property
@@ -79,12 +79,12 @@ class Command:
 
     @cached_property
     def arguments(self) -> list[Entry]:
-        """Return the arguments, without a dash."""
+        """The positional arguments."""
         return self._entries("argument")
 
     @cached_property
     def options(self) -> list[Entry]:
-        """Return the options, with a dash."""
+        """The options."""
         return self._entries("option")
 
     @cached_property
@@ -94,7 +94,7 @@ class Command:
         return [Command((*self.path, n), c) for n, c in inner.items() if not c.hidden]
 
     def walk(self) -> Iterator[Command]:
-        """Yield the command and all commands below it."""
+        """Yield this command and all commands below it."""
         yield self
         for child in self.children:
             yield from child.walk()

@@ -1,9 +1,9 @@
 #!/bin/sh
 # Build the Debian package: packaging/deb.sh [RELEASE [ARCHITECTURE [FOLDER]]]
 #
-# RELEASE is bookworm or trixie, ARCHITECTURE amd64 or arm64; by default, this machine's. Nothing is
-# compiled, so any Debian with debhelper builds all four. Modules that the release does not have come
-# as wheels with the hashes of packaging/lock/RELEASE.txt.
+# RELEASE is bookworm or trixie, ARCHITECTURE amd64 or arm64; without them, this machine's. Nothing
+# is compiled, so any Debian with debhelper builds all four packages. Modules that the release lacks
+# in a suitable version are added as wheels, with the hashes of packaging/lock/RELEASE.txt.
 set -eu
 cd "$(dirname "$0")/.."
 top=$PWD
@@ -17,12 +17,12 @@ lock=$top/packaging/lock/$release
 case $release in
     bookworm) number=12 ;;
     trixie) number=13 ;;
-    *) echo "$release: no lock; give bookworm or trixie" >&2; exit 2 ;;
+    *) echo "no lock file for $release; only bookworm and trixie have one" >&2; exit 2 ;;
 esac
 case $architecture in
     amd64) machine=x86_64 ;;
     arm64) machine=aarch64 ;;
-    *) echo "$architecture: not supported; give amd64 or arm64" >&2; exit 2 ;;
+    *) echo "no package can be built for $architecture, only for amd64 and arm64" >&2; exit 2 ;;
 esac
 for tool in dh dpkg-buildpackage; do
     command -v $tool >/dev/null || { echo "$tool is missing: sudo apt-get install debhelper dpkg-dev" >&2; exit 2; }
@@ -40,7 +40,7 @@ tree=$work/thermocald
 rm -rf "$work"
 mkdir -p "$tree/wheels"
 "$python" -m pip wheel --quiet --no-deps --wheel-dir "$tree/wheels" .
-# adbutils is published for amd64 only because it contains adb, which Debian has itself
+# adbutils is published for amd64 only, because of the adb in it, which Debian has itself
 awk -v others="$work/others.txt" -v adb="$work/adb.txt" \
     '/^[a-z]/ { out = /^adbutils==/ ? adb : others } { print > out }' "$lock.txt"
 load() { # REQUIREMENTS PLATFORM…
@@ -61,7 +61,7 @@ find "$tree/docs" -name __pycache__ -prune -exec rm -rf {} +
 cat > "$tree/debian/changelog" <<END
 thermocald ($version) $release; urgency=medium
 
-  * What changed: docs/CHANGELOG.md beside this file
+  * See docs/CHANGELOG.md in this folder.
 
  -- the thermocald founders <thermocald@localhost>  $(date -R -u -d "@$SOURCE_DATE_EPOCH")
 END

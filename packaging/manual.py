@@ -2,9 +2,9 @@
 
     python packaging/manual.py FOLDER
 
-writes FOLDER/man1/*.1 and FOLDER/{bash,zsh,fish}/. Completions are plain text, so that pressing Tab
-does not start Python, which takes seconds on a Raspberry Pi. Dates are from SOURCE_DATE_EPOCH, so
-that the same source gives the same bytes.
+writes FOLDER/man1/*.1 and FOLDER/{bash,zsh,fish}/. Completions are plain text: pressing Tab does
+not start Python, which would take seconds on a Raspberry Pi. The date is that of SOURCE_DATE_EPOCH,
+so that the same source gives the same bytes.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def _page(command: Command) -> str:
 
 
 def _roff(text: str) -> str:
-    """Escape text for groff; no line begins with a control character."""
+    """Return text in groff's syntax; no line begins with a control character."""
     escaped = text.translate(_GROFF)
     return rf"\&{escaped}" if escaped.startswith(".") else escaped
 
 
 def man_page(command: Command, commands: list[Command]) -> str:
-    """Return a command's page of section 1."""
+    """Return a command's manual page, of section 1."""
     now = time.gmtime(int(os.environ.get("SOURCE_DATE_EPOCH", time.time())))
     date = time.strftime("%Y-%m-%d", now)
     words = " ".join(command.path)
@@ -83,8 +83,8 @@ _PROGRAM_SECTIONS = [
     ".SH FILES",
     ".TP",
     ".I /etc/thermocald/config.yaml",
-    r"What the daemon runs; further ones as \fI/etc/thermocald/NAME.yaml\fR with the unit",
-    r"\fIthermocald@NAME\fR.",
+    r"The daemon's configuration; that of the unit \fIthermocald@NAME\fR is",
+    r"\fI/etc/thermocald/NAME.yaml\fR.",
     ".TP",
     ".I /var/lib/thermocald",
     "The store, the frames and the recordings of the daemon.",
@@ -107,7 +107,7 @@ def _quoted(text: str) -> str:
 
 
 def bash(commands: list[Command]) -> str:
-    """Return a completion function for bash: words of the command so far, otherwise files."""
+    """Return a completion function for bash: subcommands and options, otherwise files."""
     cases = "\n".join(
         f"        {_quoted(' '.join(c.path[1:]))}) words={_quoted(' '.join(_words(c)))} ;;"
         for c in commands
@@ -144,7 +144,7 @@ complete -o filenames -F _{NAME} {NAME}
 
 
 def zsh(commands: list[Command]) -> str:
-    """Return a completion function for zsh, with descriptions of commands and options."""
+    """Return a completion function for zsh, with the help of commands and options."""
 
     def described(word: str, text: str) -> str:
         return _quoted(f"{word}:{text}".replace("\n", " "))
@@ -182,7 +182,7 @@ _{NAME} "$@"
 
 
 def fish(commands: list[Command]) -> str:
-    """Return completions for fish, one line per word."""
+    """Return completions for fish: one line for every word."""
     lines = [f"# fish completion for {NAME}, made from its commands"]
     for c in commands:
         seen = [f"__fish_seen_subcommand_from {word}" for word in c.path[1:]]

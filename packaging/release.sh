@@ -1,15 +1,16 @@
 #!/bin/sh
-# Build everything that is published in dist/, and test the artefacts, not the tree.
+# Build everything that is published into dist/, and test these artefacts, not the tree.
 #
-# sdist, wheel and Debian packages are built twice and must be identical, and the sdist must give the same
-# wheel. The wheel is installed with the locked versions in a new environment and passes the sdist's tests
-# there, without the tree. Debian packages need debhelper; they are installed, upgraded and purged in a
-# bare Debian, which needs root (.ci/deb). SBOM (CycloneDX) and checksums come last.
+# sdist, wheel and Debian packages are built twice and must be identical; the sdist must give the same
+# wheel. The wheel is installed with the locked versions in an environment of its own, and the sdist's
+# tests are run on it there, without the tree. Debian packages are built if debhelper is installed; as
+# root they are also installed, upgraded and purged in a bare Debian (.ci/deb). SBOM (CycloneDX) and
+# checksums come last.
 set -eu
 cd "$(dirname "$0")/.."
 python=$PWD/.venv/bin/python
 [ -z "$(git status --porcelain --untracked-files=no)" ] ||
-    { echo "there are uncommitted changes; commit them, since a commit is released" >&2; exit 1; }
+    { echo "there are uncommitted changes; commit them first: a release is a commit" >&2; exit 1; }
 SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
 export SOURCE_DATE_EPOCH
 version=$("$python" -c 'import thermocald; print(thermocald.__version__)')
@@ -54,7 +55,7 @@ echo "== the wheel alone, with the locked versions"
     venv/bin/python -c 'import thermocald; assert "venv" in thermocald.__file__'
 )
 
-echo "== SBOM of what the wheel is tested with"
+echo "== SBOM of the wheel's environment"
 sbom=dist/thermocald-$version.cdx.json
 "$python" -m cyclonedx_py environment --output-reproducible --output-format JSON \
     --output-file "$sbom" "$work/venv/bin/python"
@@ -111,15 +112,15 @@ if [ -n "$packages" ]; then
     DEBS=dist .ci/deb $(printf '%s\n' $packages | grep -- "-$(dpkg --print-architecture)\$") || status=$?
     case $status in
         0) ;;
-        77) echo "   skipped: .ci/deb needs root and a network" ;;
+        77) echo "   not possible here: run .ci/deb on a machine with root and a network" ;;
         *) exit $status ;;
     esac
 else
     echo "== no Debian packages: debhelper is missing"
 fi
 
-echo "== notes: the changelog's UNRELEASED part"
-sed -n '/^## UNRELEASED/,/^## [^U]/p' CHANGELOG.md | sed '1d;/^## /d' > "dist/NOTES-$version.md"
-[ -s "dist/NOTES-$version.md" ] || echo "   CHANGELOG.md has no UNRELEASED entries" >&2
+echo "== notes: the newest section of the changelog"
+awk '/^## /{section++; next} section == 1' CHANGELOG.md > "dist/NOTES-$version.md"
+[ -s "dist/NOTES-$version.md" ] || echo "   the newest section is empty" >&2
 (cd dist && sha256sum -- * > SHA256SUMS && sha256sum --quiet --check SHA256SUMS)
 ls -l dist

@@ -2,8 +2,8 @@
 # Inside a bare Debian: install /share/first.deb, use it, upgrade to second.deb, downgrade, remove, purge.
 # `test_deb.sh NAME depends` only installs its dependencies.
 #
-# ROOT is a Debian of another architecture: apt and dpkg run natively (from Debian 13; an older dpkg supports
-# its own architecture only), the programs in ROOT (maintainer scripts, thermocald) emulated.
+# ROOT is the folder of a Debian of another architecture: apt and dpkg run natively from here (those of
+# Debian 13; an older dpkg handles only its own architecture), its own programs are emulated.
 set -euo pipefail
 name=${1:-here} ROOT=${ROOT:-}
 inside() { if [ -n "$ROOT" ]; then chroot "$ROOT" "$@"; else "$@"; fi; }
@@ -52,10 +52,10 @@ zgrep -q thermocald "$ROOT/usr/share/man/man1/thermocald.1.gz" 2>/dev/null || gr
 inside thermocald check /etc/thermocald/config.yaml >/dev/null
 # the private environment sees what the distribution installs (picamera2, libcamera)
 inside /usr/lib/thermocald/bin/python -c 'import sys, yaml; assert "/usr/lib/python3/dist-packages" in sys.path' ||
-  fail "the system's modules are not found"
-# into a file, because `grep -q` exits at the first match, and a program that still writes would fail
-inside thermocald doctor >/tmp/doctor || [ $? = 1 ] || fail "thermocald doctor fails"
-grep -q 'does not start with the machine' /tmp/doctor || fail "thermocald doctor does not report the service"
+  fail "the system's modules are not seen"
+# into a file: `grep -q` exits at the first match, and a program that still writes would then fail
+inside thermocald doctor >/tmp/doctor || [ $? = 1 ] || fail "the doctor fails"
+grep -q 'does not start with the machine' /tmp/doctor || fail "the doctor does not see the service"
 run() { inside su -s /bin/sh thermocald -c "cd /var/lib/thermocald && $1"; }
 if [ -d /share/M1 ]; then # identical (.ci/arm64), and saves a minute of emulation
   cp -r /share/M1 "$ROOT/var/lib/thermocald"
@@ -76,7 +76,7 @@ if [ -z "$ROOT" ] && apt-cache show python3-libcamera >/dev/null 2>&1; then
 fi
 echo "# mine" >> "$ROOT/etc/thermocald/config.yaml"
 run "thermocald export series.db --output first.csv"
-# SQLite's user_version, from the header of the file
+# SQLite's user_version, read at its place in the file
 schema() { od -An -tu4 --endian=big -j60 -N4 "$ROOT/var/lib/thermocald/$1" | tr -d ' '; }
 old=$(schema series.db)
 
@@ -87,7 +87,7 @@ version=$(dpkg ${ROOT:+--root="$ROOT"} -s thermocald | sed -n 's/^Version: //p')
 grep -q '^# mine' "$ROOT/etc/thermocald/config.yaml" || fail "the upgrade lost the configuration"
 run "test -e M1/epochs.csv" || fail "the upgrade lost data"
 inside thermocald --version >/dev/null
-# its schema is one version later: reading does not change a store, writing first copies it
+# its schema is one version later: a reader changes nothing, a writer copies the store first
 run "thermocald export series.db --output second.csv"
 run "cmp first.csv second.csv" || fail "the store reads differently after the upgrade"
 [ "$(schema series.db)" = "$old" ] || fail "reading changed the store"
@@ -99,13 +99,13 @@ lap "schema brought up to date"
 apt_get install --allow-downgrades /share/first.deb
 lap "downgraded"
 grep -q '^# mine' "$ROOT/etc/thermocald/config.yaml" || fail "the downgrade lost the configuration"
-# a store of a later version is refused with advice; the backup can be read
+# the store with the later schema is left alone, with a message; the backup can be used
 ! run "thermocald export series.db --output third.csv 2>refusal" || fail "a later store was opened"
 run "cat refusal"
-run "grep -q 'update thermocald' refusal && grep -q series.db.version-$old refusal" || fail "the refusal has no advice"
+run "grep -q 'update thermocald' refusal && grep -q series.db.version-$old refusal" || fail "the message does not tell what to do"
 [ "$(schema series.db)" = $((old + 1)) ] || fail "a later store was changed"
 run "thermocald export series.db.version-$old --output third.csv && cmp first.csv third.csv" ||
-  fail "the backup cannot be read"
+  fail "the backup cannot be used"
 lap "backup read"
 
 apt_get remove thermocald

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Install thermocald as a service from this checkout (as root); again: update. --uninstall: remove it.
+# Install or update thermocald as a service from this checkout (as root). --uninstall: remove it.
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 root=${DESTDIR:-}
@@ -27,7 +27,7 @@ place 644 "$here/thermocald.tmpfiles" /usr/lib/tmpfiles.d/thermocald.conf
 place 644 "$here/60-thermocald.rules" /etc/udev/rules.d/60-thermocald.rules
 [ -e "$root/etc/thermocald/config.yaml" ] ||
     place 644 "$here/../config.yaml" /etc/thermocald/config.yaml
-[ -z "$root" ] || exit 0 # a package build: the rest is the target machine's
+[ -z "$root" ] || exit 0 # a package build: the rest is done on the target machine
 
 echo "program in /opt/thermocald:"
 [ -x /opt/thermocald/bin/python ] || python3 -m venv --system-site-packages /opt/thermocald
@@ -39,4 +39,4 @@ udevadm control --reload && udevadm trigger || true
 systemctl daemon-reload
 sed -i 's|^  path: thermocald.db|  path: /var/lib/thermocald/thermocald.db|;s|^  folder: frames|  folder: /var/lib/thermocald/frames|' \
     /etc/thermocald/config.yaml
-echo "now: edit /etc/thermocald/config.yaml, then  systemctl enable --now thermocald thermocald-archive.timer thermocald-backup.timer"
+echo "next: edit /etc/thermocald/config.yaml, then  systemctl enable --now thermocald thermocald-archive.timer thermocald-backup.timer"

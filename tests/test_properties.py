@@ -247,7 +247,7 @@ def test_any_other_meaning_of_a_recording(amount, recorded, tmp_path):
         if not epochs.ok.all() or series.doubts(epochs):
             return
         if np.nanmedian(epochs.sigma0) > 5.0 * np.nanmedian(right.sigma0):
-            return  # printed as: image points scatter that many times as much as stated
+            return  # printed as: the image points' scatter over the stated one
         pitch = series.head.camera.sensor.pixel_pitch / 0.00112
         values, sds = np.median(epochs.values, axis=0), np.median(epochs.sd, axis=0)
         assert 0.8 < values[0] / 3.04 < 1.25

@@ -1,4 +1,4 @@
-"""Thermal calibration of low-cost cameras: live, with true standard deviations.
+"""Thermal calibration of low-cost cameras: live, with realistic standard deviations.
 
     import thermocald as tc
     epochs = tc.open("M1").calibrate()

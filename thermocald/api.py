@@ -182,7 +182,7 @@ def study(
         raise UsageError(
             f"{len(labels)} labels for {len(series)} series; give one for each at most"
         )
-    _refuse_twice(series)
+    _require_series(series)
     check_exterior(exterior)
     settings = StudySettings(
         window=window, alpha=alpha, sets=sets, seed=seed, distance_mm=distance_mm, grid=grid,
@@ -251,7 +251,7 @@ def fit(
 
     if not series:
         raise UsageError("give at least one series to fit a model to")
-    _refuse_twice(series)
+    _require_series(series)
     require_within(T0=(T0, COLDEST_C))
     if isinstance(kind, Path) or (isinstance(kind, str) and Path(kind).suffix in (".yaml", ".yml")):
         kind = read_model(source_of(kind))
@@ -306,7 +306,7 @@ def discover(
     require_within(jobs=(jobs, 1))
     tell = say or (lambda _: None)
     every = (series, *verify)
-    _refuse_twice(every)
+    _require_series(every)
     start = _model_of(model)
     inputs = []
     for one in every:
@@ -346,6 +346,8 @@ def plan(
 
     require_within(strength_px=(strength_px, 0.001), seeds=(seeds, 1))
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
+    if series is not None:
+        _require_series((series,))
     source = None if series is None else series.observed()
     inputs = set_ups(source, thermal, preset, testfield, course, seeds)
     return plan_power(inputs, strength_px, progress or (lambda _: None))
@@ -465,9 +467,11 @@ def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
     return [source_of(p) for p in ((given,) if isinstance(given, str | Path) else given)]
 
 
-def _refuse_twice(series: Sequence[Series]) -> None:
-    """Raise UsageError if a series is given twice: it would count as two that agree."""
+def _require_series(series: Sequence[Series]) -> None:
+    """Raise UsageError for what is not a series, and for a series that is given twice."""
     for i, one in enumerate(series):
+        if not isinstance(one, Series):
+            raise UsageError(f"{str(one)[:80]!r} is not a series: open it with thermocald.open")
         for other in series[:i]:
             if one is other or one.place == other.place:
                 raise UsageError(

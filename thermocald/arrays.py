@@ -1,4 +1,4 @@
-"""Names of array types, evenly spread rows, and reused buffers.
+"""Names of array types, times in seconds, evenly spread rows, and reused buffers.
 
 The system provides fresh memory page by page, which for an 8 MP frame takes longer than the
 arithmetic on it. A `scratch` array must not leave the function that asked for it.
@@ -10,7 +10,7 @@ import threading
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -20,6 +20,14 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 _buffers = threading.local()  # by name
+
+
+def seconds(times: ArrayLike) -> Array:
+    """Return times in s; datetime64 and pandas times count from 1970-01-01 UTC."""
+    given = np.asarray(times)
+    if np.issubdtype(given.dtype, np.datetime64):
+        given = given.astype("datetime64[us]").astype(np.int64) * 1e-6
+    return np.asarray(given, dtype=float)
 
 
 def spread_rows(count: int, most: int) -> Index:

@@ -112,6 +112,11 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
     return typeset_powers(f"{body} {unit}").rstrip().replace("-", _MINUS)
 
 
+def counted(count: int, noun: str) -> str:
+    """Write `1 epoch`, `3 epochs`."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def duration(seconds: float) -> str:
     """Write a duration in words: `25 minutes`, `1 minute`, `3.5 hours`, `12 days`."""
     for unit, length in (("day", 86_400.0), ("hour", 3600.0), ("minute", 60.0)):

@@ -1,4 +1,4 @@
-"""The page of code: a tick, a series, a discovery, an effect and a driver, as they are today."""
+"""The page of code: a tick, a series, a discovery, an effect and a driver, from the source."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = {
     "A tick": (
         (
-            "A camera's thread hands a frame over; the readings next to it are paired, it is "
-            "measured and adjusted, and kept in the order of the frames."
+            "A camera's thread passes a frame on; it is paired with the nearest readings, measured "
+            "and adjusted, and the epochs are stored in the order of the frames."
         ),
         "thermocald.acquisition.pipeline:Pipeline.submit",
         "thermocald.acquisition.pipeline:calibrate_frame",
     ),
     "A series": (
-        "All epochs are adjusted together; first the data decide how the camera moved.",
+        "All epochs are adjusted together, after the data have decided how the camera moved.",
         "thermocald.photogrammetry.series.adjustment:adjust_series",
         "thermocald.photogrammetry.series.adjustment:adjusted",
     ),
     "A discovery": (
         (
-            "Targets that moved and the measuring noise come first, then the search: effects are "
-            "added while they are worth their penalty, and removed when they no longer are."
+            "First moved targets and the measuring noise are determined. Then the search adds "
+            "effects while they gain more than their penalty, and removes those that no longer do."
         ),
         "thermocald.discovery.examination:examine_series",
         "thermocald.discovery.search:Search.expand",
@@ -36,23 +36,23 @@ PAGES = {
     "An effect": (
         (
             "One class, used forward in the simulation, as columns of a fit, and as words in a "
-            "report. Everything in which effects differ is stated here."
+            "report. Everything in which effects differ is in these classes."
         ),
         "thermocald.physics.effects.heat:ThermalLag",
     ),
     "A driver": (
         (
-            "One class for one contract of the HAL. It gives what the hardware said, when it said "
-            "it, or an error that says whether trying again can help."
+            "One class for one interface of the HAL. It returns what the hardware reported, with "
+            "the time, or raises an error whose type tells whether a retry can help."
         ),
         "thermocald_drivers.i2c:Tmp117Thermometer",
     ),
 }
-"""Title: a sentence, and what is shown."""
+"""{title: (introduction, names of the functions and classes to show …)}."""
 
 
 def page() -> str:
-    """Title, sentence and source of each of PAGES."""
+    """Return the title, the introduction and the source of each of PAGES."""
     parts = []
     for title, (sentence, *names) in PAGES.items():
         parts += [f"## {title}", sentence]

@@ -1,4 +1,4 @@
-"""What mkdocs does for this site beside its own: generated pages, notebooks, mathematics.
+"""The hooks of mkdocs for this site: generated pages, notebooks, mathematics.
 
 Run by `mkdocs.yml`. Nothing is loaded from elsewhere: formulas become MathML while the site is
 built. With `THERMOCALD_DOCS_API=no` the reference of the Python modules, which takes most of the
@@ -35,12 +35,12 @@ GENERATORS = {**reference.GENERATORS, "explanation/five-pages.md": five_pages.pa
 
 
 def api_wanted() -> bool:
-    """Whether the modules' reference is built."""
+    """Return whether the reference of the Python modules is built."""
     return os.environ.get("THERMOCALD_DOCS_API", "yes") != "no"
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Put the generated pages where the navigation says `generated: …`."""
+    """Put the generated pages into the navigation, in place of `generated …`."""
     packages = reference.packages() if api_wanted() else []
     pages: Mapping[str, list[Any]] = {
         "examples": [f"examples/{path.stem}.md" for path in notebooks.found()],
@@ -84,5 +84,5 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Formulas as MathML."""
+    """Convert the formulas of a page to MathML."""
     return mathematics.as_mathml(html)

@@ -15,7 +15,7 @@ _FORMULA = re.compile(
 
 
 def as_mathml(page: str) -> str:
-    """A page with every `arithmatex` element converted; ValueError for what cannot be."""
+    """Return a page with its `arithmatex` elements converted; ValueError if one cannot be."""
     return _FORMULA.sub(_converted, page)
 
 
@@ -23,7 +23,7 @@ def _converted(match: re.Match[str]) -> str:
     latex = html.unescape(match["latex"]).strip()
     block = match["open"] == "["
     mathml = convert(latex, display="block" if block else "inline")
-    # what the converter does not know it prints as text
+    # the converter outputs unknown commands as text
     if unknown := re.search(r">(\\[A-Za-z]+)", mathml):
-        raise ValueError(f"{unknown[1]} is not known in the formula {latex!r}")
+        raise ValueError(f"{unknown[1]} is unknown, in the formula {latex!r}")
     return f'<div class="formula">{mathml}</div>' if block else mathml

@@ -14,12 +14,12 @@ _PICTURES = {"image/png": "png"}
 
 
 def found() -> list[Path]:
-    """The notebooks, in the order of their names."""
+    """Return the notebooks, in the order of their names."""
     return sorted(FOLDER.glob("*.ipynb"))
 
 
 def pages() -> dict[str, str | bytes]:
-    """Address within the site → Markdown or picture, of all notebooks."""
+    """Return {address within the site: Markdown or picture} of all notebooks."""
     contents: dict[str, str | bytes] = {}
     for path in found():
         notebook = json.loads(path.read_text(encoding="utf-8"))
@@ -37,7 +37,7 @@ def pages() -> dict[str, str | bytes]:
 
 
 def _joined(outputs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What was printed in pieces, in one."""
+    """Join the pieces of printed output."""
     found: list[dict[str, Any]] = []
     for output in outputs:
         if found and output["output_type"] == found[-1]["output_type"] == "stream":
@@ -48,7 +48,7 @@ def _joined(outputs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _shown(output: dict[str, Any], stem: str, contents: dict[str, str | bytes]) -> str:
-    """One output as Markdown; its picture goes into `contents`."""
+    """Return one output as Markdown; its picture is added to `contents`."""
     if output["output_type"] == "stream":
         return f"```text\n{''.join(output['text']).rstrip()}\n```"
     data = output["data"]

@@ -17,7 +17,7 @@ LAG = {"thermal_lag": {"tau": 75}}
 
 
 def draw_drift(first: tc.Series, second: tc.Series, to: Path) -> None:
-    """Draw x0 of a series, and what the model of another one leaves of it."""
+    """Draw x0 of a series, before and after correction with the model of another series."""
     found = tc.discover(first, verify=[second])
     camera = tc.fit(first, model=found.model)
     epochs = second.calibrate()
@@ -34,7 +34,7 @@ def draw_drift(first: tc.Series, second: tc.Series, to: Path) -> None:
 
 
 def photograph_page(page: Path, to: Path) -> None:
-    """Keep the top of a page, 1280 px wide, as a small picture of few colours."""
+    """Save the top of a page, 1280 px wide, as a small picture of few colours."""
     from PIL import Image
     from playwright.sync_api import sync_playwright
 
@@ -50,7 +50,7 @@ def photograph_page(page: Path, to: Path) -> None:
 
 
 def main() -> int:
-    """Make both pictures, from the same seeds each time."""
+    """Make both pictures, always from the same seeds."""
     HERE.mkdir(exist_ok=True)
     series = [tc.simulate("rpi-v2.1-heating", effects=LAG, seed=k, series=f"M{k}") for k in (1, 2)]
     draw_drift(*series, HERE / "drift.png")

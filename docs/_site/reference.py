@@ -1,4 +1,4 @@
-"""The reference, made from the code: commands, configuration, effects, drivers, modules."""
+"""The reference, generated from the code: commands, configuration, effects, drivers, modules."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROOTS = ("thermocald", "thermocald_drivers")
 
 
 def packages() -> list[str]:
-    """Every package with modules of its own; commands have a page of their own."""
+    """Return the names of the packages except `cli`: commands have a page of their own."""
     found = []
     for root in ROOTS:
         package = importlib.import_module(root)
@@ -35,7 +35,7 @@ def packages() -> list[str]:
 
 
 def api_pages() -> dict[str, str]:
-    """One page per package with what its modules offer, for mkdocstrings."""
+    """Return {address: page} of the packages: their modules, for mkdocstrings."""
     pages = {}
     for name in packages():
         package = importlib.import_module(name)
@@ -54,7 +54,7 @@ def api_pages() -> dict[str, str]:
 
 
 def commands(app: typer.Typer | None = None, above: str = "thermocald") -> Iterator[Any]:
-    """(name, function) of every command, groups' own included."""
+    """Yield (name, function) of every command, including those of groups."""
     if app is None:
         from thermocald.cli import application
 
@@ -92,7 +92,7 @@ def _rows(function: Callable[..., Any]) -> Iterator[tuple[str, ...]]:
         kind, info, default = hints[parameter.name], parameter.default, parameter.default
         if typing.get_origin(kind) is typing.Annotated:
             kind, info = typing.get_args(kind)[:2]
-            # the first name of an option stands where a default would
+            # with Annotated, the first name of an option is in the place of the default
             names = (info.default, *(info.param_decls or ()))
         else:
             default, names = info.default, info.param_decls or ()
@@ -106,8 +106,8 @@ def _rows(function: Callable[..., Any]) -> Iterator[tuple[str, ...]]:
             flag = isinstance(default, bool)
             declared = [f"{option} / --no-{option[2:]}" if flag else option]
         label = ", ".join(f"`{d}`" for d in declared)
-        told = f"(advanced) {info.help}" if info.rich_help_panel else info.help or ""
-        yield label, _values(kind, info), shown, _cell(told)
+        meaning = f"(advanced) {info.help}" if info.rich_help_panel else info.help or ""
+        yield label, _values(kind, info), shown, _cell(meaning)
 
 
 def _values(kind: Any, info: Any) -> str:
@@ -163,7 +163,7 @@ def _configuration_page() -> str:
 
 
 def meanings(model: type[BaseModel]) -> dict[str, str]:
-    """What stands below each field in the source, the nearest class first."""
+    """Return {field: the text below it in the source}; a subclass has precedence."""
     found: dict[str, str] = {}
     for cls in model.__mro__:
         if not cls.__module__.startswith("thermocald"):
@@ -177,13 +177,13 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
 
 
 def _keys(model: type[BaseModel]) -> Iterator[tuple[str, ...]]:
-    said = meanings(model)
+    texts = meanings(model)
     for name, row in zip(model.model_fields, _values_of(model), strict=True):
-        yield *row, _cell(said[name])
+        yield *row, _cell(texts[name])
 
 
 def _values_of(model: type[BaseModel]) -> Iterator[tuple[str, ...]]:
-    """(key, what may stand there, default) of each key."""
+    """Yield (key, permitted values, default) of each key."""
     schema = model.model_json_schema(by_alias=True)
     for name, field in model.model_fields.items():
         key = field.alias or name
@@ -206,7 +206,7 @@ def _yaml(value: Any) -> str:
 
 
 def _schema(part: dict[str, Any], definitions: dict[str, Any]) -> str:
-    """What may stand there, in words."""
+    """Return the permitted values in words."""
     if "anyOf" in part:
         kinds = [_schema(p, definitions) for p in part["anyOf"]]
         return " or ".join("null" if k == "null" else k for k in kinds)
@@ -260,11 +260,11 @@ def _effect_page() -> str:
             parts.append(_table(("parameter", "unit", "values", ""), iter(rows)))
         if effect.linear:
             others = [f"`{key}`" for key in effect.linear if key not in effect.usual]
-            said = f"Coefficients: {', '.join(usual)}"
-            parts.append(said + (f"; also {', '.join(others)}." if others else "."))
-        told = [f"{EXPERIMENTS[k]}: it {v}" for k, v in effect.behaviour.items()]
-        if told:
-            parts.append("What tells it from others:\n\n" + "\n".join(f"- {t}" for t in told))
+            coefficients = f"Coefficients: {', '.join(usual)}"
+            parts.append(coefficients + (f"; also {', '.join(others)}." if others else "."))
+        behaviour = "\n".join(f"- {EXPERIMENTS[k]}: it {v}" for k, v in effect.behaviour.items())
+        if behaviour:
+            parts.append(f"How it differs from other effects:\n\n{behaviour}")
         parts.append(f"Kind: `{effect.kind}`.")
     return "\n\n".join(parts)
 
@@ -282,7 +282,7 @@ def _driver_page() -> str:
         ]
         points.sort(key=lambda point: (point.module, point.name))
         for module, group in groupby(points, key=lambda point: point.module):
-            drivers = list(group)  # several drivers of one module have one text
+            drivers = list(group)  # the drivers of one module share its text
             parts.append(f"### {', '.join(f'`{point.name}`' for point in drivers)}")
             parts.append(_prose(importlib.import_module(module)))
             for point in drivers:
@@ -296,7 +296,7 @@ def _driver_page() -> str:
 
 
 def _prose(documented: Any) -> str:
-    """A docstring as Markdown: its indented examples as blocks."""
+    """Return a docstring as Markdown, with its indented examples as code blocks."""
     lines, inside = [], False
     for line in (inspect.getdoc(documented) or "").splitlines():
         block = line.startswith("    ")
@@ -333,7 +333,7 @@ def _python_page() -> str:
     nouns = [n for n in thermocald.__all__ if n[0].isupper()]
     parts = ["## Functions"]
     parts += [_public(name, getattr(thermocald, name), "###") for name in functions]
-    parts.append("## Nouns")
+    parts.append("## Classes")
     for name in nouns:
         noun = getattr(thermocald, name)
         parts.append(_public(name, noun, "###"))
@@ -346,7 +346,7 @@ def _python_page() -> str:
 
 
 def _is_own(noun: type, member: str) -> bool:
-    """Whether a member is a method or a property that a class of ours has written down."""
+    """Return whether a member is a method or a property that a class of ours defines."""
     for base in noun.__mro__:
         if member in vars(base):
             value = vars(base)[member]
@@ -358,7 +358,7 @@ def _is_own(noun: type, member: str) -> bool:
 
 
 def _public(name: str, value: Any, level: str) -> str:
-    """A heading, the signature of what is called, and the docstring with its examples."""
+    """Return a heading, the signature of a callable, and the docstring with its examples."""
     text = [f"{level} `{name}`"]
     if callable(value) and not isinstance(value, type):
         signature = inspect.signature(value)
@@ -370,8 +370,8 @@ def _public(name: str, value: Any, level: str) -> str:
         text.append(f"```text\n{name.rsplit('.', 1)[-1]}{written}\n```")
     if hasattr(value, "func"):  # a cached property
         value = value.func
-    told = (inspect.getdoc(value) or "").strip()
-    plain, mark, example = told.partition("\n>>> ")
+    docstring = (inspect.getdoc(value) or "").strip()
+    plain, mark, example = docstring.partition("\n>>> ")
     text.append(plain)
     if mark:
         text.append(f"```pycon\n>>> {example}\n```")
@@ -385,4 +385,4 @@ GENERATORS: dict[str, Callable[[], str]] = {
     "reference/effects.md": _effect_page,
     "reference/drivers.md": _driver_page,
 }
-"""By page: what stands in place of its mark."""
+"""{page: the function that returns its generated part}."""

@@ -1,1 +1,1 @@
-"""Drivers: one module per device family. They import thermocald.hal and thermocald.errors alone."""
+"""Device drivers, one module per family, built on thermocald.hal and thermocald.errors."""

@@ -1,11 +1,11 @@
-"""Alerts: thresholds on the results, reported once out and once in again, and delivered.
+"""Alerts: thresholds on results; each crossing is delivered once, out of its limits and back in.
 
-A condition that is out is in again only when the value is clearly back (hysteresis): a value at
-its threshold does not ring all night. A result without the value changes nothing.
+Hysteresis: a value counts as back only when it is clearly within its limits, so that noise at a
+threshold does not raise alerts all night. A result without the value changes nothing.
 
-Each alert driver is an output of its own, with its own thread and bounded queue in the daemon, so
-that one that cannot be reached delays neither a tick nor the others. What could not be delivered
-is kept, in order, over closing and opening; the newest `MOST_WAITING` of them.
+Each alert driver is a separate output with its own thread and bounded queue in the daemon: an
+unreachable receiver delays neither a tick nor the others. Undelivered alerts wait in order, also
+while the output is closed and opened again; the newest `MOST_WAITING` are retained.
 """
 
 from __future__ import annotations
@@ -35,13 +35,14 @@ log = logging.getLogger(__name__)
 
 MOST_WAITING = 100
 _BACK = 0.8
-"""A drift is in again below this part of its threshold."""
+"""A drift is back below this fraction of its threshold."""
 _DISK_BACK = 1.1
+"""Free space is back above this multiple of its threshold."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alert:
-    """One change of one condition: `state` is `out` or `in`; utc: s, the epoch's."""
+    """A change of one condition; state: `out` or `in`; utc: the epoch's time, s."""
 
     device: str
     condition: str
@@ -54,15 +55,16 @@ class Alert:
     utc: float | None
 
     def document(self) -> dict[str, Any]:
-        """Return the alert as JSON has it."""
+        """Return the alert's JSON document."""
         return {"format": "thermocald-alert/1", **dataclasses.asdict(self)}
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What a condition compares: a value, NaN where the result does not have it, and its bounds.
+    """A condition's value, NaN if the result does not have it, and its bounds.
 
-    back: how far inside a bound the value is in again; step: what is added to a bound in words.
+    back: distance inside a bound at which the value counts as back; step: added to a bound in
+    messages.
     """
 
     value: float
@@ -75,7 +77,7 @@ class Measured:
 
 
 class Condition(DriverOptions):
-    """A threshold of `when`; `name` is what it is called in alerts."""
+    """A threshold of `when`; name: its name in alerts."""
 
     per_device: ClassVar[bool] = True
     called: ClassVar[str] = ""
@@ -85,9 +87,10 @@ class Condition(DriverOptions):
         return self.called
 
     def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:
-        """Return what is compared of a result.
+        """Return the value and bounds to compare.
 
-        failed: epochs in a row; lost: epochs that were taken and not kept since the last result.
+        failed: epochs in a row without a result; lost: epochs that were taken but not stored since
+        the last result.
         """
         raise NotImplementedError
 
@@ -96,7 +99,7 @@ Amount = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
 class Drift(Condition):
-    """A parameter's drift, in px or in its standard deviations, from the start or from a value."""
+    """A parameter's drift from the start of the series or a value, in px or standard deviations."""
 
     drift: Literal["c", "x0", "y0"]
     px: Amount | None = None
@@ -145,7 +148,8 @@ class Temperature(Condition):
             raise ConfigurationError(f"temperature {self.temperature} needs above_c or below_c")
         if high - low <= 2 * self.hysteresis_k:
             raise ConfigurationError(
-                f"temperature {self.temperature}: nothing is left between the limits"
+                f"temperature {self.temperature}: above_c must exceed below_c by more than twice "
+                f"hysteresis_k ({2 * self.hysteresis_k:g} K)"
             )
         return self
 
@@ -167,9 +171,9 @@ class Temperature(Condition):
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
-def _counted(count: int, most: int, said: str) -> Measured:
-    """Return epochs as they are compared: out from `most` on, in again at none."""
-    words = f"{count} epochs {said}"
+def _counted(count: int, most: int, described: str) -> Measured:
+    """Return a count of epochs with its bounds: out at `most` or more, back below it."""
+    words = f"{count} epochs {described}"
     return Measured(float(count), -math.inf, most - 1, most - 1, words, step=1)
 
 
@@ -184,18 +188,18 @@ class NoResult(Condition):
 
 
 class Lost(Condition):
-    """Epochs that were taken and not kept since the last result, or wait in memory in a row."""
+    """Epochs that were taken but not stored since the last result, or in a row wait in memory."""
 
     per_device: ClassVar[bool] = False
     lost: Count
     called: ClassVar[str] = "lost"
 
     def measure(self, result: Mapping[str, Any], failed: int, lost: int) -> Measured:  # noqa: ARG002
-        return _counted(lost, self.lost, "were taken and not kept")
+        return _counted(lost, self.lost, "were taken but not stored")
 
 
 class FreeDisk(Condition):
-    """The space that is left at a path, GB."""
+    """The free space at a path, GB."""
 
     per_device: ClassVar[bool] = False
     free_disk_gb: Amount
@@ -218,7 +222,7 @@ _KINDS: dict[str, type[Condition]] = {
 
 
 def condition_of(stanza: Mapping[str, Any]) -> Condition:
-    """Return a condition of an entry of `when`; ConfigurationError names what is wrong in it."""
+    """Read an entry of `when`; raises ConfigurationError."""
     kind = next((kind for key, kind in _KINDS.items() if key in stanza), None)
     if kind is None:
         raise ConfigurationError(f"when: {dict(stanza)} has none of {', '.join(_KINDS)}")
@@ -232,7 +236,7 @@ def _number(value: object) -> float:
 
 
 class AlertOptions(DriverOptions):
-    """What all alert drivers have."""
+    """The options of every alert driver."""
 
     when: Annotated[list[dict[str, Any]], Field(min_length=1)]
     device: support.Text = "thermocald"
@@ -240,9 +244,9 @@ class AlertOptions(DriverOptions):
 
 
 class AlertOutput(Output):
-    """An output that delivers alerts; a driver says how in `deliver`, and where in `where`.
+    """An output that delivers alerts; a driver implements `deliver` and `open` and sets `where`.
 
-    Its `open` looks whether that can be.
+    `open` checks that alerts can be delivered.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -252,9 +256,9 @@ class AlertOutput(Output):
         if twice := {name for name in names if names.count(name) > 1}:
             raise ConfigurationError(f"when: {min(twice)} is given twice")
         self._waiting: deque[Alert] = deque(maxlen=MOST_WAITING)
-        self._out: set[tuple[str, str]] = set()  # devices and conditions
-        self._in_a_row: dict[str, int] = {}  # epochs of a device without a result
-        self._told: dict[str, tuple[Any, Any]] = {}
+        self._out: set[tuple[str, str]] = set()  # (device, condition)
+        self._in_a_row: dict[str, int] = {}  # {device: latest epochs without a result}
+        self._last: dict[str, tuple[Any, Any]] = {}  # {device: (series, epoch)}
         self._lost = self._unstored = 0
 
     def close(self) -> None:
@@ -270,11 +274,11 @@ class AlertOutput(Output):
             self._waiting.popleft()
 
     def changes(self, result: Mapping[str, Any], device: str) -> list[Alert]:
-        """Return what this result changes; the same result again changes nothing."""
+        """Return an alert for each condition that a result changes; a repeated result, none."""
         moment = (result.get("series"), result.get("epoch"))
-        if moment[1] is not None and self._told.get(device) == moment:
+        if moment[1] is not None and self._last.get(device) == moment:
             return []
-        self._told[device] = moment
+        self._last[device] = moment
         failed = 0 if result.get("status") in WITH_VALUES else self._in_a_row.get(device, 0) + 1
         self._in_a_row[device] = failed
         before, self._lost = self._lost, int(result.get("lost", self._lost))
@@ -309,12 +313,12 @@ class AlertOutput(Output):
         return changes
 
     def deliver(self, alert: Alert) -> None:
-        """Deliver one alert, within `timeout_s`; a DeviceError if that failed."""
+        """Deliver one alert within `timeout_s`; raises a DeviceError."""
         raise NotImplementedError
 
 
 def secret(name: str, path: str | None) -> str | None:
-    """Return the text of a file that holds a password or a token, None without a file."""
+    """Read a password or token from a file and hide it from logs; None without a file."""
     if path is None:
         return None
     try:

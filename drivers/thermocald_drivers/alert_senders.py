@@ -1,18 +1,18 @@
-"""Alerts to a program, to a web address, by e-mail; by MQTT see `mqtt`.
+"""Alerts to a program, to a web address and by e-mail; for MQTT see `mqtt`.
 
     outputs:
       - name: alarm
         driver: alert_exec
-        command: [/usr/local/bin/alarm, --loud]    # a list: no shell reads it
+        command: [/usr/local/bin/alarm, --loud]    # a list; no shell is involved
         when:                                      # as in docs/how-to/alerts.md
           - {drift: c, px: 0.5}
           - {no_result: 30}
-        device: thermocald                         # the name of results that have none
+        device: thermocald                         # for results that name no device
         timeout_s: 10
       - name: hook
         driver: alert_webhook
         url: https://example.org/hooks/thermocald
-        token_file: /etc/thermocald/hook-token     # sent as `Authorization: Bearer …`; or none
+        token_file: /etc/thermocald/hook-token     # sent as `Authorization: Bearer …`; optional
         when: [{drift: x0, sds: 5}, {free_disk_gb: 1, path: /var/lib/thermocald}]
         timeout_s: 5
       - name: letter
@@ -20,26 +20,26 @@
         host: mail.example.org
         port: 587
         security: starttls                         # tls: from the first byte (port 465); none
-        username: thermocald                       # and password_file: /etc/mail-password
-        ca: /etc/ssl/own-ca.pem                    # of a server with a certificate of its own
+        username: thermocald                       # with password_file: /etc/mail-password
+        ca: /etc/ssl/own-ca.pem                    # for a server with a private certificate
         sender: thermocald@example.org
         recipients: [me@example.org]
         when: [{temperature: temperature, above_c: 60}]
         timeout_s: 10
 
-alert_exec: the program gets the alert as JSON on its standard input, and `THERMOCALD_STATE` (out,
-in), `THERMOCALD_CONDITION`, `THERMOCALD_DEVICE`, `THERMOCALD_TEXT` in its environment, which has
-PATH, HOME, LANG, LC_ALL, TZ besides and nothing else of the daemon's. What it prints is not kept.
-After `timeout_s` it is killed with all that it started. One that fails is tried again three times,
-then the alert is dropped, which is logged.
+alert_exec: the program receives the alert as JSON on its standard input, and `THERMOCALD_STATE`
+(out, in), `THERMOCALD_CONDITION`, `THERMOCALD_DEVICE` and `THERMOCALD_TEXT` in its environment. Of
+the daemon's environment it receives only PATH, HOME, LANG, LC_ALL and TZ. Its output is discarded.
+After `timeout_s` it is killed with all processes it started. After three failures the alert is
+dropped and an error is logged.
 
-alert_webhook: one POST of JSON. Delivered is what the server answers with 2xx. 401, 403 and 404 end
-the output; everything else is tried again. Redirections are not followed: a POST would become a GET
-on the way, and a foreign server could point at this network. A user name or password in the address
-is refused; the address itself, which may hold a key, never stands in a message.
+alert_webhook: each alert is one POST of JSON. An answer of 2xx means delivered; 401, 403 and 404
+stop the output; after any other answer the alert is sent again. Redirections are not followed: they
+would turn the POST into a GET and let a foreign server point into this network. A user name or
+password in the address is rejected; messages never quote the address, since it may contain a key.
 
-alert_mail: one letter for each alert. A password is never sent without TLS; one that the server
-refuses ends the output.
+alert_mail: each alert is one e-mail. A password is never sent without TLS; if the server rejects
+it, the output stops.
 """
 
 from __future__ import annotations
@@ -87,21 +87,21 @@ log = logging.getLogger(__name__)
 
 
 class ExecOptions(AlertOptions):
-    """As above."""
+    """The options of `alert_exec`."""
 
     command: Annotated[list[support.Text], Field(min_length=1)]
     timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 10.0
 
 
 class WebhookOptions(AlertOptions):
-    """As above."""
+    """The options of `alert_webhook`."""
 
     url: support.Text
     token_file: support.Text | None = None
 
 
 class MailOptions(AlertOptions):
-    """As above."""
+    """The options of `alert_mail`."""
 
     host: support.Text
     port: support.Port = 587
@@ -115,7 +115,7 @@ class MailOptions(AlertOptions):
 
 
 class ExecAlert(AlertOutput):
-    """Runs a program for each alert."""
+    """An output that runs a program for each alert."""
 
     Options = ExecOptions
 
@@ -126,7 +126,7 @@ class ExecAlert(AlertOutput):
 
     def open(self) -> None:
         if shutil.which(self.where) is None:
-            raise DeviceNotFound(f"{self.where}: there is no such program that may be run")
+            raise DeviceNotFound(f"{self.where}: does not exist or is not executable")
         self.handle = True
 
     def deliver(self, alert: Alert) -> None:
@@ -140,7 +140,7 @@ class ExecAlert(AlertOutput):
         self._failed = 0
 
     def _run(self, alert: Alert) -> None:
-        told = {
+        variables = {
             f"THERMOCALD_{name.upper()}": getattr(alert, name).replace("\0", "")
             for name in ("state", "condition", "device", "text")
         }
@@ -151,7 +151,7 @@ class ExecAlert(AlertOutput):
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                env={**passed_on, **told},
+                env={**passed_on, **variables},
                 start_new_session=True,
             )
         except OSError as error:
@@ -163,7 +163,7 @@ class ExecAlert(AlertOutput):
                 os.killpg(child.pid, signal.SIGKILL)
             child.communicate()
             raise DeviceTimeout(
-                f"{self.where}: not done in {self.options.timeout_s:g} s"
+                f"{self.where}: not finished in {self.options.timeout_s:g} s"
             ) from error
         if child.returncode:
             raise BadReading(f"{self.where}: ended with exit status {child.returncode}")
@@ -175,7 +175,7 @@ class _NoRedirection(urllib.request.HTTPRedirectHandler):
 
 
 class WebhookAlert(AlertOutput):
-    """One POST for each alert."""
+    """An output that sends one POST for each alert."""
 
     Options = WebhookOptions
 
@@ -186,15 +186,15 @@ class WebhookAlert(AlertOutput):
             parts = urllib.parse.urlsplit(url)
             port = parts.port or (443 if parts.scheme == "https" else 80)
         except ValueError:
-            raise ConfigurationError("url: is not an address; its port is no number?") from None
+            raise ConfigurationError("url: is not an address; check its port") from None
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise ConfigurationError("url: does not begin with https:// or http:// and a host")
         if "@" in parts.netloc:
             raise ConfigurationError(
-                "url: holds a user name or password; write token_file, or a key in the path"
+                "url: contains a user name or password; use token_file, or a key in the path"
             )
         if not url.isascii() or not url.isprintable() or " " in url:
-            raise ConfigurationError("url: has characters that an address must write as %XX")
+            raise ConfigurationError("url: contains characters that must be written as %XX")
         self._address = (parts.hostname, port)
         self.where = f"webhook at {parts.hostname}:{port}"
         self._open = urllib.request.build_opener(_NoRedirection).open
@@ -235,7 +235,7 @@ class WebhookAlert(AlertOutput):
 
 
 class MailAlert(AlertOutput):
-    """One letter for each alert."""
+    """An output that sends one e-mail for each alert."""
 
     Options = MailOptions
 
@@ -264,7 +264,7 @@ class MailAlert(AlertOutput):
         self._send(letter)
 
     def _send(self, letter: EmailMessage | None) -> None:
-        """Send a letter; without one, only see whether the server would take it."""
+        """Send a letter; without one, only check that the server accepts the connection."""
         o = self.options
         password = secret("password_file", o.password_file)
         try:
@@ -277,10 +277,10 @@ class MailAlert(AlertOutput):
                     server.send_message(letter)
         except smtplib.SMTPAuthenticationError:
             raise DeviceDenied(
-                f"{self.where}: refuses the password; check username and password_file"
+                f"{self.where}: rejects the password; check username and password_file"
             ) from None
         except (smtplib.SMTPRecipientsRefused, smtplib.SMTPSenderRefused):
-            raise BadReading(f"{self.where}: refuses the sender or a recipient") from None
+            raise BadReading(f"{self.where}: rejects the sender or a recipient") from None
         except (OSError, ValueError, smtplib.SMTPException) as error:
             raise DeviceGone(f"{self.where}: {support.reason(error)}") from None
 

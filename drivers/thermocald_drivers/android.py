@@ -8,25 +8,25 @@
         folder: /sdcard/DCIM/Camera
         width: 4032
         height: 3024
-        delete: true                  # delete the photograph on the phone once it is here
+        delete: true                  # delete the photograph on the phone after its transfer
         refuse_unlocked: null         # null: focus, focal length, zoom; true: exposure too; false
         minimum_free_mb: 200          # less free storage is an error
         timeout_s: 15
         host: 127.0.0.1               # of the adb server
         port: 5037
-        start_server: true            # if none runs
+        start_server: true            # start a server if none runs
 
-Nothing of a phone's camera can be set through adb: set the camera app to its manual (pro) mode and
-fix focus, ISO and exposure time before the first frame. Each photograph is compared with the first
-one, by EXIF and the camera service, and what they report is stored with the epoch. A photograph
-whose focus, focal length or zoom changed is refused (`refuse_unlocked`); where a phone does not
-report its focus, the status says that it cannot be checked.
+A phone's camera settings cannot be set through adb: switch the camera app to its manual (pro) mode
+and fix focus, ISO and exposure time before the first frame. The driver compares each photograph
+with the first by EXIF and the camera service, and stores the reported settings with the epoch. A
+photograph whose focus, focal length or zoom has changed is rejected (`refuse_unlocked`); if a phone
+does not report its focus, the status warns that it cannot be checked.
 
-The driver wakes and unlocks the phone (not through a PIN), opens the camera app once and keeps it
-open, since a restart would focus again. A photograph is the one new file of the folder; it is taken
-when its size no longer changes, all bytes were received and the JPEG is complete. Its time is that
-of EXIF, with the phone's clock compared to this machine's at each open, or the trigger's if EXIF
-has none.
+The driver wakes and unlocks the phone (but enters no PIN), opens the camera app once and leaves it
+open, since a restart would focus again. A photograph is the single new file in the folder; it is
+accepted when its size no longer changes, all bytes were received and the JPEG is complete. Its time
+is the EXIF time, corrected by the phone's clock offset as measured at each open; without one, the
+time of the trigger.
 Source: CIPA DC-008 (Exif 2.32), Android's `dumpsys media.camera`.
 """
 
@@ -85,11 +85,11 @@ EXPOSURE = ("exposure_s", "iso")
 LENS = ("f_number", "focal_length_mm", "digital_zoom")
 FOCUS = ("subject_distance_m", "focus_distance_dioptres")
 SETTINGS = (*EXPOSURE, *LENS, *FOCUS)
-"""What a photograph reports of its camera's settings, stored with its epoch."""
+"""The camera settings that a photograph reports; they are stored with its epoch."""
 
 
 class CameraOptions(PhoneOptions):
-    """As above."""
+    """The options of the camera `android`."""
 
     width: Annotated[int, Field(ge=64, le=20_000)]
     height: Annotated[int, Field(ge=64, le=20_000)]
@@ -106,7 +106,7 @@ class CameraOptions(PhoneOptions):
 
 
 class AndroidCamera(AdbPhone, Camera):
-    """The camera app of a phone, triggered through adb."""
+    """A phone's camera app, triggered through adb."""
 
     Options = CameraOptions
 
@@ -116,7 +116,7 @@ class AndroidCamera(AdbPhone, Camera):
         if o.trigger != "tap":
             self.command = f"input keyevent {KEYS[o.trigger]}"
         elif o.tap is None:
-            raise ConfigurationError("trigger: tap needs tap: [x, y] of the shutter button, px")
+            raise ConfigurationError("trigger: tap needs tap: [x, y], the shutter button in px")
         else:
             self.command = f"input tap {o.tap[0]} {o.tap[1]}"
         self.folder = o.folder.rstrip("/")
@@ -126,7 +126,7 @@ class AndroidCamera(AdbPhone, Camera):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """List the phones of the adb server, whatever their state."""
+        """List the phones of the adb server in any state."""
         return [
             Found({"serial": serial, "width": 4032, "height": 3024}, f"{serial} {state}")
             for serial, state in list_devices()
@@ -144,7 +144,7 @@ class AndroidCamera(AdbPhone, Camera):
         if self.options.refuse_unlocked is False:
             found.append("refuse_unlocked: false accepts a phone that focuses between frames")
         if self._unchecked:
-            found.append(f"{self._unchecked}: whether they stay as they are cannot be checked")
+            found.append(f"{self._unchecked}: whether they change cannot be checked")
         return found
 
     def frame_size(self) -> tuple[int, int]:
@@ -187,7 +187,7 @@ class AndroidCamera(AdbPhone, Camera):
         )
 
     def _wake(self) -> None:
-        """Switch the screen on and dismiss a lock without PIN; DeviceDenied if it has one."""
+        """Switch on the screen and dismiss a lock without PIN; DeviceDenied if it has a PIN."""
         self.shell(f"input keyevent {WAKE_KEY}; wm dismiss-keyguard")
         state = self.shell(STATE)
         if "Lockscreen=true" in state or "isKeyguardShowing=true" in state:
@@ -196,22 +196,22 @@ class AndroidCamera(AdbPhone, Camera):
                 "'None' (and 'Stay awake' in the developer options)"
             )
         if "mWakefulness=" in state and "Awake" not in state:
-            raise DeviceGone(f"{self.where}: the screen does not come on")
+            raise DeviceGone(f"{self.where}: the screen does not switch on")
 
     def _require_space(self) -> None:
-        """PermanentDeviceError if the storage is full; unknown free space is accepted."""
+        """Raise PermanentDeviceError if the storage is full; unknown free space passes."""
         lines = self.shell(f"df -k '{self.folder}' 2>/dev/null || df -k /sdcard").split("\n")
         fields = lines[-1 if lines[-1].strip() else -2].split() if len(lines) > 1 else []
         if len(fields) >= 4 and fields[3].isdigit():
             free_mb = int(fields[3]) / 1024.0
             if free_mb < self.options.minimum_free_mb:
                 raise PermanentDeviceError(
-                    f"{self.where}: its storage is full ({free_mb:.0f} MB left, "
-                    f"{self.options.minimum_free_mb:g} wanted); delete photographs, or delete: true"
+                    f"{self.where}: its storage is full ({free_mb:.0f} MB free, minimum "
+                    f"{self.options.minimum_free_mb:g}); delete photographs, or set delete: true"
                 )
 
     def _new_photograph(self, before: set[str]) -> tuple[str, bytes]:
-        """Return (path, bytes) of the one new photograph, once it is complete."""
+        """Wait for the one new photograph to be complete; return its (path, bytes)."""
         deadline = time.monotonic() + self.options.timeout_s
         last_size, name, short = -1, "", ""
         while time.monotonic() < deadline:
@@ -225,14 +225,14 @@ class AndroidCamera(AdbPhone, Camera):
             if len(new) > 1:
                 raise BadReading(
                     f"{self.where}: {len(new)} new photographs ({', '.join(sorted(new))}); "
-                    "switch off burst, HDR and RAW+JPEG copies, and touch nothing"
+                    "switch off burst, HDR and RAW+JPEG copies, and do not touch the phone"
                 )
             for name, size in new.items():
                 if size > 0 and size == last_size:
                     jpeg = self.pull(f"{self.folder}/{name}")
                     if len(jpeg) == size and support.jpeg_end(jpeg):
                         return f"{self.folder}/{name}", jpeg
-                    short = f"{name} has {len(jpeg)} of {size} bytes and no end"
+                    short = f"{name} has {len(jpeg)} of {size} bytes or its JPEG has no end"
                 last_size = size
             time.sleep(POLL_S)
         if short or name:
@@ -241,13 +241,13 @@ class AndroidCamera(AdbPhone, Camera):
         self._wake()
         raise DeviceTimeout(
             f"{self.where}: no new photograph in {self.folder} {self.options.timeout_s:g} s "
-            "after the trigger; is the camera app open, is the trigger right (camera, volume, tap)?"
+            "after the trigger; check that the camera app is open, and trigger: camera, volume, tap"
         )
 
     def _require_lock(self, tags: dict[str, Any]) -> None:
-        """Compare a photograph with the first; BadReading where what moved is refused."""
+        """Compare a photograph with the first; BadReading for a change that is refused."""
         first = self._first or tags
-        # nothing can be compared with one that was still focusing
+        # a photograph taken while focusing is no reference
         self._first = None if "SCAN" in str(first.get("af_state", "")) else first
         refuse = self.options.refuse_unlocked
         moved = _changed((*LENS, *FOCUS), first, tags)
@@ -258,26 +258,26 @@ class AndroidCamera(AdbPhone, Camera):
         why = {None: moved, True: moved or changed, False: ""}[refuse]
         if why:
             raise BadReading(
-                f"{self.where}: focus or exposure moved, {why}; set the camera app to manual "
-                "(refuse_unlocked: false accepts it)"
+                f"{self.where}: focus or exposure changed, {why}; set the camera app to manual "
+                "(refuse_unlocked: false accepts the change)"
             )
 
     def _exposure_start(self, tags: Mapping[str, Any], triggered: float) -> float:
         """Return the start of the exposure, s UTC on this machine's clock."""
-        exif = exposure_start(tags, self._zone)
-        if exif is None:
+        stated = exposure_start(tags, self._zone)
+        if stated is None:
             return triggered
-        utc, resolution_s = exif
+        utc, resolution_s = stated
         start = utc - self._offset
         if abs(start - triggered) > CLOCKS_DIFFER_S:
             return triggered
-        if resolution_s >= 1.0:  # whole seconds: the trigger, within that second
+        if resolution_s >= 1.0:  # whole seconds: the trigger's time within that second
             return min(max(triggered, start), start + 1.0)
         return start
 
 
 def exif(jpeg: bytes) -> dict[str, Any]:
-    """Return those of TAGS that the photograph has, and `width`, `height`, `make`, `model`."""
+    """Return the TAGS of a photograph, and its `width`, `height`, `make` and `model`."""
     image_module = support.library("PIL.Image", "android")
     try:
         with image_module.open(io.BytesIO(jpeg)) as image:
@@ -291,7 +291,7 @@ def exif(jpeg: bytes) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Rationals as floats, texts without their padding."""
+    """Convert an EXIF value: rationals to floats, texts without padding; None for NaN."""
     if value is None or isinstance(value, int):
         return value
     if isinstance(value, str):
@@ -304,9 +304,9 @@ def _plain(value: Any) -> Any:
 
 
 def exposure_start(tags: Mapping[str, Any], zone: str) -> tuple[float, float] | None:
-    """Return when the exposure began, s UTC by the phone's clock, and the resolution of that, s.
+    """Return the start of the exposure (s UTC on the phone's clock) and its resolution (s).
 
-    zone: +hhmm, used if the photograph has none.
+    zone: the time zone, +hhmm, of a photograph that states none. None without a valid time.
     """
     text = tags.get("time")
     if not isinstance(text, str):
@@ -325,7 +325,7 @@ def exposure_start(tags: Mapping[str, Any], zone: str) -> tuple[float, float] | 
 
 
 def focus_state(dump: str) -> dict[str, Any]:
-    """Lens position and autofocus state from `dumpsys media.camera`, where it reports them."""
+    """Return the lens position and autofocus state that `dumpsys media.camera` reports, if any."""
     found: dict[str, Any] = {}
     distance = re.search(
         r"android\.lens\.focusDistance \([^)]*\):[^\n]*\n\s*\[\s*([-\d.eE]+)", dump
@@ -339,7 +339,7 @@ def focus_state(dump: str) -> dict[str, Any]:
 
 
 def _changed(names: Iterable[str], first: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return what differs from the first photograph, or ""."""
+    """Return the first difference from the first photograph in words, or ""."""
     for name in names:
         if name in first and now.get(name) != first[name]:
             return f"{name} was {first[name]} and is {now.get(name)}"
@@ -347,7 +347,7 @@ def _changed(names: Iterable[str], first: Mapping[str, Any], now: Mapping[str, A
 
 
 def unreported(now: Mapping[str, Any]) -> str:
-    """Return what would have to be reported to know whether it stayed, or ""."""
+    """Return in words which settings are not reported, so cannot be checked, or ""."""
     missing = [name for name in EXPOSURE if name not in now]
     if missing:
         return f"the photographs do not report {', '.join(missing)}"

@@ -1,9 +1,8 @@
-"""A phone behind an adb server: state, shell, listing, pull; each fault has its own error.
+"""An Android phone behind an adb server: state, shell, files; its thermometers.
 
-Uses adbutils, which implements the adb server's protocol (127.0.0.1:5037). The server is Android's
-own (`adb start-server`); one server serves several phones by their serial numbers.
-
-The thermometers of an Android phone: battery, thermal service, thermal zones.
+adbutils implements the adb server's protocol (127.0.0.1:5037). The server is Android's own
+(`adb start-server`); it serves several phones by their serial numbers. Each fault has its own
+error. The thermometers are the battery, the thermal service and the thermal zones:
 
     thermometers:
       - name: pixel
@@ -14,22 +13,22 @@ The thermometers of an Android phone: battery, thermal service, thermal zones.
         timeout_s: 5
         host: 127.0.0.1               # of the adb server
         port: 5037
-        start_server: true            # if none runs
+        start_server: true            # start a server if none runs
 
-A sensor that the phone does not report, that is frozen, or whose unit is not known is absent from
-the reading; the reason names the option that states the unit. A unit that was certain once is kept
-until the phone is closed; a number that fits the last one in another unit only is refused. What
-sensors give that are not fitted (see `chips`) needs a recent reading within 5 K.
+A sensor that the phone does not report, that is frozen, or whose unit is unknown is absent from the
+reading; the reason names the option that states the unit. Once a unit is certain, it holds until
+the phone is closed; a number that agrees with the last one only in another unit is rejected. A
+value that absent sensors report (see `chips`) needs a recent reading within 5 K.
 
-`dumpsys battery`: tenths of a degree, but whole degrees on boards that also give whole volts, and
-on some that give millivolts: up to 70 it may be either. It is refused where the phone has no
-battery (`present: false`, or 0 °C at a voltage that no cell has) and where its values are frozen or
+`dumpsys battery` reports tenths of a degree, but whole degrees on boards that also report whole
+volts and on some that report millivolts: up to 70 it may be either. It is rejected if the phone has
+no battery (`present: false`, or 0 °C at a voltage that no cell has) and if its values are frozen or
 forged (`UPDATES STOPPED`, after `dumpsys battery unplug` or `set`).
 
 `dumpsys thermalservice`: only the live section "Current temperatures from HAL" is used; the cache
 before it may be hours old. The section also lists volts, currents and percent (types 6 to 8), and
-differences or flags in any unit (type −1); 0.0 is a sensor that is not fitted, and `lmh-dcvs` is a
-limit of the processor. Thermal zones: see `kernel`.
+differences or flags in any unit (type −1); 0.0 means that a sensor is not fitted, and `lmh-dcvs` is
+a limit of the processor. Thermal zones: see `kernel`.
 Source: android.hardware.thermal TemperatureType, AOSP BatteryService; dumps of eleven phones.
 """
 
@@ -63,8 +62,8 @@ if TYPE_CHECKING:
 
 
 DENIED = (
-    "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); "
-    "if nothing is asked: developer options, 'Revoke USB debugging authorizations', re-plug"
+    "unauthorized: unlock the phone and confirm 'Allow USB debugging' (tick 'always'); if no "
+    "dialog appears: developer options, 'Revoke USB debugging authorizations', re-plug"
 )
 OFFLINE = (
     "offline: re-plug the cable, or `adb reconnect offline`; an unpowered hub is a common cause"
@@ -72,11 +71,11 @@ OFFLINE = (
 
 _CLOCK_S, _CLOCK_TRIES = 0.002, 12
 ADB_CLASSES = ("char-usb_device",)
-"""Opened by the adb server where this driver starts it."""
+"""The nodes that an adb server opens if this driver starts it."""
 
 
 class PhoneOptions(DriverOptions):
-    """The phone, and the adb server behind which it is."""
+    """The options of a phone and of its adb server."""
 
     serial: support.Text
     host: support.Text = "127.0.0.1"
@@ -86,7 +85,7 @@ class PhoneOptions(DriverOptions):
 
 
 def list_devices() -> list[tuple[str, str]]:
-    """Return (serial, state) of what a running adb server lists; [] without one."""
+    """Return (serial, state) of the phones on a running adb server; [] without one."""
     adbutils = support.library("adbutils", "android")
     try:
         require_server("127.0.0.1", 5037, 1.0, seen=False)
@@ -96,7 +95,7 @@ def list_devices() -> list[tuple[str, str]]:
 
 
 def _devices(client: Any) -> list[tuple[str, str]]:
-    """Return (serial, state) of `host:devices`; adbutils' own list cuts both at blanks."""
+    """Return (serial, state) by `host:devices`; adbutils' own list cuts both at blanks."""
     with client.make_connection() as line:
         line.send_command("host:devices")
         line.check_okay()
@@ -106,7 +105,7 @@ def _devices(client: Any) -> list[tuple[str, str]]:
 
 
 def require_server(host: str, port: int, timeout_s: float, *, seen: bool) -> None:
-    """Raise a DeviceError unless an adb server answers; none is started."""
+    """Raise a DeviceError unless an adb server answers; start none."""
     try:
         socket.create_connection((host, port), timeout=timeout_s).close()
     except OSError as error:
@@ -115,7 +114,7 @@ def require_server(host: str, port: int, timeout_s: float, *, seen: bool) -> Non
 
 
 class AdbPhone(Device):
-    """What the drivers of a phone share."""
+    """A phone's connection, shared by its drivers."""
 
     device_classes = ADB_CLASSES
     Options: ClassVar[type[DriverOptions]] = PhoneOptions
@@ -129,7 +128,7 @@ class AdbPhone(Device):
         return {"serial": self.options.serial}
 
     def open(self) -> None:
-        """Find the phone among the server's devices; DeviceError says why it cannot be used."""
+        """Find the phone among the server's devices; raises a DeviceError if it cannot be used."""
         adbutils = support.library("adbutils", "android")
         o = self.options
         if not o.start_server:
@@ -137,23 +136,23 @@ class AdbPhone(Device):
         client = adbutils.AdbClient(o.host, o.port, socket_timeout=o.timeout_s)
         connect = client.make_connection
 
-        def remembering(timeout: float | None = None) -> Any:
+        def connect_and_record(timeout: float | None = None) -> Any:
             self._lines.append(connect(timeout))
             return self._lines[-1]
 
-        client.make_connection = remembering
+        client.make_connection = connect_and_record
         listed = self._call(lambda: _devices(client))
         states = [state for serial, state in listed if serial == o.serial]
         if len(states) > 1:
             raise WrongDevice(
                 f"{self.where}: {len(states)} devices have this serial number "
-                f"({', '.join(states)}); cheap phones share one: attach them to different machines"
+                f"({', '.join(states)}), as cheap phones may; attach them to different machines"
             )
         if not states:
             others = ", ".join(f"{serial} ({state})" for serial, state in listed) or "none"
             raise support.absent(
-                f"{self.where}: not attached; adb lists {others}; is USB debugging on, "
-                "the cable one that carries data?",
+                f"{self.where}: not attached; adb lists {others}; switch on USB debugging, "
+                "and use a cable that carries data",
                 seen=self.seen,
             )
         state = states[0]
@@ -167,7 +166,7 @@ class AdbPhone(Device):
         self.handle, self.seen = client.device(serial=o.serial), True
 
     def close(self) -> None:
-        """Forget the phone; the server keeps running."""
+        """Close the phone; the server keeps running."""
         self.handle = None
 
     def shell(self, command: str) -> str:
@@ -177,22 +176,22 @@ class AdbPhone(Device):
         return str(answer.output)
 
     def listing(self, folder: str) -> dict[str, int]:
-        """Return {name: bytes} of the plain files of a folder."""
+        """Return {name: bytes} of the regular files in a folder."""
         device = self.opened()
         entries = self._call(lambda: list(device.sync.iter_directory(folder)))
         return {e.path: e.size for e in entries if stat.S_ISREG(e.mode)}
 
     def pull(self, path: str) -> bytes:
-        """Return a file's bytes; BadReading if the phone ends it early."""
+        """Return a file's bytes; a DeviceError if the transfer breaks off."""
         device = self.opened()
         return bytes(self._call(lambda: device.sync.read_bytes(path)))
 
     def clock_offset(self) -> tuple[float, str, float]:
-        """Return (phone minus this machine in s, the phone's time zone as +hhmm, uncertainty in s).
+        """Return (phone's clock minus this machine's, s; its time zone, +hhmm; uncertainty, s).
 
-        Each round trip bounds the offset by its two ends; the result is the middle of the interval
-        that satisfies all bounds, as soon as it is within 2 ms. If the clock is set meanwhile, no
-        interval does: the shortest round trip then counts.
+        Each round trip bounds the offset from both sides; the result is the middle of the interval
+        that satisfies all bounds, as soon as it is known to 2 ms. If the clock is set meanwhile, no
+        interval satisfies them, and the shortest round trip is used.
         """
         low, high = -math.inf, math.inf
         found: list[tuple[float, str, float]] = []
@@ -205,8 +204,8 @@ class AdbPhone(Device):
         return (low + high) / 2.0, found[-1][1], (high - low) / 2.0
 
     def _ask_clock(self) -> tuple[float, str, float]:
-        # the connection is opened first: adbutils sleeps 10 ms while opening and closing one, which
-        # would lengthen one side of the round trip only
+        # the connection is opened beforehand: adbutils sleeps 10 ms while opening and closing one,
+        # which would lengthen only one side of the round trip
         line = self.opened().open_transport(timeout=self.options.timeout_s)
         start = time.time()
         line.send_command("shell:date '+%s.%N %z'")
@@ -216,17 +215,17 @@ class AdbPhone(Device):
         try:
             phone = support.parse_number(text[0])
         except (ValueError, IndexError) as error:
-            raise BadReading(f"{self.where}: `date` says {' '.join(text)!r}") from error
+            raise BadReading(f"{self.where}: `date` prints {' '.join(text)!r}") from error
         return phone - (start + end) / 2.0, "".join(text[1:2]), (end - start) / 2.0
 
     def _call(self, action: Callable[[], Any]) -> Any:
-        """Translate adbutils' errors, by what the server answers."""
+        """Run an action; raises adbutils' errors as DeviceErrors by the server's answer."""
         adbutils = support.library("adbutils", "android")
         try:
             return action()
         except (adbutils.AdbTimeout, TimeoutError) as error:
-            within = f"{self.options.timeout_s:g} s"
-            raise DeviceTimeout(f"{self.where}: no answer in {within}") from error
+            limit = f"{self.options.timeout_s:g} s"
+            raise DeviceTimeout(f"{self.where}: no answer in {limit}") from error
         except adbutils.AdbError as error:
             raise self._translated(str(error)) from error
         except (EOFError, struct.error, ConnectionError) as error:
@@ -258,9 +257,9 @@ class AdbPhone(Device):
 ZONES = 'for z in /sys/class/thermal/thermal_zone*; do echo "$(cat $z/type) $(cat $z/temp)"; done'
 DUMPS = {"battery": "dumpsys battery", "thermal": "dumpsys thermalservice", "zone": ZONES}
 PHONE_RANGE_C = (-30.0, 125.0)
-STATE_UNIT = "write units: {{{channel}: degC}}, tenths or thousandths"
+STATE_UNIT = "set units: {{{channel}: degC}}, tenths or thousandths"
 NO_BATTERY = (
-    "no battery temperature: not fitted, frozen (`dumpsys battery reset` ends that), or in an "
+    "no battery temperature: no battery, frozen values (`dumpsys battery reset` ends that), or an "
     "unknown unit ({state})"
 )
 # TemperatureType: CPU 0, GPU, BATTERY, SKIN, USB_PORT, POWER_AMPLIFIER; BCL_VOLTAGE 6, BCL_CURRENT
@@ -284,7 +283,10 @@ _HEADING = re.compile(r"^[^\s,}][^{}\n]*:[ \t]*$", re.MULTILINE)
 
 
 class ThermometerOptions(PhoneOptions):
-    """sensors: {channel: battery, thermal:NAME or zone:TYPE}; units: {channel: unit}."""
+    """The options of the thermometer `android`.
+
+    sensors: {channel: battery, thermal:NAME or zone:TYPE}; units: {channel: unit}.
+    """
 
     sensors: dict[str, str] = {"temperature": "battery"}  # noqa: RUF012 - pydantic copies it
     units: dict[str, Literal["degC", "tenths", "thousandths"]] = {}  # noqa: RUF012
@@ -292,7 +294,7 @@ class ThermometerOptions(PhoneOptions):
 
 
 class AndroidThermometer(AdbPhone, Thermometer):
-    """Battery, thermal service and thermal zones of a phone, in one shell call each."""
+    """A phone's battery, thermal service and thermal zones, read in one shell call each."""
 
     Options = ThermometerOptions
 
@@ -308,7 +310,7 @@ class AndroidThermometer(AdbPhone, Thermometer):
         for channel in self.options.units:
             if self.sensors.get(channel, "").partition(":")[0] not in ("battery", "zone"):
                 raise ConfigurationError(
-                    f"units.{channel}: there is no battery or zone of that name in sensors"
+                    f"units.{channel}: sensors has no battery or zone of that name"
                 )
         self._watch = kernel.UnitWatch(self.clock)
         self._believed = support.Channels(self.clock, *PHONE_RANGE_C)
@@ -349,20 +351,20 @@ class AndroidThermometer(AdbPhone, Thermometer):
         if isinstance(value, str):
             state = STATE_UNIT.format(channel=channel)
             raise BadReading(f"{where}: {value.format(state=state)}")
-        idle = "as of a sensor that is not fitted" if chips.is_idle("", value) else ""
+        idle = "what an absent sensor reports" if chips.is_idle("", value) else ""
         return self._believed.judge(source, value, where, idle)
 
     def _stated(self) -> dict[str, float]:
-        """Return {source: factor to °C} of the units in the stanza."""
+        """Return {source: factor to °C} for the units in the stanza."""
         return {
             self.sensors[channel]: kernel.UNITS[unit]
             for channel, unit in self.options.units.items()
         }
 
     def _in_unit(self, source: str, number: float, scale: float) -> float | str:
-        """°C, or why the unit is not believed; a unit that is certain is kept until `close`."""
+        """Return °C, or why the unit is doubtful, in words."""
         if self._watch.switched(source, number, scale):
-            return f"{number:g} fits the last reading in another unit only: it has switched"
+            return f"{number:g} agrees with the last reading only in another unit: it has switched"
         return round(number * scale, 6)
 
     def _battery(self, texts: Mapping[str, str]) -> dict[str, float | str]:
@@ -385,18 +387,18 @@ class AndroidThermometer(AdbPhone, Thermometer):
             if name in scales:
                 found[source] = self._in_unit(source, value, scales[name])
             elif not kernel.is_temperature(name):
-                found[source] = f"{value} is not a temperature; if it is, {{state}}"
+                found[source] = f"by its name, {value} is not a temperature; if it is, {{state}}"
             elif value == 0:
-                found[source] = "0, as of a sensor not fitted; if not, {state}"
+                found[source] = "0 is what an absent sensor reports; if it is fitted, {state}"
             else:
-                found[source] = f"the unit of {value} is not known; {{state}}"
+                found[source] = f"the unit of {value} is unknown; {{state}}"
         return found
 
 
 def battery(text: str, scale: float | None = None) -> tuple[float, float] | None:
-    """Return (number, factor to °C) of `dumpsys battery`; None where there is none to be believed.
+    """Return (number, factor to °C) of `dumpsys battery`; None without a credible temperature.
 
-    scale: the factor, where it is known.
+    scale: the factor, if it is known.
     """
     text = text.replace("\r", "")
     if "UPDATES STOPPED" in text:
@@ -410,19 +412,19 @@ def battery(text: str, scale: float | None = None) -> tuple[float, float] | None
         return None
     if scale is not None:
         return (raw, scale) if abs(raw) * scale <= HOTTEST_BATTERY_C else None
-    if raw == 0 and volts not in CELL_MV:  # a board that runs from the mains
+    if raw == 0 and volts not in CELL_MV:  # a board with mains supply
         return None
     degrees = COLDEST_BATTERY_C <= raw <= HOTTEST_BATTERY_C
     if volts in WHOLE_VOLTS and degrees:
         return raw, 1.0
     lowest = 2 * HOTTEST_BATTERY_C if volts in WHOLE_VOLTS else 10 * COLDEST_BATTERY_C
-    # up to 70 it is tenths, or whole degrees: some boards give them beside mV
+    # up to 70 it may be tenths or whole degrees, which some boards report beside mV
     tenths = not degrees and lowest <= raw <= 10 * HOTTEST_BATTERY_C
     return (raw, 0.1) if tenths else None
 
 
 def thermalservice(text: str) -> dict[str, float]:
-    """Return {sensor: °C} of the live section; empty where the phone does not print one."""
+    """Return {sensor: °C} of the live section; empty if the phone prints none."""
     text = text.replace("\r", "")
     _, found, rest = text.partition(LIVE_SECTION)
     if not found or "HAL Ready: false" in text:
@@ -439,7 +441,7 @@ def thermalservice(text: str) -> dict[str, float]:
         except ValueError:
             continue  # NaN
         name = " ".join(record["name"].split())
-        # 0.0 is the HAL's way to say "not fitted"
+        # 0.0 is the HAL's value for a sensor that is not fitted
         if value == 0.0 or kernel.is_limit(name):
             continue
         if values.setdefault(name, value) != value:

@@ -1,9 +1,9 @@
-"""What chips give when nothing was measured: one row per family, with its data sheet.
+"""Idle values: what chips report without having measured, one row per family with its source.
 
-A chip that has just been powered, that lost its supply or its bus, or whose probe is open gives a
-fixed word, and firmware and kernel drivers turn it into a temperature like any other. Such a value
-is a property of the chip; only what was measured shortly before can tell it from the same
-temperature (`support.Neighbours`). The words are those before offset, scale and unit.
+A chip that was just powered up, that lost its supply or its bus, or whose probe is open returns a
+fixed word, and firmware and kernel drivers convert it to a temperature like any other. The value is
+a property of the chip; only a reading shortly before can distinguish it from a real temperature
+(`support.Channels`). Words are given before offset, scale and unit.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import re
 from dataclasses import dataclass
 
-# words of any chip: no conversion yet, a bus that is held low, a bus that nothing drives
+# idle words of any chip: no conversion yet, a bus that is held low, a bus that nothing drives
 # (all ones in 8 to 24 bits, with status bits masked), the ends of a converter's scale
 ANY_WORDS = frozenset(
     [0, -1, 0x8000, 0x80000]
@@ -20,20 +20,20 @@ ANY_WORDS = frozenset(
     + [-(2**bits) for bits in range(7, 24)]
     + [0xFFFF & ~low for low in (0, 1, 3, 7, 15, 63)]
 )
-# °C of any input of the kernel: not connected, and the ends of the commonest scale
+# idle °C of any kernel input: not connected, and the ends of the commonest scale
 ANY_C = (0.0, -40.0, 125.0)
 ALL_ONES_C = (-1.0, -0.5, -0.25, -0.125, -0.0625, -0.03125, -0.015625, -0.0078125, -0.00390625)
-"""What 8 to 16 bits that nothing drives mean."""
+"""The °C of 8 to 16 bits that nothing drives."""
 ENDS_C = (-99.0, -99.9, -99.99, -100.0, 99.9, 199.9, 999.9, -200.0, 850.0, -270.0, 1372.0)
-"""What displays, transmitters (PT100, type K) and loggers give beyond their ends."""
+"""The °C that displays, transmitters (PT100, type K) and loggers report out of their range."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chip:
-    """A family. names: as the kernel, a driver or a library calls its members.
+    """A family of chips and its idle values.
 
-    celsius: what it gives without having measured, °C; words: the same as the chip sends it, where
-    ANY_WORDS does not have it.
+    names: the members, as the kernel, a driver or a library calls them; celsius: the idle values,
+    °C; words: the same as the chip sends them, if not in ANY_WORDS; source: data sheet or survey.
     """
 
     names: str
@@ -157,45 +157,47 @@ FIRMWARE_C = tuple(
         {c for chip in CHIPS for c in chip.celsius if not LOWEST_LIKELY_C < c < HIGHEST_LIKELY_C}
     )
 )
-"""What firmware prints without a sensor, whatever the sensor: hardly temperatures."""
+"""What firmware prints without a sensor, for any sensor: unlikely temperatures."""
 UNLIKELY_C = tuple(c for c in FIRMWARE_C if not LOWEST_LIKELY_C < c < HIGHEST_OF_A_PROCESSOR_C)
 
 
 def names() -> list[str]:
-    """Return all chips of the table, sorted."""
+    """Return the names of all chips in the table, sorted."""
     return sorted(_BY_NAME)
 
 
 def idle_celsius(name: str) -> tuple[float, ...]:
-    """Return the °C that a chip gives without having measured; () if it is not in the table."""
+    """Return a chip's idle values, °C; () if it is not in the table."""
     chip = _chip(name)
     return () if chip is None else chip.celsius
 
 
 def _chip(name: str) -> Chip | None:
-    """A chip by its name, or the kernel's, which may go on (ms8607-temppressure, bq27541_0)."""
+    """Find a chip by a name that may have a suffix (ms8607-temppressure, bq27541_0)."""
     first = re.split("[-_ ]", name.lower())[0]
     known = _BY_NAME.get(name.lower()) or _BY_NAME.get(first)
     return known or (_ALARM if re.fullmatch(r"pmi?\d{2,4}\w{0,2}", first) else None)
 
 
 def is_idle(name: str, celsius: float) -> bool:
-    """Whether a chip, by the kernel's name, gives this without having measured (to 1/1000 °C).
+    """Return whether a temperature is an idle value of a chip, within 1/1000 °C.
 
-    Of a chip that is not in the table, whatever is hardly a temperature is doubted.
+    name: the kernel's. For a chip that is not in the table, any unlikely temperature counts as
+    idle.
     """
-    idle = idle_celsius(name) if _chip(name) else (*UNLIKELY_C, *ALL_ONES_C)
+    chip = _chip(name)
+    idle = (*UNLIKELY_C, *ALL_ONES_C) if chip is None else chip.celsius
     return any(abs(celsius - one) < 1e-3 for one in (*ANY_C, *idle))
 
 
 def is_idle_word(name: str, word: float) -> bool:
-    """Whether a word, before offset and scale, is one that a chip has without a measurement."""
+    """Return whether a word, before offset and scale, is an idle word of a chip."""
     chip = _chip(name)
     return word in ANY_WORDS or (chip is not None and word in chip.words)
 
 
 def prints(number: float, decimals: int, value: float) -> bool:
-    """Return whether a number of so many decimals can be `value`, rounded either way or cut off."""
+    """Return whether a number with these decimals can be `value`, rounded up, down or truncated."""
     step = 10.0**-decimals
     low = math.floor(value / step + 1e-6)
     high = math.ceil(value / step - 1e-6)

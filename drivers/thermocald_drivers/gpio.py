@@ -1,24 +1,24 @@
-"""A status LED and a relay on the Raspberry Pi's pins, through gpiozero.
+"""A status LED and a heating relay on the Raspberry Pi's GPIO pins, through gpiozero.
 
     outputs:
       - {name: status, driver: led, pin: 17, blink_s: 0.25}   # BCM number
       - name: lamp
         driver: relay
         pin: 27
-        active_high: false                         # most relay boards switch on at low
+        active_high: false                         # most relay boards switch on at a low level
         limit_c: 60
-        watchdog_s: 30                             # off after so long without an epoch
-        unknown_s: 60                              # off after so long without a temperature
-        channel: temperature                       # of the epoch's result
+        watchdog_s: 30                             # without an epoch for this long: off
+        unknown_s: 60                              # without a temperature for this long: off
+        channel: temperature                       # the column of the epoch's result
         hysteresis_k: 0.5
         programme: [{seconds: 600, hold_c: null}, {seconds: 1500, hold_c: 45}]
 
 The LED is steady while epochs have results and blinks while they have none.
 
-The relay fails safe. It is off before the first result and after the last, at the limit (until it
-is reopened), without a temperature, without a result for `watchdog_s`, and when it is closed. The
-kernel releases the pins of a process that crashes: wire the relay so that a released pin is off.
-See `heating` for the programme.
+The relay is fail-safe. It is off before the first result and after the last step, once the limit
+was reached (until the configuration is reloaded), without a temperature for `unknown_s`, without a
+result for `watchdog_s`, and while closed. The kernel releases the pins of a process that crashes:
+wire the relay so that a released pin switches it off. See `heating` for the programme.
 """
 
 from __future__ import annotations
@@ -44,27 +44,27 @@ log = logging.getLogger(__name__)
 
 
 class PinOptions(DriverOptions):
-    """A pin by its BCM number."""
+    """A pin, given by its BCM number."""
 
     pin: Annotated[int, Field(ge=0, le=53)]
     active_high: bool = True
 
 
 class LedOptions(PinOptions):
-    """As above."""
+    """The options of `led`."""
 
     blink_s: Annotated[float, Field(ge=0.05, le=10.0)] = 0.25
 
 
 class RelayOptions(HeatingOptions, PinOptions):
-    """As above."""
+    """The options of `relay`."""
 
     watchdog_s: Annotated[float, Field(ge=0.05, le=3600.0)] = 30.0
     channel: support.Text = "temperature"
 
 
 def _pin(kind: str, options: PinOptions) -> Any:
-    """Return a gpiozero device; translate its errors."""
+    """Return a gpiozero device; raises its errors as DeviceErrors."""
     pin = options.pin
     gpiozero = support.library("gpiozero", "gpio")
     try:
@@ -76,12 +76,12 @@ def _pin(kind: str, options: PinOptions) -> Any:
     except (gpiozero.PinInvalidPin, gpiozero.PinError) as error:
         raise DeviceNotFound(f"GPIO {pin}: {error}") from error
     except OSError as error:
-        hint = "is the user in the group gpio?"
+        hint = "check that the user is in the group gpio"
         raise support.fault(error, f"GPIO {pin}", seen=False, hint=hint) from error
 
 
 class LedOutput(Output):
-    """Steady while epochs have results, blinking while they have none, dark while closed."""
+    """An LED: steady while epochs have results, blinking while they have none, off while closed."""
 
     device_classes = GPIO_CLASSES
     Options = LedOptions
@@ -104,7 +104,7 @@ class LedOutput(Output):
         led = self.opened()
         good = result.get("status") == "ok"
         if good == self._good:
-            return  # restarting at each epoch would hide the blinking
+            return  # restarting the blinking at each epoch would hide it
         self._good = good
         if good:
             led.on()
@@ -139,7 +139,6 @@ class RelayOutput(HeatingOutput):
 
     def measure(self, result: Mapping[str, Any]) -> float | None:
         self._stop_watchdog()
-        self.opened()
         value = result.get(self.channel)
         return float(value) if isinstance(value, int | float) else None
 
@@ -158,9 +157,9 @@ class RelayOutput(HeatingOutput):
             watchdog.join()
 
     def _starve(self) -> None:
-        """Switch off until the next result: there was none for `watchdog_s`."""
+        """Switch off until the next result, after `watchdog_s` without one."""
         with self._lock:
             if self.handle is not None:
                 self.handle.off()
                 self.heating = False
-        log.warning("%s: no result for %g s, off", self.where, self.options.watchdog_s)
+        log.warning("%s: switched off, no result for %g s", self.where, self.options.watchdog_s)

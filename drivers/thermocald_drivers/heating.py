@@ -1,32 +1,32 @@
-"""The heating programme of `relay` and `android_load`, with a hard limit; `android_load` itself.
+"""The heating programme of `relay` and `android_load`, and the driver `android_load`.
 
-The limit switches off until the device
-is opened again; so does the end of the programme. The options of both drivers:
+At the limit, and at the end of the programme, heating stops until the configuration is reloaded. A
+device that goes away and comes back continues its programme. Both drivers have these options:
 
-    limit_c: 60                   # at and above it: off until the device is opened again
-    unknown_s: 60                 # off after so long without a temperature
-    programme:                    # in order; hold_c: null is "do not heat"
+    limit_c: 60                   # at or above it: off until the configuration is reloaded
+    unknown_s: 60                 # without a temperature for this long: off
+    programme:                    # steps in order; hold_c: null is "do not heat"
       - {seconds: 600, hold_c: null}
       - {seconds: 1500, hold_c: 45}
     hysteresis_k: 0.5
 
-`android_load` warms a phone up by processor load, for experiments with a cold and a warm phone:
+`android_load` warms up a phone by processor load, for experiments with a cold and a warm phone:
 
     outputs:
       - name: warm-pixel
         driver: android_load
         serial: 0A1B2C3D4E
-        limit_c: 42                   # of the battery, which this driver reads itself
+        limit_c: 42                   # of the battery, which the driver itself reads
         programme: [{seconds: 600, hold_c: null}, {seconds: 1800, hold_c: 38}]
         processes: 4
         lease_s: 30
         timeout_s: 5
         host: 127.0.0.1               # of the adb server
         port: 5037
-        start_server: true            # if none runs
+        start_server: true            # start a server if none runs
 
-The load ends by itself `lease_s` after it was last renewed, so that a phone whose cable falls out
-cools down.
+The load stops `lease_s` after its last renewal, so that a phone cools down when its cable is pulled
+out.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from thermocald.errors import BadReading, ConfigurationError, DeviceError
+from thermocald.errors import ConfigurationError, DeviceError, PermanentDeviceError
 from thermocald.hal import DriverOptions, HeatingStep, Output
 from thermocald_drivers.android_phone import AdbPhone, PhoneOptions, battery
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 class HeatingOptions(DriverOptions):
-    """What every output that heats has."""
+    """The options of every output that heats."""
 
     limit_c: Annotated[float, Field(ge=-40.0, le=150.0)]
     programme: Annotated[list[HeatingStep], Field(min_length=1)]
@@ -67,36 +67,47 @@ class HeatingOptions(DriverOptions):
 
 
 class HeatingOutput(Output):
-    """Heats by its programme: a driver says in `measure` how warm it is, and obeys in `switch`."""
+    """An output that heats by its programme; a driver implements `measure` and `switch`."""
 
     heats = True
     channel: str
-    """What is limited, for messages."""
+    """The name of the limited temperature, for messages."""
+
+    heating = False
+    tripped = ""
+    _known_at = 0.0
+    _started: float | None = None
+    _reported = False
 
     def begin(self) -> None:
-        """Start the programme again: heating off, limit not reached."""
+        """Start the programme at the first opening; continue it, with the heating off, later."""
         self.heating = False
-        self.tripped = ""
-        self._known_at = 0.0
-        self._started = self.clock.monotonic()
+        if self._started is None:
+            self._started = self.clock.monotonic()
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        """Heat or not; BadReading once, when the limit was reached."""
-        temperature_c, was_tripped = self.measure(result), self.tripped
+        """Switch the heating by the programme; PermanentDeviceError once at the limit."""
+        self.opened()
+        assert self._started is not None
+        temperature_c = self.measure(result)
         self.switch(self._decide(self.clock.monotonic() - self._started, temperature_c))
-        if self.tripped and not was_tripped:
-            raise BadReading(f"{self.where}: off for good, {self.tripped}")
+        if self.tripped and not self._reported:
+            self._reported = True
+            raise PermanentDeviceError(
+                f"{self.where}: heating is off, {self.tripped}; reload the configuration to heat "
+                "again"
+            )
 
     def measure(self, result: Mapping[str, Any]) -> float | None:
-        """Return the temperature °C that an epoch gives; None if it is not known."""
+        """Return the temperature °C at an epoch; None if it is unknown."""
         raise NotImplementedError
 
     def switch(self, heat: bool) -> None:
-        """Heat, or do not."""
+        """Switch the heating on or off."""
         raise NotImplementedError
 
     def _decide(self, elapsed_s: float, temperature_c: float | None) -> bool:
-        """Return whether to heat now; sets `tripped` (a sentence) once the limit was reached."""
+        """Return whether to heat now; set `tripped` (a sentence) when the limit is reached."""
         limit = self.options.limit_c
         if temperature_c is not None and not math.isfinite(temperature_c):
             temperature_c = None
@@ -112,7 +123,7 @@ class HeatingOutput(Output):
         half = self.options.hysteresis_k / 2
         if self.tripped or hold_c is None:
             self.heating = False
-        elif temperature_c is None:  # a missing value now and then does not stop a warm-up
+        elif temperature_c is None:  # an occasional missing value does not stop a warm-up
             self.heating = self.heating and elapsed_s - self._known_at < self.options.unknown_s
         elif temperature_c >= hold_c + half or temperature_c <= hold_c - half:
             self.heating = temperature_c < hold_c
@@ -123,7 +134,7 @@ MARK = "thermocald_load"
 
 
 class LoadOptions(HeatingOptions, PhoneOptions):
-    """As above; a battery above 50 °C is in danger."""
+    """The options of `android_load`; a battery above 50 °C is in danger."""
 
     limit_c: Annotated[float, Field(ge=0.0, le=50.0)]
     processes: Annotated[int, Field(ge=1, le=16)] = 4
@@ -132,7 +143,7 @@ class LoadOptions(HeatingOptions, PhoneOptions):
 
 
 class AndroidLoadOutput(AdbPhone, HeatingOutput):
-    """Busy loops on the phone while the programme asks for heat."""
+    """Busy loops on a phone while its programme calls for heat."""
 
     Options = LoadOptions
     channel = "battery"
@@ -141,24 +152,24 @@ class AndroidLoadOutput(AdbPhone, HeatingOutput):
     def open(self) -> None:
         super().open()
         self.begin()
-        self.switch(False)  # what a crashed program left behind
+        self.switch(False)  # stops the load of a program that crashed
 
     def close(self) -> None:
-        with contextlib.suppress(DeviceError):  # out of reach: the lease ends the load
+        with contextlib.suppress(DeviceError):  # out of reach: the load stops with its lease
             self.switch(False)
         super().close()
 
-    def measure(self, result: Mapping[str, Any]) -> float | None:  # noqa: ARG002 - it asks the phone
+    def measure(self, result: Mapping[str, Any]) -> float | None:  # noqa: ARG002 - asks the phone
         found = battery(self.shell("dumpsys battery"))
         return None if found is None else found[0] * found[1]
 
     def switch(self, heat: bool) -> None:
-        """End the load, or renew it where half of its lease is over."""
+        """Stop the load, or renew it after half of its lease."""
         now = self.clock.monotonic()
         if heat and now - self._renewed < self.options.lease_s / 2.0:
             return
         self._renewed = float("-inf")
-        # [t]: the pattern must not match the shell that carries it
+        # [t]: the pattern must not match the shell that runs this command
         self.shell(f"pkill -f '[{MARK[0]}]{MARK[1:]}'")
         if not heat:
             return

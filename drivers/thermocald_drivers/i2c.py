@@ -7,24 +7,24 @@
       - {name: box, driver: sht3x, bus: 1, address: 0x44}              # 0x44, 0x45
       - {name: room, driver: bme280, bus: 1, address: 0x76}            # 0x76, 0x77
 
-smbus2 opens /dev/i2c-N (Raspberry Pi: `dtparam=i2c_arm=on`, user in the group `i2c`). Where the
-kernel has a driver for the chip, prefer it (`hwmon`, `iio`): an address that a kernel driver holds
-is refused here with EBUSY. The chip's identity is checked when it is opened; 0xFFFF is a bus that
-nothing drives. `channel` (temperature) names the value.
+smbus2 opens /dev/i2c-N (Raspberry Pi: `dtparam=i2c_arm=on`, user in the group `i2c`). If the kernel
+has a driver for the chip, prefer that (`hwmon`, `iio`): an address that a kernel driver holds is
+denied here with EBUSY. The chip's identity is checked when it is opened; 0xFFFF means that nothing
+drives the bus. `channel` names the temperature.
 
-* TMP117 (±0.1 °C): a one-shot conversion of 8 averages per reading, its Data_Ready awaited, so that
-  no value is read twice; 0x8000 is the register before the first one (data sheet SNOSD82D, 7.6).
+* TMP117 (±0.1 °C): one one-shot conversion of 8 averages per reading. The driver waits for
+  Data_Ready, so that no value is read twice; 0x8000 precedes the first conversion (SNOSD82D, 7.6).
 * MCP9808 (±0.25 °C): bits 15–13 of the register are alert flags, bit 12 the sign (DS25095A, 5).
-* LM75 family, `chip`: lm75 (also LM75A, LM75B, which use two more bits), lm75b, tmp75, tmp102. It
-  has no identity: the bits that the chip leaves at zero are checked, and that its limits are of the
-  same grid (LM75B rev. 6.1, TMP75 SBOS288, TMP102 SBOS397H).
+* LM75 family, `chip`: lm75 (also LM75A, LM75B, which use two more bits), lm75b, tmp75, tmp102. They
+  have no identity: the driver checks the bits that a chip leaves at zero, in its limits as well
+  (LM75B rev. 6.1, TMP75 SBOS288, TMP102 SBOS397H).
 * SHT3x: a single shot with high repeatability; each word has a CRC (SHT3x-DIS v6, 4.3 … 4.13).
-* BME280: a forced measurement; it warms itself and measures its board (BST-BME280-DS002 1.23, 4.2,
-  8.1).
+* BME280: a forced measurement; the chip warms itself and measures its board (BST-BME280-DS002 1.23,
+  4.2, 8.1).
 
-MCP9808 and the LM75 family convert all the time: in shut-down they would repeat their last value
-for ever, so they are woken and one conversion awaited. What they hold from power-up (see `chips`)
-is read again after one conversion, and then accepted only if a recent reading lay within 5 K.
+MCP9808 and the LM75 family convert continuously. In shut-down they would repeat their last value
+forever, so the driver wakes them and waits for a conversion. Their power-up value (see `chips`) is
+read again after one conversion and then accepted only if a recent reading is within 5 K.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 
 class I2cOptions(DriverOptions):
-    """Where a chip is, and how its channel is called; address None: the chip's first."""
+    """A chip's place and its channel's name; address None: the chip's first address."""
 
     bus: Annotated[int, Field(ge=0, le=255)] = 1
     address: int | None = None
@@ -54,7 +54,7 @@ class I2cOptions(DriverOptions):
 
 
 class I2cThermometer(Thermometer):
-    """A thermometer at one address of one bus; a chip gives `_identify` and `_measure`."""
+    """A thermometer at one address of a bus; a chip's class implements `_identify`, `_measure`."""
 
     device_classes = ("char-i2c",)
     Options = I2cOptions
@@ -76,7 +76,7 @@ class I2cThermometer(Thermometer):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
-        """List the buses a chip could be on; scanning addresses could upset other chips."""
+        """List the buses that may have the chip; scanning addresses could upset other chips."""
         return [
             Found(
                 {"bus": int(path.name.split("-")[1]), "address": cls.addresses[0]},
@@ -88,7 +88,7 @@ class I2cThermometer(Thermometer):
 
     def open(self) -> None:
         smbus2 = support.library("smbus2")
-        hint = "is I2C switched on (dtparam=i2c_arm=on), the chip wired, the user in group i2c?"
+        hint = "check dtparam=i2c_arm=on, the wiring and that the user is in group i2c"
         try:
             self.handle = smbus2.SMBus(self.options.bus)
             self._identify()
@@ -107,30 +107,30 @@ class I2cThermometer(Thermometer):
 
     def read(self) -> Reading:
         self.opened()
-        return self._channels.reading({self.options.channel: (self.where, self._believed)})
+        return self._channels.reading({self.options.channel: (self.where, self._checked)})
 
-    def _believed(self) -> float:
+    def _checked(self) -> float:
         value, idle = self._measure()
         return self._channels.judge("", value, self.where, idle)
 
     def _identify(self) -> None:
-        """Check that it is this chip and make it convert; WrongDevice if it is another."""
+        """Check the chip's identity and make it convert; WrongDevice if it is another chip."""
         raise NotImplementedError
 
     def _measure(self) -> tuple[float, str]:
-        """Return a fresh value in °C; in words, if the chip may not have measured it."""
+        """Return (a fresh value in °C, why it may not have been measured or "")."""
         raise NotImplementedError
 
     def _byte(self, register: int) -> int:
         return int(self.handle.read_byte_data(self.address, register))
 
     def _word(self, register: int) -> int:
-        """A 16-bit register: high byte first on the wire, where SMBus has the low one first."""
+        """Read a 16-bit register: high byte first on the wire, unlike an SMBus word."""
         value = int(self.handle.read_word_data(self.address, register))
         return (value & 0xFF) << 8 | value >> 8
 
     def _reader(self, mask: int) -> Callable[[int], int]:
-        """Return what reads a register that has the bits of a mask."""
+        """Return the method that reads a register as wide as a mask."""
         return self._word if mask > 0xFF else self._byte
 
     def _write_word(self, register: int, value: int) -> None:
@@ -138,7 +138,7 @@ class I2cThermometer(Thermometer):
         self.handle.write_word_data(self.address, register, swapped)
 
     def _driven(self, word: int) -> int:
-        """Return a measurement's word; 0xFFFF is a bus that nothing drives, and is refused."""
+        """Return a measured word; BadReading for 0xFFFF, of a bus that nothing drives."""
         if word == 0xFFFF:
             raise BadReading(f"{self.where}: reads 0xFFFF, nothing drives the bus")
         return word
@@ -147,15 +147,15 @@ class I2cThermometer(Thermometer):
         if found != wanted:
             raise WrongDevice(
                 f"{self.where}: {what} reads 0x{found:04x} and a {self.chip} has 0x{wanted:04x}; "
-                "another chip sits at this address"
+                "another chip has this address"
             )
 
     def _wait(self, seconds: float) -> None:
-        """Let a conversion finish on the driver's own clock."""
+        """Wait for a conversion, on the driver's clock."""
         self.clock.sleep_until(self.clock.monotonic() + seconds)
 
     def _await(self, register: int, mask: int, wanted: int, poll_s: float) -> None:
-        """Poll a status until its bits are as wanted; DeviceTimeout after 20 looks."""
+        """Poll a status register for the wanted bits; DeviceTimeout after 20 attempts."""
         read = self._reader(mask)
         for _ in range(20):
             if read(register) & mask == wanted:
@@ -165,7 +165,7 @@ class I2cThermometer(Thermometer):
 
 
 class Tmp117Thermometer(I2cThermometer):
-    """One TMP117, a conversion per reading."""
+    """A TMP117, with one conversion per reading."""
 
     chip = "TMP117"
     addresses = range(0x48, 0x4C)
@@ -177,7 +177,7 @@ class Tmp117Thermometer(I2cThermometer):
         self._expect("the device identity", self._word(self.DEVICE) & 0x0FFF, 0x0117)
 
     def _measure(self) -> tuple[float, str]:
-        self._word(self.CONFIGURATION)  # reading it clears a Data_Ready left over from before
+        self._word(self.CONFIGURATION)  # reading clears the Data_Ready of an earlier conversion
         self._write_word(self.CONFIGURATION, self.ONE_SHOT_8_AVERAGES)
         self._wait(0.1245)
         self._await(self.CONFIGURATION, self.DATA_READY, self.DATA_READY, 0.01)
@@ -188,14 +188,14 @@ class Tmp117Thermometer(I2cThermometer):
 
 
 class _ConvertingThermometer(I2cThermometer):
-    """A chip without a data-ready flag that converts all the time unless it is shut down."""
+    """A chip without a data-ready flag that converts continuously unless it is shut down."""
 
     conversion_s: float
     TEMPERATURE, CONFIGURATION = 0x00, 0x01
     SHUTDOWN = 1
 
     def _wake(self) -> None:
-        """Leave shut-down, and wait for a conversion."""
+        """Wake the chip from shut-down and wait for a conversion."""
         read = self._reader(self.SHUTDOWN)
         configuration = read(self.CONFIGURATION)
         if not configuration & self.SHUTDOWN:
@@ -216,16 +216,16 @@ class _ConvertingThermometer(I2cThermometer):
         if value == 0.0:
             self._wait(self.conversion_s)
             value = self._decode(self._driven(self._word(self.TEMPERATURE)))
-        idle = "its power-up value: it lost its supply, or does not convert"
+        idle = "its power-up value: it lost its supply or does not convert"
         return value, "" if value else idle
 
     def _decode(self, word: int) -> float:
-        """Return the °C of a temperature word."""
+        """Convert a temperature word to °C."""
         raise NotImplementedError
 
 
 class Mcp9808Thermometer(_ConvertingThermometer):
-    """One MCP9808 in continuous conversion."""
+    """An MCP9808 in continuous conversion."""
 
     chip = "MCP9808"
     addresses = range(0x18, 0x20)
@@ -244,13 +244,13 @@ class Mcp9808Thermometer(_ConvertingThermometer):
 
 
 class Lm75Options(I2cOptions):
-    """The family has several chips."""
+    """The options of `lm75`, of which chip is the member of the family."""
 
     chip: Literal["lm75", "lm75b", "tmp75", "tmp102"] = "lm75"
 
 
 class Lm75Thermometer(_ConvertingThermometer):
-    """One chip of the family in continuous conversion."""
+    """A chip of the LM75 family in continuous conversion."""
 
     Options = Lm75Options
     chip = "LM75"
@@ -278,7 +278,7 @@ class Lm75Thermometer(_ConvertingThermometer):
             if limit == 0xFFFF or (limit & unused and not extended):
                 raise WrongDevice(
                     f"{self.where}: {what} reads 0x{limit:04x}, which a {self.options.chip} "
-                    "cannot; another chip sits at this address"
+                    "cannot; another chip has this address"
                 )
         self._wake()
 
@@ -294,7 +294,7 @@ class Lm75Thermometer(_ConvertingThermometer):
 
 
 class Sht3xThermometer(I2cThermometer):
-    """One SHT3x, a conversion per reading."""
+    """An SHT3x, with one conversion per reading."""
 
     chip = "SHT3x"
     addresses = (0x44, 0x45)
@@ -302,7 +302,7 @@ class Sht3xThermometer(I2cThermometer):
     SINGLE_SHOT_HIGH, SERIAL_NUMBER, SOFT_RESET = 0x2400, 0x3780, 0x30A2
 
     def _identify(self) -> None:
-        self._command(self.SOFT_RESET, 0.002)  # leave the periodic mode of an earlier user
+        self._command(self.SOFT_RESET, 0.002)  # ends the periodic mode of an earlier program
         self._command(self.SERIAL_NUMBER, 0.001)
         self._words(2)
 
@@ -317,7 +317,7 @@ class Sht3xThermometer(I2cThermometer):
         self._wait(wait_s)
 
     def _words(self, count: int) -> list[int]:
-        """Plain read of `count` words, each followed by its CRC."""
+        """Read `count` words, each followed by its CRC, without a register address."""
         message = support.library("smbus2").i2c_msg.read(self.address, 3 * count)
         self.handle.i2c_rdwr(message)
         data = bytes(message)
@@ -330,7 +330,7 @@ class Sht3xThermometer(I2cThermometer):
 
 
 class Bme280Thermometer(I2cThermometer):
-    """One BME280, a forced measurement per reading."""
+    """A BME280, with one forced measurement per reading."""
 
     chip = "BME280"
     addresses = (0x76, 0x77)
@@ -363,14 +363,14 @@ class Bme280Thermometer(I2cThermometer):
 
 
 def bme280_celsius(raw: int, calibration: tuple[int, ...]) -> float:
-    """Return the °C of a raw temperature; calibration: dig_T1 … dig_T3 (data sheet 8.1)."""
+    """Convert a raw temperature to °C; calibration: dig_T1 … dig_T3 (data sheet 8.1)."""
     t1, t2, t3 = calibration
     first = (raw / 16384.0 - t1 / 1024.0) * t2
     return (first + (raw / 131072.0 - t1 / 8192.0) ** 2 * t3) / 5120.0
 
 
 def crc8(data: bytes) -> int:
-    """CRC of the SHT3x: polynomial 0x31, initial value 0xFF; BE EF gives 0x92 (table 20)."""
+    """Return the SHT3x's CRC: polynomial 0x31, initial value 0xFF; BE EF has 0x92 (table 20)."""
     crc = 0xFF
     for byte in data:
         crc ^= byte
@@ -380,6 +380,6 @@ def crc8(data: bytes) -> int:
 
 
 def signed(value: int, bits: int) -> int:
-    """Return two's complement of the lowest `bits` bits."""
+    """Return the lowest `bits` bits as a two's complement number."""
     value &= (1 << bits) - 1
     return value - (1 << bits) if value >> (bits - 1) else value

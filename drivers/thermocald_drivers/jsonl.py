@@ -1,4 +1,4 @@
-"""Each epoch's result as one line of JSON, into a file or a named pipe.
+"""An output that writes each epoch's result as one line of JSON to a file or a named pipe.
 
     outputs:
       - {name: log, driver: jsonl, path: /var/lib/thermocald/results.jsonl}
@@ -6,8 +6,8 @@
 
 A line is written completely or not at all: if the disk fills up or the daemon is killed within a
 line, the incomplete line is removed. A file that was moved away (logrotate) is created again. A
-pipe without a reader is an error; it is not waited for. NaN and infinities become null, since JSON
-has neither.
+pipe without a reader is an error; the output does not wait for one. A reader that is slower than
+`timeout_s` is an error, too. JSON has no NaN or infinity: both become null.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ _LONGEST_LINE = 1_000_000
 
 
 def encode(result: Mapping[str, Any]) -> bytes:
-    """Return a result as JSON; numpy scalars as numbers, NaN and infinities as null."""
+    """Encode a result as JSON: numpy scalars as numbers, NaN and infinities as null."""
     return json.dumps(jsonable(dict(result)), default=str).encode()
 
 
 class JsonLinesOptions(DriverOptions):
-    """As above."""
+    """The options of `jsonl`."""
 
     path: support.Text
     timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 1.0
 
 
 class JsonLinesOutput(Output):
-    """Appends to a file, or writes into a pipe."""
+    """An output that appends to a file or writes to a pipe."""
 
     Options = JsonLinesOptions
 
@@ -63,19 +63,19 @@ class JsonLinesOutput(Output):
     def open(self) -> None:
         self.close()
         if is_unmounted(self.path, self._mount):
-            raise DeviceGone(f"{self.path}: {self._mount} is not mounted any more")
+            raise DeviceGone(f"{self.path}: {self._mount} is no longer mounted")
         self._mount = mount_point(self.path)
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
         try:
             self.handle = os.fdopen(os.open(self.path, flags, 0o644), "wb", buffering=0)
         except OSError as error:
             if error.errno == errno.ENXIO:
-                raise DeviceGone(f"{self.path}: nobody reads the pipe") from error
+                raise DeviceGone(f"{self.path}: no program reads the pipe") from error
             raise support.fault(error, str(self.path), seen=self.seen) from error
         mode = os.fstat(self.handle.fileno()).st_mode
         self._pipe = stat.S_ISFIFO(mode)
         if stat.S_ISREG(mode):
-            if not mode & 0o600:  # of a umask of 777
+            if not mode & 0o600:  # under a umask of 777
                 os.fchmod(self.handle.fileno(), 0o600)
             self._end_half_line()
         self.seen = True
@@ -87,15 +87,15 @@ class JsonLinesOutput(Output):
             self._reopen_if_moved()
             self._write(line)
         except BrokenPipeError as error:
-            raise DeviceGone(f"{self.path}: nobody reads the pipe any more") from error
+            raise DeviceGone(f"{self.path}: no program reads the pipe any longer") from error
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                full = f"{self.path}: the disk is full; line not written"
+                full = f"{self.path}: the disk is full; the line was not written"
                 raise TransientDeviceError(full) from error
             raise support.fault(error, str(self.path), seen=True) from error
 
     def _end_half_line(self) -> None:
-        """Remove the half of a line that a killed process or a power cut left at the end."""
+        """Remove the partial line that a killed process or a power cut left at the end."""
         file_number = self.handle.fileno()
         size = os.fstat(file_number).st_size
         with contextlib.suppress(OSError), self.path.open("rb") as file:
@@ -103,9 +103,9 @@ class JsonLinesOutput(Output):
             half = file.read().rpartition(b"\n")[2]
             try:
                 json.loads(half or b"0")
-                ours = False  # whole, and written by hand
+                ours = False  # complete, so not written by this driver
             except ValueError:
-                ours = half.strip(b"\0")[:1] in (b"", b"{")  # what was not written may read as 0
+                ours = half.strip(b"\0")[:1] in (b"", b"{")  # unwritten bytes may read as 0
             if ours and len(half) < _LONGEST_LINE:
                 os.ftruncate(file_number, size - len(half))
             elif half:
@@ -121,7 +121,7 @@ class JsonLinesOutput(Output):
             self.open()
 
     def _write(self, line: bytes) -> None:
-        """Write the whole line; on failure remove what was written of it."""
+        """Write the whole line; on failure, remove the part that was written."""
         file_number = self.handle.fileno()
         start = os.fstat(file_number).st_size
         deadline = time.monotonic() + self.options.timeout_s

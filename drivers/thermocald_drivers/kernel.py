@@ -1,4 +1,4 @@
-"""Temperatures that the kernel already reads: hwmon, iio and thermal zones in sysfs.
+"""Thermometers that the kernel reads: hwmon, iio and thermal zones in sysfs.
 
     thermometers:
       - {name: lens, driver: hwmon, chip: lm75}                  # or chip: 1-0048 (the bus address)
@@ -6,26 +6,27 @@
       - {name: sensor, driver: iio, chip: tmp117}
       - {name: soc, driver: thermal_zone, zone: cpu-thermal, unit: thousandths}   # the default
 
-`channels` maps channel names to the kernel's input (`temp1`, `in_temp_ambient`) or its label;
+`channels` maps channel names to the kernel's inputs (`temp1`, `in_temp_ambient`) or their labels;
 without it every temperature input is read, a single one as `temperature`. `minimum_c` and
-`maximum_c` bound what is accepted (a broken diode reads 127 °C); `sysfs` (/sys) is where the files
-are. The kernel renumbers its devices at every plug: they are looked up by name at each open, and
-the name is checked at each read.
+`maximum_c` bound the accepted values (a broken diode reads 127 °C); `sysfs` (/sys) is the folder of
+the files. The kernel renumbers its devices whenever one is plugged in: the driver looks them up by
+name at each open and checks the name at each reading.
 
-What a chip gives without having measured (`chips`: 0, the ends of its scale, all ones, its value at
-power-up; of iio the raw word before offset and scale; of a chip that is not listed what is hardly
-a temperature) is accepted only if a recent reading lay within 5 K. A zone of −40 °C is one that is
-not fitted, and the hwmon entry of a 1-wire sensor is refused at its power-on value: use the driver
+An idle value, which a chip reports without having measured (`chips`: 0, the ends of its scale, all
+ones, its power-up value; with iio the raw word before offset and scale; for an unlisted chip any
+unlikely temperature), is accepted only if a recent reading is within 5 K. A zone at −40 °C is not
+fitted. The hwmon entry of a 1-wire sensor is rejected at its power-on value: use the driver
 ds18b20, which sees the CRC.
 
-A zone of a vendor's kernel may be in °C or tenths: a number up to 1250 is refused until one above
-has shown that it is in thousandths, and then believed only within 5 K of a recent reading, or
-`unit` states it. It is refused where the number fits the last reading in another unit only: the
-unit has switched. Within 0.125 °C of zero only a reading close by tells thousandths from degrees.
+A zone of a vendor's kernel may be in °C or tenths. Unless `unit` states the unit, a number up to
+1250 is rejected until a larger one has shown that the zone is in thousandths, and is then accepted
+only within 5 K of a recent reading. A number that agrees with the last reading only in another unit
+is rejected: the unit has switched. Within 0.125 °C of zero, only a reading close by distinguishes
+thousandths from degrees.
 
-Of a phone's zones, the unit is taken from the zone's family where only one fits, else from the
-phone's other zones, and is otherwise unknown: 37000, 370 and 37 all mean 37 °C, a zone may hold
-percent, mA or mV, and a wrong temperature is worse than none.
+The unit of a phone's zone is that of the zone's family if only one fits, else that of the phone's
+other zones, else unknown: 37000, 370 and 37 may all mean 37 °C, a zone may hold percent, mA or mV,
+and a wrong temperature is worse than none.
 Source: Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio, driver-api/thermal; qcom
 tsens and qpnp-adc-tm of kernels 3.10 to 4.9, MediaTek mtk_ts_*, power_supply class; zones of eleven
 phones.
@@ -50,15 +51,15 @@ if TYPE_CHECKING:
     from thermocald.hal import Clock, Reading
 
 NOT_FITTED_C = -40.0
-LARGEST_OF_TENTHS = 1250  # 125 °C; what is larger can only be thousandths
+LARGEST_OF_TENTHS = 1250  # 125 °C; a larger number can only be thousandths
 LARGEST_OF_DEGREES = 125
 UNITS = {"degC": 1.0, "tenths": 0.1, "thousandths": 0.001}
-"""The option's words: what a zone's number is multiplied by to be °C."""
+"""Factors that convert a zone's number to °C, by the words of the option."""
 
 LOWEST_C, HIGHEST_C = -30.0, 125.0
 SWITCH_K, SWITCH_S = 5.0, 600.0
 COOLER_K = 10.0
-"""No zone of a phone is colder than its coldest other zone by more than this."""
+"""No zone of a phone is colder than the coldest of the others by more than this."""
 
 _OTHER_QUANTITIES = re.compile(
     r"soc|socd|(?:batt?(?:ery)?|bms|maxfg|fg)[-_]?soc"
@@ -71,7 +72,7 @@ _LIMIT = re.compile(r"lmh[-_]dcvs.*", re.IGNORECASE)  # always 75 or 95 °C
 
 
 class KernelOptions(DriverOptions):
-    """Which inputs are read, and what is believed of them."""
+    """The inputs to read and the bounds of their temperatures."""
 
     channels: dict[str, str] = {}  # noqa: RUF012 - pydantic copies it
     minimum_c: support.Celsius = -55.0
@@ -80,20 +81,20 @@ class KernelOptions(DriverOptions):
 
 
 class ChipOptions(KernelOptions):
-    """A chip by its name or bus address."""
+    """A chip, given by its name or bus address."""
 
     chip: support.Text
 
 
 class ZoneOptions(KernelOptions):
-    """A thermal zone by its type; unit None: thousandths, once they are certain."""
+    """A thermal zone, given by its type; unit None: thousandths, once they are certain."""
 
     zone: support.Text
     unit: Literal["degC", "tenths", "thousandths"] | None = None
 
 
 class _KernelThermometer(Thermometer):
-    """One device folder of a sysfs class, found by its name."""
+    """A device folder of a sysfs class, found by its name."""
 
     Options: ClassVar[type[DriverOptions]] = ChipOptions
     key: ClassVar[str] = "chip"
@@ -121,13 +122,13 @@ class _KernelThermometer(Thermometer):
             try:
                 name = support.read_line(folder / cls.name_file)
             except OSError:
-                continue  # unplugged between the listing and the reading
+                continue  # unplugged after the listing
             device = folder / "device"
             yield folder, name, device.resolve().name if device.exists() else folder.name
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
-        """List what is there as stanzas, for `thermocald devices`."""
+        """List the devices as stanzas, for `thermocald devices`."""
         found = list(cls.devices(Path(sysfs)))
         names = [name for _, name, _ in found]
         return [
@@ -146,7 +147,7 @@ class _KernelThermometer(Thermometer):
             raise support.absent(f"{where} is not there; there is {names}", seen=self.seen)
         if len(matches) > 1:
             addresses = ", ".join(a for folder, _, a in found if folder in matches)
-            raise WrongDevice(f"{where} is there {len(matches)} times; write chip: {addresses}")
+            raise WrongDevice(f"{where} is there {len(matches)} times; set chip: {addresses}")
         inputs = self._inputs(matches[0])
         if not inputs:
             raise WrongDevice(f"{matches[0]}: this device has no temperature input")
@@ -165,11 +166,11 @@ class _KernelThermometer(Thermometer):
         return {"chip": self.chip, "path": str(self.handle or "")}
 
     def _select(self, inputs: dict[str, str], folder: Path) -> dict[str, str]:
-        """Return {our channel: kernel's input}, from the option `channels`."""
+        """Return {channel: kernel's input} by the option `channels`."""
         if not self.options.channels:
             if len(inputs) == 1:
                 return {"temperature": next(iter(inputs))}
-            # two inputs of one label would be one channel, and a label may be no name of one
+            # inputs with the same label would be one channel; a label may be no channel name
             given = [*inputs.values(), *inputs]
             return {
                 key if channel_fault(label) or given.count(label) > 1 else label: key
@@ -195,7 +196,7 @@ class _KernelThermometer(Thermometer):
             name = support.read_line(folder / self.name_file)
         except OSError as error:
             raise DeviceGone(f"{folder}: unplugged ({error.strerror})") from error
-        if name != self._name:  # a kernel name is handed on: hwmon3 may be another after a re-plug
+        if name != self._name:  # hwmon3 may be another device after a re-plug
             raise DeviceGone(f"{folder} is {name!r} now and was {self._name!r}")
         return reading
 
@@ -209,14 +210,14 @@ class _KernelThermometer(Thermometer):
         raise NotImplementedError
 
     def _convert(self, folder: Path, key: str) -> tuple[float, str]:
-        """(The input's value in °C; in words, if it is one that the chip gives unmeasured)."""
+        """Return (an input's value in °C, why it may be an idle value or "")."""
         raise NotImplementedError
 
     def _idle(self, value: float) -> str:
         return UNMEASURED if chips.is_idle(self._name, value) else ""
 
 
-UNMEASURED = "what such an input gives without a sensor or before it has measured"
+UNMEASURED = "what such an input reports without a sensor or before a measurement"
 
 
 def _number(path: Path) -> float:
@@ -231,7 +232,7 @@ def _label(folder: Path, key: str) -> str:
 
 
 class HwmonThermometer(_KernelThermometer):
-    """`/sys/class/hwmon`: temp*_input in 1/1000 °C; temp*_fault says that the diode is open."""
+    """`/sys/class/hwmon`: temp*_input in 1/1000 °C; temp*_fault flags an open diode."""
 
     folder = "class/hwmon"
     prefix = "hwmon"
@@ -249,7 +250,7 @@ class HwmonThermometer(_KernelThermometer):
         if self._name.startswith("w1_") and value in chips.idle_celsius("ds18b20"):
             raise BadReading(
                 f"{folder.name} {key}: {value:g} °C is a 1-wire power-on value; use driver: "
-                "ds18b20, which sees the sensor's bytes"
+                "ds18b20, which reads the sensor's bytes"
             )
         return value, self._idle(value)
 
@@ -270,7 +271,7 @@ class IioThermometer(_KernelThermometer):
         return {key: _label(folder, key) for key in sorted(keys)}
 
     def _convert(self, folder: Path, key: str) -> tuple[float, str]:
-        for fault in sorted(folder.glob("fault_*")):  # of thermocouples and PT100: an open wire
+        for fault in sorted(folder.glob("fault_*")):  # open wire of a thermocouple or PT100
             if _number(fault) != 0:
                 raise BadReading(f"{folder.name} {key}: the chip reports a fault ({fault.name})")
         processed = folder / f"{key}_input"
@@ -285,12 +286,12 @@ class IioThermometer(_KernelThermometer):
 
     @staticmethod
     def _shared(folder: Path, key: str, what: str, default: float | None) -> float:
-        """Return a channel's own attribute, or the one that all temperature channels share."""
+        """Return a channel's attribute, else the one shared by all temperature channels."""
         for path in (folder / f"{key}_{what}", folder / f"in_temp_{what}"):
             if path.exists():
                 return _number(path)
         if default is None:
-            raise BadReading(f"{folder.name} {key}: the kernel gives no {what}")
+            raise BadReading(f"{folder.name} {key}: the kernel reports no {what}")
         return default
 
 
@@ -310,8 +311,8 @@ class ThermalZoneThermometer(_KernelThermometer):
         self._watch = UnitWatch(self.clock)
         if self.options.unit is None and not is_temperature(self.chip):
             raise ConfigurationError(
-                f"zone: {self.chip!r} holds percent, mA or mV on the machines that have it; if "
-                "yours is a temperature, write unit: thousandths (or degC, tenths)"
+                f"zone: {self.chip!r} holds percent, mA or mV on known machines; if it is a "
+                "temperature on yours, set unit: thousandths (or degC, tenths)"
             )
 
     def close(self) -> None:
@@ -320,9 +321,9 @@ class ThermalZoneThermometer(_KernelThermometer):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
-        """List what is there as stanzas, for `thermocald devices`."""
-        return [found for found in super().attached(sysfs) if is_temperature(
-            str(found.options["zone"]))]  # fmt: skip
+        """List the devices as stanzas, for `thermocald devices`."""
+        zones = super().attached(sysfs)
+        return [found for found in zones if is_temperature(str(found.options["zone"]))]
 
     @classmethod
     def _inputs(cls, folder: Path) -> dict[str, str]:
@@ -342,32 +343,32 @@ class ThermalZoneThermometer(_KernelThermometer):
         stated = self.options.unit is not None
         if not stated and not self._certain and not larger and number != 0:
             raise BadReading(
-                f"{folder.name}: the unit of {number:g} is not known; write unit: degC, tenths or "
+                f"{folder.name}: the unit of {number:g} is unknown; set unit: degC, tenths or "
                 "thousandths"
             )
         if value == NOT_FITTED_C:
-            raise BadReading(f"{folder.name}: {value:g} °C, as of a sensor that is not fitted")
+            raise BadReading(f"{folder.name}: {value:g} °C is what an absent sensor reports")
         if self._watch.switched(key, number, scale):
             raise BadReading(
-                f"{folder.name}: {number:g} is {value:g} °C in {self.unit} and fits the last "
-                "reading in another unit only; the kernel has switched it"
+                f"{folder.name}: {number:g} is {value:g} °C in {self.unit} and agrees with the "
+                "last reading only in another unit; the kernel has switched the unit"
             )
         if not stated and not larger and not self._believed.support(key, value):
-            return value, f"{number:g} in a unit that is not certain (write unit: {self.unit})"
+            return value, f"{number:g} in a unit that is not certain (set unit: {self.unit})"
         if self.unit == "thousandths" and 0 < abs(number) <= LARGEST_OF_DEGREES:
             return value, f"{number:g} in thousandths, or in degrees"
         return value, self._idle(value)
 
 
-# Zones whose names match a pattern, the first counts: the highest temperature in whole degrees and
-# in tenths that such a zone can have, °C, -inf where the family does not use the unit; the smallest
-# |number| that is read as 1/1000 °C, below 1251, from which on it can be nothing else.
+# Families of zones: a pattern of their names (the first match counts); the highest temperature, °C,
+# in whole degrees and in tenths, -inf if the family does not use the unit; the smallest |number|
+# that may be 1/1000 °C (from 1251 on, it can be nothing else).
 _FAMILIES: tuple[tuple[str, float, float, int], ...] = (
     # qcom tsens: tenths on msm8909 … msm8998, whole degrees before
     (r"tsens_tz_sensor\d*", 105.0, HIGHEST_C, 1251),
-    # power supply class: tenths; fuel gauges: thousandths; a battery above 70 °C is on fire
+    # power supply class: tenths; fuel gauges: thousandths; a battery above 70 °C burns
     (r"(?:.*[-_])?(?:batt?|battery|bms|maxfg|fg)(?:[-_].*)?", 70.0, 70.0, 500),
-    # MediaTek: thousandths, mtktsAP of some kernels whole degrees
+    # MediaTek: thousandths; mtktsAP of some kernels: whole degrees
     (r"mtkts(?:batt).*", 70.0, -math.inf, 126),
     (r"mtkts.*", 105.0, -math.inf, 126),
     # qcom ADC thermistors of kernels 3.x: whole degrees
@@ -377,9 +378,9 @@ _FAMILIES: tuple[tuple[str, float, float, int], ...] = (
 
 
 class UnitWatch:
-    """The last temperature of each source, by which a unit that switches is noticed.
+    """The last temperature of each source, for detecting a unit that switches.
 
-    Kernels give 45000 for 45 °C and, after an update of the fuel gauge or a suspend, 45.
+    Kernels report 45000 for 45 °C and, after an update of the fuel gauge or a suspend, 45.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -387,7 +388,7 @@ class UnitWatch:
         self._last: dict[str, tuple[float, float]] = {}
 
     def switched(self, source: str, number: float, scale: float) -> bool:
-        """Return whether the number agrees with the last temperature in another unit only."""
+        """Return whether a number agrees with the last temperature only in another unit."""
         value, now = number * scale, self._clock.monotonic()
         at, last = self._last.get(source, (now, value))
         other = None
@@ -399,17 +400,17 @@ class UnitWatch:
 
 
 def is_temperature(zone: str) -> bool:
-    """Return whether a zone of that name holds a temperature, not percent, mA, mV or a limit."""
+    """Return whether a zone, by its name, holds a temperature: not percent, mA, mV or a limit."""
     return _OTHER_QUANTITIES.fullmatch(zone) is None and not is_limit(zone)
 
 
 def is_limit(name: str) -> bool:
-    """Whether a zone or sensor of that name holds a limit of the hardware, not a temperature."""
+    """Return whether a zone or sensor, by its name, holds a hardware limit."""
     return _LIMIT.fullmatch(name) is not None
 
 
 def raw_zones(text: str) -> dict[str, int]:
-    """Return {zone: number} of lines "type number"; a name that is used twice is left out."""
+    """Parse lines "type number" to {zone: number}; omit a name that has several numbers."""
     values: dict[str, int] = {}
     ambiguous = set()
     for line in text.replace("\r", "").split("\n"):
@@ -423,9 +424,9 @@ def raw_zones(text: str) -> dict[str, int]:
 
 
 def zone_scales(raw: Mapping[str, int], known: Mapping[str, float]) -> dict[str, float]:
-    """Return {zone: factor to °C} of those whose unit is certain.
+    """Return {zone: factor to °C} for the zones whose unit is certain.
 
-    raw: all zones of the phone at one time; known: factors that were stated or found before.
+    raw: all zones of the phone at one time; known: factors that were stated or determined before.
     """
     found = {name: known[name] for name in raw if name in known}
     temperatures = {n: v for n, v in raw.items() if v != 0 and n not in known and is_temperature(n)}
@@ -441,7 +442,7 @@ def zone_scales(raw: Mapping[str, int], known: Mapping[str, float]) -> dict[str,
 
 
 def _candidates(name: str, value: int) -> list[float]:
-    """Return the factors that make a possible temperature of a zone's number, by its name."""
+    """Return the factors with which a zone's number is a possible temperature, by its name."""
     family = next(row for row in _FAMILIES if re.fullmatch(row[0], name, re.IGNORECASE))
     _, whole_c, tenths_c, thousandths_from = family
     thousandths_c = HIGHEST_C if abs(value) >= thousandths_from else -math.inf
@@ -450,12 +451,12 @@ def _candidates(name: str, value: int) -> list[float]:
 
 
 def _among(value: int, fits: list[float], others: Iterable[float], whole: bool) -> float | None:
-    """The one factor that agrees with the phone's other zones; None if that does not decide."""
+    """Return the factor that agrees with the phone's other zones; None if they do not decide."""
     coldest = min(others, default=None)
     if coldest is None:
         return None
     near = [scale for scale in fits if value * scale >= coldest - COOLER_K]
     if len(near) == 1:
         return near[0]
-    # colder than everything else in any unit: as its neighbours are written
+    # colder than all other zones in any unit: the unit of its neighbours
     return 1.0 if not near and whole and 1.0 in fits else None

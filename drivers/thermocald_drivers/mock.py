@@ -1,4 +1,4 @@
-"""Simulated devices that obey the rules of real ones, and fail on demand as hardware fails.
+"""Simulated devices that obey the rules of real ones and fail on demand as hardware does.
 
     cameras:
       - name: mock
@@ -6,12 +6,12 @@
         testfield: markers            # markers, circles, plain, or the path of a testfield.csv
         model: camera.thermal.yaml    # default: an RPi camera v2.1, half a pixel per kelvin
         programme: [[0, 25.0], [700, 50.0], [1500, 27.0]]   # s since the first open, °C
-        seed: 0                       # of the noise, which depends on the time alone
+        seed: 0                       # of the noise, which depends only on the time
         exposure_s: 0.02
         latency_s: 0.3                # from the call to the end of the exposure
     thermometers:
       - name: mock
-        driver: mock                  # the same programme, with lag, offset, noise, quantisation
+        driver: mock                  # the programme with lag, offset, noise and quantisation
         programme: [[0, 25.0], [700, 50.0], [1500, 27.0]]
         channels:                     # default: one channel `temperature` with these values
           temperature: {lag_s: 0, offset_k: 0, gain: 1, noise_k: 0.02, resolution_k: 0.0625}
@@ -20,20 +20,20 @@
     outputs:
       - {name: kept, driver: mock, keep: 1000}              # the last results, in memory
 
-The programme is linear between its points and constant before and after them; time counts from the
-first `open`: unplugging a device does not cool it. `gain` scales the difference to the first
-temperature, for a second channel that warms more. All three take faults:
+The programme is linear between its points and constant before and after them. Time counts from the
+first `open`: a device does not cool down while it is unplugged. `gain` scales the difference from
+the first temperature, for a second channel that warms more. All three accept faults:
 
     timeout_s: 1
     faults:
-      - {kind: timeout, at: 3}                      # the 3rd capture or reading does not answer
+      - {kind: timeout, at: 3}                      # the 3rd capture or reading gets no answer
       - {kind: unplugged, at_s: 60, for_s: 30}      # s after the first open; open fails meanwhile
       - {kind: stuck, at: 10, count: 20}            # 20 times the same value
 
 Kinds: `timeout` (no answer within `timeout_s`), `unplugged` (gone, also for `open`), `truncated`
-(half a frame, half a line: what a driver refuses as a bad reading), `wrong_size` (a frame of
-another size, an answer of another length), `stuck` (the same value or image with new times, which
-no driver can detect). A test may also call `inject` while the device is open.
+(half a frame or line, which a driver rejects as a bad reading), `wrong_size` (a frame of another
+size, an answer of another length), `stuck` (the same value or image with new times, which no driver
+can detect). A test may also call `inject` while the device is open.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ Kind = Literal["timeout", "unplugged", "truncated", "wrong_size", "stuck"]
 
 
 class Fault(DriverOptions):
-    """One fault: `count` calls from call number `at`, or `for_s` seconds from `at_s`."""
+    """A fault of `count` calls from call number `at`, or of `for_s` seconds from `at_s`."""
 
     kind: Kind
     at: Annotated[int, Field(ge=1)] = 1
@@ -89,7 +89,7 @@ class Fault(DriverOptions):
 
 
 def _points(points: list[list[float]]) -> list[list[float]]:
-    """[seconds, °C] points; ValueError for times that do not increase."""
+    """Validate [seconds, °C] points; raises ConfigurationError."""
     if any(len(point) != 2 for point in points):
         raise ConfigurationError("must be a list of [seconds, °C]")
     if any(b[0] <= a[0] for a, b in itertools.pairwise(points)):
@@ -105,14 +105,14 @@ Seed = Annotated[int, Field(ge=0, le=2**31)]
 
 
 class MockOptions(DriverOptions):
-    """What all mocks have."""
+    """The options of every mock."""
 
     faults: list[Fault] = []  # noqa: RUF012 - pydantic copies it
     timeout_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 1.0
 
 
 class CameraOptions(MockOptions):
-    """As above."""
+    """The options of the mock camera."""
 
     testfield: support.Text = "markers"
     model: support.Text | None = None
@@ -123,7 +123,7 @@ class CameraOptions(MockOptions):
 
 
 class Channel(DriverOptions):
-    """How a channel differs from the programme."""
+    """A channel's deviations from the programme."""
 
     lag_s: Annotated[float, Field(ge=0.0, le=1e5)] = 0.0
     offset_k: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
@@ -133,7 +133,7 @@ class Channel(DriverOptions):
 
 
 class ThermometerOptions(MockOptions):
-    """As above."""
+    """The options of the mock thermometer."""
 
     programme: Programme = DEFAULT_PROGRAMME
     channels: Annotated[
@@ -145,13 +145,13 @@ class ThermometerOptions(MockOptions):
 
 
 class OutputOptions(MockOptions):
-    """As above."""
+    """The options of the mock output."""
 
     keep: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
 
 
 class MockDevice(Device):
-    """What the mocks share: opening and closing, faults, and the time since the first opening."""
+    """A mock's opening and closing, its faults, and the time since it was first opened."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -171,7 +171,7 @@ class MockDevice(Device):
         if self._started is None:
             self._started = self.clock.monotonic()
         if self._fault(self._calls + 1) == "unplugged":
-            self._calls += 1  # such an attempt counts as a call
+            self._calls += 1  # an attempt to open counts as a call
             raise DeviceGone(f"{self.where}: unplugged")
         self.handle = True
 
@@ -187,10 +187,10 @@ class MockDevice(Device):
         return next((f.kind for f in self._faults if f.active(call, elapsed)), None)
 
     def _call(self, unit: str, seconds: float = 0.0) -> bool:
-        """Let a capture or reading of so many seconds pass; return whether it is stuck.
+        """Wait as long as a capture or reading takes, in seconds; return whether it is stuck.
 
-        Raises DeviceTimeout after the time has passed, DeviceGone, or BadReading for an answer (a
-        `unit`) that a driver must refuse.
+        Raises the error of an active fault: DeviceTimeout after `timeout_s`, DeviceGone, or
+        BadReading for an answer (a `unit`) that a driver must reject.
         """
         self.opened()
         self._calls += 1
@@ -207,17 +207,17 @@ class MockDevice(Device):
         return kind == "stuck"
 
     def _elapsed(self, monotonic: float) -> float:
-        """Return seconds from the first opening to a time of the monotonic clock; 0 before it."""
+        """Return the seconds since the device was first opened; 0 if it never was."""
         return monotonic - (monotonic if self._started is None else self._started)
 
     def _programme(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times (n,) s and temperatures (n,) °C."""
+        """Return times (n,) s and temperatures (n,) °C."""
         times, values = np.array(self.options.programme, dtype=float).T
         return times, values
 
 
 class MockCamera(MockDevice, Camera):
-    """Renders what a warming camera would see; equal times give equal frames."""
+    """A camera that renders the view of a warming camera; equal times give equal frames."""
 
     where = "mock camera"
     Options = CameraOptions
@@ -237,7 +237,7 @@ class MockCamera(MockDevice, Camera):
 
     @cached_property
     def field(self) -> TestField:
-        """The test field that is rendered; loaded at first use, as the two below."""
+        """The rendered test field, loaded at first use like `model` and `scene`."""
         from thermocald.physics.testfields import load_field
 
         return load_field(self.options.testfield)
@@ -252,7 +252,7 @@ class MockCamera(MockDevice, Camera):
         model = demonstration_model(self.field) if path is None else read_model(Path(path))
         if model.exterior is None:
             raise ConfigurationError(
-                f"{path}: has no exterior orientation; the mock camera needs one in front of "
+                f"{path}: has no exterior orientation; add one that places the camera in front of "
                 "its test field"
             )
         return model
@@ -296,7 +296,7 @@ class MockCamera(MockDevice, Camera):
 
 
 class MockThermometer(MockDevice, Thermometer):
-    """Reads a programme; equal times give equal readings."""
+    """A thermometer that follows a programme; equal times give equal readings."""
 
     where = "mock thermometer"
     Options = ThermometerOptions
@@ -320,9 +320,9 @@ class MockThermometer(MockDevice, Thermometer):
         return support.middle_reading(self.clock, self._last, start)
 
     def truth(self, monotonic: float, lag_s: float = 0.0) -> float:
-        """Return the programme's temperature (°C) at a time of the monotonic clock.
+        """Return the programme's temperature (°C) at a monotonic time, with a first-order lag.
 
-        Behind a first-order lag; in equilibrium before its first point.
+        Before its first point the programme is in equilibrium.
         """
         elapsed, times, values = self._elapsed(monotonic), self._times, self._values
         if lag_s == 0.0:
@@ -343,7 +343,7 @@ class MockThermometer(MockDevice, Thermometer):
 
 
 class MockOutput(MockDevice, Output):
-    """Keeps the last results in `results`, oldest first."""
+    """An output that retains the last results in `results`, oldest first."""
 
     where = "mock output"
     Options = OutputOptions

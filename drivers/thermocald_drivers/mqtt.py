@@ -1,28 +1,28 @@
-"""Results and alerts to an MQTT broker, announced to Home Assistant.
+"""Results and alerts published to an MQTT broker and announced to Home Assistant.
 
     outputs:
       - name: home
         driver: mqtt
         host: broker.local
         port: 1883                           # 8883 with TLS
-        username: thermocald                 # and password_file: /etc/thermocald/mqtt-password
+        username: thermocald                 # with password_file: /etc/thermocald/mqtt-password
         tls: true                            # encrypted; the server's certificate is verified
-        ca: /etc/thermocald/ca.pem           # of a broker with a certificate of its own
-        cert: /etc/thermocald/client.pem     # and key: client.key; where the broker asks for it
+        ca: /etc/thermocald/ca.pem           # for a broker with a private certificate
+        cert: /etc/thermocald/client.pem     # with key: client.key; if the broker requires one
         topic: thermocald                    # thermocald/<device>/result and …/available
-        discovery: homeassistant             # null: none
-        device: thermocald                   # the name of results that have none
+        discovery: homeassistant             # null: no announcement
+        device: thermocald                   # for results that name no device
         timeout_s: 5
       - name: alarm
         driver: alert_mqtt                   # thermocald/<device>/alert/<condition>; as above, and
         host: broker.local
         when: [{drift: c, px: 0.5}]          # as in docs/how-to/alerts.md
 
-A name that a topic or identifier cannot hold as it is gets a mark of its own: cam.1 becomes
-cam_1-d2d6, so that cam.1 and cam_1 are two. Alerts are retained: who connects later learns what is
-out. ca, cert and key imply `tls`. Each result is one JSON object with QoS 1. `emit` waits for the
-broker's acknowledgement, at most `timeout_s`, so that a loss is noticed. The last will sets the
-device to `offline`.
+Each result is one JSON object with QoS 1. `emit` waits at most `timeout_s` for the broker's
+acknowledgement, so that a loss is noticed. Alerts are retained: a client that connects later
+receives the current state. The last will sets the device to `offline`. ca, cert and key imply
+`tls`. A name with characters that a topic or identifier excludes is changed and gets a suffix:
+cam.1 becomes cam_1-66498b, so that it differs from cam_1.
 Source: paho-mqtt 2 (callback API 2), Home Assistant "MQTT discovery".
 """
 
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from thermocald_drivers.alert import Alert
 
 SENSORS: Mapping[str, tuple[str, str | None, str | None, int | None]] = {
-    # key of the result: (name, unit, Home Assistant's device class, decimals it shows)
+    # column of the result: (name, unit, Home Assistant's device class, decimals shown)
     "temperature": ("Temperature", "°C", "temperature", 2),
     "c": ("Principal distance", "mm", None, 5),
     "x0": ("Principal point x0", "mm", None, 5),
@@ -72,9 +72,9 @@ SENSORS: Mapping[str, tuple[str, str | None, str | None, int | None]] = {
 
 
 def node_of(device: str) -> str:
-    """Return a device's name as topics and identifiers may hold it; two names are never one."""
+    """Return a device's name for topics and identifiers; different names stay different."""
     node = re.sub(r"[^A-Za-z0-9_-]", "_", device)
-    if node != device:  # `cam.1` must not be `cam_1`
+    if node != device:  # `cam.1` must not become `cam_1`
         node += "-" + hashlib.sha256(device.encode()).hexdigest()[:6]
     return node
 
@@ -82,10 +82,10 @@ def node_of(device: str) -> str:
 def discovery_messages(
     prefix: str, topic: str, device: str, speaker: str
 ) -> dict[str, dict[str, Any]]:
-    """Return {topic: configuration} with which Home Assistant shows the device's sensors.
+    """Return {topic: configuration} from which Home Assistant shows the device's sensors.
 
-    speaker: the name under which the last will is left: a connection has one, so that all devices
-    are available only while it is.
+    speaker: the device of the last will. A connection has only one, so all devices count as
+    available only while it is.
     """
     node = node_of(device)
     messages = {}
@@ -113,9 +113,9 @@ def discovery_messages(
 
 
 def _topic(topic: str) -> str:
-    """Return a topic to publish under; refuse wildcards and the broker's own."""
+    """Validate a topic to publish under: neither wildcards nor the broker's own topics."""
     if not topic.strip("/") or any(c in topic for c in "+#\0") or topic.startswith("$"):
-        raise ConfigurationError(f"{topic!r} is not a topic: no +, no #, no $ at its beginning")
+        raise ConfigurationError(f"{topic!r} is not a topic: leave out +, # and a leading $")
     return topic.strip("/")
 
 
@@ -123,7 +123,7 @@ Topic = Annotated[str, AfterValidator(_topic)]
 
 
 class BrokerOptions(DriverOptions):
-    """port None: 1883, with TLS 8883; discovery None: no announcement."""
+    """The options of a broker; port None: 1883, with TLS 8883; discovery None: not announced."""
 
     host: support.Text
     port: support.Port | None = None
@@ -140,7 +140,7 @@ class BrokerOptions(DriverOptions):
 
 
 class MqttAlertOptions(BrokerOptions, AlertOptions):
-    """A broker's, and `when`."""
+    """The options of `alert_mqtt`."""
 
 
 class _Broker(Output):
@@ -165,12 +165,12 @@ class _Broker(Output):
         return self.handle is not None and bool(self.handle.is_connected())
 
     def connect(self, will: str | None) -> None:
-        """Connect; will: the topic that says `offline` once the connection breaks."""
+        """Connect; will: the topic that is set to `offline` when the connection breaks."""
         mqtt = support.library("paho.mqtt.client", "mqtt")
         answered: Future[Any] = Future()
 
         def on_connect(_client: Any, _data: Any, _flags: Any, code: Any, _more: Any) -> None:
-            if not answered.done():  # it connects by itself again and again
+            if not answered.done():  # the library reconnects by itself
                 answered.set_result(code)
 
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
@@ -233,8 +233,7 @@ class _Broker(Output):
                 context.load_cert_chain(self.options.cert, self.options.key)
         except ssl.SSLError as error:
             raise ConfigurationError(
-                f"ca, cert, key: not certificates and key that belong together "
-                f"({error.reason or 'not readable'})"
+                f"ca, cert, key: do not belong together ({error.reason or 'not readable'})"
             ) from error
         except OSError as error:
             raise support.fault(error, "ca, cert or key", seen=False) from error
@@ -242,7 +241,7 @@ class _Broker(Output):
 
 
 class MqttOutput(_Broker):
-    """Every result as a message; devices are announced with their first."""
+    """An output that publishes each result; a device is announced with its first."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -279,7 +278,7 @@ class MqttOutput(_Broker):
 
 
 class MqttAlert(_Broker, AlertOutput):
-    """One retained message for each change."""
+    """An output that publishes a retained message for each alert."""
 
     Options = MqttAlertOptions
 
@@ -308,6 +307,6 @@ class MqttAlert(_Broker, AlertOutput):
 
 
 def _about(device: str) -> dict[str, Any]:
-    """Return the device as Home Assistant groups its sensors."""
+    """Return the device under which Home Assistant groups the sensors."""
     identifiers = [f"thermocald-{node_of(device)}"]
     return {"identifiers": identifiers, "name": device, "manufacturer": "thermocald"}

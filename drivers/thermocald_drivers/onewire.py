@@ -1,20 +1,20 @@
-"""DS18B20 and its family on the kernel's 1-wire bus (w1_therm in sysfs).
+"""Thermometers of the DS18B20 family on the kernel's 1-wire bus (w1_therm in sysfs).
 
     thermometers:
       - name: field
         driver: ds18b20
         sensors: {camera: 28-000000bfe244, air: 28-00000a1b2c3d}   # {channel: ROM id}
         timeout_s: 3                    # per sensor; one conversion takes 0.75 s
-        attempts: 2                     # a refused reading is repeated once
+        attempts: 2                     # a rejected reading is repeated once
         sysfs: /sys
 
-Refused are: a wrong CRC (computed here too, over the printed bytes), all zeros (a shorted or
+The driver rejects a wrong CRC (recomputed from the printed bytes), all zeros (a shorted or
 unplugged line: the CRC of zeros is zero), a `t=` that does not follow from its bytes, values
-outside −55 … 125 °C (127.94 °C is a failed conversion), a MAX31850 that reports a fault of its
-thermocouple, and the value that the chip holds before its first conversion. That power-on value is
+outside −55 … 125 °C (127.94 °C is a failed conversion), the fault flag of a MAX31850's
+thermocouple, and the power-on value, which the chip holds before its first conversion. This is
 85 °C in every family and at every resolution (DS18S20: 0x00AA), and 25 °C in the counterfeits of
-family D, whose last scratchpad byte is not 0x10. It is accepted only if a recent reading lay within
-5 K: a probe also passes through it on a ramp.
+family D, whose last scratchpad byte is not 0x10. It is accepted only if a recent reading is within
+5 K: a probe may pass through this temperature, too.
 
 All sensors are read at once, each in its own thread. The kernel (as of 6.1) still holds the bus
 during a conversion, so n sensors on one bus take n · 0.8 s; the reading's time is the middle.
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from thermocald.hal import Reading
 
-POWER_ON = "the power-on value (the sensor lost its supply, or has not converted yet)"
+POWER_ON = "the power-on value (the sensor lost its supply or has not converted yet)"
 _FILE = re.compile(
     r"(?P<pad>[0-9a-f]{2}(?: [0-9a-f]{2}){8}) : crc=[0-9a-f]{2} (?P<verdict>YES|NO)\s*\n"
     r"[0-9a-f ]*t=(?P<milli>-?[0-9]{1,7})"
@@ -50,7 +50,7 @@ FAMILIES = {"10": "DS18S20", "22": "DS1822", "28": "DS18B20", "3b": "DS1825", "4
 
 
 def crc8(data: bytes) -> int:
-    """The 1-wire CRC, x⁸ + x⁵ + x⁴ + 1, least significant bit first (application note 27)."""
+    """Return the 1-wire CRC: x⁸ + x⁵ + x⁴ + 1, low bit first (Maxim application note 27)."""
     crc = 0
     for byte in data:
         crc ^= byte
@@ -60,9 +60,9 @@ def crc8(data: bytes) -> int:
 
 
 def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
-    """Return (°C, scratchpad) of a `w1_slave` file; BadReading says what is wrong with it."""
+    """Return (°C, scratchpad) of a `w1_slave` file; raises BadReading if it fails a check."""
     if not content.strip():
-        raise BadReading(f"{where}: empty: no answer, or one whose CRC the kernel refused")
+        raise BadReading(f"{where}: the file is empty: no answer, or one whose CRC failed")
     match = _FILE.fullmatch(content.strip())
     if match is None:
         raise BadReading(f"{where}: {content!r} is not a w1_slave file")
@@ -76,14 +76,14 @@ def decode(content: str, where: str, family: str = "28") -> tuple[float, bytes]:
     if family == "10" and pad[7] == 0:
         raise BadReading(f"{where}: COUNT_PER_C is 0 in {match['pad']!r}; no DS18S20 sends that")
     computed = _kernel_millidegrees(pad, family)
-    # kernels before 5.10 do not know the further bits of GX20MH01 and MAX31850
+    # kernels before 5.10 ignore the additional bits of GX20MH01 and MAX31850
     if milli not in (computed, int(int.from_bytes(pad[:2], "little", signed=True) * 1000 / 16)):
         raise BadReading(f"{where}: t={milli} does not follow from the bytes {match['pad']!r}")
     return computed / 1000.0, pad
 
 
 def is_power_on(pad: bytes, family: str) -> bool:
-    """Return whether a scratchpad is one of a chip that has not converted yet."""
+    """Return whether a scratchpad holds the power-on value."""
     raw = int.from_bytes(pad[:2], "little")
     if family == "3b" and pad[4] & 0x80:
         raw &= ~3
@@ -105,7 +105,7 @@ def _kernel_millidegrees(pad: bytes, family: str) -> int:
 
 
 class OneWireOptions(DriverOptions):
-    """sensors: {channel: ROM id}; the others as above."""
+    """The options of `ds18b20`; sensors: {channel: ROM id}."""
 
     sensors: Annotated[dict[str, support.Text], Field(min_length=1)]
     timeout_s: Annotated[float, Field(ge=0.01, le=60.0)] = 3.0
@@ -131,7 +131,7 @@ class Ds18b20Thermometer(Thermometer):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:
-        """List what is there as a stanza, for `thermocald devices`."""
+        """List the sensors on the bus as one stanza, for `thermocald devices`."""
         ids = sorted(
             path.name
             for family in FAMILIES
@@ -149,7 +149,7 @@ class Ds18b20Thermometer(Thermometer):
             there = ", ".join(sorted(p.name for p in self.root.glob("??-*"))) or "no sensor"
             raise support.absent(
                 f"1-wire {', '.join(missing)}: not on the bus, there is {there}; "
-                "is dtoverlay=w1-gpio set and the sensor wired?",
+                "check dtoverlay=w1-gpio and the wiring",
                 seen=self.seen,
             )
         self.handle = self.seen = True
@@ -166,8 +166,8 @@ class Ds18b20Thermometer(Thermometer):
         deadline = self.clock.monotonic() + self.options.timeout_s * len(self.sensors)
         for channel in self.sensors:
             late = self._pending.get(channel)
-            if late is None or late.done():  # one that still hangs is not read twice
-                # an answer that came after its epoch is dropped here
+            if late is None or late.done():  # a sensor that still hangs is not read twice
+                # a result that came after its epoch is discarded here
                 self._pending[channel] = support.in_thread(
                     partial(self._read_one, channel), f"w1-{channel}"
                 )
@@ -179,7 +179,7 @@ class Ds18b20Thermometer(Thermometer):
         )
 
     def _await(self, channel: str, deadline: float) -> float:
-        """Return what a sensor's thread found, as soon as it has."""
+        """Wait for a sensor's thread and return its result."""
         task = self._pending[channel]
         try:
             return task.result(max(0.0, deadline - self.clock.monotonic()))

@@ -3,31 +3,31 @@
     cameras:
       - name: rpi
         driver: picamera2
-        camera: 0                     # as `rpicam-hello --list-cameras` counts
-        model: imx219                 # refuses any other sensor
-        width: 3280                   # the whole sensor, no scaling
+        camera: 0                     # its number in `rpicam-hello --list-cameras`
+        model: imx219                 # any other sensor is rejected
+        width: 3280                   # the whole sensor, unscaled
         height: 2464
         exposure_s: 0.02              # or `auto`
         gain: 1.0                     # analogue; or `auto`
-        focus_dioptres: 2.0           # lens position in 1/m, `auto`, or left out: locked as it is
-        colour_gains: [1.8, 1.5]      # red, blue; `auto`, or left out: locked as they are
-        tolerance: 0.05               # by which exposure, gain and focus may differ
+        focus_dioptres: 2.0           # lens position in 1/m, `auto`, or omitted: locked as it is
+        colour_gains: [1.8, 1.5]      # red, blue; `auto`, or omitted: locked as they are
+        tolerance: 0.05               # relative; for exposure, gain and focus as read back
         timeout_s: 10
 
-The frame is the luminance plane of the sensor's YUV output, without a JPEG in between. Automatic
-exposure, gain, white balance and focus are off; lens position and colour gains are locked at the
-values of the first frame after opening, and at the same ones when the camera is opened again. What
-the sensor really did is read back with each frame, stored with the epoch, and must agree with what
-was set (`tolerance`: exposures are whole numbers of lines). `auto` is accepted only by name, with a
-warning in the status. A frame that began before the call is discarded. A capture that hangs is
-given up after `timeout_s` and the camera closed, so that the next `open` starts again. picamera2
-comes from Raspberry Pi OS (`apt install python3-picamera2`; the environment needs
+The frame is the luminance plane of the sensor's YUV output; no JPEG is involved. Automatic
+exposure, gain, white balance and focus are off. An omitted lens position or colour gain is locked
+at its value in the first frame after opening, also when the camera is opened again. The sensor's
+actual settings are read back with each frame, stored with the epoch, and must agree with the
+options (`tolerance`: exposures are whole numbers of lines). `auto` has to be written explicitly and
+is shown as a warning in the status. A frame that began before the call is discarded. A capture that
+hangs is abandoned after `timeout_s` and the camera closed, so that the next `open` starts afresh.
+picamera2 comes with Raspberry Pi OS (`apt install python3-picamera2`; the environment needs
 `--system-site-packages`).
 
-libcamera's SensorTimestamp is on CLOCK_BOOTTIME, when the first line began to be read out: half an
-exposure later than the middle of that line's exposure. SensorTemperature is stored with an epoch
-where it is plausible: the IMX219 gives none; others give their lower limit (−20) or 0.0 until it is
-measured.
+libcamera's SensorTimestamp, on CLOCK_BOOTTIME, is the start of the first line's readout: half an
+exposure after the middle of that line's exposure. SensorTemperature is stored with an epoch if it
+is plausible: the IMX219 reports none; others report their lower limit (−20) or 0.0 until they have
+measured it.
 Source: libcamera control_ids_core.yaml, Picamera2 manual (Raspberry Pi Ltd), appendix C.
 """
 
@@ -77,7 +77,7 @@ def _gains(value: list[float] | str | None) -> tuple[float, float] | str | None:
 
 
 class PicameraOptions(DriverOptions):
-    """None: locked as it is."""
+    """The options of `picamera2`; focus_dioptres, colour_gains None: locked as they are."""
 
     camera: Annotated[int, Field(ge=0, le=9)] = 0
     model: support.Text | None = None
@@ -92,7 +92,7 @@ class PicameraOptions(DriverOptions):
 
 
 def _current_settings(library: Any, number: int) -> dict[str, Any]:
-    """Return the size and lens position of a camera that nobody uses; {} otherwise."""
+    """Return a camera's size and lens position; {} if another program uses it."""
     try:
         camera = library.Picamera2(number)
     except RuntimeError:
@@ -109,7 +109,7 @@ def _current_settings(library: Any, number: int) -> dict[str, Any]:
 
 
 class Picamera2Camera(Camera):
-    """One libcamera camera, configured for stills and kept running."""
+    """A libcamera camera, configured for stills and streaming while it is open."""
 
     device_classes = ("char-video4linux", "char-media", "char-dma_heap")
 
@@ -130,7 +130,7 @@ class Picamera2Camera(Camera):
 
     @classmethod
     def attached(cls, sysfs: str = "/sys") -> list[Found]:  # noqa: ARG003
-        """List the cameras that libcamera knows."""
+        """List libcamera's cameras."""
         library = support.library("picamera2")
         found = []
         for k, info in enumerate(library.Picamera2.global_camera_info()):
@@ -150,7 +150,7 @@ class Picamera2Camera(Camera):
             names = ", ".join(str(info.get("Model")) for info in cameras) or "none"
             raise support.absent(
                 f"{self.where}: libcamera lists {len(cameras)} ({names}); "
-                "is the ribbon cable seated, camera_auto_detect=1 set?",
+                "check the ribbon cable and camera_auto_detect=1",
                 seen=self.seen,
             )
         found = str(cameras[self.options.camera].get("Model", ""))
@@ -160,7 +160,7 @@ class Picamera2Camera(Camera):
             camera = library.Picamera2(self.options.camera)
         except RuntimeError as error:
             raise DeviceDenied(
-                f"{self.where}: cannot be opened ({error}); does another program have it?"
+                f"{self.where}: cannot be opened ({error}); another program may be using it"
             ) from error
         try:
             self._configure(camera)
@@ -179,9 +179,7 @@ class Picamera2Camera(Camera):
                 "a scaled image has another interior orientation"
             )
         if self.options.focus_dioptres is not None and not focuses:
-            raise WrongDevice(
-                f"{self.where}: this lens cannot be focused; leave focus_dioptres out"
-            )
+            raise WrongDevice(f"{self.where}: this lens cannot be focused; omit focus_dioptres")
         controls: dict[str, Any] = {
             "AeEnable": AUTO in (self.options.exposure_s, self.options.gain),
             "AwbEnable": self.options.colour_gains == AUTO,
@@ -199,7 +197,7 @@ class Picamera2Camera(Camera):
         self._lock(camera)
 
     def _lock(self, camera: Any) -> None:
-        """Hold lens position and colour gains where the stanza leaves them out."""
+        """Lock the lens position and colour gains that the stanza omits."""
         o = self.options
         wanted = {"LensPosition": o.focus_dioptres, "ColourGains": o.colour_gains}
         open_ones = [name for name, value in wanted.items() if value is None]
@@ -238,12 +236,12 @@ class Picamera2Camera(Camera):
         if plane is None:
             raise BadReading(f"{self.where}: no frame that began after the call")
         for name, value in (self._held | self._stated).items():
-            # libcamera delivers what it can, not what was asked
+            # libcamera applies the nearest possible setting
             if not agrees(value, got := metadata.get(name), self.options.tolerance):
                 shown = f"{value:g}" if isinstance(value, int | float) else f"{value}"
                 raise BadReading(f"{self.where}: {name} was set to {shown} and is {got}")
         exposure = metadata["ExposureTime"] * 1e-6
-        sleep_s = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()  # since booting
+        sleep_s = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()  # suspended, s
         middle = metadata["SensorTimestamp"] * 1e-9 - sleep_s - exposure / 2.0
         monotonic, utc = support.on_clock(self.clock, middle)
         return Frame(
@@ -271,14 +269,14 @@ class Picamera2Camera(Camera):
         return None, {}
 
     def _plane(self, array: Any) -> Any:
-        """The luminance of a YUV420 array: the top H rows, whose stride may exceed the width."""
+        """Return the luminance of a YUV420 array: its top H rows; their stride may exceed W."""
         rows, stride = array.shape
         if rows < self.options.height * 3 // 2 or stride < self.options.width:
             raise BadReading(f"{self.where}: partial frame, {stride}×{rows} bytes")
         return np.array(array[: self.options.height, : self.options.width], np.uint8)
 
     def _modes(self, metadata: Mapping[str, Any]) -> dict[str, float]:
-        """Which settings are left to the camera, as 1.0 and 0.0."""
+        """Return 1.0 for each setting that is left to the camera, 0.0 for the others."""
         found = {
             "exposure_auto": float(AUTO in (self.options.exposure_s, self.options.gain)),
             "white_balance_auto": float(self.options.colour_gains == AUTO),
@@ -288,7 +286,7 @@ class Picamera2Camera(Camera):
         return found
 
     def _in_time(self, work: Any, what: str, timeout_s: float | None = None) -> Any:
-        """Run in a thread of its own, which is left behind if it hangs."""
+        """Run work in a new thread, which is abandoned if it hangs; raises DeviceTimeout."""
         limit = self.options.timeout_s if timeout_s is None else timeout_s
         task = support.in_thread(work, f"picamera2-{what}")
         try:
@@ -302,7 +300,7 @@ class Picamera2Camera(Camera):
 
 
 def agrees(asked: Any, got: Any, tolerance: float) -> bool:
-    """Whether a value, or each of several, was reported as it was set, to a relative tolerance."""
+    """Return whether a value, or each of several, was read back within a relative tolerance."""
     if isinstance(asked, tuple | list):
         same = isinstance(got, tuple | list) and len(got) == len(asked)
         return same and all(agrees(a, g, tolerance) for a, g in zip(asked, got, strict=True))
@@ -312,7 +310,7 @@ def agrees(asked: Any, got: Any, tolerance: float) -> bool:
 
 
 def frame_settings(metadata: Mapping[str, Any]) -> dict[str, float]:
-    """Return what moves the image, as the sensor reports it, under the names of the stanza."""
+    """Return the settings that affect the image, as the sensor reports them, by option name."""
     found = {
         name: round(float(metadata[key]) * unit, 9)
         for name, key, unit in _NUMBERS
@@ -327,7 +325,7 @@ def frame_settings(metadata: Mapping[str, Any]) -> dict[str, float]:
 
 
 def sensor_temperature(metadata: Mapping[str, Any]) -> float | None:
-    """Return the sensor's °C; None where it is absent or a value that means "unknown"."""
+    """Return the sensor's °C; None if it is absent or an idle value."""
     value = metadata.get("SensorTemperature")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None

@@ -1,16 +1,16 @@
-"""A recording played as a camera and as a thermometer.
+"""A recording played back as a camera and as a thermometer.
 
     cameras:
       - {name: replayed, driver: replay, recording: ../recordings/M1}
     thermometers:
       - {name: replayed, driver: replay, recording: ../recordings/M1}
 
-`loop: true` starts again at the end, with times that continue. Otherwise the end is a
-DeviceFinished. An epoch that has no frame, or no temperature, is a BadReading.
+`loop: true` starts again after the last epoch, with times that continue. Otherwise the device
+raises DeviceFinished. An epoch without a frame, or without a temperature, raises BadReading.
 
-Frames keep their recorded time: `utc` is as recorded, `monotonic` the same on the clock's monotonic
-scale; `sequence` is the epoch's number. A JPEG is delivered as recorded, in `encoded`. A recording
-of measurements gives frames without an image, with `observations`.
+Frames retain their recorded time: `utc` is the recorded time, `monotonic` the same instant on the
+clock's monotonic scale; `sequence` is the epoch's number. A JPEG is delivered as recorded, in
+`encoded`. A recording of observations delivers frames with `observations` and no image.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ if TYPE_CHECKING:
 
 
 class ReplayOptions(DriverOptions):
-    """As above."""
+    """The options of `replay`."""
 
     recording: support.Text | Path
     loop: bool = False
 
 
 @contextmanager
-def _for_good() -> Iterator[None]:
-    """What is wrong with a file stays so: asking again does not help."""
+def _permanent_errors() -> Iterator[None]:
+    """Raise a DataError as a PermanentDeviceError: reading the file again does not help."""
     try:
         yield
     except DataError as error:
@@ -54,7 +54,7 @@ def _for_good() -> Iterator[None]:
 
 
 class _Replay(Device):
-    """The epochs of a recording in order; opening it again continues where it was."""
+    """The epochs of a recording, in order; re-opening continues with the next epoch."""
 
     Options = ReplayOptions
 
@@ -72,7 +72,7 @@ class _Replay(Device):
         if self._recording is None:
             from thermocald.store.recording.reader import open_recording
 
-            with _for_good():
+            with _permanent_errors():
                 self._recording = open_recording(self._path)
             self._epochs = self._recording.iter_epochs()
         self.handle = self._recording
@@ -88,7 +88,7 @@ class _Replay(Device):
 
     def _next(self) -> Epoch:
         recording: Recording = self.opened()
-        with _for_good():
+        with _permanent_errors():
             epoch = next(self._epochs, None)
         if epoch is None and self.options.loop:
             times = recording.columns.frame_time
@@ -100,13 +100,13 @@ class _Replay(Device):
         return epoch
 
     def _times(self, recorded: float) -> tuple[float, float]:
-        """Return (monotonic, utc) of a recorded UTC time."""
+        """Convert a recorded UTC time to (monotonic, utc)."""
         utc = recorded + self._shift_s
         return utc - self.clock.utc() + self.clock.monotonic(), utc
 
 
 class ReplayCamera(_Replay, Camera):
-    """Delivers the frames, or the measurements, of a recording."""
+    """A camera that delivers the frames or observations of a recording."""
 
     def capture(self) -> Frame:
         epoch = self._next()
@@ -135,7 +135,7 @@ class ReplayCamera(_Replay, Camera):
 
 
 class ReplayThermometer(_Replay, Thermometer):
-    """Delivers the readings of all channels of a recording."""
+    """A thermometer that delivers the readings of all channels of a recording."""
 
     def read(self) -> Reading:
         epoch = self._next()

@@ -1,4 +1,4 @@
-r"""Thermometers on a serial line that send lines of text.
+r"""Thermometers that send lines of text on a serial port.
 
     thermometers:
       - {name: air, driver: serial, port: /dev/ttyUSB0, instrument: vaisala-hmp}
@@ -7,35 +7,36 @@ r"""Thermometers on a serial line that send lines of text.
         port: /dev/serial/by-id/usb-FTDI_FT232R_A50285BI-if00-port0   # the same after a re-plug
         baud: 9600
         framing: 8N1                            # data bits, parity (N, E, O), stop bits
-        command: "T?\\r\\n"                      # sent for each reading; empty: it sends by itself
+        command: "T?\\r\\n"                      # sent for each reading; empty: sends unprompted
         pattern: 'T=(?P<temperature>[-+]?\\d+\\.\\d+)F\\*(?P<checksum>[0-9A-F]{2})'
         unit: F                                 # C (default), F, K; mA: of a 4 … 20 mA loop
-        scale: 1.0                              # times the number, then
-        offset: 0.0                             # added
+        scale: 1.0                              # factor of the printed number
+        offset: 0.0                             # added after the scale
         timeout_s: 2
         minimum_c: -60                          # and maximum_c: 125; instruments: -100 … 300
-        chip: sht31                             # the sensor behind the firmware, if it is known
+        chip: sht31                             # the sensor behind the firmware, if known
         refuse_c: [-127, -50, -46.85, -45, 85]  # values that mean "no sensor"
         checksum: xor                           # of the text before it: xor, sum8, nmea
 
-Each named group of `pattern` is a channel, scaled and offset, then converted to °C by `unit`. The
-pattern must match the **whole** line: the rest of a line whose start was lost (`3.5C` of `+023.5C`)
-is not a reading. A decimal comma is read as a point. A `°` in the pattern matches the degree signs
-of UTF-8, Latin-1, code page 437 and LCD fonts. Instruments by name: see INSTRUMENTS.
+Each named group of `pattern` is a channel; its number is scaled, offset, and converted to °C by
+`unit`. The pattern must match the **whole** line: the rest of a line that lost its start (`3.5C` of
+`+023.5C`) is not a reading. A decimal comma is read as a point. A `°` in the pattern matches the
+degree signs of UTF-8, Latin-1, code page 437 and LCD fonts. For named instruments see INSTRUMENTS.
 
-Firmware prints a fixed number where its sensor does not answer: −127 and 85 (DS18B20), −45 and
-−46.85 (SHT), −50 (an input at 0 V), −40 and 125 (ends of a scale), all in `chips`. With `pattern`
-they are refused as **printed**, before scale and offset, rounded or cut off as the line shows them
-(`refuse_c` instead of the table's; [] accepts all), and 0, what all ones give, and with `chip` its
-further values (25.00 of an LSM6DS3) only with a recent reading within 5 K; so are the ends of
-displays and transmitters (-99.9, -200, 850). A number with fewer decimals than lines before, or
-that begins or ends with its point, lost digits on its way and is refused. With `instrument` the
-instrument's own error texts are known. A loop in mA below 3.6 or above 21 is broken (NAMUR NE 43).
+Firmware prints a fixed number if its sensor does not answer: −127 and 85 (DS18B20), −45 and −46.85
+(SHT), −50 (an input at 0 V), −40 and 125 (ends of a scale); `chips` lists them. With `pattern` they
+are rejected as **printed**, before scale and offset, rounded or truncated as in the line;
+`refuse_c` replaces the list, and [] accepts all. Accepted only with a recent reading within 5 K are
+0, words of all ones, the ends of displays and transmitters (-99.9, -200, 850), and with `chip` its
+further idle values (25.00 of an LSM6DS3). A number is rejected as incomplete if it has fewer
+decimals than earlier lines, or begins or ends with its point. With `instrument`, the instrument's
+own error texts serve instead. A loop current below 3.6 or above 21 mA means a broken loop (NAMUR
+NE 43).
 
-A line that was in the queue before the reading was requested is never used: with `command` the
-line must be quiet first, and what completes an unfinished line is dropped and the command repeated;
-without it the next line that *ends* after the call counts. Echo, garbage and a prompt are skipped
-until `timeout_s`; the error then quotes what was received.
+A line that was in the queue before the reading was requested is never used. With `command`, the
+driver waits until the line is quiet, discards the end of an unfinished line and then repeats the
+command; without it, the next line that *ends* after the call counts. Echo, garbage and prompts are
+skipped until `timeout_s`; the error then quotes what was received.
 Source: the instruments' manuals, named with each.
 """
 
@@ -63,31 +64,31 @@ if TYPE_CHECKING:
 NUMBER = r"[-+]?\d+(?:\.\d+)?"
 LONGEST_LINE = 512
 DEGREES = str.maketrans("ºø˚∘ß℃", "°°°°°°")
-"""What a degree sign of another encoding becomes in Latin-1: masculine ordinal, 0xF8, 0xDF."""
+"""Degree signs of other encodings as Latin-1 text: masculine ordinal, 0xF8, 0xDF."""
 POLL_S = 0.05  # changing pyserial's time-out later would configure the port again
 QUEUE = 4000
-"""Bytes that may have waited before the kernel's buffer (4096) could have lost some."""
+"""A queue of this many bytes may have overflowed the kernel's buffer (4096)."""
 PROMPTS = b">#$%?]:"
 NO_SENSOR_STEP_K = 0.006
 LOOP_MA = (3.6, 21.0)
 CORRECTION = (0.5, 2.0)
-"""A scale within these corrects a temperature; another one is the number's format."""
+"""A scale within these bounds corrects a temperature; any other is the number's format."""
 ENDS_OF_WORDS = {32767, 32768, 65535}
-"""Digits of 16 bits at their end, wherever the decimal point stands (655.35)."""
+"""Digits of 16 bits at the end of their range, with the point anywhere (655.35)."""
 FULL_SCALE = {-1.0, 1023.0, 4095.0, 16383.0, 32767.0, 65535.0}
 
 
-# its own error texts say that nothing was measured
+# an instrument's own error texts report that nothing was measured
 OF_AN_INSTRUMENT = {"minimum_c": -100.0, "maximum_c": 300.0, "refuse_c": []}
 INSTRUMENTS: Mapping[str, dict[str, Any]] = {
-    # Papouch TM, TMU: sends by itself every 10 s, ends with CR alone.
+    # Papouch TM, TMU: sends unprompted every 10 s; lines end with CR alone.
     "papouch-tm": {"pattern": r"(?P<temperature>[-+]\d{3}\.\d)C", "timeout_s": 22.0},
     # Vaisala HMP230/240/260 series, user's guides, appendix "Serial commands".
     "vaisala-hmp": {
         "pattern": rf"(?:RH= *{NUMBER} *%RH +)?T= *(?P<temperature>{NUMBER}) *'C(?: .*)?",
         "command": "SEND\r", "baud": 4800, "framing": "7E1",
     },
-    # Lake Shore 218, user's manual 6.2: eight inputs in one line; kelvin keeps the sign simple.
+    # Lake Shore 218, user's manual 6.2: eight inputs in one line; kelvin has no negative values.
     "lakeshore-218": {
         "pattern": ",".join(rf"(?P<input{k}>[-+]\d+\.\d+)" for k in range(1, 9)),
         "command": "KRDG?\r\n", "framing": "7O1", "unit": "K",
@@ -111,12 +112,12 @@ UNITS: Mapping[str, tuple[float, float]] = {
 
 
 def _one_end(received: bytes) -> bytes:
-    """CR, LF and CR LF all end a line; empty lines are skipped anyway."""
+    """Replace CR by LF: CR, LF and CR LF all end a line, and empty lines are skipped."""
     return received.replace(b"\r", b"\n")
 
 
 class SerialOptions(DriverOptions):
-    """Those of an instrument stand in INSTRUMENTS."""
+    """The options of `serial`; INSTRUMENTS has those of each instrument."""
 
     port: support.Text
     instrument: Literal["papouch-tm", "vaisala-hmp", "lakeshore-218", "fluke-1522"] | None = None
@@ -140,7 +141,7 @@ class SerialOptions(DriverOptions):
         name = data.get("instrument")
         if (name is None) == (data.get("pattern") is None):
             raise ConfigurationError(
-                f"write either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
+                f"set either instrument: ({', '.join(INSTRUMENTS)}) or pattern:"
             )
         own = {}
         if isinstance(name, str) and name in INSTRUMENTS:
@@ -149,7 +150,7 @@ class SerialOptions(DriverOptions):
 
 
 class SerialThermometer(Thermometer):
-    """A line protocol by a pattern, or an instrument by its name."""
+    """A thermometer with a line protocol, given by a pattern or an instrument's name."""
 
     device_classes = ("char-ttyUSB", "char-ttyACM", "char-ttyAMA", "char-ttyS")
     Options = SerialOptions
@@ -167,7 +168,7 @@ class SerialThermometer(Thermometer):
             raise ConfigurationError("unit: mA needs scale: (K per mA) and offset: (°C at 0 mA)")
         self._corrects = CORRECTION[0] <= abs(o.scale) <= CORRECTION[1]
         try:
-            self.pattern = re.compile(o.pattern, re.ASCII)  # other scripts have digits too
+            self.pattern = re.compile(o.pattern, re.ASCII)  # not the digits of other scripts
         except re.error as error:
             raise ConfigurationError(f"pattern: {o.pattern!r}: {error}") from error
         self.channels = [name for name in self.pattern.groupindex if name != "checksum"]
@@ -189,7 +190,7 @@ class SerialThermometer(Thermometer):
         return [
             Found(
                 {"port": p.device, "instrument": "papouch-tm"},
-                f"{p.description}; write the instrument that is on it",
+                f"{p.description}; set the instrument connected to it",
                 certain=False,
             )
             for p in (links or [p for p in ports if p.hwid != "n/a"])
@@ -214,7 +215,7 @@ class SerialThermometer(Thermometer):
         except OSError as error:
             if "exclusively lock" in str(error):
                 error = OSError(16, "another program holds the port")
-            hint = "is it plugged in, and the user in the group dialout?"
+            hint = "check that it is plugged in and the user is in the group dialout"
             raise support.fault(error, self.where, seen=self.seen, hint=hint) from error
         self.seen = self._owed = True
         self._decimals.clear()
@@ -242,7 +243,7 @@ class SerialThermometer(Thermometer):
             if isinstance(error, BadReading | DeviceTimeout):
                 raise
             if isinstance(error, support.library("serial").SerialTimeoutException):
-                raise DeviceTimeout(f"{self.where}: cannot send, the line is held") from error
+                raise DeviceTimeout(f"{self.where}: cannot send, flow control blocks it") from error
             # pyserial reports an unplug without an errno, or with EIO
             raise DeviceGone(f"{self.where}: unplugged ({error})") from error
         reading = self._reading(match, start)
@@ -252,24 +253,24 @@ class SerialThermometer(Thermometer):
         return replace(reading, monotonic=monotonic, utc=utc)
 
     def _ask(self) -> None:
-        """Send the command once the line is quiet, and note whether a line is unfinished."""
+        """Wait for a quiet line, note whether its last line is unfinished, and send the command."""
         late, deadline = self._line, time.monotonic() + self.options.timeout_s
         while (self._owed or late or self.handle.in_waiting) and time.monotonic() < deadline:
-            # an answer to an earlier command may be on its way, or its rest
+            # the answer to an earlier command, or the rest of it, may still arrive
             if not (more := self.handle.read(max(1, self.handle.in_waiting))):
                 break
             late += more
         rest = _one_end(late).rpartition(b"\n")[2].strip(b" \0")
-        # the rest of a late line would look like a whole one; a prompt is no line
+        # the rest of a late line would look like a whole line; a prompt does not
         self._synchronous = not rest or rest[-1:] in PROMPTS
         self._line, self._owed = b"", True
         self.handle.write(self.command)
 
     def _skip_queue(self) -> None:
-        """Discard what came before now, but keep the start of the current line."""
+        """Discard the complete lines received so far, but not the start of the current one."""
         waiting = self.handle.read(self.handle.in_waiting)
         if len(waiting) >= QUEUE:
-            self._line, self._synchronous = b"", False  # bytes may be missing in the middle
+            self._line, self._synchronous = b"", False  # bytes may be missing
             return
         head, mark, tail = (self._line + _one_end(waiting)).rpartition(b"\n")
         if mark:
@@ -277,7 +278,7 @@ class SerialThermometer(Thermometer):
         self._line = tail if mark else head + tail
 
     def _next_match(self) -> tuple[re.Match[str], float]:
-        """Return the next line that matches, and the machine's monotonic time."""
+        """Return the next line that matches, and the machine's monotonic time at its end."""
         deadline = time.monotonic() + self.options.timeout_s
         skipped: list[str] = []
         problem = ""
@@ -286,7 +287,7 @@ class SerialThermometer(Thermometer):
                 line, self._line = self._line.split(b"\n", 1)
                 whole, self._synchronous = self._synchronous, True
                 if not whole and self.command:
-                    self.handle.write(self.command)  # the answer may have hung on the late line
+                    self.handle.write(self.command)  # the answer may have been joined to it
                 line = line.strip(b"\0")
                 if not line or not whole or line.strip() == self.command.strip():
                     continue
@@ -306,9 +307,9 @@ class SerialThermometer(Thermometer):
             self._line += _one_end(self.handle.read(max(1, self.handle.in_waiting)))
 
     def _nothing(self, skipped: list[str], problem: str) -> BadReading | DeviceTimeout:
-        """Return the error for a time-out: what was wrong with the lines that came."""
+        """Return the error for a time-out, which names the fault of the lines received."""
         rest = self._line.decode("ascii", "backslashreplace")
-        # with a command, the next one drops the end of this line
+        # the next reading's command discards the end of this line
         self._line, self._synchronous = self._line[-1:] if self.command else b"", False
         if problem:
             return BadReading(f"{self.where}: {problem}")
@@ -316,8 +317,8 @@ class SerialThermometer(Thermometer):
             o = self.options
             quoted = "; ".join(repr(text[:60]) for text in [*skipped, rest][:3] if text)
             return BadReading(
-                f"{self.where}: no line fits the pattern in {o.timeout_s:g} s, but {quoted}; "
-                f"is {o.baud} Bd {o.framing} right?"
+                f"{self.where}: no line matches the pattern in {o.timeout_s:g} s; received: "
+                f"{quoted}; check {o.baud} Bd {o.framing}"
             )
         return DeviceTimeout(f"{self.where}: silent for {self.options.timeout_s:g} s")
 
@@ -327,7 +328,7 @@ class SerialThermometer(Thermometer):
         given = match["checksum"] or ""
         if not re.fullmatch(r"[0-9A-Fa-f]{1,4}", given):
             return f"checksum {given!r} in {match.string!r} is not hexadecimal"
-        # the checksum is of bytes: those before it are the line without what follows
+        # the checksum covers the bytes before it
         after = len(match.string[match.start("checksum") :].encode("latin-1", "replace"))
         computed = CHECKSUMS[self.options.checksum](line[: len(line) - after])
         if int(given, 16) == computed:
@@ -335,7 +336,7 @@ class SerialThermometer(Thermometer):
         return f"checksum {given} in {match.string!r}, computed {computed:02X}"
 
     def _reading(self, match: re.Match[str], start: float) -> Reading:
-        """Return the channels of a line; one without a usable number is absent."""
+        """Return the reading of a line; a channel without a usable number is missing."""
         there = [channel for channel in self.channels if match[channel] is not None]
         if not there:
             raise BadReading(f"{self.where}: {match.string!r} has no value")
@@ -346,7 +347,7 @@ class SerialThermometer(Thermometer):
         return self._believed.reading(measures, start)
 
     def _celsius(self, channel: str, text: str) -> float:
-        """Return the °C of a printed number; BadReading if it means that nothing was measured."""
+        """Convert a printed number to °C; BadReading if it means that nothing was measured."""
         number = support.parse_number(text, comma=True)
         where = f"{self.where}, {channel}: {text}"
         exponent = Decimal(text.strip().replace(",", ".")).as_tuple().exponent
@@ -362,35 +363,35 @@ class SerialThermometer(Thermometer):
             for refused in self.options.refuse_c
         ):
             raise BadReading(
-                f"{where} is what firmware prints without a sensor; if it is a temperature, write "
+                f"{where} is what firmware prints without a sensor; if it is a temperature, set "
                 "refuse_c: []"
             )
         idle = self._idle(number, decimals) if self.options.refuse_c else ""
         return self._believed.judge(channel, celsius, where, idle)
 
     def _require_whole(self, channel: str, mantissa: str, where: str) -> None:
-        """Raise BadReading for a number that lost digits: firmware prints as many each time.
+        """Raise BadReading for a number that lost digits, since firmware always prints as many.
 
-        Where trailing zeros are left out (21.5 after 21.56) two readings are given up at most.
+        If trailing zeros are omitted (21.5 after 21.56), at most two readings are rejected.
         """
         whole, point, digits = mantissa.replace(",", ".").partition(".")
         if point and not (digits and whole.strip("+-")):
-            raise BadReading(f"{where} begins or ends with its decimal point; was the line cut?")
+            raise BadReading(f"{where} begins or ends with its decimal point; the line may be cut")
         most, zeros, fewer = self._decimals.get(channel, (len(digits), False, 0))
         short = len(digits) < most
         zeros |= len(digits) >= max(most, 2) and digits.endswith("0")
         self._decimals[channel] = max(most, len(digits)), zeros, fewer + short
         if short and (zeros or fewer < 2):
-            raise BadReading(f"{where} has fewer decimals than lines before; was the line cut?")
+            raise BadReading(f"{where} has fewer decimals than earlier lines; the line may be cut")
 
     def _printed(self, number: float, decimals: int, celsius: float) -> bool:
-        """Return whether the number is this temperature before the offset, or before the scale."""
+        """Return whether a number is a temperature before the offset, or before the scale."""
         factor, zero = UNITS[self.options.unit]
         scales = {self.options.scale, 1.0} if self._corrects else {self.options.scale}
         return any(chips.prints(number, decimals, (celsius / factor + zero) / s) for s in scales)
 
     def _idle(self, number: float, decimals: int) -> str:
-        """In words, if this is a number that a chip gives without having measured."""
+        """Return why a number may be an idle value, in words, or ""."""
         idle = (0.0, *chips.ENDS_C, *chips.idle_celsius(self.options.chip or ""))
         if decimals >= 2:
             idle += (-0.0625, -0.0078125)
@@ -406,7 +407,7 @@ class SerialThermometer(Thermometer):
 
 
 def _decodings(line: bytes) -> Iterator[str]:
-    """Yield the line as text: UTF-8 if it is, Latin-1, and Latin-1 with every degree sign as °."""
+    """Yield a line as text: UTF-8 if valid, then Latin-1, each also with every degree sign as °."""
     with contextlib.suppress(UnicodeDecodeError):
         text = line.decode("utf-8")
         yield text

@@ -1,9 +1,8 @@
-"""What the drivers share: lazy imports, bounded options, errno as our errors, strict numbers.
+"""Functions shared by drivers: lazy imports, bounded options, device errors, strict numbers.
 
-Camera buffers to grey images: GREY, Y10 to Y16, YUYV, UYVY, NV12, YU12, MJPEG, Bayer.
-
-Grey means luminance: of a colour format its Y plane, of a Bayer mosaic OpenCV's demosaiced grey in
-full size and full depth. A buffer that is too short, or a JPEG without an end, is a BadReading.
+They also convert camera buffers to grey images: GREY, Y10 to Y16, YUYV, UYVY, NV12, YU12, MJPEG and
+Bayer formats. Grey means luminance: the Y plane of a colour format; for a Bayer mosaic, OpenCV's
+demosaiced grey at full size and depth. A truncated buffer or JPEG raises BadReading.
 Source: Linux userspace API, "Image formats" (V4L2 fourcc codes).
 """
 
@@ -47,11 +46,11 @@ if TYPE_CHECKING:
 
 
 AUTO = "auto"
-"""What a stanza says to leave a setting to the camera."""
+"""The value that leaves a setting to the camera."""
 Text = Annotated[
     str, BeforeValidator(lambda v: str(v) if type(v) is int else v), Field(min_length=1)
 ]
-"""An option that is text; whole numbers are taken as written."""
+"""A text option; a whole number is accepted as the text that was written."""
 Seconds = Annotated[float, Field(ge=0.01, le=600.0)]
 """A time-out."""
 Celsius = Annotated[float, Field(ge=-273.15, le=3000.0)]
@@ -64,7 +63,7 @@ _GONE = {errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EREMOTEIO, errno.ENOTCON
 
 
 def library(module: str, extra: str = "") -> Any:
-    """Import a device's library when the device is opened; DriverMissing says what to install."""
+    """Import a device's library, on opening the device; DriverMissing names what to install."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -73,7 +72,7 @@ def library(module: str, extra: str = "") -> Any:
 
 
 def or_auto(low: float, high: float) -> AfterValidator:
-    """Return the check of an option: a number within bounds, the word AUTO, or None."""
+    """Return a validator that accepts a number within bounds, the word AUTO, or None."""
 
     def check(value: float | str | None) -> float | str | None:
         if isinstance(value, str) and value != AUTO:
@@ -86,34 +85,33 @@ def or_auto(low: float, high: float) -> AfterValidator:
 
 
 def automatic_warnings(options: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each of some options that leaves its setting to the camera."""
+    """Return a warning for each option that leaves its setting to the camera."""
     return [
-        f"{name}: auto lets the camera change it; every change is another camera"
+        f"{name}: auto lets the camera change it; every change alters the calibration"
         for name, value in options.items()
         if value == AUTO
     ]
 
 
 def absent(message: str, *, seen: bool) -> DeviceError:
-    """Return the error of a missing device: gone if it was open before, else not found."""
+    """Return the error for a missing device: DeviceGone if `seen`, else DeviceNotFound."""
     return DeviceGone(message) if seen else DeviceNotFound(message)
 
 
 def denied(message: str, *, seen: bool) -> DeviceError:
-    """Return the error of a device that may not be used: permanent, unless it was open before.
+    """Return the error for a denied device: permanent, unless it was open before (`seen`).
 
-    A device that has just been plugged in again belongs to root until udev has seen it, and other
-    programs probe it; a phone is unauthorized until it has recognised the host's key.
+    A device that has just been plugged in again belongs to root until udev has handled it, and
+    other programs probe it; a phone is unauthorized until it has recognised the host's key.
     """
     return TransientDeviceError(message) if seen else DeviceDenied(message)
 
 
 def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceError:
-    """Return the device error that a system call's errno stands for.
+    """Return the device error for the errno of a system call.
 
-    where: the device as the user knows it.
-    seen: whether it was open before.
-    hint: what to do if it is missing or access is denied.
+    where: the device's name in messages; seen: whether it was open before; hint: advice for a
+    missing device or denied access.
     """
     if isinstance(error, DeviceError):
         return error
@@ -132,7 +130,7 @@ def fault(error: OSError, where: str, *, seen: bool, hint: str = "") -> DeviceEr
 
 
 def reason(error: BaseException) -> str:
-    """What went wrong, without the library's words: they may quote an address and its secrets."""
+    """Return the cause of an error without the library's text, which may quote secrets."""
     cause = getattr(error, "reason", error)  # urllib's URLError wraps the real one
     cause = cause if isinstance(cause, BaseException) else error
     if isinstance(cause, TimeoutError):
@@ -145,13 +143,13 @@ def reason(error: BaseException) -> str:
 
 
 def in_thread(work: Callable[[], Any], name: str) -> Future[Any]:
-    """Start work in a thread of its own, which is left behind if it hangs."""
+    """Start work in a new thread, which is abandoned if it hangs; return its future."""
     task: Future[Any] = Future()
 
     def run() -> None:
         try:
             task.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - handed over to who waits
+        except BaseException as error:  # noqa: BLE001 - raised again by `result`
             task.set_exception(error)
 
     threading.Thread(target=run, daemon=True, name=name).start()
@@ -159,7 +157,7 @@ def in_thread(work: Callable[[], Any], name: str) -> Future[Any]:
 
 
 def on_clock(clock: Clock, monotonic: float) -> tuple[float, float]:
-    """Return a time of the machine's CLOCK_MONOTONIC (s) on the clock's (monotonic, utc) scales."""
+    """Convert a time on the machine's CLOCK_MONOTONIC (s) to the clock's (monotonic, utc)."""
     now, *scales = read_together(time.monotonic, clock.monotonic, clock.utc)
     age = now - monotonic
     return scales[0] - age, scales[1] - age
@@ -171,7 +169,7 @@ def middle_reading(
     start: float,
     missing: Mapping[str, str] | None = None,
 ) -> Reading:
-    """Return a reading timed half-way between `start` (clock's monotonic, s) and now."""
+    """Return a reading whose time is midway between `start` (clock's monotonic, s) and now."""
     now = time.monotonic()
     half = (clock.monotonic() - start) / 2.0
     monotonic, utc = on_clock(clock, now)
@@ -179,15 +177,15 @@ def middle_reading(
 
 
 def read_line(path: Path) -> str:
-    """Return what a file of the kernel says, whatever the locale; bytes that are no UTF-8 as �."""
+    """Return the text of a sysfs file in any locale; bytes that are not UTF-8 become �."""
     return path.read_text(encoding="utf-8", errors="replace").strip()
 
 
 def parse_number(text: str, *, comma: bool = False) -> float:
-    """Return the number in a text from a device: ASCII digits, one decimal point, nothing else.
+    """Convert a device's text to a number: ASCII digits, one decimal point, nothing else.
 
-    float() also takes `2_5.0`, `nan`, `infinity` and digits of any script, which a damaged line
-    may hold. comma: whether a decimal comma is accepted. Raises ValueError.
+    float() also accepts `2_5.0`, `nan`, `infinity` and digits of any script, which a damaged line
+    may contain. comma: whether a decimal comma is accepted. Raises ValueError.
     """
     plain = text.strip(" \t\r\n")
     if not _NUMBER.fullmatch(plain) or ("," in plain and not comma):
@@ -196,11 +194,11 @@ def parse_number(text: str, *, comma: bool = False) -> float:
 
 
 class Channels:
-    """The channels of one thermometer: which temperatures are believed, and the reading of all.
+    """The channels of one thermometer: checks their temperatures and makes its readings.
 
-    low_c, high_c: the sensor's range. What a chip gives without having measured (see `chips`) is a
-    temperature too. It is accepted only where a reading less than NEIGHBOUR_AGE_S old and within
-    NEIGHBOUR_STEP_K makes it likely; it never supports itself.
+    low_c, high_c: the sensor's range. An idle value, which a chip reports without having measured
+    (see `chips`), is accepted only if a reading less than NEIGHBOUR_AGE_S old lies within
+    NEIGHBOUR_STEP_K of it. An idle value never supports another.
     """
 
     def __init__(self, clock: Clock, low_c: float, high_c: float) -> None:
@@ -209,17 +207,17 @@ class Channels:
         self._last: dict[str, tuple[float, float]] = {}
 
     def clear(self) -> None:
-        """Forget the last readings: the device was closed."""
+        """Forget the last readings, when the device is closed."""
         self._last.clear()
 
     def support(self, channel: str, value_c: float) -> bool:
-        """Return whether a recent reading of the channel lay near enough."""
+        """Return whether a recent reading of the channel is close to a value."""
         at, last_c = self._last.get(channel, (-math.inf, math.nan))
         recent = self._clock.monotonic() - at <= NEIGHBOUR_AGE_S
         return recent and abs(last_c - value_c) <= NEIGHBOUR_STEP_K
 
     def require_range(self, value_c: float, where: str) -> None:
-        """Raise BadReading for what is not a number within the sensor's range."""
+        """Raise BadReading for a value that is not finite or outside the sensor's range."""
         if not math.isfinite(value_c) or not self._low_c <= value_c <= self._high_c:
             raise BadReading(
                 f"{where}: {value_c:g} °C is outside the sensor's range {self._low_c:g} … "
@@ -227,10 +225,10 @@ class Channels:
             )
 
     def judge(self, channel: str, value_c: float, where: str, idle: str = "") -> float:
-        """Return a temperature that is believed; raise BadReading for others.
+        """Return a temperature that passes the checks; raise BadReading for any other.
 
-        Those are what lies outside the range, and what is `idle`, in words, without a neighbour
-        that supports it.
+        idle: why the value may not have been measured, for the message; "" for a measured value.
+        An idle value fails without a recent reading near it; every value fails out of range.
         """
         self.require_range(value_c, where)
         if not idle:
@@ -244,10 +242,10 @@ class Channels:
     def reading(
         self, measures: Mapping[str, tuple[str, Callable[[], float]]], start: float | None = None
     ) -> Reading:
-        """Measure every channel; {channel: (where, what returns its °C)}.
+        """Measure every channel; measures: {channel: (where, function that returns °C)}.
 
-        Timed half-way between `start` (s, by default the call) and the end. Where no channel gives
-        a value their errors are raised as one.
+        The reading's time is midway between `start` (s, by default the call) and the end. If no
+        channel has a value, one error with the reasons of all is raised.
         """
         start = self._clock.monotonic() if start is None else start
         values: dict[str, float] = {}
@@ -269,31 +267,31 @@ class Channels:
 
 
 BAYER_ORDERS = {
-    # V4L2's names give the first row: RG10 starts with R G
+    # V4L2 names a format by its first row: RG10 starts with R G
     "RGGB": "RGGB", "RG10": "RGGB", "RG12": "RGGB", "RG16": "RGGB", "pRAA": "RGGB",
     "BA81": "BGGR", "BG10": "BGGR", "BG12": "BGGR", "BYR2": "BGGR", "pBAA": "BGGR",
     "GBRG": "GBRG", "GB10": "GBRG", "GB12": "GBRG", "GB16": "GBRG", "pGAA": "GBRG",
     "GRBG": "GRBG", "BA10": "GRBG", "BA12": "GRBG", "GR16": "GRBG", "pgAA": "GRBG",
 }  # fmt: skip
-_ONE_BYTE = {"GREY", "NV12", "YU12", "RGGB", "BA81", "GBRG", "GRBG"}  # a pixel, in the first plane
-_TWO_PIXELS = {"YUYV": 0, "UYVY": 1}  # in four bytes: where Y is
+_ONE_BYTE = {"GREY", "NV12", "YU12", "RGGB", "BA81", "GBRG", "GRBG"}  # per pixel, first plane
+_TWO_PIXELS = {"YUYV": 0, "UYVY": 1}  # in four bytes: {format: the first byte of Y}
 _PACKED = {"pRAA", "pBAA", "pGAA", "pgAA"}
 FORMATS = ("GREY", "Y10 ", "Y12 ", "Y16 ", "YUYV", "UYVY", "NV12", "YU12", *BAYER_ORDERS)
 
 
 def _plane(data: memoryview, height: int, row_bytes: int, stride: int) -> NDArray[np.uint8]:
-    """(height, row_bytes) bytes out of rows of `stride` bytes; the last may lack its padding."""
+    """Copy (height, row_bytes) bytes from rows of `stride` bytes; the last may lack padding."""
     stride = max(stride, row_bytes)
     needed = stride * (height - 1) + row_bytes
     if len(data) < needed:
         raise BadReading(f"partial frame: {len(data)} of {needed} bytes")
     flat = np.frombuffer(data, np.uint8)
     rows = np.lib.stride_tricks.as_strided(flat, (height, row_bytes), (stride, 1))
-    return rows.copy()  # the camera writes into its buffer again as soon as it is given back
+    return rows.copy()  # the camera overwrites its buffer as soon as it is queued again
 
 
 def unpack_10(packed: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """MIPI RAW10: four high bytes, then one byte with the four pairs of low bits."""
+    """Unpack MIPI RAW10: four high bytes, then one byte with the four pairs of low bits."""
     high = packed.reshape(packed.shape[0], -1, 5)
     low = high[..., 4:5] >> np.array([0, 2, 4, 6], np.uint8) & 3
     pixels = (high[..., :4].astype(np.uint16) << np.uint16(2)) | low
@@ -301,7 +299,7 @@ def unpack_10(packed: NDArray[np.uint8]) -> NDArray[np.uint16]:
 
 
 def _grey(data: memoryview, fourcc: str, width: int, height: int, stride: int) -> Grey:
-    """Return the grey image in the bytes of one buffer."""
+    """Return the grey image in one buffer."""
     image: Grey
     if fourcc in _TWO_PIXELS:
         first = _TWO_PIXELS[fourcc]
@@ -321,14 +319,14 @@ def _grey(data: memoryview, fourcc: str, width: int, height: int, stride: int) -
 
 
 def jpeg_end(data: bytes) -> bool:
-    """Return whether the bytes start and end as a JPEG; cameras pad the end with zeros."""
+    """Return whether the bytes start and end like a JPEG; cameras pad the end with zeros."""
     return data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
 
 
 def decode(
     data: memoryview, fourcc: str, width: int, height: int, stride: int = 0
 ) -> tuple[Grey, bytes | None]:
-    """Return (grey image, the JPEG as it came or None) of one buffer, which is free after it."""
+    """Return (grey image, the JPEG as received or None); the buffer may then be reused."""
     if fourcc not in ("MJPG", "JPEG"):
         return _grey(data, fourcc, width, height, stride), None
     import simplejpeg

@@ -1,4 +1,4 @@
-"""Cameras of Video4Linux: UVC (USB) cameras, and the Raspberry Pi camera in legacy mode.
+"""Video4Linux cameras: UVC (USB) cameras, and the Raspberry Pi camera in legacy mode.
 
     cameras:
       - name: logitech
@@ -7,25 +7,25 @@
         width: 1920
         height: 1080
         pixel_format: MJPG            # GREY, Y16, YUYV, NV12, MJPG, Bayer (RG10, pRAA) …
-        exposure_s: 0.0156            # these four: a value, `auto`, or left out: locked as it is
+        exposure_s: 0.0156            # these four: a value, `auto`, or omitted: locked as it is
         gain: 0
         focus: 0                      # focus position in the camera's own unit
         white_balance_k: 4600
-        controls: {power_line_frequency: 1, sharpness: 0}     # any other, named as v4l2-ctl does
-        card: C920                    # refuses a camera that does not call itself so
-        strict: true                  # false: a setting that does not hold is only stored
+        controls: {power_line_frequency: 1, sharpness: 0}     # any others, by v4l2-ctl's names
+        card: C920                    # a camera whose name lacks this is rejected
+        strict: true                  # false: a setting that changes is stored, not an error
         timeout_s: 5
-        backend: auto                 # linuxpy, opencv; auto: what is installed
-        dev: /dev                     # where the nodes are
+        backend: auto                 # linuxpy, opencv; auto: linuxpy if installed
+        dev: /dev                     # the folder of the device nodes
 
-A camera that focuses is another camera: what is left out is locked at the value that it has when it
-is opened, automatic modes are switched off, and `auto` is accepted only by name, with a warning in
-the status. Every setting is read back after it was set and with each frame, and stored with the
-epoch; a camera that does not obey, or that falls back to automatic, is an error and not a frame.
-`thermocald devices` writes the current values into the stanza.
+A camera that refocuses has another calibration. An omitted setting is therefore locked at its value
+when the camera is opened, automatic modes are switched off, and `auto` has to be written explicitly
+and is shown as a warning in the status. Every setting is read back after it was set and with each
+frame, and is stored with the epoch; a setting that the camera ignores or resets to automatic is an
+error, and the frame is rejected. `thermocald devices` writes the current values into the stanza.
 
-The frame's time is that of its buffer, moved to the middle of the exposure; frames that were
-exposed before `capture` was called are discarded.
+The frame's time is its buffer's time stamp, moved to the middle of the exposure. Frames that were
+exposed before the call of `capture` are discarded.
 Source: Linux Documentation/userspace-api/media/v4l/ext-ctrls-camera.rst, control.rst.
 """
 
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     Wanted = float | str | None
 
 FUTURE_S = 1.0
-"""A time stamp may be this far ahead (vivid: up to a frame); beyond, it is another clock's."""
+"""A time stamp may be this far ahead (vivid: up to a frame); a later one is of another clock."""
 EXPOSURE = 0x009A0902
 EXPOSURE_UNIT_S = 1e-4
 _UNREADABLE = {errno.EINVAL, errno.EACCES, errno.ENOTTY}
@@ -69,7 +69,7 @@ _UNREADABLE = {errno.EINVAL, errno.EACCES, errno.ENOTTY}
 
 @dataclass(frozen=True)
 class Lock:
-    """One setting: its option, the automatic mode and its values, the control and its unit."""
+    """A setting: its option, the automatic mode and its values, the control and its unit."""
 
     option: str
     automatic: int
@@ -95,7 +95,7 @@ Whole = Annotated[int | str | None, support.or_auto(0, 1e6)]
 
 
 class V4l2Options(DriverOptions):
-    """None: locked as it is."""
+    """The options of `v4l2`; a setting that is None is locked as it is."""
 
     width: support.Pixels
     height: support.Pixels
@@ -115,7 +115,7 @@ class V4l2Options(DriverOptions):
 
 
 class V4l2Camera(Camera):
-    """One capture device, streaming while it is open."""
+    """A capture device, streaming while it is open."""
 
     device_classes = ("char-video4linux",)
 
@@ -125,7 +125,7 @@ class V4l2Camera(Camera):
         super().__init__(**options)
         o = self.options
         if (o.device is None) == (o.serial is None):
-            raise ConfigurationError("write either device: (/dev/v4l/by-id/…) or serial:")
+            raise ConfigurationError("set either device: (/dev/v4l/by-id/…) or serial:")
         known = ["MJPG", *(name.strip() for name in support.FORMATS)]
         if o.pixel_format not in known:
             raise ConfigurationError(
@@ -178,9 +178,9 @@ class V4l2Camera(Camera):
         except OSError as error:
             self.close()
             if self.seen and isinstance(error, WrongDevice):
-                # it was the right one before: another may have its number until the next plug
+                # another device may have its node until the camera is plugged in again
                 raise TransientDeviceError(str(error)) from error
-            hint = "is it plugged in, and the user in the group video?"
+            hint = "check that it is plugged in and the user is in the group video"
             raise support.fault(error, self.where, seen=self.seen, hint=hint) from error
         self.seen = True
 
@@ -200,7 +200,7 @@ class V4l2Camera(Camera):
         deadline = called + self.options.timeout_s
         try:
             settings = self._controls.settings(self._controls.values(stream))
-            # where the camera is in manual exposure and reports it
+            # known only in manual exposure
             exposure = None if settings.get("exposure_auto") else settings.get("exposure_s")
             grab, stamp = self._fresh(stream, called, deadline, exposure or 0.0)
             values = self._controls.values(stream)
@@ -224,7 +224,7 @@ class V4l2Camera(Camera):
     def _fresh(
         self, stream: Stream, called: float, deadline: float, exposure_s: float
     ) -> tuple[Grab, float]:
-        """Return a frame that was exposed after the call, and its time stamp in s."""
+        """Return a frame that was exposed after the call, and its time stamp, s."""
         dropped, arrived = 0, 0.0
         broken: BadReading | None = None
 
@@ -233,11 +233,11 @@ class V4l2Camera(Camera):
             arrived = time.monotonic()
             if stamp is not None and not arrived - OLDEST_S < stamp < arrived + FUTURE_S:
                 raise WrongDevice(
-                    f"{self.where}: the frame's time stamp {stamp:.3f} s is not of this machine's "
+                    f"{self.where}: the frame's time stamp {stamp:.3f} s is not on this machine's "
                     f"monotonic clock ({arrived:.3f} s)"
                 )
             if stamp is None or stamp > arrived:
-                return dropped >= BUFFERS  # no information: take the first that cannot have waited
+                return dropped >= BUFFERS  # unknown time: the first frame that cannot have waited
             return stamp - (0.0 if start_of_exposure else exposure_s) >= called
 
         while True:
@@ -251,7 +251,7 @@ class V4l2Camera(Camera):
             except DeviceTimeout as error:
                 if broken is not None:
                     raise BadReading(f"{self.where}: only broken frames; {broken}") from error
-                after = f", {dropped} old ones were in the queue" if dropped else ""
+                after = f", {dropped} old frames were in the queue" if dropped else ""
                 raise DeviceTimeout(
                     f"{self.where}: no new frame in {self.options.timeout_s:g} s{after}"
                 ) from error
@@ -261,7 +261,7 @@ class V4l2Camera(Camera):
             dropped += 1
 
     def _path(self) -> str:
-        """Return the node; a serial number is looked up among udev's names."""
+        """Return the device node; a serial number is looked up among udev's names."""
         if self.options.device is not None:
             return str(self.options.device)
         links = sorted(
@@ -269,7 +269,7 @@ class V4l2Camera(Camera):
         )
         if len(links) > 1:
             names = ", ".join(link.name for link in links)
-            raise WrongDevice(f"camera {self.options.serial}: several fit: {names}; write device:")
+            raise WrongDevice(f"camera {self.options.serial}: several match: {names}; set device:")
         if not links:
             raise support.absent(
                 f"camera {self.options.serial}: none in {self.options.dev}/v4l/by-id",
@@ -279,10 +279,10 @@ class V4l2Camera(Camera):
 
 
 class CameraControls:
-    """The settings of one camera, kept while it is closed and opened again.
+    """A camera's settings, retained while it is closed and opened again.
 
-    wanted: {option of LOCKS: value, AUTO, or None to lock what is there}; named: {control by its
-    name: value}. Raises WrongDevice where the camera does not have or hold them.
+    wanted: {option of LOCKS: value, AUTO, or None to lock the current one}; named: {control's name:
+    value}. Raises WrongDevice for a setting that the camera does not have or hold.
     """
 
     def __init__(self, where: str, wanted: Mapping[str, Wanted], named: Mapping[str, int]) -> None:
@@ -295,7 +295,7 @@ class CameraControls:
         self._available: dict[int, Control] = {}
 
     def apply(self, stream: Stream, *, strict: bool) -> None:
-        """Set all, automatic modes first; strict: raise where it does not read back."""
+        """Apply all settings, automatic modes first; strict: raise if one does not read back."""
         self._available = stream.controls()
         self._asked, self._automatic = {}, []
         locked = self._collect(stream)
@@ -303,14 +303,14 @@ class CameraControls:
             self._set(stream, control, value, locked)
         for control in locked & set(self._asked):
             if control not in MODES:
-                # the camera rounds: what it took is what is locked
+                # the camera may round: its value is what is locked
                 self._asked[control] = self._held[control] = stream.get(control)
         problems = self.deviations(self.values(stream))
         if problems and strict:
             raise WrongDevice(f"{self._where}: {'; '.join(problems)}")
 
     def _collect(self, stream: Stream) -> set[int]:
-        """Fill `_asked` and `_automatic`; the controls that nobody configured are returned."""
+        """Fill `_asked` and `_automatic`; return the controls that the stanza does not set."""
         locked = set()
         for lock in LOCKS:
             wanted = self._wanted.get(lock.option)
@@ -319,11 +319,11 @@ class CameraControls:
                 continue
             if wanted is not None and lock.control not in self._available:
                 raise WrongDevice(
-                    f"{self._where}: {lock.option}: it has no control 0x{lock.control:08x} to set"
+                    f"{self._where}: {lock.option}: it has no control 0x{lock.control:08x}"
                 )
             if wanted is None:
                 locked |= {lock.automatic, lock.control}
-                value = self._standing(stream, lock.control)
+                value = self._value_to_hold(stream, lock.control)
             else:
                 value = round(float(wanted) / lock.unit)
             if lock.automatic in self._available:
@@ -331,7 +331,7 @@ class CameraControls:
             if value is not None:
                 self._asked[lock.control] = value
         for control in HELD:
-            if (value := self._standing(stream, control)) is not None:
+            if (value := self._value_to_hold(stream, control)) is not None:
                 self._asked[control] = value
                 locked.add(control)
         self._asked |= {control: 0 for control in OFF if control in self._available}
@@ -358,8 +358,8 @@ class CameraControls:
             return
         raise WrongDevice(f"{self._where}: {lock.option}: auto is not accepted")
 
-    def _standing(self, stream: Stream, control: int) -> int | None:
-        """The value to hold: that of before a re-plug, else the current one; None without it."""
+    def _value_to_hold(self, stream: Stream, control: int) -> int | None:
+        """Return the value held before a re-plug, else the current one; None without either."""
         if control not in self._available:
             return None
         if control not in self._held:
@@ -375,18 +375,18 @@ class CameraControls:
     def _set(self, stream: Stream, control: int, value: int, locked: set[int]) -> None:
         try:
             if control in locked and stream.get(control) == value:
-                return  # some cameras refuse a value that they already have
+                return  # some cameras reject a value that they already have
             stream.set(control, value)
         except OSError as error:
             if control in locked and control not in MODES:
-                return  # it cannot be set, so it stays; every frame is checked
+                return  # it cannot be set, so it may stay; every frame is checked
             name, remedy = self._available[control].name, self._remedy(control, "it takes ")
             raise WrongDevice(
                 f"{self._where}: does not take {name} = {value} ({error.strerror}); {remedy}"
             ) from error
 
     def values(self, stream: Stream) -> dict[int, int]:
-        """Return the current values of everything that is locked, and of what is automatic."""
+        """Return the current values of all locked and automatic settings."""
         automatic = [c for lock in self._automatic for c in (lock.automatic, lock.control)]
         watched = [*self._asked, *(c for c in automatic if c in self._available)]
         return {control: stream.get(control) for control in dict.fromkeys(watched)}
@@ -415,15 +415,15 @@ class CameraControls:
         return found | others
 
     def _remedy(self, control: int, range_of: str = "") -> str:
-        """What to write where a control does not do as it is told: the option, or its range."""
+        """Return the advice for a control that does not hold: the option to set, or its range."""
         if lock := MODES.get(control):
-            return f"to let it change, write {lock.option}: auto"
+            return f"to let it change, set {lock.option}: auto"
         c = self._available[control]
         return f"{range_of}{c.minimum} … {c.maximum} in steps of {c.step}"
 
 
 def current_settings(path: str) -> dict[str, float]:
-    """Return {option: value} of a camera as it is now, {} if it cannot be opened; set nothing."""
+    """Return {option: current value} of a camera, unchanged; {} if it cannot be opened."""
     found: dict[str, float] = {}
     with suppress(OSError, DriverMissing), closing(LinuxpyStream(path)) as stream:
         available = stream.controls()

@@ -1,9 +1,9 @@
-"""One V4L2 capture stream: buffers with the kernel's time stamps, with a time-out on every wait.
+"""A V4L2 capture stream: buffers with the kernel's time stamps and a time-out on every wait.
 
-Two implementations of one contract: linuxpy's ioctls, and OpenCV where linuxpy is not installed.
-`grab` returns the next buffer, or None if `accept(stamp, start_of_exposure)` is false (an old frame
-is not decoded), and raises BadReading for a damaged one. linuxpy's own frame iterator waits for
-ever after an unplug, hence the poll here.
+Two classes implement one contract, with linuxpy's ioctls and with OpenCV. `grab` returns the next
+buffer, or None if `accept(stamp, start_of_exposure)` is false (an old frame is not decoded), and
+raises BadReading for a damaged one. linuxpy's own frame iterator waits forever after an unplug;
+hence the poll here.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ OPENCV_PROPERTIES = {
 
 @dataclass(frozen=True)
 class Grab:
-    """One buffer: time stamp (s, CLOCK_MONOTONIC; None if the driver gives none), what it marks."""
+    """One buffer; stamp: its time (s, CLOCK_MONOTONIC), None if the driver gives none."""
 
     image: Grey
     encoded: bytes | None
@@ -59,7 +59,7 @@ class Grab:
 
 @dataclass(frozen=True)
 class Control:
-    """A setting of the camera; `name` is its name in lower case with underscores."""
+    """A setting of the camera and its range; name: in lower case with underscores."""
 
     name: str
     minimum: int
@@ -68,7 +68,7 @@ class Control:
 
 
 class LinuxpyStream:
-    """Memory-mapped capture through linuxpy's ioctl wrappers; open, with its format still unset."""
+    """Memory-mapped capture through linuxpy's ioctl wrappers; `set_format` comes first."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -80,7 +80,7 @@ class LinuxpyStream:
         self.card = ""
 
     def set_format(self, fourcc: str, width: int, height: int) -> None:
-        """Ask for a format; WrongDevice if the camera gives another."""
+        """Set the format; WrongDevice if the camera chooses another."""
         path, self._fourcc, self._size = self._path, fourcc, (width, height)
         self.card = self._device.info.card
         capabilities = self._device.info.device_capabilities
@@ -120,7 +120,7 @@ class LinuxpyStream:
         buffer = self._dequeue(deadline)
         stamp: float | None = buffer.timestamp.secs + buffer.timestamp.usecs * 1e-6
         if not stamp or (not buffer.flags & TYPE_MASK and abs(stamp - time.monotonic()) > OLDEST_S):
-            stamp = None  # none, or of another clock (drivers that do not say which)
+            stamp = None  # missing, or of another clock (from a driver that does not state which)
         at_start = bool(buffer.flags & START_OF_EXPOSURE)
         try:
             if not accept(stamp, at_start):
@@ -164,7 +164,7 @@ class LinuxpyStream:
 
 
 class OpenCvStream:
-    """OpenCV's V4L2 back end; a grab that blocks (10 s) is left behind in its own thread."""
+    """OpenCV's V4L2 back end; a grab that blocks (10 s) is abandoned in its own thread."""
 
     card = "unknown: OpenCV does not report it"
 
@@ -178,12 +178,12 @@ class OpenCvStream:
             raise PermissionError(errno.EACCES, "Permission denied", path)
         self._capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
         if not self._capture.isOpened():
-            raise DeviceGone(f"{path}: OpenCV cannot open it (busy, or no capture device)")
+            raise DeviceGone(f"{path}: OpenCV cannot open it (busy, or not a capture device)")
 
     def set_format(self, fourcc: str, width: int, height: int) -> None:
-        """Ask for a format; WrongDevice if the camera gives another size."""
+        """Set the format; WrongDevice if the camera chooses another size."""
         cv2, self._fourcc, self._size = self._cv2, fourcc, (width, height)
-        # OpenCV resets a device to 640×480 on open; order matters: format, then size
+        # OpenCV resets a device to 640×480 on opening; the format has to be set before the size
         self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*fourcc))
         self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
         self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
@@ -213,7 +213,7 @@ class OpenCvStream:
         self._capture.set(getattr(self._cv2, OPENCV_PROPERTIES[control]), value)
 
     def start(self) -> None:
-        """OpenCV streams from the first grab."""
+        """Do nothing: OpenCV streams from the first grab."""
 
     def grab(self, deadline: float, accept: Accept) -> Grab | None:
         if self._pending is None or self._pending.done():
@@ -237,7 +237,7 @@ class OpenCvStream:
 
     def close(self) -> None:
         if self._pending is not None and not self._pending.done():
-            capture = self._capture  # released by the thread that is still in it
+            capture = self._capture  # released by the thread that still uses it
             self._pending.add_done_callback(lambda _: capture.release())
             return
         self._capture.release()
@@ -247,5 +247,5 @@ Stream = LinuxpyStream | OpenCvStream
 
 
 def plain_name(name: str) -> str:
-    """Return `Exposure Time, Absolute` as v4l2-ctl writes it: exposure_time_absolute."""
+    """Convert `Exposure Time, Absolute` to v4l2-ctl's form: exposure_time_absolute."""
     return "_".join("".join(c if c.isalnum() else " " for c in name.lower()).split())

@@ -15,7 +15,7 @@ import pytest
 from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import Calibrator
 from thermocald.analysis.camera.camera import Camera
-from thermocald.analysis.thermal.scene import SceneCourse, common_movement
+from thermocald.analysis.thermal.scene import SceneCourse, estimate_movement
 from thermocald.photogrammetry.camera.camera_model import partials, project, rotation
 from thermocald.store.recording.reader import read_recording
 
@@ -80,7 +80,7 @@ def test_the_turn_of_the_scene_is_that_of_control_points(shared, number):
             continue  # hidden by a person
         turn = rng.normal(0, 1e-3, 3)
         moved = room.turned(now, turn) - then
-        scene = common_movement(room.camera, room.camera, then[~control], moved[~control], k)
+        scene = estimate_movement(room.camera, room.camera, then[~control], moved[~control], k)
         assert scene is not None
         x, C = room.control_turn(then[control], moved[control])
         spread = np.sqrt(np.diag(C) + np.diag(scene.covariance)[:3])
@@ -102,7 +102,7 @@ def course(room: Room, more_c: float) -> SceneCourse:
         board, then, now = room.shared(0, row)
         scene = ~np.isin(board, room.full[:2])
         now = room.turned(now, more_c=more_c * (T[k] - T[0]) / 25)
-        found = common_movement(room.camera, room.camera, then[scene], (now - then)[scene], k)
+        found = estimate_movement(room.camera, room.camera, then[scene], (now - then)[scene], k)
         assert found is not None
         values[k], covariance[k] = found.values, found.covariance
     n = len(rows)

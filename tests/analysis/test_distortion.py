@@ -77,7 +77,7 @@ def test_a_camera_whose_distortion_keeps_its_place_in_the_image():
             assert np.abs(rate_errors(f, s)).max() < 3.0
             assert "keeps its place in the image" in lines
         else:
-            assert "the data cannot tell" in lines
+            assert "the data cannot distinguish" in lines
     assert recognised >= 4  # χ² is 25 ± 10, and 9 is required
 
 

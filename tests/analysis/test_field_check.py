@@ -152,7 +152,7 @@ def test_roll_turns_the_image_about_the_axis():
     b = station_at(np.array([0, 0, 500.0]), np.zeros(3), np.pi / 2)
     assert b.rotation[:, 2] == pytest.approx(a.rotation[:, 2])
     assert b.rotation[:, 0] == pytest.approx(a.rotation[:, 1])
-    with pytest.raises(GeometryError, match="stands where it looks at"):
+    with pytest.raises(GeometryError, match="is the point it looks at"):
         station_at(np.zeros(3), np.zeros(3))
 
 

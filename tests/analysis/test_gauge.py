@@ -242,7 +242,7 @@ def test_a_moved_camera_is_reported_with_time_turn_and_shift():
         if moved:
             found += moved[0] == 32
             assert "turned by 0.0" in events[0][1]
-            assert "looks alike" not in events[0][1]
+            assert "looks the same" not in events[0][1]
     assert found == 10
 
 
@@ -254,7 +254,7 @@ def test_a_missing_effect_is_reported_unlike_a_knock():
     gauge = GaugeCalibrator(thermal_camera(), world.field)
     *_, events = followed(gauge, [world.epoch(k, 20.0 + 0.5 * k) for k in range(1, 50)])
     assert {kind for kind, _ in events} == {"camera_moved"}
-    assert all("a model that lacks an effect looks alike" in text for _, text in events)
+    assert all("a missing effect looks the same" in text for _, text in events)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from benchmarks.audit_camera import Scene
 from tests.marks import mostly_slow
 from thermocald.acquisition.calibrator import CalibratedEpoch
 from thermocald.analysis.online.filter import FieldErrors, OnlineFilter, chi2_quantile
-from thermocald.analysis.online.observer import OnlineObserver, given_exterior
+from thermocald.analysis.online.observer import OnlineObserver, condition_on_exterior
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.photogrammetry.field.testfield import TestField
@@ -105,7 +105,7 @@ def test_one_bad_epoch_is_an_outlier_and_leaves_the_estimate_alone():
 def test_a_given_exterior_makes_the_interior_ten_times_better():
     camera = Surveyed(0.0, 3)
     _, result = camera.epoch()
-    values, gain, sds = given_exterior(result.values, result.covariance, 1.0)
+    values, gain, sds = condition_on_exterior(result.values, result.covariance, 1.0)
     assert np.all(sds[1:] < 0.1 * result.sd[1:3])
     assert np.all(np.abs(values + gain @ camera.eop - camera.iop[:3]) < 4 * sds)
 

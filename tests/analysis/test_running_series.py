@@ -228,13 +228,13 @@ def test_a_series_that_contradicts_five_epochs_begins_again_and_they_keep_their_
     scene = Scene(5)
     running, _, _, _ = take(scene, 24)
     calibrator = Calibrator(scene.sensor, scene.field, nominal_c=3.04)
-    adjusted, restarted = running._adjusted, []
+    adjusted, restarted = running._adjust_newest, []
 
     def contradicted():
         own, whole = adjusted()
         return own, replace(whole, status="global_test")
 
-    running._adjusted = contradicted
+    running._adjust_newest = contradicted
     for k in range(24, 30):
         result, columns, _ = refined(scene, calibrator, running, k)
         assert result.ok

@@ -46,8 +46,21 @@ def test_a_warm_up_is_found_in_its_parameters_only(warm_up):
         assert not {"A3", "C1", "C2"} & set(part)
 
 
+def test_a_series_that_holds_a_parameter_does_not_reduce_its_sd(warm_up):
+    one, other = warm_up()("M1"), warm_up()("M2")
+    k = IOP_NAMES.index("B1")
+    values, sds = other.values.copy(), other.sds.copy()
+    values[:, k], sds[:, k] = values[0, k], np.nan
+    held = replace(other, values=values, sds=sds)
+    both = study_camera("camera", [one, held], SETTINGS)
+    assert both.sds[k] == pytest.approx(np.std(one.values[:, k], ddof=1))
+
+
 def test_a_single_epoch_has_notes_and_no_results(warm_up):
-    result = study([warm_up(epochs=1)()], SETTINGS).cameras[0]
+    series = warm_up(epochs=1)()
+    values = series.values.copy()
+    result = study([series], SETTINGS).cameras[0]
+    np.testing.assert_array_equal(series.values, values)
     one = result.series[0]
     assert "a single epoch: nothing can be said about change" in " ".join(one.notes)
     assert "The F-test needs 31 consecutive epochs; the series has 1" in " ".join(one.notes)

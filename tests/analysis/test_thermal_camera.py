@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+import thermocald as tc
 from benchmarks.thermal_model import undistorting
 from thermocald.analysis.camera.undistortion import ideal_points
 from thermocald.analysis.thermal.predictions import warm_up
@@ -43,6 +44,7 @@ def test_the_steady_state_is_the_end_of_a_long_history(T):
     camera = ThermalCamera(thermal_model(*LISTED))
     now = camera.at(T)
     along = camera.along([0.0, 5e4, 1e5], [T, T, T])
+    assert along[-1].name == camera.model.camera
     np.testing.assert_allclose(along.values[-1], now.values, rtol=0, atol=1e-14)
     np.testing.assert_allclose(along.covariance[-1], now.covariance, rtol=1e-6, atol=1e-22)
 
@@ -130,7 +132,7 @@ def test_outside_the_validity_it_warns_or_refuses():
     with pytest.warns(ExtrapolationWarning):
         along = camera.along([0.0, 10.0], [45.0, 54.0])
     assert along.extrapolated.tolist() == [0.0, 4.0]
-    with pytest.raises(UsageError, match="ask for extrapolation by name"):
+    with pytest.raises(UsageError, match="set `extrapolate`"):
         camera.at(-20.0)
     with pytest.warns(ExtrapolationWarning):
         assert camera.at(-20.0, extrapolate=True).sd["c"] > 40 * 2e-4 * 0.99
@@ -143,6 +145,18 @@ def test_fahrenheit_is_refused(T):
         camera.at(T)
     with pytest.raises(UsageError, match="looks like fahrenheit"):
         camera.along([0.0, 10.0, 20.0], [T - 1, T, T + 1])
+
+
+def test_missing_readings_are_refused():
+    camera = ThermalCamera(thermal_model(*LISTED))
+    with pytest.raises(UsageError, match="temperature is nan: give one number"):
+        camera.at(float("nan"))
+    for times, temperatures, at in (([], [], None), ([0.0, 1.0], [25.0], None), ([0], [25], [])):
+        with pytest.raises(UsageError, match="for each of its times"):
+            camera.along(times, temperatures, at)
+    with pytest.raises(UsageError, match="no reading"):
+        camera.live().update(0.0, {})
+    assert camera.live().update(0.0, np.float32(25.0)).temperature == 25.0
 
 
 def test_images_of_another_camera_a_crop_and_a_binning():
@@ -199,3 +213,14 @@ def test_a_written_model_is_loaded(tmp_path):
     a, b = ThermalCamera.load(tmp_path / "m.yaml").at(30.0), ThermalCamera(thermal_model(*LISTED))
     np.testing.assert_array_equal(a.values, b.at(30.0).values)
     np.testing.assert_allclose(a.covariance, b.at(30.0).covariance, rtol=1e-12, atol=0)
+
+
+def test_a_formula_with_a_decimal_point_is_predicted_along_a_log(tmp_path):
+    series = tc.simulate("rpi-v2.1-heating", seed=1, epochs=60)
+    camera = tc.fit(series, effects=["above(temperature, 30.5):c"])
+    log = np.arange(0, 100, 10.0), np.linspace(25, 40, 10)
+    along = camera.along(*log)
+    assert (along.sd[:, 0] > 0).all()
+    camera.save(tmp_path / "camera.yaml")
+    again = tc.load_camera(tmp_path / "camera.yaml").along(*log)
+    np.testing.assert_allclose(again.values, along.values, rtol=1e-9)

@@ -261,7 +261,7 @@ def test_rates_are_doubtful_with_a_field_that_hardly_shows_c(depth, doubtful):
     found = fit_thermal_model([for_fit(audit_thermal.before(scene, s))], [])
     assert doubtful or np.abs(rate_errors(found, s)).max() < 3.0
     assert ("rates_hang_on_c" in found.as_dict()) is doubtful
-    assert ("rates hang on it" in " ".join(found.lines())) is doubtful
+    assert ("rates depend on it" in " ".join(found.lines())) is doubtful
 
 
 def test_correlated_constants_are_reported_by_slope_and_curvature():

@@ -161,7 +161,7 @@ def test_the_command_uses_the_type(world, tmp_path):
     arguments = ["fit", tmp_path / "M1", "-o", tmp_path / "m.yaml", "--type",
                  tmp_path / "type.yaml", "--json", tmp_path / "r.json"]  # fmt: skip
     result = succeed(*arguments)
-    assert "with what 10 cameras of the type rpi-v2.1 say of it" in result.stdout
+    assert "combined with the type rpi-v2.1 (10 cameras)" in result.stdout
     assert "show little" not in result.stdout
     found = json.loads((tmp_path / "r.json").read_text())["type"]
     assert (found["name"], found["cameras"]) == ("rpi-v2.1", 10)

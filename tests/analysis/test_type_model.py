@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermocald.analysis.thermal.camera_fit import shrunk_to_type, type_model
+from thermocald.analysis.thermal.camera_fit import shrink_to_type, type_model
 from thermocald.errors import DataError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor
 from thermocald.physics.model import ModelEffect, ThermalModel
@@ -44,7 +44,7 @@ def of_its_type(rng):
     """Draw a new camera, its true values, and its model combined with the type of ten others."""
     _, fleet = cameras(rng, 10, 0.1)
     true, (new,) = cameras(rng, 1, 1.0)
-    return new, true[0], shrunk_to_type(new, type_model(fleet, "rpi-v2.1"))
+    return new, true[0], shrink_to_type(new, type_model(fleet, "rpi-v2.1"))
 
 
 def pull(true, found):
@@ -81,6 +81,6 @@ def test_models_of_different_kinds_are_refused():
     _, fleet = cameras(np.random.default_rng(9), 4, 0.1)
     kind = type_model(fleet, "rpi")
     with pytest.raises(DataError, match="not a type model"):
-        shrunk_to_type(fleet[0], replace(kind, covariance=None))
+        shrink_to_type(fleet[0], replace(kind, covariance=None))
     with pytest.raises(DataError, match="not alike"):
-        shrunk_to_type(replace(fleet[0], T0=20.0), kind)
+        shrink_to_type(replace(fleet[0], T0=20.0), kind)

@@ -17,7 +17,7 @@ import thermocald as tc
 from tests.commands import call, finish
 from tests.golden.workshop import PROGRAMME
 from tests.marks import mostly_slow
-from thermocald.errors import DataError, StoreError, UsageError
+from thermocald.errors import ConfigurationError, DataError, StoreError, UsageError
 
 DOCUMENTED = (
     "api", "series", "results", "analysis.series.epochs", "analysis.camera.camera",
@@ -211,7 +211,7 @@ def test_a_camera_at_a_temperature(camera, tmp_path):
                  "m.cameramodel", "cam.json", "cam.ior"):  # fmt: skip
         assert now.write(tmp_path / name)
         assert (tmp_path / name).stat().st_size > 100
-    with pytest.raises(UsageError, match="say which format"):
+    with pytest.raises(UsageError, match="does not tell the format"):
         now.write(tmp_path / "camera.yaml")
 
 
@@ -273,6 +273,8 @@ def test_what_is_wrong_is_said(M1, camera):
         camera.at(95.0)
     with pytest.raises(DataError, match="there is no such file or folder"):
         tc.import_photographs("nothing", log="x.csv", testfield="M1/testfield.csv")
+    with pytest.raises(ConfigurationError, match="0×0 px is impossible"):
+        camera.live(size=(0, 0))
 
 
 OUT_OF_BOUNDS = {
@@ -290,6 +292,17 @@ OUT_OF_BOUNDS = {
     "height is 0": lambda M1, field: tc.correct("x.csv", "camera.yaml", log="M1", size=(9, 0)),
     "at least two calibrations": lambda M1, field: tc.fit_calibrations({}),
     "sigma_px is 0": lambda M1, field: tc.check_testfield(field, sigma_px=0.0),
+    "'M1' is not a series: open it": lambda M1, field: tc.fit("M1"),
+    "'M2' is not a series": lambda M1, field: tc.discover(M1, verify=["M2"]),
+}
+OF_A_CAMERA = {
+    "the temperature is 'warm'": lambda camera: camera.at("warm"),
+    "give one number": lambda camera: camera.at([30.0, 31.0]),
+    "distance_mm is -1": lambda camera: camera.at(35.0).object_error(-1),
+    "image points: must be an array \\(n, 2\\)": lambda camera: camera.at(35.0).undistort(
+        [1, 2, 3]
+    ),
+    "the pose: must be": lambda camera: camera.at(35.0).project([[0, 0, -1e3]], None),
 }
 
 
@@ -297,6 +310,12 @@ OUT_OF_BOUNDS = {
 def test_an_argument_out_of_bounds_is_refused(M1, message):
     with pytest.raises(UsageError, match=message):
         OUT_OF_BOUNDS[message](M1, M1.testfield)
+
+
+@pytest.mark.parametrize("message", OF_A_CAMERA)
+def test_what_no_camera_can_answer_is_refused(camera, message):
+    with pytest.raises(UsageError, match=message):
+        OF_A_CAMERA[message](camera)
 
 
 def test_the_import_costs_nothing():

@@ -43,8 +43,8 @@ def row(part: str, outcomes: list[Outcome]) -> str:
 
 
 def confusion(found: dict[str, list[Outcome]]) -> str:
-    """Return a table of hidden effects with wrong names."""
-    lines = ["| part | hidden | right | said instead |", "|---|---|---|---|"]
+    """Return a table of the wrong names: a line for each effect that was not named correctly."""
+    lines = ["| part | hidden | right | named instead |", "|---|---|---|---|"]
     for part, outcomes in found.items():
         rows: dict[str, Counter[str]] = {}
         for o in outcomes:
@@ -123,12 +123,12 @@ used while it was made.
 {_command(found, seeds)}
 ```
 
-writes this page, on one core; `--store FILE` lets it be interrupted. {note}
+writes this page, on one core; with `--store FILE` it can be interrupted and resumed. {note}
 
-The number of a part is the strength: the RMS of image points, px, that the fitted base model
-leaves. `hard`: irregular cadence, gaps, wrong coordinates, correlated noise, people walking by, M2
-under another programme. `none2`: twice the thermometer's noise. `lists`: alternatives that the data
-cannot exclude are named too.
+The number in a part's name is the strength of the effect: the RMS of the image residuals that the
+fitted base model leaves, px. `hard`: irregular cadence, gaps, wrong coordinates, correlated noise,
+people walking by, another heating programme in M2. `none2`: twice the thermometer's noise. `lists`:
+the share in which alternatives that the data cannot exclude are listed too.
 
 {HEAD}
 {parts}
@@ -137,11 +137,11 @@ cannot exclude are named too.
 
 ![Share of single effects named against their strength in px]({FIGURE})
 
-Bars: 68 % limits of the share.
+Bars: 68 % confidence limits of the share.
 
-## What was said instead
+## Wrong names
 
-All other names were right, at every strength.
+All other effects were named correctly, at every strength.
 
 {confusion(found)}
 

@@ -216,11 +216,12 @@ def test_the_logger_tells_the_temperature_of_photographs(tmp_path):
 @pytest.mark.parametrize(
     ("inputs", "said"),
     [
-        (("20=a.json", "20.3=b.json"), "two temperatures at least"),
+        (("20=a.json", "20.3=b.json"), "at least two temperatures"),
         (("warm=a.json", "50=b.json"), "'warm' is not a temperature"),
         (("20=a.json", "50=free.json"), "calibrate both with the same --free"),
         (("20=a.json", "M1"), "fit series and calibrations apart"),
         (("20=a.json", "50=none.json"), "no covariance"),
+        (("20=a.json", "50=list.json"), "no camera file of any of"),
     ],
 )
 def test_calibrations_that_give_no_model_are_refused(tmp_path, inputs, said):
@@ -228,6 +229,7 @@ def test_calibrations_that_give_no_model_are_refused(tmp_path, inputs, said):
     write_document(tmp_path / "a.json", 20, rng)
     write_document(tmp_path / "b.json", 50, rng)
     written(tmp_path / "none.json", COLD)
+    (tmp_path / "list.json").write_text('["thermocald-calibration/1"]')
     C = covariance()
     C[6, 6] = 1e-12
     written(tmp_path / "free.json", COLD, C)

@@ -74,7 +74,7 @@ def test_the_system_s_files_are_nothing_to_check(path):
     done = run("check", path)
     assert done.returncode == 1
     assert done.stderr.strip() == (
-        f"error: {path}: is the system's; give a recording, a config.yaml, or a store"
+        f"error: {path}: belongs to the system; give a recording, config.yaml or store"
     )
 
 
@@ -84,7 +84,7 @@ def test_a_store_below_proc_is_not_sound(tmp_path):
     )
     done = run("check", tmp_path / "config.yaml")
     assert done.returncode == 2
-    assert "store.path: /proc/self/t.db: nothing can be kept there" in done.stderr
+    assert "store.path: /proc/self/t.db: nothing can be stored there" in done.stderr
 
 
 def test_export_of_several_series_names_the_option(recording, tmp_path):

@@ -183,7 +183,7 @@ def test_what_is_printed(tmp_path):
      ("water.yaml", "line: {point: [1, 2], direction: [0, 0, 1]}\n", "must be three numbers"),
      ("gcp.csv", "target,X,Y,Z\na,1,2,3\n", "column sX is missing"),
      ("points.csv", "time,name,x,y,sx,sy\n1700021600,sky,1640,-900,0.2,0.2\n", "above the horizon"),
-     ("points.csv", "time,name,x,y,sx,sy\n1700021600,a,5000,1700,0.2,0.2\n", "px lies outside"),
+     ("points.csv", "time,name,x,y,sx,sy\n1700021600,a,5000,1700,0.2,0.2\n", "px is outside"),
      ("points.csv", "time,name,x,y,sx,sy\n1700021600,a,1640,1700,0,0.2\n", "must be above 0"),
      ("points.csv", "time,name,x,y,sx,sy\n1600000000,old,1640,1700,0.2,0.2\n", "outside the temp")],
 )  # fmt: skip

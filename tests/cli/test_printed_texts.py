@@ -107,6 +107,6 @@ def test_the_configuration_is_looked_for_here_then_in_etc(monkeypatch, tmp_path)
 def test_a_flat_field_says_what_it_is_good_for():
     told = " ".join(run("testfield", "check", "--flat").stdout.split())
     assert told.startswith("NOT ENOUGH: a series of a fixed camera gets no result")
-    assert "A flat sheet gives a drift too: photograph it in ten poses" in told
+    assert "A flat sheet also gives a drift: photograph it in ten poses" in told
     assert "719" not in told
     assert "the principal distance is not determined" in told

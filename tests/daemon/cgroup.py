@@ -1,4 +1,4 @@
-"""Control groups made by hand, version 1 or 2: what systemd would do for the units."""
+"""Control groups, version 1 or 2, made by hand as systemd makes them for the units."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ _ROOT = Path("/sys/fs/cgroup")
 
 
 class Cgroup:
-    """A group of processes with a limit of memory, and groups within it with weights of the CPU.
+    """A group of processes with a memory limit, and groups within it with CPU weights.
 
-    Together they come before whatever else the machine does. Raises OSError where none can be made:
+    Together they take precedence over other processes. Raises OSError if none can be made:
     that needs root, and the controllers.
     """
 
@@ -46,7 +46,7 @@ class Cgroup:
         return path
 
     def add(self, pid: int, name: str, cpu_weight: int) -> None:
-        """Put a process into a group of its own in this one; cpu_weight: as systemd's CPUWeight."""
+        """Put a process into a separate group within this one; cpu_weight: systemd's CPUWeight."""
         folder = self._make(self._cpu / name)
         if self.version == 1:
             (folder / "cpu.shares").write_text(str(round(10.24 * cpu_weight)))
@@ -56,25 +56,25 @@ class Cgroup:
         (folder / "cgroup.procs").write_text(str(pid))
 
     def add_visitors(self, pid: int) -> None:
-        """Put a process beside the others that does not count for their memory (version 1)."""
+        """Add a process whose memory does not count beside the others (version 1)."""
         if self.version == 1:
             folder = self._make(self._cpu / "visitors")
             (folder / "cgroup.procs").write_text(str(pid))
             self._visitors = pid
 
     def peak_mb(self) -> float:
-        """The most memory that it had at once, files read and written included."""
+        """Return the peak memory, MB, including the cache of files."""
         name = "memory.max_usage_in_bytes" if self.version == 1 else "memory.peak"
         return int((self._memory / name).read_text()) / 1024**2
 
     def kills(self) -> int:
-        """How many of its processes were ended for want of memory."""
+        """Return how many of its processes were killed for lack of memory."""
         name = "memory.oom_control" if self.version == 1 else "memory.events"
         lines = (self._memory / name).read_text().split("\n")
         return sum(int(line.split()[1]) for line in lines if line.startswith("oom_kill "))
 
     def remove(self) -> None:
-        """Remove all groups; their processes have ended, visitors go back."""
+        """Remove all groups after their processes have ended; visitors return to their own."""
         if self._visitors:
             (self._home / "cgroup.procs").write_text(str(self._visitors))
         while self._made:

@@ -1,4 +1,4 @@
-/* A wall clock that is set by others: CLOCK_REALTIME plus the seconds in a file, for one process.
+/* A wall clock that others set: CLOCK_REALTIME plus the seconds in a file, for one process.
    LD_PRELOAD=… CLOCK_OFFSET_FILE=…  The monotonic clock and the kernel's timers are left alone. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -42,7 +42,7 @@ time_t time(time_t *where) {
   return now.tv_sec;
 }
 
-/* The kernel's word on synchronisation, where CLOCK_SYNCHRONISED is set: it is. */
+/* The kernel reports a synchronised clock, if CLOCK_SYNCHRONISED is set. */
 int adjtimex(struct timex *state) {
   static int (*real)(struct timex *);
   if (!real) real = (int (*)(struct timex *))dlsym(RTLD_NEXT, "adjtimex");

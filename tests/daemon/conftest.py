@@ -1,4 +1,4 @@
-"""The real daemon as a process, small recordings to feed it, small disks to trouble it."""
+"""The real daemon as a process, with small recordings and small disks for it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"
 
 
 def fast_run(document: str, epochs: int) -> str:
-    """A script: the daemon at full speed, as `thermocald run --recording … --fast`, but looping."""
+    """Return a script that runs the daemon as `run --recording … --fast` does, but in a loop."""
     return (
         "import json; from pathlib import Path; from thermocald.config import parse_config; "
         "from thermocald.daemon.service import Service; "
@@ -40,7 +40,7 @@ def fast_run(document: str, epochs: int) -> str:
 
 
 class Daemon:
-    """One `thermocald run` in a folder."""
+    """A `thermocald run` in a folder."""
 
     def __init__(self, folder: Path, forker: Forker) -> None:
         self.folder = folder
@@ -65,7 +65,7 @@ class Daemon:
         self.process.send_signal(number)
 
     def stop(self) -> int:
-        """End it; the exit status. Nothing went wrong in a way that nobody had thought of."""
+        """Stop the daemon and return its exit status; its log must have no traceback."""
         self.signal(signal.SIGTERM)
         status = self.wait(60.0)
         assert "Traceback" not in self.log()
@@ -83,14 +83,14 @@ class Daemon:
         return path.read_text() if path.exists() else ""
 
     def status(self) -> dict:
-        """What it shows of itself, empty while it shows nothing."""
+        """Return the daemon's status document, {} without one."""
         return read_json(self.store.with_name(f"{self.store.name}.live") / "status.json")
 
     def results(self, name: str = "results.jsonl") -> list[dict]:
         path = self.folder / name
         if not path.exists():
             return []
-        lines = path.read_text().split("\n")[:-1]  # what follows the last line end is half a line
+        lines = path.read_text().split("\n")[:-1]  # an incomplete line may follow the last line end
         return [json.loads(line) for line in lines]
 
     def until(self, condition, timeout_s: float = 120.0, alive: bool = True) -> None:
@@ -101,12 +101,12 @@ class Daemon:
             time.sleep(0.05)
 
     def more(self, count: int) -> None:
-        """Wait until there are so many results more than now."""
+        """Wait for a number of further results."""
         had = len(self.results())
         self.until(lambda: len(self.results()) >= had + count)
 
     def stored(self) -> tuple[list[int], list[str]]:
-        """(numbers, statuses) of the one series; the store must be sound and no number absent."""
+        """Return (numbers, statuses) of the only series; the store must be sound, without gaps."""
         with Store.open(self.store) as store:
             assert store.examine().damaged == ()
             columns = store.series_columns(store.find_series(), ["epoch", "status"])
@@ -125,7 +125,7 @@ class Daemon:
 
 @pytest.fixture
 def spawn(forker: Forker):
-    """(folder, arguments) → a running `thermocald …`; what still runs after the test is killed."""
+    """(folder, arguments) → a running `thermocald …`, which is killed after the test."""
     started = []
 
     def start(folder: Path, *arguments: str) -> Forked:
@@ -152,7 +152,7 @@ def small_camera(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def devices(small_camera):
-    """A rendered camera and a thermometer, fast, with faults."""
+    """Sections of a configuration with a fast rendered camera and a thermometer, with faults."""
 
     def make(period_s: float = 0.2, name: str = "one", camera=(), thermometer=(), **options):
         cameras = {
@@ -173,14 +173,14 @@ def devices(small_camera):
 
 
 def warming(k: int) -> float:
-    """°C of epoch k, from 25 to 35."""
+    """Return the temperature of epoch k, 25 to 35 °C."""
     return 25.0 + 10.0 * (1 - np.exp(-k / 60.0))
 
 
 def make_recording(
     path: Path, epochs: int, per_side: int = 3, interval: float = 0.05, temperature_of=warming
 ) -> Path:
-    """Measurements of a camera that warms up, `per_side`² targets on each of three planes."""
+    """Write observations of a camera that warms up: `per_side`² targets on each of three planes."""
     field = corner_field("plain", per_side=per_side, pitch_mm=660.0 / (per_side + 0.3))
     model = demonstration_model(field)
     iop, eop = model.interior.as_array(), model.exterior.as_array()
@@ -206,7 +206,7 @@ def make_recording(
 
 
 def make_photographs(path: Path, recording: Path, frames: list[bytes]) -> Path:
-    """A recording of JPEGs, of the camera and the test field of another."""
+    """Write a recording of JPEGs with the camera and test field of another recording."""
     (path / "frames").mkdir(parents=True)
     for name in ("recording.yaml", "testfield.csv"):
         shutil.copy(recording / name, path / name)
@@ -220,12 +220,12 @@ def make_photographs(path: Path, recording: Path, frames: list[bytes]) -> Path:
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory) -> Path:
-    """200 epochs of 27 targets at 50 ms."""
+    """A recording of 200 epochs of 27 targets, one every 50 ms."""
     return make_recording(tmp_path_factory.mktemp("recording") / "small", 200)
 
 
 def replayed_camera(path: Path, **more: object) -> dict[str, object]:
-    """The entry of a camera that replays a recording."""
+    """Return the configuration entry of a camera that replays a recording."""
     sensor = read_head(path).camera.sensor
     return {
         "driver": "replay", "recording": str(path), "testfield": str(path / "testfield.csv"),
@@ -238,7 +238,7 @@ def replayed_camera(path: Path, **more: object) -> dict[str, object]:
 
 @pytest.fixture
 def replayed():
-    """A recording as devices of a configuration."""
+    """Sections of a configuration that replays a recording."""
 
     def make(path: Path, period_s: float = 0.05, loop: bool = True):
         rhythm = {"loop": loop, "period_s": period_s}
@@ -255,16 +255,16 @@ def replayed():
 
 @pytest.fixture
 def measured(recording, replayed):
-    """Devices that give measurements ten times a second: where no picture matters."""
+    """Devices that deliver observations, without images, ten times a second."""
     return replayed(recording, 0.1)
 
 
 @pytest.fixture(scope="session")
 def preloaded(tmp_path_factory):
-    """What starts daemons above all C files beside this one; each asks for its own variables."""
+    """A forker of daemons with all C files beside this one preloaded; a variable activates each."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
-        pytest.skip("no C compiler: what the system tells a process cannot be changed")
+        pytest.skip("no C compiler for the libraries that simulate the system")
     folder, built = tmp_path_factory.mktemp("preloaded"), []
     for source in sorted(Path(__file__).parent.glob("*.c")):
         built.append(str(folder / f"{source.stem}.so"))
@@ -276,13 +276,13 @@ def preloaded(tmp_path_factory):
 
 
 def tool(*command: object) -> subprocess.CompletedProcess[str]:
-    """A program of the system, which may fail."""
+    """Run a program of the system, which may fail."""
     return subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
 
 
 @pytest.fixture
 def small_disk(tmp_path: Path):
-    """MB → the folder of a disk of that size; skips where nothing can be mounted."""
+    """MB → the folder of a disk of this size; skips if nothing can be mounted."""
     mounted = []
 
     def mount(size_mb: int) -> Path:
@@ -301,7 +301,7 @@ def small_disk(tmp_path: Path):
 
 @pytest.fixture
 def loop_disk(tmp_path: Path):
-    """MB, options of mkfs and mount → (image, folder) of an ext4 disk in a file, as a card is."""
+    """MB, options of mkfs and mount → (image, folder) of an ext4 disk in a file, like a card."""
     image, folder = tmp_path / "disk.img", tmp_path / "card"
 
     def mount(size_mb: int, *mkfs: str, options: str = "loop") -> tuple[Path, Path]:
@@ -320,7 +320,7 @@ def loop_disk(tmp_path: Path):
 
 
 class Supervisor:
-    """The socket that systemd would listen on."""
+    """The notification socket, in place of systemd's."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -330,7 +330,7 @@ class Supervisor:
         self.heard: list[str] = []
 
     def listen(self, seconds: float) -> list[str]:
-        """What is said from now on, for so long."""
+        """Return the messages of the next seconds."""
         end, begin = time.monotonic() + seconds, len(self.heard)
         while time.monotonic() < end:
             try:

@@ -1,5 +1,5 @@
 /* A disk that fails beneath a database, for one process: input/output errors on request.
-   LD_PRELOAD=… DISK_ERROR_OF=database DISK_ERROR_FILE=…, which says `write` or `sync`. */
+   LD_PRELOAD=… DISK_ERROR_OF=database DISK_ERROR_FILE=…, which contains `write` or `sync`. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -21,7 +21,7 @@ static int fails(int file, const char *what) {
   if (!of || strcmp(said, what)) return 0;
   snprintf(link, sizeof link, "/proc/self/fd/%d", file);
   if (readlink(link, path, sizeof path - 1) < 0 || strncmp(path, of, strlen(of))) return 0;
-  if (path[strlen(of)] && path[strlen(of)] != '-') return 0; /* neither it nor its log */
+  if (path[strlen(of)] && path[strlen(of)] != '-') return 0; /* neither the file nor its log */
   errno = EIO;
   return 1;
 }

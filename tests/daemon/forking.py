@@ -1,8 +1,8 @@
-"""Starts daemons by fork, after everything is imported: 200 starts in the time of ten.
+"""Starts daemons by fork after all imports: 200 starts in the time of ten.
 
 As a program it reads one JSON document per line: {"arguments", "folder", "environment", "script",
-"log"} forks and prints the child's process id, whose work is a command or, where it is given, the
-script; {"ended": id} prints the exit status of a child that has ended.
+"log"} forks a child that runs the command or the script, if given, and prints its process id;
+{"ended": id} prints the exit status of a child that has ended.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import NoReturn
 
 
 class Forker:
-    """The program of this file, and the daemons that it starts."""
+    """This file as a program, and the daemons that it starts."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self._process = subprocess.Popen(
@@ -36,8 +36,8 @@ class Forker:
         self, folder: Path, *arguments: str, script: str = "", log: str = "log.txt",
         **environment: str,
     ) -> Forked:  # fmt: skip
-        """`thermocald ARGUMENTS`, or a script, in a folder, whose log gets what it prints."""
-        (folder / log).touch()  # whoever reads it need not wait for the child
+        """Start `thermocald ARGUMENTS`, or a script, in a folder with its log."""
+        (folder / log).touch()  # a reader need not wait for the child
         asked = {"arguments": arguments, "folder": str(folder), "environment": environment,
                  "script": script, "log": log}  # fmt: skip
         return Forked(self, self.ask(asked), folder / log)
@@ -78,12 +78,12 @@ class Forked:
         return self.returncode
 
     def said(self, timeout_s: float | None = 120.0) -> str:
-        """Wait for its end, and return what it has printed."""
+        """Wait for the process to end, and return its output."""
         self.wait(timeout_s)
         return self.printed()
 
     def printed(self) -> str:
-        """What it has printed so far."""
+        """Return its output so far."""
         return self._log.read_text()
 
     def send_signal(self, number: int) -> None:
@@ -95,7 +95,7 @@ class Forked:
 
 
 def _work(script: str) -> NoReturn:
-    """Run a script or the command line, and end without taking all modules to pieces."""
+    """Run a script or the command line, and exit without unloading the modules."""
     status = 0
     try:
         exec(script or "import thermocald.cli; thermocald.cli.main()", {})
@@ -140,7 +140,7 @@ def main() -> None:
             log = os.open(asked["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
             os.dup2(log, 1)
             os.dup2(log, 2)
-            faulthandler.enable()  # what ends a process without a word leaves its stack
+            faulthandler.enable()  # a crash leaves its stack in the log
             _work(asked["script"])
         print(pid, flush=True)
 

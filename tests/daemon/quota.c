@@ -1,5 +1,5 @@
-/* A quota for one process: what its files in a folder may hold together, in bytes on request.
-   LD_PRELOAD=… QUOTA_OF=folder QUOTA_FILE=…, which says how many; without the file there is none. */
+/* A quota for one process: the bytes that its files in a folder may hold together, on request.
+   LD_PRELOAD=… QUOTA_OF=folder QUOTA_FILE=…, which contains the number; without the file there is no quota. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -31,7 +31,7 @@ static long long limit(void) {
   return said[0] ? atoll(said) : -1;
 }
 
-/* How many of n bytes at `at` may be written: growth alone counts, and a part may fit. */
+/* Return how many of n bytes at `at` may be written: only growth counts, and a part may fit. */
 static long long allowed(int file, long long at, long long n) {
   char link[64], path[4096] = {0};
   const char *of = getenv("QUOTA_OF");
@@ -45,7 +45,7 @@ static long long allowed(int file, long long at, long long n) {
     used = 0;
     nftw64(of, add, 8, FTW_PHYS);
     long long inside = now.st_size > at ? now.st_size - at : 0, free = most - used;
-    long long grown = at > now.st_size ? at - now.st_size : 0; /* a hole counts too */
+    long long grown = at > now.st_size ? at - now.st_size : 0; /* a hole counts, too */
     fits = free > grown ? inside + free - grown : inside;
     if (fits > n) fits = n;
   }
@@ -91,7 +91,7 @@ int posix_fallocate64(int file, off64_t at, off64_t n) {
 
 int posix_fallocate(int file, off_t at, off_t n) { return posix_fallocate64(file, at, n); }
 
-/* File systems with delayed allocation find out late: the flush fails as long as nothing fits. */
+/* With delayed allocation, the flush fails as long as nothing fits. */
 static int flushes(int file) {
   const char *late = getenv("QUOTA_LATE");
   struct stat64 now;

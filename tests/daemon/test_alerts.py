@@ -1,4 +1,4 @@
-"""Alerts of a running daemon: a camera that warms and cools, told out and in once, four ways."""
+"""Alerts of a running daemon: one out and one in, by four drivers, as a camera warms and cools."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WHEN = [
 
 
 def up_and_down(k):
-    """°C: at rest, to 60 °C, and back."""
+    """Return a temperature that stays, rises to 60 °C and falls again."""
     return float(np.interp(k, [0, 12, 30, 42, 60], [25.0, 25.0, 60.0, 60.0, 25.0]))
 
 

@@ -32,7 +32,7 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory, forker):
-    """{key: columns of the series that was taken with it}; target 7 is 3 px off in all epochs."""
+    """{key: columns of the series taken with it}; target 7 is 3 px off in all epochs."""
     folder = tmp_path_factory.mktemp("keys")
     taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4))
     field = TestField.build(taken.testfield.names, taken.testfield.points, 0.05)
@@ -70,7 +70,7 @@ def test_every_key_changes_what_is_stored(stored):
     plain, series, offsets = stored["plain"], stored["exterior"], stored["target_offsets"]
     assert (plain["status"] == "ok").all()
     assert (plain["n_rejected"] >= 1).all()
-    # one orientation: next to the epoch's own result stands a far surer principal point
+    # with one orientation, the principal point of the series has a far smaller sd
     assert series["sd_series_x0"][-1] < 0.5 * plain["sd_x0"][-1]
     assert np.ptp(series["series_x0"][-5:]) < 0.5 * np.ptp(plain["x0"][-5:])
     np.testing.assert_array_equal(series["x0"], plain["x0"])
@@ -79,9 +79,9 @@ def test_every_key_changes_what_is_stored(stored):
     assert (stored["fixed"]["A1"] == 0.002).all()
     assert (stored["free"]["A1"] == 0.0).all()
     assert stored["priors"]["c"] == pytest.approx(3.2, abs=1e-4)
-    # the sigmas of the object coordinates stay, or it would be a tenth
+    # the sds of the object coordinates stay the same; otherwise it would be a tenth
     assert (stored["sigma_floor_px"]["sigma0"] < 0.4 * plain["sigma0"]).all()
-    # errors of the field are in every epoch the same, and no longer noise of the epoch
+    # errors of the field, the same in every epoch, no longer count as noise of the epoch
     assert np.abs(offsets["c"] - plain["c"])[1:].min() > 0
     assert np.median(offsets["sigma0"]) != pytest.approx(np.median(plain["sigma0"]), rel=0.02)
     assert (stored["correlation_bound"]["status"] == "weak_geometry").all()

@@ -1,7 +1,8 @@
-"""What a camera's frames report of focus and exposure reaches the store and the status."""
+"""The focus and exposure that frames report reach the store and the status."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,8 @@ from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.hal import Camera, Frame, VirtualClock
+from thermocald.physics.testfields import demonstration_field
+from thermocald.store.recording.testfield_file import write_testfield
 from thermocald.store.series import EpochResult
 
 CAMERA = {"name": "river", "driver": "v4l2", "device": "/dev/video0", "width": 64, "height": 48}
@@ -66,5 +69,12 @@ def test_a_setting_that_harms_is_in_the_status():
 def test_a_sensor_of_another_size_than_the_driver_is_refused():
     sensor = {"width_px": 64, "height_px": 48, "pixel_pitch_mm": 0.003}
     assert plan_of(sensor=sensor).sensor.width == 64
-    with pytest.raises(ConfigurationError, match=r"sensor says 1920×1080 px .* have 64×48 px"):
+    with pytest.raises(ConfigurationError, match=r"sensor has 1920×1080 px.* have 64×48 px"):
         plan_of(sensor={**sensor, "width_px": 1920, "height_px": 1080})
+
+
+def test_a_test_field_without_a_sensor_names_the_missing_keys(tmp_path):
+    write_testfield(tmp_path / "field.csv", demonstration_field())
+    example = "sensor: {width_px: …, height_px: …, pixel_pitch_mm: …}"
+    with pytest.raises(ConfigurationError, match=re.escape(f"`{example}`")):
+        plan_of(testfield=str(tmp_path / "field.csv"))

@@ -1,4 +1,4 @@
-"""What happens to a camera is told: a knock, a slip, another lens, a target that was moved."""
+"""Changes of a camera are reported: a knock, a slip, another lens, a moved target."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory, forker):
-    """One daemon, five cameras that see the same until epoch 23."""
+    """The store of one daemon with five cameras that see the same until epoch 23."""
     folder = tmp_path_factory.mktemp("changes")
     taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4, interval=10.0))
     field, sensor = taken.testfield, taken.camera.sensor
@@ -74,7 +74,7 @@ def told(store, name: str) -> list[tuple[str, int]]:
 
 
 def test_what_was_stored_is_what_replay_makes_of_it(store):
-    """The late epochs; at an early one the daemon cannot know what the later ones say."""
+    """For the late epochs; at an early epoch the daemon does not have the later ones."""
     series = store.find_series("nothing")
     replayed = table_of_stored(StoredRecording(store, series), AdjustmentSettings(), "series")
     names = [

@@ -1,7 +1,7 @@
-"""A hostile week at random: kills, flipped bits, clock leaps, deletions, attacks on the page.
+"""A hostile week, at random: kills, flipped bits, clock leaps, deletions, attacks on the page.
 
-Every epoch that was reported as stored is in the store as it was reported, or `check` names it, its
-series' gap, or the file as damaged. THERMOCALD_CHAOS_ROUNDS=300 is the whole of it.
+Every epoch that was reported as stored is in the store as reported, or `check` names it, the gap in
+its series, or the file as damaged. THERMOCALD_CHAOS_ROUNDS=300 runs the full test.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SEED = int(os.environ.get("THERMOCALD_CHAOS_SEED", "1"))
 
 
 class Chaos:
-    """The daemons of a folder, and what becomes of them."""
+    """The daemons of a folder, the attacks on them, and the comparison of their stores."""
 
     def __init__(self, daemon, offset: Path) -> None:
         self.daemon = daemon
@@ -41,7 +41,7 @@ class Chaos:
         self.daemon.start(CLOCK_OFFSET_FILE=str(self.offset))
 
     def progress(self) -> None:
-        """Wait for a result that comes from now on."""
+        """Wait for a new result."""
         size, deadline = self.results.stat().st_size, time.monotonic() + 60
         while self.results.stat().st_size == size:
             assert time.monotonic() < deadline, (self.folder / "log.txt").read_text()[-3000:]
@@ -54,11 +54,11 @@ class Chaos:
         self.daemon.close()
 
     def told(self) -> dict[int, tuple[float, float]]:
-        """What was reported as stored: {epoch: (c, frame_time)}."""
+        """Return {epoch: (c, frame_time)} of the epochs reported as stored."""
         return {r["epoch"]: (r["c"], r["frame_time"]) for r in self.daemon.results() if r["stored"]}
 
     def compare(self, path: Path) -> tuple[int, bool]:
-        """(reported epochs that are absent or other in a store, whether `check` names them)."""
+        """Return (reported epochs that a store lacks or changed, whether `check` names them)."""
         told = self.told()
         try:
             with Store.open(path) as store:
@@ -73,7 +73,7 @@ class Chaos:
         wrong = []
         for number, (c, frame_time) in told.items():
             found_c, found_time = kept.get(number, (None, None))
-            # what could not be calibrated in time may have been since
+            # a deferred calibration may have been added since
             if found_time != frame_time or (c is not None and found_c != c):
                 wrong.append(number)
         # only the last write can have been cut off
@@ -81,7 +81,7 @@ class Chaos:
         return len(wrong), bool(found.damaged or found.gaps or unfinished)
 
     def flip(self, rng: np.random.Generator, scratch: Path) -> None:
-        """Flip bits in a copy of what a killed daemon left, and look at that."""
+        """Flip bits in a copy of a killed daemon's store, and compare it."""
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir()
         names = [p for p in self.folder.glob("thermocald.db*") if p.is_file()]
@@ -104,7 +104,7 @@ class Chaos:
         assert not wrong or named, said
 
     def write_beside(self, rng, other: Path) -> None:
-        """A second writer, by the store's name, a link, or a hard link, which then is read too."""
+        """Try to write by the store's name, a link or a hard link, and to read by a hard link."""
         store = self.daemon.store
         kind = ["name", "link", "hard link"][int(rng.integers(3))]
         if kind == "link":
@@ -162,7 +162,7 @@ def test_what_was_reported_as_stored_is_there_and_right_or_named(chaos, tmp_path
             chosen = files if rng.random() < 0.5 else [files[int(rng.integers(len(files)))]]
             for path in chosen:
                 path.unlink(missing_ok=True)
-            chaos.progress()  # what the process still has is written again with the next epoch
+            chaos.progress()  # writes what the process holds
             chaos.progress()
             chaos.note("deletions")
         time.sleep(rng.uniform(0.0, 0.25))

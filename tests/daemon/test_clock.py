@@ -1,7 +1,7 @@
-"""The wall clock of the real daemon's process is set by others, for seconds and for good.
+"""The wall clock of the real daemon's process is set, for seconds or permanently.
 
-Real: the process, its threads, what `clock_gettime`, `gettimeofday` and `time` of the C library
-tell it. Not real: the kernel's clock itself: file times and its word on synchronisation stay.
+Real: the process, its threads, and the times that `clock_gettime`, `gettimeofday` and `time` of the
+C library return. Not real: the kernel's clock; file times and its synchronisation state stay.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DAY = 86400.0
 
 
 def content(daemon, folder):
-    """(columns, clock steps, archived times) of the one series."""
+    """Return (columns, clock steps, archived times) of the only series."""
     with Store.open(daemon.store) as store:
         assert store.examine().damaged == ()
         series = store.find_series()
@@ -33,14 +33,14 @@ def content(daemon, folder):
 
 @pytest.fixture
 def clocked(daemon, devices, preloaded, tmp_path):
-    """s → a daemon that has begun with its clock off by so much; it is set by `clocked.set`."""
+    """s → a daemon started with its clock off by this; `clocked.set` changes the offset."""
     frames = {"keep": "all", "folder": str(tmp_path / "frames"), "max_age_days": 90,
               "min_free_gb": 0.0}  # fmt: skip
     daemon.configure(**devices(period_s=0.3), frames=frames)
     daemon.forker = preloaded
 
     def set_clock(seconds):
-        # written over, since the process holds the file open
+        # overwritten, since the process holds the file open
         (tmp_path / "offset").write_text(str(int(seconds)).ljust(12))
 
     def start(seconds):
@@ -53,7 +53,7 @@ def clocked(daemon, devices, preloaded, tmp_path):
 
 
 def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, clocked, tmp_path):
-    """120 days ahead for 3 s, an hour back: found to delete all frames and to leave times wrong."""
+    """120 days ahead for 3 s, an hour back: this once deleted all frames and left times wrong."""
     clocked(0)
     for seconds, steps in ((120 * DAY, 1), (0, 2), (-HOUR, 3), (0, 4)):
         clocked.set(seconds)
@@ -75,7 +75,7 @@ def test_a_glitch_moves_no_time_and_deletes_no_frame(daemon, clocked, tmp_path):
 
 
 def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(daemon, clocked, tmp_path):
-    clocked(60 - time.time())  # a minute after 1970 began
+    clocked(60 - time.time())  # a minute after the start of 1970
     clocked.set(0)
     daemon.until(lambda: "time stamps follow" in daemon.log())
     daemon.more(2)
@@ -86,7 +86,7 @@ def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(daemon, c
     assert numbers == [r["epoch"] for r in daemon.results()] == list(range(1, len(numbers) + 1))
     assert len(list((tmp_path / "frames").rglob("*.png"))) == len(numbers)
     assert columns["frame_time"][0] < 1e6
-    # what was taken before is put in its place
+    # the earlier epochs are corrected
     assert np.diff(archived).max() < 60.0
     assert (np.diff(archived) > 0).all()
     assert abs(archived[-1] - time.time()) < 600.0

@@ -1,4 +1,4 @@
-"""The control socket: who may ask, what is refused, and that nothing said to it hurts."""
+"""The control socket: its permissions, what it refuses, and that no input harms the daemon."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SESSION = {"camera": "one", "series": "M7", "start": "cold", "epochs": 3}
 
 @pytest.fixture
 def ear(tmp_path):
-    """A socket that answers with what was asked; `ear.asked` lists it."""
+    """A socket that answers with the request; `ear.asked` lists the requests."""
     asked = []
 
     def answer(request):
@@ -28,7 +28,7 @@ def ear(tmp_path):
             raise DataError("nothing may go")
         return {"sessions": {"x": float("nan")}}
 
-    folder = tmp_path / ("deep" * 30)  # longer than a socket's address may be
+    folder = tmp_path / ("deep" * 30)  # longer than the limit of a socket address
     control = ControlSocket(folder, answer)
     control.open()
     control.asked, control.folder = asked, folder
@@ -57,7 +57,7 @@ def say(ear, data: bytes) -> dict:
 
 def test_an_answer_is_json_and_a_refusal_is_raised(ear, tmp_path):
     mode = stat.S_IMODE((ear.folder / "control.sock").stat().st_mode)
-    assert mode == 0o660  # owner and group may ask, and nobody else
+    assert mode == 0o660  # only owner and group have access
     assert ask(ear.folder, "session status") == {
         "format": FORMAT, "ok": True, "sessions": {"x": None}
     }  # fmt: skip
@@ -160,4 +160,4 @@ def test_a_full_backlog_is_not_nobody(tmp_path):
             ask(tmp_path, "session status")
         for channel in waiting:
             channel.close()
-    assert ask(tmp_path, "session status") is None  # the file is there, and nobody listens
+    assert ask(tmp_path, "session status") is None  # the file exists, but no daemon listens

@@ -24,16 +24,16 @@ _DRAWN = """() => [...document.querySelectorAll('#course .scatterlayer path.js-l
 
 @pytest.fixture
 def shown(daemon, devices):
-    """A running daemon with its page: its address."""
+    """The address of a running daemon's page."""
     port = free_port()
-    # slow enough for a busy machine: what is deferred is calibrated later, and not drawn
+    # slow enough for a busy machine: a deferred epoch is calibrated later and not drawn
     daemon.run(**devices(period_s=1.5), dashboard={"enabled": True, "port": port})
     daemon.more(3)
     daemon.until(lambda: _listens(port))
     yield f"http://127.0.0.1:{port}/"
     if daemon.process.poll() is None:
         daemon.stop()
-    assert "Traceback" not in daemon.log()  # a page was open when it ended
+    assert "Traceback" not in daemon.log()  # a page was open when the daemon stopped
 
 
 def _listens(port: int) -> bool:

@@ -1,4 +1,4 @@
-"""The drift that outputs are given: in px, against the start of the series, with its sd."""
+"""The drift that outputs receive: in px from the start of the series, with its sd."""
 
 from __future__ import annotations
 

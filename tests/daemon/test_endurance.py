@@ -1,4 +1,4 @@
-"""Months in minutes, a day on a disk of 50 MB, the rhythm under load."""
+"""Months in minutes, a day on a disk of 50 MB, and the rhythm of ticks under load."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def watched(daemon, run):
-    """What a daemon takes while it runs a script: rows of epochs stored, MB resident, open files,
-    threads, and seconds of processor time.
-    """
+    """Run a script; return rows of epochs stored, MB resident, open files, threads, CPU seconds."""
     daemon.process = subprocess.Popen(
         [sys.executable, "-c", run], cwd=daemon.folder, env=ENVIRONMENT
     )
@@ -48,7 +46,7 @@ def watched(daemon, run):
 
 
 def test_a_daemon_that_waits_keeps_to_88_mb(daemon, replayed, tmp_path):
-    """With what its unit sets, between two epochs of 12 targets: 84 with replay's series in it."""
+    """With its unit's variables, between two epochs of 12 targets: 84 with replay's series."""
     unit = configparser.ConfigParser(strict=False, interpolation=None)
     unit.optionxform = str
     unit.read(ROOT / "systemd/thermocald.service")
@@ -77,7 +75,7 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
     THERMOCALD_SOAK_EPOCHS=100000 takes a quarter of an hour of an idle core.
     """
     ticks = int(os.environ.get("THERMOCALD_SOAK_EPOCHS", "8640"))
-    period_s = 900.0  # windows fill during the first 2,500
+    period_s = 900.0  # windows fill during the first 2,500 epochs
     day = round(86_400 / period_s)
     path = make_recording(
         tmp_path / "days", 5 * day, per_side=2, interval=period_s,
@@ -91,7 +89,7 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
     epochs, resident, files, threads, used = map(np.array, zip(*seen, strict=True))
     cost_ms, held_mb = [], []
     for third in range(3):
-        # the first days belong to the start: modules are loaded, windows fill
+        # during the first days modules are loaded and windows fill
         low, high = (ticks * (0.05 + 0.95 * (third + k) / 3) for k in (0, 1))
         part = (epochs >= low) & (epochs <= high)
         assert part.sum() >= 3
@@ -103,9 +101,9 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
     assert held_mb[2] - held_mb[0] < 5.0
     assert resident.max() < 200.0
     warm = (epochs > 0.7 * ticks) & (epochs < 0.98 * ticks)
-    assert np.ptp(files[warm]) <= 2  # status.json is being written now and then
+    assert np.ptp(files[warm]) <= 2  # status.json may be open
     assert np.ptp(threads[warm]) == 0
-    assert cost_ms[2] < 1.25 * cost_ms[0]  # of a machine that may be busy; it was 1.00 and 1.15
+    assert cost_ms[2] < 1.25 * cost_ms[0]  # on a machine that may be busy; measured: 1.00 and 1.15
     with Store.open(daemon.store) as store:
         series = store.find_series()
         assert store.last_epoch(series) == ticks
@@ -127,7 +125,7 @@ def test_a_day_of_epochs_on_a_disk_of_50_mb_loses_no_result(daemon, replayed, tm
         [sys.executable, "-c", run],
         cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=True,
     )  # fmt: skip
-    assert "observations no more" in done.stderr
+    assert "observations no longer" in done.stderr
     with Store.open(daemon.store) as store:
         assert store.examine().damaged == ()
         series = store.find_series()
@@ -138,7 +136,7 @@ def test_a_day_of_epochs_on_a_disk_of_50_mb_loses_no_result(daemon, replayed, tm
 
 
 def test_the_rhythm_holds_while_the_interpreter_is_busy():
-    """p99 ≤ 5 ms; on a machine that is busy itself, not more than what it does to a bare sleep."""
+    """p99 ≤ 5 ms; on a busy machine, no more than it delays a bare sleep."""
     script = """
 import json, sys, threading, time
 import numpy as np

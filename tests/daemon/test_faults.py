@@ -1,4 +1,4 @@
-"""Faults that the real daemon, as a process, must come through."""
+"""Faults that the real daemon, as a process, must survive."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from thermocald.store.database.store import Store
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("kills", [4, pytest.param(80, marks=pytest.mark.slow)])
 def test_killed_and_restarted_nothing_committed_is_lost(daemon, recording, replayed, kills):
-    """40 more in test_chaos, and 300 of the store's writer in store/test_kills."""
+    """40 more kills in test_chaos, and 300 of the store's writer in store/test_kills."""
     daemon.configure(**replayed(recording))
     rng = np.random.default_rng(5)
     for _ in range(kills):
@@ -48,15 +48,15 @@ def test_unplugged_and_back_told_once_each_and_no_other_device_waits(daemon, dev
     times = {name: [r["frame_time"] for r in daemon.results() if r["device"] == name]
              for name in ("one", "two")}  # fmt: skip
     away = np.diff(times["one"])
-    assert 1.5 < away.max() < 4.5  # 1.5 s away, and the next tick but a few
+    assert 1.5 < away.max() < 4.5  # 1.5 s away, and a few ticks until the retry
     assert np.sort(away)[-2] < 1.5
-    # the other camera went on all the while
+    # the other camera continued meanwhile
     begin = times["one"][int(away.argmax())]
     usual = 1.5 / np.mean(np.diff(times["two"]))  # epochs in 1.5 s
     assert sum(begin < t < begin + 1.5 for t in times["two"]) >= 0.3 * usual - 1
 
 
-@pytest.mark.slow  # it waits: for the watchdog, and at the end for the hung thread
+@pytest.mark.slow  # waits for the watchdog, and at the end for the hung thread
 def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, devices, supervisor):
     hangs = [{"kind": "timeout", "at": 8}]
     sections = devices(camera=hangs, timeout_s=3600.0)
@@ -65,7 +65,7 @@ def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, dev
     daemon.start("--hang-after", "3", NOTIFY_SOCKET=str(supervisor.path), WATCHDOG_USEC="2000000")
     supervisor.until("READY=1")
     assert "WATCHDOG=1" in supervisor.listen(1.2)
-    # on a busy machine it may take long to open or to calculate, which passes
+    # on a busy machine, opening and calculating may take long
     daemon.until(lambda: sum(r["device"] == "one" for r in daemon.results()) == 7)
     daemon.until(lambda: daemon.status()["stalled"] == ["camera one hangs"])
     supervisor.listen(0.5)
@@ -73,12 +73,12 @@ def test_a_hung_capture_trips_the_watchdog_and_holds_nothing_else_up(daemon, dev
     count = len([r for r in daemon.results() if r["device"] == "two"])
     daemon.until(lambda: len([r for r in daemon.results() if r["device"] == "two"]) > count + 5)
     assert len([r for r in daemon.results() if r["device"] == "one"]) == 7
-    assert daemon.stop() == 0  # the hung thread does not keep it from ending
+    assert daemon.stop() == 0  # the hung thread does not prevent the exit
     assert "hung" in daemon.events()
 
 
 def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
-    """What a card that fails does to a running daemon: no write beyond a file size gets through."""
+    """As with a card that fails, every write beyond a file size fails."""
     daemon.run(**devices())
     daemon.more(4)
     before = resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE)
@@ -87,7 +87,7 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
     daemon.until(lambda: daemon.status().get("store", {}).get("waiting", 0) >= 5)
     resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, before)
     daemon.until(lambda: "can be written again" in daemon.log())
-    # the output's file was closed for it too, and gets what waited when it is opened again
+    # the output's file failed as well, and receives the waiting results when it is opened again
     daemon.until(lambda: sum(not r["stored"] for r in daemon.results()) >= 5)
     daemon.until(lambda: daemon.results()[-1]["stored"])
     assert daemon.stop() == 0
@@ -103,7 +103,7 @@ def test_a_store_that_cannot_be_written_waits_in_memory(daemon, devices):
 def test_a_disk_that_fails_beneath_the_store_loses_nothing(
     daemon, measured, preloaded, tmp_path, failing
 ):
-    """Input/output errors: of writes, and of the flush that a commit is worth nothing without."""
+    """Input/output errors of writes, and of the flush that a commit depends on."""
     asked = tmp_path / "asked"
     daemon.forker = preloaded
     daemon.configure(**measured)
@@ -116,7 +116,7 @@ def test_a_disk_that_fails_beneath_the_store_loses_nothing(
     asked.unlink()
     daemon.until(lambda: "can be written again" in daemon.log())
     daemon.until(lambda: daemon.results()[-1]["stored"])
-    daemon.kill()  # what is in the store now is all that there is
+    daemon.kill()  # the store has all epochs
     numbers, _ = daemon.stored()
     assert len(numbers) >= told
     assert daemon.log().count("results wait in memory") == 1
@@ -143,27 +143,27 @@ def test_a_full_disk_loses_frames_then_observations_but_no_result(daemon, device
     disk = small_disk(60)
     daemon.store = disk / "thermocald.db"
     frames = {"keep": "all", "folder": str(disk / "frames"), "min_free_gb": 0.04}
-    daemon.configure(**devices(period_s=1.0), frames=frames)  # a busy machine keeps up with it
+    daemon.configure(**devices(period_s=1.0), frames=frames)  # a busy machine keeps up with this
     daemon.start()
     daemon.until(lambda: list(disk.rglob("*.png")))
     daemon.until(lambda: any(r["status"] == "ok" for r in daemon.results()))
     (disk / "filler").write_bytes(b"\0" * 25_000_000)
     daemon.until(lambda: "no frames are kept" in daemon.log())
     free = shutil.disk_usage(disk).free
-    (disk / "more").write_bytes(b"\0" * (free - 14_000_000))  # 16 MB are kept for results
-    daemon.until(lambda: "observations no more" in daemon.log())
+    (disk / "more").write_bytes(b"\0" * (free - 14_000_000))  # 16 MB are reserved for results
+    daemon.until(lambda: "observations no longer" in daemon.log())
     free = shutil.disk_usage(disk).free
     (disk / "rest").write_bytes(b"\0" * (free - 200_000))
     daemon.more(4)
     for name in ("rest", "more", "filler"):
         (disk / name).unlink()
-    daemon.until(lambda: "observations are kept again" in daemon.log())
+    daemon.until(lambda: "observations are stored again" in daemon.log())
     again = len(daemon.results())
     daemon.until(lambda: any(r["stored"] and r["status"] == "ok" for r in daemon.results()[again:]))
     assert daemon.stop() == 0
     numbers, statuses = daemon.stored()
     assert numbers == [r["epoch"] for r in daemon.results()]
-    # on a machine that is busy with other things a calibration may have been put off
+    # on a busy machine, a calibration may have been deferred
     assert set(statuses) <= {"ok", "not_calibrated", "frame_not_kept"}
     with Store.open(daemon.store) as store:
         epochs = list(store.epochs(store.find_series()))
@@ -181,7 +181,7 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
     daemon.more(2)
     daemon.config.write_text(good.replace("period_s", "perriod_s"))
     daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: "was not read again" in daemon.log())
+    daemon.until(lambda: "cannot be reloaded" in daemon.log())
     assert "is 'period_s' meant?" in daemon.log()
     daemon.more(2)
     daemon.config.write_text(good.replace("name: rpi", "name: other"))
@@ -197,6 +197,26 @@ def test_a_broken_configuration_at_reload_changes_nothing_a_good_one_does(daemon
             numbers = store.series_columns(series, ["epoch"])["epoch"].tolist()
             assert numbers == list(range(1, len(numbers) + 1))
     assert daemon.events().count("reload_failed") == 1
+
+
+def test_a_reload_opens_a_failed_device_also_without_a_change(daemon, devices, recording, tmp_path):
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "recording.yaml").write_text("[")
+    sections = devices()
+    air = {"name": "air", "driver": "replay", "recording": "./broken", "loop": True}
+    sections["thermometers"].append({**air, "period_s": 0.2})
+    daemon.run(**sections)
+
+    def state() -> str:
+        return daemon.status().get("thermometers", {}).get("air", {}).get("device", "")
+
+    daemon.until(lambda: state() == "failed")
+    shutil.rmtree(broken)
+    shutil.copytree(recording, broken)
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: state() == "open")
+    assert daemon.stop() == 0
 
 
 @pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])

@@ -1,4 +1,4 @@
-"""The daemon without a test field: a thermal model predicts, control points pose."""
+"""The daemon without a test field: the thermal model predicts, control points give the pose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from thermocald.store.database.store import Store
 
 @pytest.fixture
 def thermal_model(small_camera, tmp_path):
-    """The rendered camera's own model, as a fit would have left it."""
+    """The rendered camera's true model, as a fit would write it."""
     document = yaml.safe_load(small_camera.read_text())
     document["validity"] = {"temperature": [15.0, 60.0]}
     names = ["interior.c", "interior.x0", "interior.y0", "rates.c", "rates.x0", "rates.y0"]
@@ -32,7 +32,7 @@ def thermal_model(small_camera, tmp_path):
 
 @pytest.fixture
 def control_points(tmp_path):
-    """Every corner of a few markers of the rendered field, in metres of a national grid."""
+    """The corners of a few markers of the rendered field, in metres of a national grid."""
     field = demonstration_field("markers")
     path = tmp_path / "gcp.csv"
     with path.open("w", newline="") as out:
@@ -61,7 +61,7 @@ def test_predicted_epochs_through_a_restart_are_not_taken_for_calibrations(
     daemon.until(lambda: len(daemon.results()) >= count + 4)
     assert daemon.stop() == 0
     _, words = daemon.stored()
-    # what a busy machine has put off is not made up for where the daemon ends before
+    # epochs that a busy machine deferred are missing if the daemon stops before
     assert {"predicted"} <= set(words) <= {"predicted", "not_calibrated"}
     row = [row for row in daemon.results() if row["status"] == "predicted"][-1]
     assert row["sd_c"] > 0
@@ -89,7 +89,7 @@ def test_predicted_epochs_through_a_restart_are_not_taken_for_calibrations(
 def test_posed_epochs_are_those_of_the_rendered_camera_and_kept_frames_stand_there_corrected_too(
     daemon, devices, thermal_model, control_points
 ):
-    """Every second frame, and beside it the same at T₀ with the row's pose."""
+    """Every second frame, and beside it the same frame at T₀ with the row's pose."""
     document = at_work(devices, thermal_model, control_points=str(control_points))
     folder = daemon.folder / "frames"
     frames = {"keep": "every_n", "every_n": 2, "corrected": True, "folder": str(folder)}
@@ -120,7 +120,7 @@ def test_posed_epochs_are_those_of_the_rendered_camera_and_kept_frames_stand_the
     assert told["pose"]["sd_X0"] == pytest.approx(row["sd_X0"])
     assert told["opencv"]["sd_fx"] == pytest.approx(row["opencv"]["sd_fx"])
     assert told["pose"]["origin_mm"] == [192e6, 313e6, 0.0]
-    # of a busy machine also frames that were kept until there was time for them
+    # on a busy machine, deferred frames are stored as well
     assert {f"{n}.png" for n in numbers} <= {e.epoch.frame.name for e in epochs if e.epoch.frame}
 
 
@@ -157,7 +157,7 @@ RIVER = Path(__file__).resolve().parents[2] / "examples" / "river"
 
 @pytest.fixture
 def river(tmp_path):
-    """The example's gauge under a bridge, in a folder where its files can be spoilt."""
+    """The example's gauge under a bridge, in a folder where its files can be damaged."""
     shutil.copytree(RIVER, tmp_path / "river")
     return tmp_path / "river"
 
@@ -191,3 +191,16 @@ def test_control_points_that_give_no_pose_are_said_before_the_start(river, rows,
     done = call("check", river / "bridge.yaml")
     assert "Traceback" not in done.stderr
     assert words in " ".join((done.stdout + done.stderr).split())
+
+
+def test_the_check_of_a_session_needs_a_test_field_in_either_process(
+    daemon, devices, thermal_model
+):
+    daemon.configure(**devices(thermal_model=str(thermal_model)))
+    session = ("session", "start", "--series", "M7", "--epochs", "2")
+    words = "camera 'one': the check needs its `testfield`"
+    assert words in call(*session, folder=daemon.folder).stderr
+    daemon.start()
+    daemon.until(lambda: daemon.status().get("cameras"))
+    assert words in call(*session, folder=daemon.folder).stderr
+    assert daemon.stop() == 0

@@ -1,4 +1,4 @@
-"""Twenty-four hours of a gauge in a minute: kills, downtimes, and a thermometer that is lost."""
+"""Twenty-four hours of a gauge in a minute: kills, downtimes and a lost thermometer."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ MODEL = demonstration_model(FIELD)
 
 
 def warmth(seconds: np.ndarray) -> np.ndarray:
-    """°C of the air in the course of a day, s from its begin."""
+    """Return the air temperature, °C, at seconds of a day."""
     return 20.0 - 10.0 * np.cos(2 * np.pi * seconds / 86_400) + 3.0 * np.sin(seconds / 2_700)
 
 
 FINE = np.arange(-86_400.0, 90_000.0, 5.0)
 LENS = np.empty_like(FINE)
 LENS[0] = warmth(FINE[0])
-for _k, _T in enumerate(warmth(FINE[1:])):  # which lags behind
+for _k, _T in enumerate(warmth(FINE[1:])):  # the lens lags
     LENS[_k + 1] = _T + (LENS[_k] - _T) * np.exp(-5.0 / TAU)
 
 
 def true_interior(seconds: np.ndarray) -> np.ndarray:
-    """c, x0, y0 (n, 3) mm at times of the day."""
+    """Return c, x0, y0 (n, 3) mm at times of the day."""
     T = np.interp(seconds, FINE, LENS)
     return MODEL.interior.as_array()[:3] + RATES * (T[:, None] - 25.0)
 
 
 def record(folder: Path, first_s: float, rng: np.random.Generator) -> Path:
-    """What the devices give from a second of the day to its end."""
+    """Write a recording of the devices from a second of the day to its end."""
 
     def epochs():
         for k, second in enumerate(np.arange(first_s, 86_400.0, PERIOD_S)):
@@ -72,7 +72,7 @@ def record(folder: Path, first_s: float, rng: np.random.Generator) -> Path:
 
 @pytest.fixture
 def site(tmp_path):
-    """Thermal model, with small sds so that only the past and the thermometer count; crosses."""
+    """Crosses and a thermal model with small sds, so that past and thermometer dominate."""
     names = ("c", "x0", "y0")
     rates = dict(zip(names, RATES.tolist(), strict=True))
     lag = ModelEffect("thermal_lag", {"tau": TAU})
@@ -92,7 +92,7 @@ def site(tmp_path):
 
 
 def run_until_killed(daemon, recording: Path, rows: int) -> list[dict]:
-    """Let a daemon work at full speed and kill it when it has told so many rows; all rows."""
+    """Run a daemon at full speed, kill it after a number of rows, and return all rows."""
     replay = {"driver": "replay", "recording": str(recording), "period_s": PERIOD_S}
     document = {
         "store": {"path": str(daemon.store)}, "frames": {"keep": "none"},
@@ -112,13 +112,13 @@ def run_until_killed(daemon, recording: Path, rows: int) -> list[dict]:
 
 @pytest.mark.timeout(900)
 def test_a_day_with_kills_and_a_lost_thermometer(daemon, site):
-    """Nothing told is lost; each c, x0, y0 is within its sds, which grow and fall as they must."""
+    """No reported row is lost; c, x0, y0 are within their sds, which rise and fall as expected."""
     rng = np.random.default_rng(5)
     first, told, starts, left = 0.0, [], [], 86_400.0
     while left > 0:
         starts.append(BEGIN + first)
         folder = record(site / f"part-{len(starts)}", first, rng)
-        # the last one has time to forget, and ends by itself
+        # the last daemon has time to forget, and stops by itself
         more = int(rng.integers(150, 300)) if first < 57_600 else 10_000
         told = run_until_killed(daemon, folder, len(told) + more)
         left = BEGIN + 86_400 - PERIOD_S - told[-1]["frame_time"]
@@ -139,7 +139,7 @@ def test_a_day_with_kills_and_a_lost_thermometer(daemon, site):
     usual = np.median(sd[~lost, 1])
     assert sd[lost, 1].max() > 20 * usual
     assert sd[-1, 1] < 1.5 * usual
-    # the first start knows nothing of the past, the others only miss what was since the last row
+    # the first start has no past; the others lack only the time since the last row
     unknown = np.array([row["unknown_past_px"] for row in told])
     at = [int(np.argmin(np.abs(when - start))) for start in starts]
     assert unknown[0] > 2 * max(unknown[k] for k in at[1:])

@@ -1,4 +1,4 @@
-"""The pipx route: a wheel of this checkout in a fresh environment takes an epoch."""
+"""Installation as by pipx: a wheel of this checkout in a new environment takes an epoch."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
-    """An environment as pipx makes it; the dependencies are those of the tests' environment."""
+    """The command in an environment as pipx makes it, with the tests' dependencies."""
     folder = tmp_path_factory.mktemp("pipx")
     built = subprocess.run(
         [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "-w", folder, str(ROOT)],
@@ -32,7 +32,7 @@ def installed(tmp_path_factory) -> Path:
     python = folder / "venv/bin/python"
     subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", wheel], check=True)
     (packages,) = (folder / "venv/lib").glob("python*/site-packages")
-    # a plain path, so that the editable install of the checkout there is not followed
+    # a plain path, so that the editable install of the checkout is not used
     (packages / "dependencies.pth").write_text(
         "\n".join(path for path in sys.path if path.endswith("-packages")) + "\n"
     )

@@ -20,7 +20,7 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.reader import read_recording
 
 UNITS = Path(__file__).resolve().parents[2] / "systemd"
-# a machine whose clock is synchronised: without that nothing is deleted for its age
+# a synchronised clock, without which no frame is deleted for its age
 SYNCHRONISED = {"CLOCK_SYNCHRONISED": "1"}
 
 
@@ -28,7 +28,7 @@ def readings_of(daemon, name=None) -> list:
     try:
         with Store.open(daemon.store) as store:
             return list(store.readings(name))
-    except StoreError:  # it is being made
+    except StoreError:  # it is being created
         return []
 
 
@@ -64,8 +64,8 @@ def test_a_thermometer_of_no_camera_is_stored_and_a_paired_one_while_the_camera_
         (out, back) = [e.utc for e in store.events() if e.kind in ("device_out", "device_back")]
         epochs = store.series_columns(store.find_series(), ["temperature_time"])
     away = [r for r in housing if out < r.utc < back]
-    assert away  # seven, where the machine has time for every tick
-    # what an epoch holds is not kept twice, but for the readings at both ends
+    assert away  # seven, if the machine has time for every tick
+    # a reading of an epoch is not stored twice, except at both ends
     assert len(set(epochs["temperature_time"]) & {r.utc for r in housing}) <= 3
 
 
@@ -86,7 +86,7 @@ def test_readings_wait_for_a_store_that_cannot_be_written(daemon, devices):
     assert daemon.stop() == 0
     times = [r.utc for r in readings_of(daemon)]
     assert times == sorted(times)
-    # those of the time in which nothing could be written: 20 ticks, fewer on a busy machine
+    # the readings while nothing could be written: 20 ticks, fewer on a busy machine
     assert sum(begin < t < end for t in times) >= 10
 
 
@@ -128,7 +128,7 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
         daemon.more(4)
         if series == "M1":
             assert daemon.stop() == 0
-    # an old frame, while the daemon runs: it is the daemon that deletes it, and logs it
+    # while the daemon runs, it deletes an old frame and logs it
     old = sorted((daemon.folder / "frames").rglob("*.png"))[0]
     yesterday = time.time() - 2 * 86400
     os.utime(old, (yesterday, yesterday))
@@ -140,7 +140,7 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
     assert not (daemon.folder / "recordings/one-M2").exists()
     assert len(read_recording(daemon.folder / "recordings/one-M1").epochs) >= 4
     assert daemon.stop() == 0
-    # and where no daemon runs, the command itself does and logs it; a second run archives nothing
+    # without a daemon, the command deletes and logs it; a second run archives nothing
     old = sorted((daemon.folder / "frames").rglob("*.png"))[0]
     os.utime(old, (yesterday, yesterday))
     status, said = timer_command()
@@ -155,7 +155,7 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
     ({"keep": "none"}, []),
 ])  # fmt: skip
 def test_the_frames_that_are_wanted_are_kept(daemon, recording, replayed, keep, kept):
-    """Pictures of nothing: every epoch is an event."""
+    """Empty images: every epoch is an event."""
     grey = cv2.imencode(".jpg", np.full((64, 64), 128, np.uint8))[1].tobytes()
     folder = make_photographs(daemon.folder / "grey", recording, [grey] * 12)
     sections = replayed(folder, period_s=0.05, loop=False)

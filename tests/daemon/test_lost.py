@@ -1,4 +1,4 @@
-"""An epoch that was taken and not kept is lost, and everybody who asks is told."""
+"""An epoch that was taken but not stored is lost, and every interface reports it."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def test_a_refused_row_is_lost_for_everybody(guard, path, tmp_path, refusal):  #
     assert "an epoch was lost" in why
     others = {"cameras": {}, "thermometers": {}, "outputs": {}, "clock": {"trusted": True},
               "frames": {"paused": ""}}  # fmt: skip
-    assert any("1 epochs are lost" in text for text in status_warnings(document | others))
+    assert any("1 epoch lost" in text for text in status_warnings(document | others))
     (event,) = [e for e in guard.stored_events() if e.kind == "epoch_lost"]
     assert "epoch" in event.text
-    # an hour later the page is well again, the count stays
+    # an hour later the page is healthy again; the count stays
     status_file = live.folder / "status.json"
     later = json.loads(status_file.read_text())
     later["store"]["lost_s_ago"] = 3601.0
@@ -76,13 +76,13 @@ def test_the_exit_status_of_status_says_so(guard, tmp_path, monkeypatch, capsys)
         "utc": 1.0, "started": 0.0, "pid": 1, "version": "0",
     }  # fmt: skip
     monkeypatch.setattr("thermocald.cli.run.read_status", lambda *_: document)
-    with pytest.raises(DataError, match="1 epochs were lost"):
+    with pytest.raises(DataError, match="1 epoch lost"):
         status()
-    assert "1 epochs are lost" in capsys.readouterr().out
+    assert "1 epoch lost" in capsys.readouterr().out
 
 
 def test_the_exit_status_of_run_says_so(tmp_path):
-    """A whole run at the command line: one epoch of twenty is refused by the file."""
+    """A run at the command line, in which the file refuses one of twenty epochs."""
     recording = make_recording(tmp_path / "small", 20)
     run = ["run", "--recording", recording, "--fast", "--store", tmp_path / "t.db"]
     with Store.open(tmp_path / "t.db", "append"):
@@ -90,7 +90,7 @@ def test_the_exit_status_of_run_says_so(tmp_path):
     refuse(tmp_path / "t.db", "BEFORE INSERT ON epoch WHEN NEW.number = 7")
     done = call(*run, folder=tmp_path)
     assert done.returncode == 1
-    assert "1 epochs were lost: epoch 7 of rpi" in done.stderr
+    assert "1 epoch lost: epoch 7 of rpi" in done.stderr
     assert stored_numbers(tmp_path / "t.db") == [n for n in range(1, 21) if n != 7]
 
 
@@ -145,7 +145,7 @@ def test_an_alert_says_so_and_takes_it_back():
     ]
     alerts = [(r["epoch"], a.state, a.text) for r in rows for a in output.changes(r, "cam")]
     assert [(n, state) for n, state, _ in alerts] == [(2, "out"), (3, "in"), (4, "out"), (5, "in")]
-    assert alerts[2][2] == "cam: 3 epochs were taken and not kept (limit 1)"
+    assert alerts[2][2] == "cam: 3 epochs were taken but not stored (limit 1)"
 
 
 def test_a_recording_whose_channels_no_epoch_can_have_is_refused_before_it_is_played(tmp_path):
@@ -166,7 +166,7 @@ def test_a_recording_whose_channels_no_epoch_can_have_is_refused_before_it_is_pl
 
 @pytest.mark.parametrize("table", ["epochs.csv", "observations.csv"])
 def test_a_recording_that_breaks_ends_the_command(tmp_path, table):
-    """It would have been opened again for ever; what came before the broken row is kept."""
+    """It is not opened again forever; the epochs before the broken row are stored."""
     recording, store = make_recording(tmp_path / "small", 20), tmp_path / "t.db"
     lines = (recording / table).read_text().splitlines()
     number = len(lines) - 1

@@ -1,4 +1,4 @@
-"""The page under clients that read slowly, say nothing, or ask for everything."""
+"""The page under clients that read slowly, send nothing, or request everything."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def make_store(path: Path, epochs: int) -> None:
 
 
 def slow_reader(port: int, path: str) -> socket.socket:
-    """A connection that has asked for something and reads nothing."""
+    """Open a connection that sends a request and reads nothing."""
     channel = socket.socket()
     channel.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     channel.connect(("127.0.0.1", port))
@@ -47,7 +47,7 @@ def slow_reader(port: int, path: str) -> socket.socket:
 
 
 class Page:
-    """A page in a process of its own."""
+    """A page in a separate process."""
 
     def __init__(self, folder: Path, store: Path) -> None:
         self.port = free_port()
@@ -71,7 +71,7 @@ class Page:
             return answer.read()
 
     def slow(self, path: str) -> socket.socket:
-        """Ask, and read nothing."""
+        """Send a request and read nothing."""
         return slow_reader(self.port, path)
 
     def close(self) -> None:
@@ -118,7 +118,7 @@ def test_slow_and_silent_clients_take_no_memory_and_hold_nobody_up(tmp_path, pag
     assert time.monotonic() - begin < 60.0  # on a busy machine
     assert refused == 46  # four are served at once
     assert resident_mb(page.process.pid) < before + 25.0
-    # who says nothing is let go
+    # a silent client is disconnected
     for channel in silent:
         channel.settimeout(25.0)
         assert channel.recv(1) == b""
@@ -163,7 +163,7 @@ ROUTES = (
 @pytest.mark.slow
 @pytest.mark.parametrize("rounds", [6, pytest.param(100, marks=pytest.mark.slow)])
 def test_the_page_keeps_to_80_mb_however_often_it_is_asked(tmp_path, page_of, rounds):
-    """Every route, by turns: 100 rounds are three months of somebody who looks once a day."""
+    """Every route in turn: 100 rounds are three months of one visit a day."""
     make_store(tmp_path / "s.db", 2000)
     page = page_of(tmp_path / "s.db")
     resident = []

@@ -1,5 +1,5 @@
-"""A disk without a byte left, or a quota that is used up, under a running daemon: all that is asked
-says so, it is waited for, and nothing is lost once there is room again.
+"""A full disk or an exhausted quota under a running daemon: every interface reports it, the daemon
+waits, and nothing is lost once there is room again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from thermocald.output.dashboard.view import View
 
 
 class Disk:
-    """A disk that can be left without a byte."""
+    """A disk that can be filled to the last byte."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.environment = folder, {}
@@ -35,9 +35,9 @@ class Disk:
 
 
 class Quota:
-    """A quota of the daemon's files in a folder, which the kernel here may not know.
+    """A quota of the daemon's files in a folder, in place of the kernel's.
 
-    late: the flush fails too, as where blocks are allocated late.
+    late: the flush fails, too, as with delayed allocation of blocks.
     """
 
     def __init__(self, folder: Path, late: bool = False) -> None:
@@ -63,7 +63,7 @@ def quota(tmp_path):
 
 @pytest.fixture
 def place(request, daemon, measured, tmp_path):
-    """A place of some kind that can be full, in which a configured daemon has its store."""
+    """A place of either kind with the store of a configured daemon."""
     match request.param:
         case "disk":
             place = Disk(request.getfixturevalue("small_disk")(40))
@@ -84,7 +84,7 @@ in_each = partial(pytest.mark.parametrize, "place", indirect=True)
 
 
 def said(daemon) -> tuple[int, str, bool, str]:
-    """Exit status and text of `status`, and what the page answers to who asks for its health."""
+    """Return exit status and text of `status`, and the page's answer to a health check."""
     done = call("status", "--store", daemon.store)
     well, why = View(daemon.store, LiveState.beside(daemon.store).folder).healthy()
     return done.returncode, done.stdout + done.stderr, well, why
@@ -105,7 +105,7 @@ def test_a_full_place_is_said_and_waited_for(daemon, place):
     place.fill()
     daemon.until(lambda: epochs_wait(daemon))
     waiting = daemon.status()["store"]["waiting"]
-    # the status goes on: it is not the one from before the disk was full
+    # the status is current, not from before the disk was full
     daemon.until(lambda: daemon.status()["store"]["waiting"] > waiting + 2)
     count = len(daemon.results())
     place.empty()
@@ -130,7 +130,7 @@ def test_what_waits_when_it_is_ended_there_is_counted(daemon, place):
     place.empty()
     numbers, _ = daemon.stored()
     lost = daemon.log().count("an epoch is lost: ")
-    assert f"error: {lost} epochs were lost" in daemon.log()
+    assert f"error: {lost} epochs lost" in daemon.log()
     assert lost > 0
     assert len(numbers) + lost >= taken
 
@@ -181,7 +181,7 @@ def test_a_command_under_a_quota_says_so_and_leaves_nothing_half(
 @in_each(argvalues=["quota"])
 @pytest.mark.parametrize("room", mostly_slow([1, 4095, 8193, 30_000], 1))
 def test_what_was_reported_kept_is_kept_where_a_quota_leaves_a_little(daemon, place, room):
-    """A write that fits in part; then it is killed, and lifted, and goes on."""
+    """A write fits in part; then the daemon is killed, the quota lifted, the daemon restarted."""
     daemon.start(**place.environment)
     daemon.more(4)
     place.fill(room)

@@ -1,6 +1,6 @@
-"""The daemon's rhythm while the page is attacked, both in 400 MB, as the units would have them.
+"""The daemon's rhythm while the page is attacked, both within 400 MB as with the units.
 
-Blocks without and with the attack take turns, and both come before whatever else the machine does.
+Blocks without and with the attack alternate; both take precedence over other processes.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ pytestmark = pytest.mark.slow
 MEMORY_MB = 400
 PERIOD_S = 0.1
 BLOCKS, BLOCK_S = 5, 6.0
-ATTEMPTS = 3  # on a machine that does other things, one block may have all of them
-SMALLEST_S = 0.001  # below one hundredth of the period the timers of the machine decide
+ATTEMPTS = 3  # on a busy machine, one block may take all of the disturbance
+SMALLEST_S = 0.001  # below one hundredth of the period, the machine's timers dominate
 
-# `thermocald run`, with the lateness of every tick written down
+# `thermocald run`, which writes the lateness of every tick
 DAEMON = """
 import json, os, sys
 from pathlib import Path
@@ -61,7 +61,7 @@ module.Service(load_config(path), path, hang_after_s=120.0).run()
 
 
 class Browser(threading.Thread):
-    """Asks for what the page in a browser asks for: see page.js."""
+    """Requests what the page in a browser does: see page.js."""
 
     def __init__(self, port: int) -> None:
         super().__init__(daemon=True)
@@ -114,9 +114,9 @@ def group():
 
 @pytest.fixture
 def processes(daemon, recording, replayed, group):
-    """(daemon, its page), each in its group as the units put them, and the page's port."""
+    """(daemon, its page) in groups as the units put them, and the page's port."""
     port = free_port()
-    make_store(daemon.store, 12000)  # what slow readers ask for: more than their sockets hold
+    make_store(daemon.store, 12000)  # the slow readers request more than their sockets hold
     daemon.configure(**replayed(recording, PERIOD_S), dashboard={"enabled": True, "port": port})
     script = [sys.executable, "-c", DAEMON, str(daemon.config), str(daemon.folder / "late")]
     page = [sys.executable, "-m", "thermocald", "dashboard", "--config", str(daemon.config)]
@@ -144,7 +144,7 @@ def lateness(folder) -> list[float]:
 
 @pytest.mark.timeout(300)
 def test_fifty_slow_readers_and_a_browser_leave_the_rhythm_as_it_was(daemon, processes, group):
-    """p99 of the lateness of ticks at most twice that of a page that nobody looks at."""
+    """p99 of the ticks' lateness is at most twice that with an idle page."""
     running, page, port = processes
     deadline = time.monotonic() + 90
     while (
@@ -175,7 +175,7 @@ def test_fifty_slow_readers_and_a_browser_leave_the_rhythm_as_it_was(daemon, pro
 
 
 def measured(folder, attack: Attack) -> tuple[float, float]:
-    """p99 of the lateness of ticks without and with the attack, s."""
+    """Return p99 of the ticks' lateness without and with the attack, s."""
     late: dict[bool, list[float]] = {False: [], True: []}
     for k in range(2 * BLOCKS):
         attacked = k % 2 == 1
@@ -192,7 +192,7 @@ def measured(folder, attack: Attack) -> tuple[float, float]:
 
 
 class Attack:
-    """Fifty readers who take up nothing, and a browser."""
+    """Fifty clients that read nothing, and a browser."""
 
     def __init__(self, port: int) -> None:
         self._port = port

@@ -1,4 +1,4 @@
-"""One command from a camera to epochs, a recording and a report."""
+"""A single command leads from a camera to epochs, a recording and a report."""
 
 from __future__ import annotations
 

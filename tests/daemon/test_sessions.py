@@ -1,4 +1,4 @@
-"""Sessions in a running daemon: the real daemon and the real command, as processes."""
+"""Sessions of the real daemon through the real command, as processes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SESSION = {"camera": "phone-1", "series": "M7", "start": "cold", "epochs": 8}
 
 @pytest.fixture
 def live(daemon, devices):
-    """configured → a running daemon with a camera that has no series of its own but `watch`."""
+    """configured → a running daemon with a camera whose own series is `watch`."""
 
     def start(**configured):
         sections = devices(**{"period_s": 0.3, "name": "phone-1", **configured})
@@ -70,7 +70,7 @@ def test_the_command_has_the_daemon_take_a_session_and_ends_with_its_recording(l
     assert recording.head.extra["device"]["serial"] == "mock-1"
     assert recording.head.extra["device"]["thermometers"]["housing"]["serial"] == "mock-0"
     assert len(recording.epochs) == 4
-    # the camera has gone back to its own series, which lost nothing but the time of the session
+    # the camera is back at its own series, which lacks only the time of the session
     count = len(stored["watch"][1])
     daemon.until(lambda: len(series_of(daemon.store)["watch"][1]) > count + 1)
     assert daemon.stop() == 0
@@ -111,7 +111,7 @@ def test_it_pauses_while_the_phone_is_away_and_the_command_survives_a_restart(li
 
 
 def test_a_camera_without_a_series_rests_until_a_session(live, daemon):
-    """A phone that is to be measured from cold must not be warmed by its own frames."""
+    """A phone must not be warmed by its own frames before a cold start."""
     live(series=None)
     daemon.until(lambda: daemon.status() and daemon.status()["cameras"]["phone-1"]["ticks"] >= 2)
     assert daemon.status()["cameras"]["phone-1"]["device"] == "closed"
@@ -138,7 +138,7 @@ def test_status_and_stop(live, command, daemon):
     assert "of 1000 epochs, stopped" in command("stop").said()
     taken = daemon.session()["taken"]
     assert daemon.session()["state"] == "stopped"
-    # it may be taken up again, but not as something else
+    # it may be continued, but not as another series
     with pytest.raises(UsageError, match="begun with --start 'warm'"):
         daemon.ask("session start", session={**SESSION, "start": "cold"})
     again = daemon.ask("session start", session={**SESSION, "start": "", "epochs": taken + 2})
@@ -166,7 +166,7 @@ def test_what_cannot_be_taken_is_refused_with_the_reason(live, daemon):
 
 
 def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon):
-    """A camera that looks at another test field than the configuration says."""
+    """The camera sees another test field than the configured one."""
     other = daemon.folder / "other.csv"
     other.write_text("target,X,Y,Z,diameter,sX,sY,sZ\n" + "".join(
         f"t{k},{100 * (k % 4)},{100 * (k // 4)},{10 * k},10,0.1,0.1,0.1\n" for k in range(12)
@@ -182,7 +182,7 @@ def test_a_failed_check_is_told_and_nothing_is_begun(live, daemon):
 
 @pytest.mark.slow
 def test_a_programme_heats_during_the_session_and_not_after_it(daemon, devices, live):
-    """The relay's own driver on a simulated pin is the drivers' test; here: which steps it gets."""
+    """Which steps the relay receives; the tests of drivers cover the relay itself."""
     pytest.importorskip("gpiozero")
     sections = devices(period_s=0.3, name="phone-1")
     relay = {"name": "lamp", "driver": "relay", "pin": 17, "limit_c": 60,
@@ -202,7 +202,7 @@ def test_a_programme_heats_during_the_session_and_not_after_it(daemon, devices, 
 
 @pytest.mark.slow
 def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, live):
-    """Planned and watched by the command, taken by the daemon; `test_closed_loop` compares."""
+    """The command plans and watches, the daemon takes the epochs; see also `test_closed_loop`."""
     pytest.importorskip("gpiozero")
     from thermocald.config import parse_config
     from thermocald.daemon.desk import plan_separation, take_in_the_daemon

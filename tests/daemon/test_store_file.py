@@ -1,4 +1,4 @@
-"""The store's file goes away underneath a running daemon, or is opened twice by another name."""
+"""The store's file disappears under a running daemon, or is opened again by another name."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def guard(path):
 
 
 def keeping(path, durable=False) -> StoreGuard:
-    """A guard with epochs 1, 2, 3, and a `keep` that notes what it told of each."""
+    """Return a guard with epochs 1, 2, 3 and a `keep` that records whether each was stored."""
     guard = StoreGuard(path, durable=durable)
     series = create_small_series(guard.store, start="cold")
     guard.told = {}
@@ -53,7 +53,7 @@ def keeping(path, durable=False) -> StoreGuard:
 
 
 def delete(path, what: str) -> None:
-    """Files by a pattern, or `.`, their folder."""
+    """Delete files by a pattern, or with `.` their folder."""
     if what == ".":
         shutil.rmtree(path.parent)
     else:
@@ -76,8 +76,8 @@ def test_a_deleted_store_is_written_again_with_all_that_it_held(guard, path, wha
 
 @pytest.mark.parametrize("what", ["t.db-wal", "t.db-shm", "t.db*"])
 def test_a_reader_in_the_middle_of_it_costs_nothing(guard, path, what):
-    """The -wal file cannot be emptied while it reads, so what it held is copied."""
-    guard.store._db.execute("PRAGMA busy_timeout = 50")  # else it is waited for
+    """The -wal file cannot be emptied while it reads, so the store is copied."""
+    guard.store._db.execute("PRAGMA busy_timeout = 50")  # otherwise the checkpoint waits for it
     reader = sqlite3.connect(path, isolation_level=None)
     reader.execute("BEGIN")
     assert reader.execute("SELECT count(*) FROM epoch").fetchone() == (3,)
@@ -119,7 +119,7 @@ from thermocald.errors import StoreError
 sys.setswitchinterval(0.0005)
 path = Path(sys.argv[1])
 guard, end = StoreGuard(path, durable=False), time.monotonic() + 1.5
-series = guard.all_series()[0]
+series = guard.store.all_series()[0]
 
 def read(epochs):
     while time.monotonic() < end:
@@ -145,7 +145,7 @@ print(len(guard.status()["notice"]) > 0)
 
 
 def test_the_file_is_followed_while_others_read(guard, path):
-    """SQLite's library ended the process: a connection was closed under a statement."""
+    """SQLite's library once crashed the process: a connection was closed under a statement."""
     for number in range(4, 200):
         guard.keep(number)
     guard.close()
@@ -238,18 +238,18 @@ def test_the_running_daemon_says_so_and_loses_nothing(daemon, measured):
 
 @pytest.fixture
 def ext4(loop_disk):
-    """A disk of 16 MB with a file system that goes read-only at its first error, as SD cards do:
-    its folder, how to break it, and how to mend it.
+    """A disk of 16 MB whose file system becomes read-only at its first error, like an SD card:
+    its folder, a function that breaks it, and one that repairs it.
     """
     options = "loop,errors=remount-ro"
     image, folder = loop_disk(16, options=options)
     device = Path(tool("findmnt", "-no", "SOURCE", folder).stdout.strip()).name
     trigger = Path(f"/sys/fs/ext4/{device}/trigger_fs_error")
     if not trigger.exists() or not shutil.which("e2fsck"):
-        pytest.skip("this kernel cannot be asked for an error of a file system")
+        pytest.skip("this kernel cannot simulate a file system error")
 
     def mended() -> None:
-        # what is still open keeps the broken one alive: its image is checked and mounted elsewhere
+        # open files keep the broken disk mounted: its image is checked and mounted elsewhere
         tool("umount", "-l", folder)
         shutil.copy(image, other := image.with_name("checked.img"))
         tool("e2fsck", "-fy", other)
@@ -266,7 +266,7 @@ def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemo
     broken()
     daemon.until(lambda: "results wait in memory" in daemon.log())
     daemon.until(lambda: not daemon.results()[-1]["stored"])
-    daemon.signal(signal.SIGSTOP)  # it sees the mended card in the place of the broken one
+    daemon.signal(signal.SIGSTOP)  # the daemon sees the repaired card in place of the broken one
     mended()
     daemon.signal(signal.SIGCONT)
     daemon.until(lambda: daemon.results()[-1]["stored"])
@@ -283,7 +283,7 @@ def test_a_running_daemon_whose_card_becomes_read_only_loses_nothing(ext4, daemo
 )  # fmt: skip
 def test_a_row_that_no_store_takes_is_lost_and_holds_up_none(guard, path, what):
     epoch = replace(small_epoch(4), **what)
-    assert not guard.append(Row(guard.all_series()[0], epoch, None, {}, True))
+    assert not guard.append(Row(guard.store.all_series()[0], epoch, None, {}, True))
     assert (guard.waiting, guard.lost) == (0, 1)
     guard.keep(5)
     assert guard.told[5]
@@ -308,7 +308,7 @@ def test_a_name_that_is_none_is_refused_in_one_line(tmp_path, name):
 
 @pytest.fixture
 def card(tmp_path):
-    """A folder on which cards are mounted and unmounted: `card("a")`, `card(None)`."""
+    """A folder on which `card("a")` mounts a card and `card(None)` unmounts it."""
     folder = tmp_path / "card"
     folder.mkdir()
 
@@ -344,7 +344,7 @@ def test_an_unmounted_card_is_waited_for_and_nothing_is_begun_in_its_place(card)
         assert guard.waiting == number - 3
     status = guard.status()
     assert (status["state"], guard.lost) == ("out", 0)
-    assert "not mounted any more" in status["why"]
+    assert "no longer mounted" in status["why"]
     assert [guard.told[number] for number in (4, 5, 6)] == [False] * 3
     assert list(path.parent.iterdir()) == []
     card("a")
@@ -370,14 +370,14 @@ def test_another_card_gets_what_waited(card, folder):
     guard.close()
     assert numbers(path) == [4, 5]
     card("a")
-    assert numbers(path) == [1, 2, 3, 4]  # where 4 had been tried; nothing said that it was kept
+    assert numbers(path) == [1, 2, 3, 4]  # where 4 was tried, but not reported as stored
 
 
 def test_a_card_that_was_plugged_in_again_keeps_what_its_wal_file_holds(card, tmp_path):
-    """The same files, of the same numbers of inodes, on a disk of another number."""
+    """The same files with the same inode numbers, on a disk with another number."""
     path = card("a") / "t.db"
     guard = keeping(path, durable=True)
-    for name in ("t.db", "t.db-wal", "t.db-shm"):  # in the order in which they were made
+    for name in ("t.db", "t.db-wal", "t.db-shm"):  # in the order of their creation
         assert (path.parent / name).exists()
     card("b")
     for name in ("t.db", "t.db-wal", "t.db-shm"):
@@ -428,7 +428,7 @@ def test_a_running_daemon_whose_card_is_unmounted_and_mounted_again(card, daemon
     daemon.run(**sections, frames=frames)
     daemon.more(4)
     card(None)
-    daemon.until(lambda: "not mounted any more" in daemon.log())
+    daemon.until(lambda: "no longer mounted" in daemon.log())
     daemon.until(lambda: not daemon.results()[-1]["stored"])
     daemon.until(lambda: daemon.status().get("store", {}).get("state") == "out")
     assert {p.name for p in folder.iterdir()} == {"thermocald.db.live"}

@@ -1,4 +1,4 @@
-"""The units: hardened, sound, and the template the same as the plain one."""
+"""The units: hardened, valid, and each template equal to the plain unit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_exposure_is_at_most_two_and_a_half(analyze, unit):
 
 
 def test_systemd_understands_every_line(analyze, tmp_path):
-    """With a program that exists; also the systemd 252 of Debian 12 warns of nothing."""
+    """With a program that exists; systemd 252 of Debian 12 has no warnings, either."""
     for unit in UNITS.glob("thermocald*.service"):
         text = unit.read_text().replace("/opt/thermocald/bin/thermocald", "/bin/true")
         (tmp_path / unit.name.replace("@", "@one")).write_text(text)
@@ -46,7 +46,7 @@ def test_systemd_understands_every_line(analyze, tmp_path):
 
 
 def test_the_daemon_is_in_every_group_that_its_devices_belong_to():
-    """sysusers makes the groups that a system lacks: an unknown one would prevent the start."""
+    """sysusers creates the groups that a system lacks: an unknown one would prevent the start."""
     unit = (UNITS / "thermocald.service").read_text()
     groups = set(re.search(r"^SupplementaryGroups=(.*)$", unit, re.M)[1].split())
     rules = (UNITS / "60-thermocald.rules").read_text()
@@ -60,7 +60,7 @@ def test_the_template_is_the_plain_unit_with_a_name(name):
     plain = (UNITS / f"{name}.service").read_text().splitlines()[1:]
     template = (UNITS / f"{name}@.service").read_text().splitlines()[1:]
     for a, b in zip(plain, template, strict=True):
-        # not below /run/thermocald, which goes when the plain unit ends
+        # not below /run/thermocald, which is deleted when the plain unit stops
         b = b.replace("RuntimeDirectory=thermocald-%i", "RuntimeDirectory=thermocald")
         b = b.replace("@%i.service", ".service")
         assert b.replace("/%i.yaml", "/config.yaml").replace(" (%i)", "").replace("/%i", "") == a
@@ -100,7 +100,7 @@ def test_everything_is_installed_where_it_belongs(tmp_path):
 
 
 def test_the_page_shares_neither_memory_nor_processor_with_the_daemon():
-    """A control group of its own, ended first when there is no memory; the daemon is ended last."""
+    """When memory runs out, the page's control group is killed first, the daemon last."""
 
     def values(unit: str) -> dict[str, str]:
         lines = (UNITS / unit).read_text().splitlines()

@@ -1,4 +1,4 @@
-"""What is told outside: the journal's fields, `thermocald status` and `top` in a terminal."""
+"""Reports to the outside: the journal's fields, `thermocald status` and `top` in a terminal."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from thermocald.daemon.systemd import JournalHandler
 
 
 class Journal:
-    """The socket of a journal; entries as dictionaries."""
+    """A journal's socket; its entries as dictionaries."""
 
     def __init__(self, path) -> None:
         self.path = str(path)
@@ -86,7 +86,7 @@ def test_levels_are_the_journals(log, journal, level, priority):
 
 
 def test_lines_and_forged_fields_in_a_message_stay_in_the_message(log, journal):
-    """A device's answer must not be able to write fields."""
+    """A device's answer must not write fields."""
     message = "first\nPRIORITY=0\nMESSAGE=forged = yes\nlast"
     log.error("%s", message, extra={"device": "a\nTHERMOCALD_EVENT=forged"})
     entry = journal.entry()
@@ -103,7 +103,7 @@ def test_without_a_journal_it_goes_to_standard_error(log, journal, capsys):
 
 
 def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeypatch, tmp_path):
-    """Under systemd's environment; the socket's place is the only thing that is not systemd's."""
+    """With systemd's environment; only the socket's path is not systemd's."""
     journal = Journal(tmp_path / "journal.sock")
     sections = devices(camera=[{"kind": "unplugged", "at": 3}])
     daemon.configure(**sections)
@@ -131,7 +131,7 @@ def test_the_daemon_tells_the_journal_what_a_device_did(daemon, devices, monkeyp
 
 
 def in_a_terminal(daemon, seconds: float, *options: str, key: bytes = b"") -> tuple[str, int]:
-    """What a command draws in a terminal of 80 columns until a key, or else Ctrl-C, ends it."""
+    """Return what a command draws in a terminal of 80 columns until a key, or Ctrl-C, ends it."""
     terminal, inner = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "thermocald", *options], cwd=daemon.folder,
@@ -156,7 +156,7 @@ def in_a_terminal(daemon, seconds: float, *options: str, key: bytes = b"") -> tu
             else:
                 process.send_signal(signal.SIGINT)
     try:
-        status = process.wait(30)  # the terminal is closed before the process has ended
+        status = process.wait(30)  # the terminal closes before the process ends
     except subprocess.TimeoutExpired:
         process.kill()
         status = process.wait()

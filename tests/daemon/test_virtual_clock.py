@@ -17,7 +17,7 @@ from thermocald.store.database.store import Store
 
 @pytest.fixture
 def run(tmp_path, small_camera):
-    """A count, faults of camera and thermometer → what the daemon stored of so many epochs."""
+    """A count, faults of camera and thermometer → the stored columns of that many epochs."""
 
     def ran(epochs, camera=(), thermometer=()):
         document = demo_config(tmp_path, 1).model_dump(mode="json", by_alias=True)
@@ -37,12 +37,12 @@ def run(tmp_path, small_camera):
 
 
 def skew_s(found):
-    """Reading minus frame; that of a neighbouring tick, at its own time, is further away."""
+    """Return reading minus frame time; a reading of a neighbouring tick would be further away."""
     return found["temperature_time"] - found["frame_time"]
 
 
 def test_every_tick_is_an_epoch_and_nothing_is_told_that_nobody_put_in(run):
-    """However long calibration takes; no name of a column can be a channel's, which loses it."""
+    """However long calibration takes; a channel with a column's name would lose it."""
     store, series, found = run(24)
     with store:
         assert [event.kind for event in store.events()] == ["started", "series_begun", "stopped"]

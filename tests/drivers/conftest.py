@@ -1,4 +1,4 @@
-"""The adb server on loopback that several modules ask; its phones are theirs to give."""
+"""The adb server on loopback for several modules, which add its phones."""
 
 from __future__ import annotations
 

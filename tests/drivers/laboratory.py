@@ -1,4 +1,4 @@
-"""The laboratory: a bench for each driver, on which the contract test sets it up and unplugs it.
+"""The laboratory: a bench for each driver, where the contract test sets it up and unplugs it.
 
 `LABORATORY` has an entry (kind, driver) for each driver: a context manager of (tmp_path,
 monkeypatch) that yields a Bench and cleans up.
@@ -44,8 +44,8 @@ class Bench:
     """A device on the bench.
 
     options: for the driver's constructor; unplug: makes the device vanish below the driver; plug:
-    brings it back. clock: what the driver is given. says: what the first fault then says; gone:
-    what an attempt to open it raises, which the daemon tries again.
+    brings it back. clock: the driver's clock. says: the message of the first fault then; gone: the
+    error of an attempt to open it, which the daemon repeats.
     """
 
     options: dict[str, Any]
@@ -58,7 +58,7 @@ class Bench:
 
 @contextmanager
 def on_loopback(server, options, tmp_path, monkeypatch, clock=VirtualClock):
-    """An output to a server on loopback; unplugging breaks its lines and stops it."""
+    """An output to a server on loopback; unplugging breaks the connections and stops the server."""
     running = [server()]
     port = running[0].port
     yield Bench(
@@ -81,7 +81,7 @@ def webhook(tmp_path, monkeypatch):
 
 @contextmanager
 def script(tmp_path, monkeypatch):
-    """Unplugging takes the program away."""
+    """A program; unplugging deletes it."""
     hook, away = tmp_path / "hook", tmp_path / "away"
     hook.write_text("#!/bin/sh\ncat > /dev/null\n")
     hook.chmod(0o755)
@@ -93,7 +93,7 @@ def script(tmp_path, monkeypatch):
 
 @contextmanager
 def on_sysfs(attach, says, options, tmp_path, monkeypatch):
-    """A sensor in a sysfs tree; unplugging makes its folder vanish, as w1_therm does.
+    """A sensor in a sysfs tree; unplugging deletes its folder, as w1_therm does.
 
     attach: (tree, 0 or 1 the second time) → the folder.
     """
@@ -109,7 +109,7 @@ def on_sysfs(attach, says, options, tmp_path, monkeypatch):
 
 @contextmanager
 def on_i2c(name, tmp_path, monkeypatch):
-    """A chip on a fake SMBus adapter; unplugging takes it off its address."""
+    """A chip on a fake SMBus adapter; unplugging frees its address."""
     import smbus2
 
     from tests.drivers.fakes.chips import CHIPS
@@ -128,7 +128,7 @@ def on_i2c(name, tmp_path, monkeypatch):
 
 @contextmanager
 def on_pins(options, tmp_path, monkeypatch):
-    """gpiozero's mock pins; unplugging takes the pins away from the machine."""
+    """gpiozero's mock pins; unplugging removes the machine's pins."""
     import gpiozero
     from gpiozero.pins.mock import MockFactory
 
@@ -145,7 +145,7 @@ def on_pins(options, tmp_path, monkeypatch):
 
 @contextmanager
 def on_adb(options, tmp_path, monkeypatch):
-    """A phone behind an adb server on loopback; unplugging takes it off the server's list."""
+    """A phone behind an adb server on loopback; unplugging removes it from the server's list."""
 
     def shoot(phone):
         when = phone.now()
@@ -168,7 +168,7 @@ def on_adb(options, tmp_path, monkeypatch):
 
 @contextmanager
 def fifo(tmp_path, monkeypatch):
-    """A named pipe; unplugging is its reader going away."""
+    """A named pipe; unplugging closes its reader."""
     path = tmp_path / "results.fifo"
     os.mkfifo(path)
     read = partial(os.open, path, os.O_RDONLY | os.O_NONBLOCK)
@@ -184,7 +184,7 @@ def fifo(tmp_path, monkeypatch):
 
 @contextmanager
 def mock(options_of, tmp_path, monkeypatch):
-    """Unplugged by its own faults: by time, since it is not yet constructed."""
+    """A mock, unplugged by its own faults, which are set by time before it is constructed."""
     clock = VirtualClock()
     fault = {"kind": "unplugged", "at_s": 1000.0, "for_s": 1000.0}
     yield Bench(
@@ -217,7 +217,7 @@ def picamera2(tmp_path, monkeypatch):
 
 @contextmanager
 def v4l2(tmp_path, monkeypatch):
-    """The ioctls of one camera; unplugging takes the node away and fails them with ENODEV."""
+    """The ioctls of one camera; unplugging deletes the node, and they fail with ENODEV."""
     import linuxpy.ioctl
 
     kernel = FakeCamera(tmp_path / "video0")
@@ -251,14 +251,14 @@ def replay(tmp_path, monkeypatch):
         {"recording": str(path)},
         unplug=lambda: path.rename(away),
         plug=lambda: away.rename(path),
-        clock=VirtualClock(utc=1.6e9 + 1000.0),  # it was recorded in the past
+        clock=VirtualClock(utc=1.6e9 + 1000.0),  # its times are in the past
         gone=DeviceNotFound,
     )
 
 
 @contextmanager
 def serial(tmp_path, monkeypatch):
-    """An instrument on a pseudo terminal behind a link, as udev makes one."""
+    """An instrument on a pseudo terminal behind a link like udev's."""
     link = tmp_path / "usb-instrument"
     instruments = []
 

@@ -1,4 +1,4 @@
-"""The demonstration's camera with a sixteenth of its pixels: quick to render and measure."""
+"""The demonstration camera with a sixteenth of its pixels: quick to render and measure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from thermocald.physics.testfields import demonstration_field, demonstration_mod
 
 
 def write_small_camera(path: Path) -> Path:
-    """Write its model, for the mock's option `model`."""
+    """Write the camera's model for the mock's option `model`."""
     model = demonstration_model(demonstration_field("markers"))
     write_model(path, replace(model, sensor=Sensor(820, 616, 0.00448)))
     return path

@@ -1,4 +1,4 @@
-"""Alerts: once out, once in; delivered by program, web, mail and MQTT, also after an outage."""
+"""Alerts: one out, one in; delivered by program, web, mail and MQTT, also after an outage."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def result(epoch, **values):
 
 
 def told(when, results):
-    """(epoch, state) of all changes."""
+    """Return (epoch, state) of all changes."""
     options = {"command": ["true"], "when": [when]}
     output = open_device("output", "alert_exec", options, VirtualClock())
     return [(r["epoch"], a.state) for r in results for a in output.changes(r, "cam")]
@@ -30,7 +30,7 @@ def told(when, results):
 def test_a_drift_is_out_once_and_in_once():
     drifts = [0.1, 0.49, 0.51, 0.48, 0.52, math.nan, 0.41, 0.39, 0.45, -0.6]
     results = [result(i, drift_c_px=d) for i, d in enumerate(drifts)]
-    # 0.48 and 0.41 are under the threshold but not clearly back
+    # 0.48 and 0.41 are below the threshold but not clearly back
     assert told({"drift": "c", "px": 0.5}, results) == [(2, "out"), (7, "in"), (9, "out")]
 
 
@@ -80,7 +80,7 @@ def test_a_program_that_hangs_is_killed(tmp_path):
         with pytest.raises(DeviceTimeout):
             device.emit(OUT)
         assert time.monotonic() - begin < 10
-        with pytest.raises(DeviceTimeout):  # tried again, though the result is the same
+        with pytest.raises(DeviceTimeout):  # tried again, although the result is the same
             device.emit(OUT)
         device.emit(OUT)  # dropped after three tries
         device.emit(OUT)
@@ -88,7 +88,7 @@ def test_a_program_that_hangs_is_killed(tmp_path):
 
 @pytest.fixture
 def start():
-    """A server of a class on loopback, which is closed after the test."""
+    """class → its server on loopback, which is closed after the test."""
     started = []
 
     def make(server, **options):
@@ -110,7 +110,7 @@ def test_a_webhook_and_an_outage(start, tmp_path):
     server.answer = 503
     with pytest.raises(DeviceError, match="503"):
         device.emit(OUT)
-    device.close()  # as the daemon does, before it tries again
+    device.close()  # as the daemon does before it tries again
     server.answer = 204
     device.open()
     device.emit(IN)
@@ -182,7 +182,7 @@ def test_an_address_with_a_secret_is_refused_and_not_quoted(url):
 
 @pytest.mark.parametrize("answer", [500, 404, 302, None])
 def test_a_secret_is_never_quoted(answer, start, tmp_path, caplog):
-    """Not by the address, not by the token, whatever the server or the library says."""
+    """Neither of the address nor of the token, whatever the server or library answers."""
     server = start(WebServer)
     (tmp_path / "token").write_text("SECRET\n")
     options = {"url": f"http://127.0.0.1:{server.port}/SECRET?key=SECRET", "when": WHEN,

@@ -1,4 +1,4 @@
-"""Phones through adbutils against an adb server on loopback; the laboratory uses a real adbd."""
+"""Phones through adbutils against an adb server on loopback; `make hil` uses a real adbd."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def phone(server):
 
 
 def shoot(count=1, delay=0.0, writing_s=0.0, **tags):
-    """A camera app that writes `count` photographs per trigger."""
+    """Return a camera app that writes `count` photographs per trigger."""
 
     def action(phone):
         time.sleep(delay)
@@ -98,7 +98,7 @@ def test_the_time_is_exifs_with_the_phones_clock_compared(server, phone, offset)
     exposed = []
 
     def action(phone):
-        time.sleep(0.15)  # a shutter lag that the trigger's time does not know
+        time.sleep(0.15)  # a shutter lag that the trigger's time lacks
         exposed.append(time.time())
         shoot()(phone)
         exposed.append(time.time())
@@ -113,10 +113,10 @@ def test_the_time_is_exifs_with_the_phones_clock_compared(server, phone, offset)
 @pytest.mark.parametrize(
     ("trips", "offset", "half"),
     [
-        # (s, half of the round trip s): what fits all is narrower than the shortest
+        # (s, half of the round trip s): the common interval is narrower than the shortest
         ([(0.020, 0.025), (-0.015, 0.018), (0.004, 0.006), (-0.001, 0.0045)], 0.0005, 0.0025),
         ([(0.0, 0.0015)], 0.0, 0.0015),  # close enough at once
-        ([(0.0, 0.02), (3600.0, 0.01)], 3600.0, 0.01),  # set meanwhile: the shortest
+        ([(0.0, 0.02), (3600.0, 0.01)], 3600.0, 0.01),  # the clock is set meanwhile: the shortest
     ],
 )
 def test_the_phones_clock_lies_where_all_round_trips_overlap(trips, offset, half):
@@ -157,7 +157,7 @@ REFUSED = {
         {"shoot": lambda phone: phone.add("IMG_1.jpg", photograph(time.time())[:-300])}, SOON,
         errors.BadReading, "partial photograph, IMG_1"),
     "two": ({"shoot": shoot(count=2)}, {}, errors.BadReading, "2 new photographs"),
-    "none": ({"shoot": None}, SOON, errors.DeviceTimeout, "is the trigger right"),
+    "none": ({"shoot": None}, SOON, errors.DeviceTimeout, "the camera app is open"),
     "smaller": (
         {"shoot": shoot(size=(48, 32))}, {}, errors.WrongDevice, "has 48×32 px, not 96×64"),
     "broken off": ({"cut_transfer": True}, {}, errors.DeviceGone, "broke off"),
@@ -355,7 +355,7 @@ def test_a_unit_that_was_certain_once_is_kept(server, phone, source, numbers, ce
 def test_a_zone_of_unknown_unit_asks_for_the_option(server, phone):
     phone.zones = "tsens_tz_sensor5 45\n"
     sensors = {"soc": "zone:tsens_tz_sensor5"}
-    asked = r"unit of 45 is not known; write units: \{soc: degC\}"
+    asked = r"unit of 45 is unknown; set units: \{soc: degC\}"
     device = thermometer(server, sensors=sensors)
     with device, pytest.raises(errors.BadReading, match=asked):
         device.read()
@@ -398,7 +398,7 @@ def test_warm_up_by_load_which_the_limit_stops_for_good(server, phone):
         output.emit({})
         assert phone.load
         heat(phone, 42.0)
-        with pytest.raises(errors.BadReading, match=r"battery 42\.00 °C reached the limit"):
+        with pytest.raises(errors.PermanentDeviceError, match=r"42\.00 °C reached the limit"):
             output.emit({})
         assert not phone.load
         heat(phone, 20.0)
@@ -420,7 +420,7 @@ def test_the_load_is_a_lease_that_is_renewed(server, phone):
         assert len([c for c in phone.commands if c.startswith("timeout 30 ")]) == 4
 
 
-# EXIF, and the proof that focus and exposure stayed where they were
+# EXIF, and that focus and exposure did not change
 
 WHEN = 1_605_956_400.0
 DUMP = """    android.control.afState (10020): byte[1]

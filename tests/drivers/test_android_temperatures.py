@@ -1,4 +1,4 @@
-"""What real phones print, read through the driver; expected values were read from it by hand."""
+"""Outputs of real phones, read through the driver; expected values were read by hand."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from thermocald.errors import BadReading
 
 
 def read(server, kind, names, **dumps):
-    """{name: °C} of what the driver reads of the sources `kind:name`."""
+    """Return {name: °C} of the sources `kind:name`, as the driver reads them."""
     sensors = {name: f"{kind}:{name}" for name in names}
     try:
         return dict(phone_reads(server, sensors, **dumps))
@@ -40,12 +40,12 @@ def test_battery_of_real_phones(server, shared, number, celsius):
 
 A52 = {"AP": 25.6, "BAT": 23.8, "LRB": 24.7, "LRF": 24.7, "LRP": 24.7, "PA": 25.7}
 LIVE = {"cpu0-silver-usr": 32.300003}
-# number of the file, which of its parts, some of what is read, how many sensors altogether
+# number of the file, its part, some of the readings, the number of sensors
 DUMPS = [
     ("06", 0, A52, 6),  # without the sensors that are not fitted
     ("07", 0, {}, 0),  # only the cache is printed
     ("08", 0, LIVE | {"maxfg": 25.900002}, 13),  # the cache says 54.600002
-    ("10", 0, {"skin": 33.136}, 12),  # volts and percents, vbat and socd, are none
+    ("10", 0, {"skin": 33.136}, 12),  # vbat and socd are volts and percent
     ("12", 0, LIVE, 1), ("12", 1, LIVE, 1), ("12", 2, {"test temperature sensor": 30.8}, 1),
     ("15", 0, {}, 0),  # a HAL that is not ready
 ]  # fmt: skip
@@ -112,7 +112,7 @@ RECORDS = [
     (record(3.9, 6, "vbat"), {}),  # a voltage
     *((record(46.7, kind), {}) for kind in (-1, 7, 8, 20)),  # their unit is not degrees
     *((record(value), {}) for value in ("2_5.0", "Infinity", "٢٥", "")),
-    # a name with a line end does not hide the rest
+    # a name with a line end does not hide the other sensors
     (record(42.0, -1, "soc\n") + record(31.0, 3, "skin\n") + record(25.0),
      {"skin": 31.0, "battery": 25.0}),
     ((record(25.0) + "Cached temperatures:\n" + record(55.0, 0, "cpu")).replace("\n", "\r\n"),
@@ -142,7 +142,7 @@ ZONES = [
     ("mtktsbattery 31000", 31.0), ("mtktsAP 45", 45.0), ("pa_therm0 30", 30.0),
     ("xo_therm_buf 31", 31.0), ("pa_therm1 -40", None),  # not fitted
     ("foo -274000", None), ("foo 0", None),
-    # among others: as its neighbours are written
+    # among others: in the unit of its neighbours
     ("foo 37\n" + WARM, 37.0), ("tsens_tz_sensor5 45\n" + WARM, 45.0),
     ("tsens_tz_sensor5 45\n" + COLD, None),  # 45 °C under load or 4.5 °C at rest
     (f"chg_temp 7\n{WARM}xo_therm 31", 7.0),

@@ -1,8 +1,8 @@
-"""What chips and loggers give, from their data sheets and public drivers: right, or refused.
+"""Outputs of chips and loggers, from data sheets and public drivers: right or rejected.
 
-`chip_outputs.tsv` has a row each: the driver, the chip, what it gives, further options, the
-temperature that it means or `refuse`, and the source. All go through the driver as it is, as the
-first reading after opening: nothing supports a value that the chip gives without having measured.
+`chip_outputs.tsv` has a row for each: the driver, the chip, its output, further options, the
+temperature or `refuse`, and the source. The unchanged driver reads each as the first reading after
+opening, so that nothing supports an idle value.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def kernel(row, folder):
 
 
 def reading(row, server, folder):
-    """°C as the driver reads the row; BadReading where it refuses it."""
+    """Return the driver's °C for a row; raises BadReading."""
     if row["driver"] == "serial":
         options = {"pattern": r"T=(?P<temperature>\S+)", **json.loads(row["options"] or "{}")}
         return serial(server, folder, row["what it gives"], options)
@@ -83,6 +83,6 @@ def test_a_chip_is_read_rightly_or_refused(driver, every, server, tmp_path):
 
 
 def test_there_are_enough():
-    """With good readings among them: a driver that refuses everything would pass otherwise."""
+    """With good readings among them: otherwise a driver that rejects everything would pass."""
     assert len(ROWS) >= 1050
     assert sum(row["expected"] != REFUSE for row in ROWS) >= 200

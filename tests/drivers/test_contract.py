@@ -1,6 +1,6 @@
 """The contract of `thermocald.hal`, for every registered driver, each on its laboratory's bench.
 
-The drivers are those of the entry points, never a list of ours: one that is registered without a
+The drivers are those of the entry points, not of a list here: a registered driver without a
 laboratory fails.
 """
 
@@ -39,7 +39,7 @@ RESULT["sd_c"] = None
 
 @pytest.fixture
 def bench(kind, name, tmp_path, monkeypatch):
-    """The bench of one driver; a driver without one has not been tested at all."""
+    """The bench of one driver; a driver without one fails."""
     with LABORATORY[kind, name](tmp_path, monkeypatch) as one:
         yield one
 
@@ -52,7 +52,7 @@ def device(kind, name, bench):
 
 
 def use(kind, device):
-    """One capture, reading, or result."""
+    """Take one frame or reading, or emit one result."""
     if kind == "camera":
         return device.capture()
     if kind == "thermometer":
@@ -61,7 +61,7 @@ def use(kind, device):
 
 
 def test_every_driver_has_a_laboratory_and_every_laboratory_a_driver():
-    """Without entry points nothing below would be tested."""
+    """Without entry points, the tests below would be empty."""
     assert set(REGISTERED) == set(LABORATORY), "see tests/drivers/laboratory.py"
 
 
@@ -74,7 +74,7 @@ def test_driver_is_what_it_is_registered_as_and_explains_its_stanza(kind, name):
     assert issubclass(driver, KINDS[kind])
     assert issubclass(driver.Options, DriverOptions)
     assert all(c.startswith("char-") for c in driver.device_classes)
-    if kind == "output":  # a session replaces the programme of what heats
+    if kind == "output":  # a session replaces the programme of a heating output
         assert driver.heats == ("programme" in option_names(kind, name))
     text = sys.modules[driver.__module__].__doc__ or ""
     assert f"driver: {name}" in text
@@ -88,7 +88,7 @@ def test_driver_is_what_it_is_registered_as_and_explains_its_stanza(kind, name):
     ids=lambda path: path.stem,
 )
 def test_driver_imports_no_device_library(path):
-    """At its top a driver imports the standard library, numpy, pydantic, thermocald and its own."""
+    """At its top, a driver imports the standard library, numpy, pydantic and our packages."""
     allowed = {*sys.stdlib_module_names, "numpy", "pydantic", "thermocald", "thermocald_drivers"}
     found = []
     for node in ast.parse(path.read_text()).body:
@@ -129,7 +129,7 @@ def test_a_device_is_opened_twice_unplugged_and_back(kind, name, device, bench):
 
 
 def use_until_it_fails(kind, device) -> None:
-    """What had been buffered or read ahead may still come: a few uses at most."""
+    """Use the device until it raises; a few buffered results may come first."""
     for _ in range(3):
         use(kind, device)
         device.close()
@@ -178,7 +178,7 @@ def test_readings_keep_the_contract(device, bench):
             assert -100 < value < 200
         assert reading.monotonic <= bench.clock.monotonic() + 1e-6
         assert math.isfinite(reading.utc)
-    # On a virtual clock that stands still, the system's instants are brought over to some µs.
+    # The system's times are converted to a virtual clock that stands still within some µs.
     instants = [r.monotonic for r in readings]
     assert all(b > a - 1e-3 for a, b in itertools.pairwise(instants))
 

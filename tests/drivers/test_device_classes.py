@@ -50,7 +50,7 @@ def test_the_unit_allows_what_the_drivers_open_and_nothing_else(unit):
 
 @pytest.mark.parametrize(("kind", "name"), DRIVERS)
 def test_a_driver_that_names_a_node_declares_it(kind, name):
-    """A module that mentions /dev/ or adb opens something there."""
+    """A module that mentions /dev/ or adb opens a node there."""
     driver = load_driver(kind, name)
     modules = {inspect.getmodule(one) for one in driver.__mro__}
     text = "".join(inspect.getsource(m) for m in modules if m.__name__.startswith("thermocald_dr"))

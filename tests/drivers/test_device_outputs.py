@@ -1,7 +1,7 @@
-"""Outputs of devices as found in the wild, each with what it must be read as.
+"""Outputs of devices as found in public, each with the expected reading.
 
 The files of ../shared/data/devices; the first line of each: source, kind, expected, options.
-Everything goes through the driver as it is: an adb server, a tty, a sysfs tree below it.
+The unchanged driver reads each: from an adb server, a tty or a sysfs tree.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from thermocald.errors import BadReading, DeviceDenied, DeviceError, DeviceGone
 from thermocald.hal import SystemClock, VirtualClock, open_device
 
 FOLDER = Path(__file__).parents[3] / "shared/data/devices"
-# what libcamera says of the sensor's temperature is not read
+# libcamera's sensor temperature is not a reading
 FILES = [p for p in sorted(FOLDER.glob("*.txt")) if b"kind: picamera" not in p.read_bytes()]
 HEAD = re.compile(
     r"# source: .*? \| kind: (?P<kind>\w+) \| expected: (?P<expected>.*?)"
@@ -69,7 +69,7 @@ def serial(server, tmp_path, text, options):
     line = text.encode("latin-1").replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
 
     def speak():
-        """By itself, again and again: on a busy machine the first may come before the reading."""
+        """Send unprompted and repeatedly: on a busy machine the first may precede the reading."""
         while not stop.wait(0.02):
             far.send(b"\r\n" + line + b"\r\n")
 

@@ -1,4 +1,4 @@
-"""The example of drivers/README.md is this file's subject, and what the README shows."""
+"""The example driver works, and drivers/README.md shows it unchanged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def example(monkeypatch):
     path = DRIVERS / "example_thermometer.py"
     spec = importlib.util.spec_from_file_location("example_thermometer", path)
     module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "example_thermometer", module)  # pydantic looks there
+    monkeypatch.setitem(sys.modules, "example_thermometer", module)  # pydantic resolves names there
     spec.loader.exec_module(module)
     return module.Tc74Thermometer
 

@@ -1,4 +1,4 @@
-"""Faults on demand: the mocks fail as hardware fails, and come back."""
+"""Faults on demand: the mocks fail as hardware does, and come back."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def small(tmp_path_factory) -> dict[str, str]:
 
 
 def use(device) -> None:
-    """One capture, reading or result."""
+    """Take one frame or reading, or emit one result."""
     if isinstance(device, hal.Camera):
         device.capture()
     elif isinstance(device, hal.Thermometer):
@@ -36,7 +36,7 @@ def use(device) -> None:
 
 
 def outcomes(device, calls: int) -> list[str]:
-    """What each use came to."""
+    """Return the outcome of each use."""
     found = []
     for _ in range(calls):
         try:
@@ -112,7 +112,7 @@ def test_a_stuck_camera_shows_the_same_picture(clock, small):
         frames = [device.capture() for _ in range(3)]
     first, second, third = (frame.image for frame in frames)
     assert np.array_equal(first, second)
-    assert not np.array_equal(second, third)  # noise alone makes every picture another
+    assert not np.array_equal(second, third)  # noise alone makes images differ
     assert frames[1].monotonic > frames[0].monotonic
 
 

@@ -9,8 +9,9 @@ import gpiozero
 import pytest
 from gpiozero.pins.mock import MockFactory
 
-from thermocald.errors import BadReading, DeviceDenied, DeviceNotFound
-from thermocald.hal import VirtualClock, open_device
+from thermocald.acquisition.device_loop import OutputLoop
+from thermocald.errors import DeviceDenied, DeviceNotFound, DeviceTimeout, PermanentDeviceError
+from thermocald.hal import SystemClock, VirtualClock, open_device
 
 PROGRAMME = [
     {"seconds": 100, "hold_c": None},
@@ -55,7 +56,7 @@ def test_the_led_tells_whether_there_are_results(pins):
 
 # (s, °C, whether the lamp is on after it)
 HEATED = {
-    # off at the upper edge of the hysteresis, on at the lower; off before, between and after
+    # off above the hysteresis, on below it; off before and after the programme
     "the programme": ({}, [(10, 20.0, 0), (110, 20.0, 1), (200, 44.9, 1), (300, 45.5, 0),
                            (310, 45.0, 0), (320, 44.5, 1), (1150, 20.0, 0), (5000, 20.0, 0)]),
     "the limit is for good": ({}, [(200, 20.0, 1), (200, 60.0, "60.00 °C reached the limit 60 °C"),
@@ -78,7 +79,7 @@ def test_when_the_lamp_is_on(pins, clock, case):
         for seconds, temperature, expected in steps:
             clock.sleep_until(seconds)
             if isinstance(expected, str):
-                with pytest.raises(BadReading, match=expected):
+                with pytest.raises(PermanentDeviceError, match=expected):
                     lamp.emit({"temperature": temperature})
                 expected = 0
             else:
@@ -97,6 +98,48 @@ def test_no_result_for_long_stops_the_lamp(pins, clock):
         assert not pins.pin(27).state
         lamp.emit({"temperature": 20.0})  # and heats again with the next result
         assert pins.pin(27).state
+
+
+def test_the_daemon_does_not_reopen_a_relay_at_its_limit(pins):
+    """Opening it again would reset the limit and start the programme from its beginning."""
+    programme = [{"seconds": 1000, "hold_c": 45.0}]
+    pin, events = pins.pin(27), []
+    loop = OutputLoop("lamp", relay(SystemClock(), programme=programme), SystemClock(),
+                      lambda utc, kind, text: events.append(kind))  # fmt: skip
+    loop.start()
+    for temperature, condition in ((20.0, lambda: pin.state), (60.0, lambda: events)):
+        loop.put({"temperature": temperature})
+        deadline = time.monotonic() + 5.0
+        while not condition() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert condition()
+    for _ in range(3):
+        loop.put({"temperature": 20.0})
+    assert loop.stop(5.0)
+    assert not pin.state
+    assert (events, loop.link.state) == (["device_failed"], "failed")
+    assert "reached the limit" in loop.link.why
+
+
+def test_opening_again_neither_restarts_the_programme_nor_resets_the_limit(pins, clock):
+    lamp, pin = relay(clock), pins.pin(27)
+    for seconds, heating in ((200, 1), (1150, 0)):  # the programme ends at 1100
+        with lamp:
+            clock.sleep_until(seconds)
+            lamp.emit({"temperature": 20.0})
+            assert pin.state == heating
+    lamp = relay(clock, programme=[{"seconds": 5000, "hold_c": 45.0}])
+    switch = lamp.switch
+
+    def fail(heat: bool) -> None:
+        raise DeviceTimeout("no answer")
+
+    lamp.switch = fail
+    with lamp, pytest.raises(DeviceTimeout):
+        lamp.emit({"temperature": 60.0})
+    lamp.switch = switch
+    with lamp, pytest.raises(PermanentDeviceError, match="reached the limit"):
+        lamp.emit({"temperature": 20.0})
 
 
 def test_closing_switches_off(pins, clock):
@@ -125,7 +168,7 @@ def test_a_machine_without_pins(monkeypatch, clock):
 
 
 def test_permission_denied(pins, monkeypatch, clock):
-    """The kernel refuses /dev/gpiochip0 to whom is not in the group."""
+    """The kernel denies /dev/gpiochip0 to a user outside the group."""
 
     def refused(*_args):
         raise PermissionError(errno.EACCES, "Permission denied", "/dev/gpiochip0")

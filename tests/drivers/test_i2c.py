@@ -19,7 +19,7 @@ def bus(monkeypatch):
     adapter = Bus()
     monkeypatch.setattr(smbus2, "SMBus", adapter)
     yield adapter
-    assert adapter.opened == 0  # every driver gives the bus back
+    assert adapter.opened == 0  # every driver releases the bus
 
 
 def thermometer(name, **options):
@@ -61,7 +61,7 @@ def test_what_keeps_a_chip_from_being_opened(bus, name):
     held = chip()
     held.error = errno.EBUSY
     for chips, bus_error, error, message in [
-        ({}, None, errors.DeviceNotFound, "dtparam=i2c_arm=on"),  # nobody at the address
+        ({}, None, errors.DeviceNotFound, "dtparam=i2c_arm=on"),  # no chip at the address
         ({address: held}, None, errors.DeviceDenied, "a kernel driver"),
         ({}, errno.ENOENT, errors.DeviceNotFound, None),
         ({}, errno.EACCES, errors.DeviceDenied, None),
@@ -87,7 +87,7 @@ def test_0xffff_is_a_line_that_nobody_drives(bus, name):
             device.read()
 
 
-# what a chip holds: °C, or what is said of it; MCP9808 DS25095A: flags in bits 15–13, sign in 12;
+# a chip's word: °C, or the message; MCP9808 DS25095A: flags in bits 15–13, sign in 12;
 # TMP117 SNOSD82D table 7-1; LM75B rev. 6.1 table 10; TMP102 SBOS397H tables 6-2 and 6-3
 HELD = [
     *(

@@ -1,4 +1,4 @@
-"""hwmon, iio and thermal zones over a sysfs tree, and each of its faults."""
+"""hwmon, iio and thermal zones in a sysfs tree, and each of their faults."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def thermometer(driver, sysfs, **options):
     return open_device("thermometer", driver, {"sysfs": str(sysfs.root), **options}, VirtualClock())
 
 
-# lm-sensors issue 100: some folders hold temp2 and temp4 only
+# lm-sensors issue 100: some folders have only temp2 and temp4
 IT87 = {"temp2_input": "51000", "temp4_input": "31000", "temp4_label": "board"}
 READ = [
     ("hwmon", "amdgpu", {"temp1_input": "28000", "temp1_crit": "80000"}, {}, {"temperature": 28.0}),
@@ -43,7 +43,7 @@ READ = [
     ("iio", "adc", {"in_temp_raw": "731"}, {}, "scale"),
     ("zone", "cpu-thermal", "48312", {}, {"temperature": 48.312}),
     ("zone", "gpu-thermal", "-274000", {}, "outside"),  # THERMAL_TEMP_INVALID
-    ("zone", "camera-therm-usr", "-40000", {}, "not fitted"),
+    ("zone", "camera-therm-usr", "-40000", {}, "absent sensor"),
     ("zone", "soc", "310", {"unit": "tenths"}, {"temperature": 31.0}),
 ]  # fmt: skip
 
@@ -82,7 +82,7 @@ def test_an_open_diode_is_not_a_temperature(sysfs):
 
 
 def test_an_input_of_a_sleeping_device_is_absent(sysfs):
-    # a folder in place of the file: the read fails with an errno, as EINVAL does on the real one
+    # a folder in place of the file: the read fails with an errno, as with EINVAL on a real one
     folder = sysfs.hwmon(0, "amdgpu", temp1_input="28000", temp2_input="1")
     with thermometer("hwmon", sysfs, chip="amdgpu") as device:
         (folder / "temp2_input").unlink()
@@ -106,14 +106,14 @@ def test_a_number_handed_on_to_another_chip_is_noticed(sysfs):
 def test_two_chips_of_one_name_need_the_address(sysfs):
     sysfs.hwmon(0, "lm75", "1-0048", temp1_input="21000")
     sysfs.hwmon(1, "lm75", "1-0049", temp1_input="22000")
-    with pytest.raises(WrongDevice, match="write chip: 1-0048, 1-0049"):
+    with pytest.raises(WrongDevice, match="set chip: 1-0048, 1-0049"):
         thermometer("hwmon", sysfs, chip="lm75").open()
     with thermometer("hwmon", sysfs, chip="1-0049") as device:
         assert device.read().values == {"temperature": 22.0}
 
 
 def test_permission_denied(sysfs, monkeypatch):
-    # root reads everything: the errno is injected at the file
+    # root can read every file, so the errno is injected
     folder = sysfs.hwmon(0, "lm75", temp1_input="21000")
     with thermometer("hwmon", sysfs, chip="lm75") as device:
         original = type(folder).read_text

@@ -12,7 +12,7 @@ QUIET = {"noise_k": 0.0, "resolution_k": 0.0}
 
 
 def read(options, times):
-    """Readings of all channels at instants of a fresh clock, {channel: (n,)}."""
+    """Return the readings of all channels at times of a new clock, {channel: (n,)}."""
     clock = VirtualClock()
     rows = []
     with open_device("thermometer", "mock", {"conversion_s": 0.0, **options}, clock) as device:
@@ -69,6 +69,6 @@ def test_noise_has_the_stated_size_and_is_seeded():
     assert abs(first["a"].mean() - 25) < 4 * 0.05 / np.sqrt(4000)
     assert abs(np.corrcoef(first["a"], first["b"])[0, 1]) < 0.08
     assert np.array_equal(first["a"], read(options, times)["a"])
-    # the noise hangs on the instant, not on how often it was read before
+    # the noise depends on the time, not on the number of earlier readings
     assert np.array_equal(first["a"][::2], read(options, times[::2])["a"])
     assert not np.array_equal(first["a"], read({**options, "seed": 5}, times)["a"])

@@ -1,4 +1,4 @@
-"""Debian's own MQTT broker with TLS: what it keeps, under which topics, and whom it lets in."""
+"""Debian's MQTT broker with TLS: its retained messages, their topics, and who may connect."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ paho = pytest.importorskip("paho.mqtt.client")
 
 
 class Mosquitto:
-    """The broker in a process of its own on loopback, with TLS and a password."""
+    """The broker in a separate process on loopback, with TLS and a password."""
 
     def __init__(self, folder):
         self.ca, key = own_certificate(folder)
@@ -65,7 +65,7 @@ class Mosquitto:
                 "password_file": str(self.folder / "password"), "timeout_s": 9, **more}  # fmt: skip
 
     def retained(self):
-        """{topic: payload} of what a client that connects now is given."""
+        """Return {topic: payload} of the messages that a new client receives."""
         found = {}
         client = paho.Client(paho.CallbackAPIVersion.VERSION2)
         client.username_pw_set("pi", "sword fish")
@@ -108,7 +108,7 @@ def test_two_cameras_are_two_devices(broker):
     assert len(states) == 2
     assert len(identities) == len(set(identities)) == 22
     online = [topic for topic, payload in kept.items() if payload == b"online"]
-    assert len(online) == 3  # the two, and the speaker
+    assert len(online) == 3  # the two, and the device of the last will
     assert set(broker.retained().values()) & {b"offline"}
 
 
@@ -128,7 +128,7 @@ def _emit_for(device, seconds):
         device.emit({"device": "cam", "status": "ok"})
 
 
-# paho leaves the socket of a refused handshake to the garbage collector, which says so
+# paho leaves the socket of a refused handshake to the garbage collector, which warns
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_who_is_let_in_and_what_an_outage_does(broker, tmp_path):

@@ -49,7 +49,7 @@ def test_a_result_arrives_and_is_announced(broker):
     sent = {t: json.loads(p) for t, p, _ in broker.messages if t in announced}
     drift = next(m for t, m in sent.items() if "drift_x0_px" in t)
     assert (drift["unit_of_measurement"], drift["suggested_display_precision"]) == ("px", 2)
-    # the last will is left at `thermocald`: without it the device is not available either
+    # the last will is at `thermocald`: the device is available only together with it
     assert {a["topic"] for a in drift["availability"]} == {
         "thermocald/rpi_1-a6a219/available", "thermocald/thermocald/available"
     }  # fmt: skip
@@ -115,7 +115,7 @@ def test_a_line_that_breaks_leaves_the_will(broker):
     assert broker.messages[-1] == ("thermocald/thermocald/available", b"offline", True)
 
 
-# paho leaves the socket of a refused handshake to the garbage collector, which says so
+# paho leaves the socket of a refused handshake to the garbage collector, which warns
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_tls(tmp_path):
     ca, context = own_context(tmp_path)

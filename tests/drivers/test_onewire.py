@@ -1,4 +1,4 @@
-"""DS18B20: real w1_slave contents, and its faults."""
+"""DS18B20: real w1_slave files, and the sensor's faults."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_every_real_block_is_judged_rightly(shared):
             believed.append(decode(content, "w1", family)[0])
         except BadReading as error:
             refused.append(str(error))
-    # by hand from the file: the power-on value twice (judged later, by context), six good readings
+    # by hand from the file: two power-on values (checked later, by context), six good readings
     assert believed == [85.0, 85.0, 23.562, 25.812, 25.187, 3.937, 21.875, 20.875]
     assert sum("CRC error" in text for text in refused) == 4  # three NO, one forged
     assert sum("all zeros" in text for text in refused) == 1
@@ -80,7 +80,7 @@ def test_what_is_not_believed(sysfs, content, why):
 
 
 NEAR, HOT = w1_slave(21.5), w1_slave(84.9375)
-# (content, s until the next): 85 °C is believed with a neighbour alone, which it is not itself
+# (content, s until the next): 85 °C is accepted only near a recent reading other than 85 °C
 AT_85 = {
     "without a neighbour": ([(NEAR, 0), (POWER_ON, 0)], [21.5, "power-on"]),
     "on a ramp": ([(HOT, 0), (POWER_ON, 0)], [84.937, 85.0]),
@@ -107,7 +107,7 @@ def test_85_needs_a_neighbour(sysfs, case):
 
 
 def scratchpad(pad, milli):
-    """A w1_slave file around 8 bytes; the CRC by the fake's own code."""
+    """Return a w1_slave file with 8 bytes; its CRC is by the fake's code."""
     data = bytes.fromhex(pad)
     text = f"{data.hex(' ')} {w1_crc(data):02x}"
     return f"{text} : crc={w1_crc(data):02x} YES\n{text} t={milli}"
@@ -153,7 +153,7 @@ def test_the_power_on_value_of_every_family(sysfs, family, pad, milli):
         ("28", "90 01 4b 46 7f ff 10 10", 25000, 25.0),  # 25 °C of a chip that is not of family D
         ("28", "93 01 7f 80 7f ff 0d 10", 25187, 25.187),
         ("28", "90 01 4b 46 e3 ff 0c 10", 25046, 25.046),  # GX20MH01
-        ("28", "90 01 4b 46 e3 ff 0c 10", 25000, 25.046),  # by a kernel that does not know it
+        ("28", "90 01 4b 46 e3 ff 0c 10", 25000, 25.046),  # by a kernel that does not support it
         ("28", "70 fe 4b 46 e2 ff 0c 10", -24968, -24.968),
         ("3b", "94 01 98 19 f0 ff ff ff", 25250, 25.25),  # MAX31850
         ("10", "2a 00 4b 46 ff ff 0e 10", 20875, 20.875),
@@ -205,7 +205,7 @@ def test_one_dead_sensor_does_not_take_the_others_along(sysfs):
 
 
 def feed(path, content, delay):
-    """A FIFO in place of the file answers after `delay` s, as a conversion does."""
+    """A FIFO in place of the file that answers after `delay` s, like a conversion."""
     path.unlink()
     os.mkfifo(path)
 
@@ -222,7 +222,7 @@ def feed(path, content, delay):
 @pytest.mark.parametrize(
     ("delays_s", "timeout_s", "most_s"),
     [
-        ([0.3] * 4, 3.0, 0.8),  # one after the other would be 1.2 s
+        ([0.3] * 4, 3.0, 0.8),  # one after the other would take 1.2 s
         # w1_therm of Linux 6.1 converts one after the other: the last after four times the first
         ([0.15, 0.3, 0.45, 0.6], 0.3, math.inf),
     ],

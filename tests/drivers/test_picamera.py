@@ -1,4 +1,4 @@
-"""picamera2 against a stand-in with its API, and the metadata of real cameras."""
+"""The driver picamera2 with a stand-in of its library, and metadata of real cameras."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_manual_controls(pi):
 
 @pytest.fixture
 def focusing(pi):
-    """A camera with a lens that moves, such as the Camera Module 3."""
+    """A camera with a focusing lens, such as the Camera Module 3."""
     pi.camera_controls = {"LensPosition": (0.0, 32.0, 1.0)}
     pi.standing = {"LensPosition": 1.5, "ColourGains": (1.75, 1.5)}
     return pi

@@ -1,4 +1,4 @@
-"""Camera buffers to grey: each format against an image whose answer is known."""
+"""Camera buffers to grey: each format against a known image."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_rows_may_be_padded_and_the_last_one_cut():
 
 @pytest.mark.parametrize("fourcc", sorted(BAYER_ORDERS))
 def test_bayer_of_a_plain_colour_is_its_luminance(fourcc):
-    """The order matters: a wrong one swaps red and blue, 0.299 and 0.114."""
+    """A wrong order would swap red and blue, 0.299 and 0.114."""
     red, green, blue = 200, 100, 40
     colour = {"R": red, "G": green, "B": blue}
     tile = np.array([colour[letter] for letter in BAYER_ORDERS[fourcc]], np.uint16).reshape(2, 2)
@@ -61,7 +61,7 @@ def test_bayer_of_a_plain_colour_is_its_luminance(fourcc):
 
 
 def pack_10(values):
-    """MIPI CSI-2 RAW10, written from the standard's byte order and not from the decoder."""
+    """Pack MIPI CSI-2 RAW10 by the standard's byte order, independently of the decoder."""
     rows = []
     for row in values:
         packed = []

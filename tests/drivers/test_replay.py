@@ -1,4 +1,4 @@
-"""Replay: frames, measurements and readings come with the instants at which they were taken."""
+"""Replay: frames, observations and readings come with their recorded times."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_measurements_come_without_a_picture(write):
     path = write((epoch(1, seen=seen), None))
     with open_device("camera", "replay", {"recording": path}, VirtualClock()) as camera:
         frame = camera.capture()
-    field = TestField.build(["c", "b", "a"], np.eye(3))  # another order: names count, not rows
+    field = TestField.build(["c", "b", "a"], np.eye(3))  # another order: by name, not by row
     found = observations_from_lists(frame.observations, field)
     assert frame.image is None
     assert found.targets.tolist() == [0, 2]

@@ -1,7 +1,7 @@
-"""Outputs of devices that nobody wrote down: refused with one line, or right.
+"""Random outputs of devices: right, or rejected in one line.
 
-Strategies make a chip's conversion, a firmware's way of printing and a user's correction, and what
-the chip gives without having measured. Few examples here, thousands in the slow suite.
+Strategies generate a chip's conversion and idle values, a firmware's formats and a user's
+corrections. Few examples here, thousands in the slow suite.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def printed(celsius, unit, decimals, comma):
 
 
 def line_read(text, **options):
-    """°C of a line as the driver converts it, without the tty; None where it is refused."""
+    """Return the driver's °C of a line, without the tty; None if it is rejected."""
     device = SerialThermometer(clock=VirtualClock(), port="none", pattern=r"(?P<t>\S+)", **options)
     match = device.pattern.fullmatch(text)
     try:
@@ -233,7 +233,7 @@ LINES = [b"+023.5C\r", b"T=+023.5C\r\n", b"  21.75 C\r\n"]
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("reopened", [False, True])
 def test_the_rest_of_a_late_line_is_no_answer(line, reopened):
-    """Cut at every other byte: what was late is dropped, and the answer to this command used."""
+    """Cut at every other byte: the late part is discarded, and the answer to this command used."""
     number = r"(?:T=)?\s*(?P<temperature>[-+]?\d*\.\d+) ?C"
     for cut in range(2, len(line), 2):
         far = Instrument()
@@ -245,7 +245,7 @@ def test_the_rest_of_a_late_line_is_no_answer(line, reopened):
             time.sleep(0.02)
             device.close()
             device.open()
-        rest = b"" if reopened else line[cut:]  # what was late is lost while it is closed
+        rest = b"" if reopened else line[cut:]  # the late part is lost while it is closed
         far.answers = {b"?\r": [rest + b"+018.25C\r", b"+018.25C\r", b"+018.25C\r"]}
         try:
             assert device.read().values["temperature"] == 18.25 or not line[:cut].strip()

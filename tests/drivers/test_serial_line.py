@@ -1,4 +1,4 @@
-"""Line protocols over a real tty (a pseudo terminal), and each of its faults."""
+"""Line protocols over a real tty (a pseudo terminal), and each of their faults."""
 
 from __future__ import annotations
 
@@ -69,18 +69,18 @@ def later(action, seconds=0.05):
 def test_an_instrument_that_speaks_by_itself(instrument):
     far = instrument()
     with thermometer(far, instrument="papouch-tm", timeout_s=2.0) as device:
-        far.send(b"+099.9C\r3.5C\r+0")  # in the queue before the call: old, and half a line
+        far.send(b"+099.9C\r3.5C\r+0")  # in the queue before the call: an old line, and half a line
         time.sleep(0.05)
         sent = []
         thread = later(lambda: (far.send(b"21.5C\r"), sent.append(time.monotonic())))
         reading = device.read()
         thread.join()
     assert reading.values == {"temperature": 21.5}
-    assert reading.monotonic == pytest.approx(sent[0], abs=0.04)  # when the line ended
+    assert reading.monotonic == pytest.approx(sent[0], abs=0.04)  # the end of the line
 
 
 def test_the_rest_of_a_line_is_no_reading(instrument):
-    """`3.5C` of `+023.5C`: the first piece after opening is dropped, even one that would fit."""
+    """`3.5C` of `+023.5C`: the first piece after opening is discarded, even if it matches."""
     far = instrument()
     with thermometer(far, pattern=r"(?P<temperature>[-+]?\d+\.\d)C", timeout_s=1.0) as device:
         thread = later(lambda: far.send(b"3.5C\r+021.5C\r"))
@@ -124,7 +124,7 @@ def test_echo_and_garbage_before_the_answer_are_skipped(instrument, before):
 @pytest.mark.parametrize(
     ("answer", "error", "said"),
     [
-        *((rubbish, errors.BadReading, "is 9600 Bd 8N1 right")
+        *((rubbish, errors.BadReading, "check 9600 Bd 8N1")
           for rubbish in (b"\xf8\x80\x00\xfe" * 20, b"\xf8\x80\r\n" * 20, b"T=\r\n")),
         (b"T=20.", errors.BadReading, r"'T=20\.'"),
         (b"", errors.DeviceTimeout, r"silent for 0\.4 s"),
@@ -164,7 +164,7 @@ def test_checksums(instrument, kind):
 
 
 def answer(instrument, line, **options):
-    """What the driver makes of one line: °C, or None where it refuses."""
+    """Return the driver's °C of one line, or None if it is rejected."""
     far = instrument({b"T?\r\n": line + b"\r\n"})
     with asked(far, **{"timeout_s": 0.15, **options}) as device:
         try:

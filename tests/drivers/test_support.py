@@ -1,4 +1,4 @@
-"""What the drivers share."""
+"""Functions shared by drivers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from thermocald.hal import SystemClock
 
 
 class InterruptedClock(SystemClock):
-    """A thread that is preempted between two looks at the clock, now and then."""
+    """A clock of a thread that is sometimes preempted between two readings."""
 
     def __init__(self, pauses):
         self.pauses = list(pauses)

@@ -1,4 +1,4 @@
-"""V4L2 over the ioctls of a fake kernel device; the laboratory does it with real kernel drivers."""
+"""V4L2 over the ioctls of a fake kernel device; `make hil` uses real kernel drivers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_frame_is_fresh_and_its_time_the_buffers(kernel):
     assert abs(frame.utc - time.time()) < 0.1
 
 
-# v4l2loopback 0.12: the stamp is right, its type not stated
+# v4l2loopback 0.12: the stamp is right, but its type is not stated
 @pytest.mark.parametrize(("flags", "shift"), [(0x2000, -0.05), (0x12000, +0.05), (0, -0.05)])
 def test_the_time_is_the_middle_of_the_exposure(kernel, flags, shift):
     kernel.flags = flags
@@ -77,13 +77,13 @@ def test_times_are_on_the_daemons_clock(kernel):
     [
         (0, lambda _now: 0.0),
         (0, lambda _now: 1_700_000_000.0),
-        (0x2000, lambda now: now + 0.15),  # vivid's lie up to a frame in the future
+        (0x2000, lambda now: now + 0.15),  # vivid's stamps are up to a frame in the future
     ],
 )
 def test_where_stamps_tell_nothing_no_frame_is_old_nor_from_the_future(kernel, flags, stamp):
     kernel.flags, kernel.stamp = flags, stamp
     with camera(kernel) as device:
-        time.sleep(0.1)  # the queue fills with frames that do not say how old they are
+        time.sleep(0.1)  # the queue fills with frames of unknown age
         begin = kernel.made_by(time.monotonic())
         frame = device.capture()
         assert frame.monotonic <= time.monotonic()
@@ -139,7 +139,7 @@ AUTO_EXPOSURE, EXPOSURE, GAIN = 0x9A0901, 0x9A0902, 0x980913
 
 @pytest.fixture
 def focusing(kernel):
-    """A camera that focuses by itself: its position drifts while the automatic mode is on."""
+    """A camera that focuses automatically: its position drifts in the automatic mode."""
     kernel.controls |= {
         AUTO_FOCUS: ["Focus, Automatic Continuous", 0, 1, 1, 1],
         FOCUS: ["Focus, Absolute", 0, 255, 5, 35],
@@ -189,13 +189,13 @@ def test_after_a_plug_the_same_values_are_set_again(focusing):
 
 def test_an_automatic_mode_that_cannot_be_switched_off(focusing):
     focusing.obeys = lambda control, value: 1 if control == AUTO_FOCUS else value
-    with pytest.raises(errors.WrongDevice, match="to let it change, write focus: auto"):
+    with pytest.raises(errors.WrongDevice, match="to let it change, set focus: auto"):
         camera(focusing).open()
     with camera(focusing, focus="auto") as device:
         focusing.controls[FOCUS][4] = 60
         frame = device.capture()
         assert device.warnings() == [
-            "focus: auto lets the camera change it; every change is another camera"
+            "focus: auto lets the camera change it; every change alters the calibration"
         ]
     assert (frame.settings["focus_auto"], frame.settings["focus"]) == (1.0, 60.0)
 
@@ -213,11 +213,11 @@ def test_auto_by_name_switches_it_on(focusing):
 
 
 def test_a_camera_that_rounds_its_own_value_is_locked_at_what_it_takes(focusing):
-    """It reports 37 while it focuses by itself, and can be set in steps of 5."""
+    """It reports 37 while it focuses automatically, and can be set in steps of 5."""
 
     def obeys(control, value):
         if control == AUTO_FOCUS and value == 0:
-            focusing.controls[FOCUS][4] = 0  # forgets where it was
+            focusing.controls[FOCUS][4] = 0  # loses its position
         return value // 5 * 5 if control == FOCUS else value
 
     focusing.controls[FOCUS][4], focusing.obeys = 37, obeys
@@ -277,9 +277,9 @@ def test_what_is_busy_denied_no_camera_or_not_there(kernel, knobs, error, messag
 @pytest.mark.parametrize(
     ("knob", "value", "message"),
     [
-        # the node is root's until udev has seen it
+        # the node belongs to root until udev has handled it
         ("errors", {"QUERYCAP": errno.EACCES}, "Permission denied"),
-        # v4l2loopback without its feeder captures no more; /dev/video0 may be another camera
+        # v4l2loopback without its source no longer captures; /dev/video0 may be another camera
         ("capture_device", False, "not a capture device"),
     ],
 )
@@ -302,7 +302,7 @@ def test_a_single_broken_frame_is_skipped(kernel):
 
 
 def first(count):
-    """So many bytes of a frame."""
+    """Return the first bytes of a frame."""
     return {"encode": lambda image, fourcc: encode(image, fourcc)[:count]}
 
 
@@ -339,12 +339,12 @@ def test_by_serial_number(kernel, tmp_path):
     with device:
         device.capture()
     (by_id / "usb-046d_HD_Pro_Webcam_C920_18A3F-video-index0").symlink_to(kernel.path)
-    with pytest.raises(errors.WrongDevice, match="several fit"):
+    with pytest.raises(errors.WrongDevice, match="several match"):
         device.open()
 
 
 class FakeCapture:
-    """cv2.VideoCapture of a good camera; `stall` holds a read as a dead one does."""
+    """cv2.VideoCapture of a good camera; `stall` blocks a read as a dead camera does."""
 
     stall: threading.Event | None = None
     good = True
@@ -395,7 +395,7 @@ def test_opencv_where_linuxpy_is_missing(opencv, kernel, monkeypatch):
 
 
 def test_opencv_that_stalls_is_left_behind(opencv, kernel):
-    """OpenCV waits 10 s for a dead camera; the driver does not, and gives it back afterwards."""
+    """OpenCV waits 10 s for a dead camera; the driver does not, and releases it afterwards."""
     opencv.stall = threading.Event()
     device = camera(kernel, backend="opencv")
     device.open()

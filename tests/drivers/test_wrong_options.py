@@ -1,4 +1,4 @@
-"""Stanzas that are refused when they are read, with the option and what is wrong with it."""
+"""Stanzas that are rejected when they are read, with the option and its fault."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOAD = {**PHONE, "limit_c": 60, "programme": [{"seconds": 9, "hold_c": 30}]}
 WHEN = {"when": [{"drift": "c", "px": 0.5}]}
 OPEN = {"host": "x", "sender": "a@b", "recipients": ["a@b"], **WHEN,
         "username": "u", "password_file": "p", "security": "none"}  # fmt: skip
-# {driver: (options of all its rows, [(further options, what is said)])}
+# {driver: (options of all its rows, [(further options, message)])}
 WRONG = {
     ("camera", "v4l2"): (V4L2, [
         ({"device": None}, "either device"), ({"serial": "x"}, "either device"),
@@ -41,7 +41,7 @@ WRONG = {
     **{("thermometer", chip): ({}, [({"address": 0x50}, "0x50 is not an address of a")])
        for chip in ("bme280", "lm75", "mcp9808", "sht3x", "tmp117")},
     ("thermometer", "thermal_zone"): ({}, [
-        ({"zone": "pm8150b-vbat-lvl0"}, "write unit: thousandths")]),
+        ({"zone": "pm8150b-vbat-lvl0"}, "set unit: thousandths")]),
     ("thermometer", "serial"): ({"port": "/dev/null"}, [
         ({}, "either instrument"), ({"pattern": "("}, "pattern"),
         ({"pattern": r"\d+"}, "name the value"),
@@ -58,7 +58,7 @@ WRONG = {
         ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
         ({"programme": [0, 20]}, "valid list"), ({"programme": "warm"}, "valid list"),
         ({"programme": [[0, 20, 3]]}, "list of"),
-        *(({"programme": [[0, celsius]]}, "programme")  # temperatures that do not exist
+        *(({"programme": [[0, celsius]]}, "programme")  # impossible temperatures
           for celsius in (1e300, -300, "nan", float("inf"))),
         ({"channels": {"t": {"lag": 3}}}, "channels.t.lag: unknown; is 'lag_s' meant"),
         ({"channels": {"t": {"noise_k": -1}}}, "channels.t.noise_k: is -1"),
@@ -81,7 +81,7 @@ WRONG = {
         ({"programme": []}, "at least 1 item"), ({"pin": 99}, "pin"),
         ({"programme": [{"seconds": 10}]}, r"programme\[0\]"),
     ]),
-    # a limit that a battery does not survive
+    # a limit above what a battery survives
     ("output", "android_load"): (LOAD, [({}, "limit_c: is 60; input should be less")]),
     ("output", "mqtt"): ({"host": "x"}, [
         ({"password_file": "y"}, "username"), ({"key": "y"}, "cert")]),

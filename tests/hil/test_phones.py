@@ -145,7 +145,7 @@ def test_warm_up_by_processor_load(phone):
         output.emit({})
         assert running() == "2"
         phone.say("dumpsys.battery", "  voltage: 4100\n  temperature: 425\n")
-        with pytest.raises(BadReading, match="reached the limit"):
+        with pytest.raises(PermanentDeviceError, match="reached the limit"):
             output.emit({})
         assert running() == "0"
     phone.say("dumpsys.battery", "  voltage: 4100\n  temperature: 300\n")

@@ -342,7 +342,7 @@ def test_the_stores_disk_is_full(station):
     station.machine.run(f"rm {STORE}/balloon {STORE}/rest")
     station.until(store_is_ok, "a working store again")
     assert station.status()["store"]["lost"] == 0
-    for text in ("observations no more", "can be written again", "observations are kept again"):
+    for text in ("observations no longer", "can be written again", "observations are stored again"):
         assert station.journal(text)
     kinds = station.events()
     assert {"store_out", "observations_paused", "observations_resumed"} <= set(kinds)

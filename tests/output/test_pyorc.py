@@ -160,6 +160,15 @@ def test_control_points_that_pyorc_would_not_take_are_said(tmp_path, gcps, words
     assert str(refused.value).count(str(path)) == 1
 
 
+def test_properties_that_are_no_object_are_an_error(tmp_path):
+    point = {"type": "Point", "coordinates": [313000.0, 192000.0, 138.0]}
+    document = {"type": "FeatureCollection", "features": [{"geometry": point, "properties": [1]}]}
+    path = tmp_path / "gcp.geojson"
+    path.write_text(json.dumps(document))
+    with pytest.raises(DataError, match="is not valid JSON of control points"):
+        ControlPoints.read(path, "m")
+
+
 def river_camera() -> Camera:
     """The Geul's camera as solved by pyorc, with an sd of a hundredth of its focal length."""
     document = json.loads((RIVER / "geul-pyorc.json").read_text())

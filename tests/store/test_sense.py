@@ -206,7 +206,7 @@ DOUBTS = {
         lambda p: change(p, "epochs.csv", frame_time=scaled(1 / 86400),
                          temperature_time=scaled(1 / 86400)), "every 0.000116 s"),
     "a name that no store keeps": (
-        lambda p: head(p, "{name: rpi", "{name: a/rpi"), "no store can keep it"),
+        lambda p: head(p, "{name: rpi", "{name: a/rpi"), "no store accepts it"),
     "an hour as the interval": (
         lambda p: head(p, "interval: 10.0", "interval: 3600"), "every 10 s"),
     "an epoch twice": (repeat_epoch, "1 epochs hold the image points of another one: epoch 18"),
@@ -257,7 +257,7 @@ def test_width_and_height_exchanged_in_the_middle_of_the_image(recording):
     header, *rows = file.read_text().splitlines()
     kept = [r for r in rows if float(r.split(",")[2]) < 2460]
     file.write_text("\n".join([header, *kept]) + "\n")
-    assert call("check", recording).stdout.startswith(f"{recording}: a sound recording")
+    assert call("check", recording).stdout.startswith(f"{recording}: a valid recording")
     head(recording, SIZE, "width: 2464, height: 3280")
     checked, replayed = call("check", recording), call("replay", recording)
     for text in (checked.stdout, replayed.stderr):

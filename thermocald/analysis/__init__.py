@@ -1,1 +1,1 @@
-"""What the calibrated epochs say: statistics, significance, Monte-Carlo, thermal models."""
+"""Analysis of calibrated epochs: statistics, significance, Monte-Carlo, thermal models."""

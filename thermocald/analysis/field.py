@@ -1,9 +1,9 @@
-"""What a camera at a given place would get out of a test field, before anything is put up.
+"""Check of a planned test field: the precision that a camera at a given station would reach.
 
-Which targets it sees and how large, how the image is filled, how deep the field is, and the
-standard deviations of the interior orientation that one image and a series would reach: the inverse
-of the normal equations of a planned network (Grafarend's first-order design), no image needed. And
-what to add to the field or to change; every proposal is computed before it is made.
+Reports which targets the camera sees and how large, how the image is filled, how deep the field is,
+and the standard deviations of the interior orientation from one image and in a series: the inverse
+of the normal equations of a planned network (Grafarend's first-order design), without any image. It
+also proposes what to add or change; the effect of every proposal is computed.
 """
 
 from __future__ import annotations
@@ -42,33 +42,33 @@ if TYPE_CHECKING:
 _USED = [PARAMETER_NAMES.index(name) for name in (*DEFAULT_FREE, *EOP_NAMES)]
 _COLUMNS, _ROWS = ("left", "centre left", "centre right", "right"), ("upper", "middle", "lower")
 CELLS = (4, 3)
-"""The image is divided into so many columns and rows to see whether it is filled."""
+"""Columns and rows of the parts of the image that are checked for targets."""
 MIN_SIZE_PX = 8.0
 MAX_TILT_COSINE = 0.2
 _FILL = 0.92
-_NONE = 1e300  # a standard deviation that does not exist
-_WORTH = 0.85  # a proposal must bring a standard deviation below this share of what it is
-_RAISED = 0.25  # of the distance: how far in front of the field proposed targets stand
+_NONE = 1e300  # a standard deviation from here on is infinite
+_WORTH = 0.85  # a proposal must reduce a standard deviation below this fraction
+_RAISED = 0.25  # distance of proposed targets in front of the field, over its distance
 _GOOD_SIZE_PX = 12.0
 _FEW = 40
-_FLAT = 0.02  # depth of a field over its distance below which it is a plane
+_FLAT = 0.02  # depth over distance below which a field is a plane
 _ONE_PLANE = (
-    "the field is one plane: no single image separates c, x0 and y0 from where the camera "
-    "stands. For a series of a fixed camera print the corner (thermocald testfield print). A "
-    "flat sheet gives a drift too: photograph it in ten poses with the cold camera and in ten "
+    "the field is one plane: no single image separates c, x0 and y0 from the camera's "
+    "position. For a series of a fixed camera print the corner (thermocald testfield print). A "
+    "flat sheet also gives a drift: photograph it in ten poses with the cold camera and in ten "
     "with the warm one, run `thermocald calibrate` on each, and take the difference"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class FieldCheck:
-    """The result: rows of visible targets, why the others are not, how they fill image and depth.
+    """The result of the check of a test field.
 
-    sigma_px: of an image coordinate; sizes: smaller diameter in px of each visible circle; cells:
-    targets per part of the image (rows, columns); coverage: share of the image inside the targets'
-    hull; depth_relief: range of depth over mean depth; distance: mean depth mm; flatness: how far
-    the targets lie off their best plane, over that distance; precision: what `precision` returns;
-    weak: why the program would call an image of it too weak for a result, empty if it would not.
+    sigma_px: of an image coordinate; visible: rows of the targets; hidden: {target: reason}; sizes:
+    smaller diameter of each visible circle, px; cells: targets per part of the image (rows,
+    columns); coverage: fraction of the image inside the targets' hull; depth_relief: range of depth
+    over mean depth; distance: mean depth mm; flatness: extent of the targets across their best
+    plane, over `distance`; precision: as `precision` returns; weak: why an image would be too weak.
     """
 
     camera: CameraModel
@@ -88,16 +88,16 @@ class FieldCheck:
 
     @property
     def sds_px(self) -> dict[str, tuple[float, float, float]]:
-        """Sd of c, x0, y0 in px: (epoch, series, level) by name."""
+        """Standard deviations of c, x0, y0 in px: (epoch, series, level) by name."""
         rows = np.stack([*self.precision.values()], axis=1)[:3] / self.camera.sensor.pixel_pitch
         return {name: tuple(row) for name, row in zip(DEFAULT_FREE, rows.tolist(), strict=False)}
 
     @cached_property
     def advice(self) -> list[str]:
-        """Sentences on what would be better, the most helpful first; none if nothing would help by
-        a seventh.
+        """Sentences on improvements, the most effective first.
 
-        That a field is one plane comes before all else: more targets in front of it are no print.
+        Proposals that reduce no standard deviation by a seventh are left out. That a field is one
+        plane comes first: targets in front of it cannot be printed on a sheet.
         """
         points, sigmas = self.field.points[self.visible], self.field.sigmas[self.visible]
         typical = np.broadcast_to(np.median(sigmas, axis=0), (1, 3))
@@ -108,7 +108,7 @@ class FieldCheck:
             both = np.concatenate([points, added])
             spread = np.concatenate([sigmas, np.repeat(typical, len(added), axis=0)])
             then = precision(self.camera, self.station, both, spread, self.sigma_px)["epoch"]
-            with np.errstate(invalid="ignore"):  # what is not determined now is worth everything
+            with np.errstate(invalid="ignore"):  # determining a parameter is the largest gain
                 gain = np.where(np.isfinite(now), then / now, 0.0)[:3]
             gain = np.where(np.isfinite(then[:3]), gain, 1.0)
             best = int(np.argmin(gain))
@@ -122,7 +122,9 @@ class FieldCheck:
 
         near = self.distance * (1 - _RAISED)
         propose(
-            _along(self, np.array([(c, r) for r in range(2) for c in range(4)]), (4, 2), near),
+            _place_in_parts(
+                self, np.array([(c, r) for r in range(2) for c in range(4)]), (4, 2), near
+            ),
             f"8 targets standing {self.distance * _RAISED:.0f} mm in front of the field, spread "
             "over the image",
         )
@@ -131,7 +133,7 @@ class FieldCheck:
             words = [f"{_ROWS[r]} {_COLUMNS[c]}" for c, r in empty]
             where = ", ".join(words[:4]) + (f" and {len(words) - 4} more" if len(words) > 4 else "")
             propose(
-                _beside(self, empty, points),
+                _extend_field(self, empty, points),
                 f"{len(empty)} targets in the empty parts of the image ({where})",
             )
         if len(points) < _FEW:
@@ -141,7 +143,7 @@ class FieldCheck:
         return [*plane, *sentences, *_remarks(self)]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the document that `testfield check` writes with `--json`."""
+        """Return what `thermocald testfield check --json` writes."""
         sds = {}
         for kind, values in self.precision.items():
             named = zip(DEFAULT_FREE, values, strict=True)
@@ -167,7 +169,7 @@ class FieldCheck:
         }
 
     def lines(self) -> list[str]:
-        """Return the lines that `testfield check` prints."""
+        """Return what `thermocald testfield check` prints."""
         X, Y, Z = self.station.centre
         reasons = list(self.hidden.values())
         lines = ["good: every image from there can be calibrated by itself"]
@@ -190,31 +192,31 @@ class FieldCheck:
 
 
 def usual_station(camera: CameraModel, field: TestField) -> ExteriorOrientation:
-    """Where one would put the camera: in front of the field, which just fills the image.
+    """Return the usual station: in front of a field that just fills the image.
 
-    In front of a plane, on the diagonal of a corner; upright if Z is up, else Y.
+    That is in front of a plane, or on the diagonal of a corner; upright if Z is up, or else Y.
     """
     centre = (field.points.min(axis=0) + field.points.max(axis=0)) / 2
     towards = _front(field)
     low, high = 1e-3 * _extent(field), 1e3 * _extent(field)
-    # the pinhole decides: a distortion polynomial folds back far outside of the image
+    # without distortion, whose polynomial folds back far outside the image
     pinhole = CameraModel(camera.sensor, type(camera.interior)(c=camera.interior.c))
     middle_px = camera.sensor.centre
     for _ in range(60):
         middle = np.sqrt(low * high)
         image = pinhole.project(station_at(centre + middle * towards, centre), field.points)
-        # NaN, behind the camera, is not inside
+        # NaN (behind the camera) compares as outside
         inside = np.all(np.abs(image - middle_px) < middle_px * _FILL)
         low, high = (low, middle) if inside else (middle, high)
     return station_at(centre + high * towards, centre)
 
 
 def station_at(place: Array, target: Array, roll: float = 0.0) -> ExteriorOrientation:
-    """The orientation of a camera at `place` that looks at `target` (3,) mm, rolled by rad."""
+    """Return the orientation of a camera at `place` looking at `target` (3,) mm, rolled by rad."""
     backward = np.asarray(place, dtype=float) - target
     length = float(np.linalg.norm(backward))
     if not length > 0:
-        raise GeometryError("the camera stands where it looks at: give another place")
+        raise GeometryError("the camera's place is the point it looks at: give another place")
     backward = backward / length
     up = np.array([0.0, 0.0, 1.0])
     if abs(backward @ up) > 0.9:  # looks along Z: Y is up
@@ -232,9 +234,7 @@ def _extent(field: TestField) -> float:
 
 
 def _front(field: TestField) -> Array:
-    """The direction (3,) from which most of the field is seen best: the mean of its normals, each
-    towards the side on which the rest of the field lies.
-    """
+    """Return the direction (3,) that the field faces: its mean normal, towards its inside."""
     normals = field_normals(field)
     known = np.isfinite(normals[:, 0])
     if not known.any():
@@ -243,7 +243,7 @@ def _front(field: TestField) -> Array:
     n, p = normals[known], field.points[known]
     side = np.sum((field.points.mean(axis=0) - p) * n, axis=1)
     flat = np.abs(side) < 0.02 * _extent(field)
-    # a plane alone tells no side; printed sheets are seen from the positive one
+    # a single plane has no such side; printed sheets are seen from the positive one
     largest = n[np.arange(len(n)), np.argmax(np.abs(n), axis=1)]
     sign = np.where(flat, np.sign(largest), np.sign(side))
     mean = (n * sign[:, None]).mean(axis=0)
@@ -272,7 +272,7 @@ def check_field(
     # the reasons for which `adjust` would give an image of these points no result
     A, _ = _partials(camera, station, points)
     covariance = np.zeros((len(PARAMETER_NAMES),) * 2)
-    # what nothing determines gets a variance that is large, and correlations that are 1
+    # undetermined parameters get large variances, and correlations of 1
     covariance[np.ix_(_USED, _USED)] = scaled_inverse(
         _normal_matrix(A, np.eye(2) * sigma_px**2), 1e-13
     )
@@ -308,7 +308,7 @@ def check_field(
 def _visible(
     camera: CameraModel, field: TestField, station: ExteriorOrientation
 ) -> tuple[NDArray[np.int64], dict[str, str], Array]:
-    """Rows that can be measured, reasons for the others, smaller diameters in px of the former."""
+    """Return the visible targets' rows, why others are hidden, and the smaller diameters px."""
     image = camera.project(station, field.points)
     normals, cosine = facing(station.centre, field.points, field_normals(field))
     round_ = np.isfinite(field.diameters)
@@ -341,12 +341,11 @@ def precision(
     sigmas: Array,
     sigma_px: float,
 ) -> dict[str, Array]:
-    """The standard deviations that targets at points (n, 3) mm with sigmas (n, 3) mm give, by
-    `DEFAULT_FREE`; c, x0, y0 … in mm etc.
+    """Return standard deviations of `DEFAULT_FREE` from targets at points (n, 3) mm with sigmas mm.
 
-    epoch: one image, its orientation free, image noise alone; series: of one epoch relative to the
-    others where the camera stands still, many epochs; level: one image, the test field's own
-    uncertainty included: what is common to all epochs. inf where nothing determines a parameter.
+    epoch: one image with free exterior orientation, image noise only; series: an epoch relative to
+    the others in a long series of a fixed camera; level: one image, including the test field's
+    uncertainty, which is common to all epochs. c, x0, y0 in mm; inf for an undetermined parameter.
     """
     A, by_point = _partials(camera, station, points)
     k, noise = len(DEFAULT_FREE), np.eye(2) * sigma_px**2
@@ -362,7 +361,7 @@ def precision(
 def _partials(
     camera: CameraModel, station: ExteriorOrientation, points: Array
 ) -> tuple[Array, Array]:
-    """Partials of the image points (n, 2, …) by what is estimated, and by the targets."""
+    """Return partials (n, 2, …) of the image points by the estimated parameters and the targets."""
     interior, exterior = camera.interior.as_array(), station.as_array()
     _, by_parameter, by_point = partials(camera.sensor, interior, exterior, points)
     return by_parameter[:, :, _USED], by_point
@@ -374,7 +373,7 @@ def _normal_matrix(A: Array, covariance: Array) -> Array:
 
 
 def _sds(N: Array) -> Array:
-    """Square roots of the diagonal of N⁻¹; inf for parameters in an undetermined direction."""
+    """Return the square roots of the diagonal of N⁻¹; inf for an undetermined parameter."""
     scaled, scale = unit_diagonal(N)
     values, vectors = np.linalg.eigh(scaled)
     undetermined = values < 1e-12 * values.max()
@@ -393,10 +392,10 @@ def assess_field(
     roll: float = 0.0,
     sigma_px: float = 0.03,
 ) -> FieldCheck:
-    """Assess a test field for a camera at a place X, Y, Z mm, roll degrees about its axis.
+    """Assess a test field for a camera at a place X, Y, Z mm; roll: degrees about its axis.
 
-    Without a place it stands where the field just fills its image, without a point to look at it
-    looks at the field's middle.
+    By default the camera is placed where the field just fills its image, and looks at the field's
+    centre. Raises GeometryError if fewer than four targets are visible.
     """
     middle = (field.points.min(axis=0) + field.points.max(axis=0)) / 2
     target = middle if look_at is None else np.array(look_at)
@@ -410,7 +409,7 @@ def assess_field(
 
 
 def _remarks(check: FieldCheck) -> list[str]:
-    """What is wrong with the targets themselves."""
+    """List what is wrong with the targets themselves."""
     notes = []
     too_small = sum("smaller" in reason for reason in check.hidden.values())
     if too_small:
@@ -428,18 +427,16 @@ def _remarks(check: FieldCheck) -> list[str]:
     level, epoch = check.precision["level"][:3], check.precision["epoch"][:3]
     if np.all(np.isfinite(level)) and np.any(level > 2 * epoch):
         notes.append(
-            "the test field's own uncertainty is larger than what the image could give: survey it "
+            "the test field's own uncertainty limits the precision of the image: survey the field "
             "(thermocald testfield survey)"
         )
     return notes
 
 
-def _along(
+def _place_in_parts(
     check: FieldCheck, parts: NDArray[np.int64], counts: tuple[int, int], depth: float
 ) -> Array:
-    """Object points (n, 3) mm in some depth that appear in the middles of parts (column, row) of
-    the image, of which there are so many columns and rows.
-    """
+    """Return points (n, 3) mm at a depth in the centres of image parts (column, row)."""
     sensor = check.camera.sensor
     middles = (parts + 0.5) / counts * (sensor.width, sensor.height) - 0.5
     rays = check.camera.rays(middles)
@@ -449,11 +446,9 @@ def _along(
     return placed
 
 
-def _beside(check: FieldCheck, parts: NDArray[np.int64], points: Array) -> Array:
-    """Object points (n, 3) mm that appear in parts of the image: on the field's plane if it is one
-    (and is in view there), else in its mean depth.
-    """
-    placed = _along(check, parts, CELLS, check.distance)
+def _extend_field(check: FieldCheck, parts: NDArray[np.int64], points: Array) -> Array:
+    """Return points (n, 3) mm in parts of the image: on a plane field in view, or at mean depth."""
+    placed = _place_in_parts(check, parts, CELLS, check.distance)
     if check.flatness >= _FLAT:
         return placed
     centre, axes, _ = plane_fit(points)

@@ -33,7 +33,7 @@ from thermocald.cli.common import (
 )
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
-from thermocald.numbers import duration, with_sd
+from thermocald.numbers import counted, duration, with_sd
 
 
 def run(
@@ -157,7 +157,7 @@ def status(
     show(document, json, *status_lines(document))
     store_ = document["store"]
     if store_["lost"]:
-        raise DataError(f"{store_['lost']} epochs were lost: taken but not stored")
+        raise DataError(f"{counted(store_['lost'], 'epoch')} lost: taken but not stored")
     if store_["state"] == "out":
         raise DataError(f"the store cannot be written; {store_['waiting']} epochs wait in memory")
 
@@ -404,7 +404,8 @@ def status_warnings(document: dict[str, Any]) -> list[str]:
     if store["state"] != "ok":
         found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
     if store["lost"]:
-        found.append(f"{store['lost']} epochs are lost, taken but not stored: {store['lost_why']}")
+        lost = counted(store["lost"], "epoch")
+        found.append(f"{lost} lost, taken but not stored: {store['lost_why']}")
     if store.get("notice"):
         found.append(f"store: {store['notice']}")
     if document.get("dashboard", {}).get("why"):

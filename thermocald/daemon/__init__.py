@@ -1,1 +1,1 @@
-"""The daemon: what a configuration names, acquired, calibrated and kept, for months."""
+"""The daemon: acquires, calibrates and stores the epochs of a configuration, for months."""

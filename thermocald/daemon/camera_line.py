@@ -1,9 +1,9 @@
-"""One camera from its device to the store; the series it takes may change, the device stays open.
+"""A camera from its device to the store; its series may change while the device stays open.
 
     device loop ─► frame ─► a series: pipeline ─► keeper ─► store, outputs, live state
                       └───► or the check before a session
 
-Where neither wants frames, the device is closed: a phone cools down for a cold start.
+While neither needs frames, the device is closed, so that a phone cools down for a cold start.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.field.testfield import Observations
 
 START_EPOCHS = 10
-"""The start of a series is the mean of so many of its first epochs with a result."""
+"""The start of a series is the mean of this many first epochs with a result."""
 _NAMES = PARAMETER_NAMES[PRINCIPAL]
 
 
 class SeriesDrift:
-    """Columns `drift_c_px`, `sd_drift_c_px` …, `pixel_pitch` for the rows of one series.
+    """The columns `drift_c_px`, `sd_drift_c_px` …, `pixel_pitch` for the rows of a series.
 
-    pixel_pitch: mm; earlier: the first epochs of the series that are stored already, as rows. The
-    standard deviation takes the epochs as independent: where they share a level that cancels in
-    the difference, it is too large rather than too small.
+    pixel_pitch: mm; earlier: rows of the first stored epochs of the series. The standard deviation
+    assumes independent epochs: an error that they share cancels in the difference, so that it is
+    too large rather than too small.
     """
 
     def __init__(self, pixel_pitch: float, earlier: Iterable[dict[str, Any]] = ()) -> None:
@@ -58,7 +58,7 @@ class SeriesDrift:
             self.columns(row)
 
     def columns(self, row: dict[str, Any]) -> dict[str, float]:
-        """Return the columns for one epoch; NaN without a result, and until the start is known."""
+        """Return the columns for an epoch; NaN without a result and until the start is complete."""
         good = row.get("status") == "ok"
         if good and len(self._start) < START_EPOCHS:
             self._start.append({k: float(row[k]) for n in _NAMES for k in (n, f"sd_{n}")})
@@ -75,12 +75,12 @@ class SeriesDrift:
 
 
 @dataclass(frozen=True)
-class Ground:
-    """What outlives a configuration: the store, the clock, how a run was asked for.
+class Runtime:
+    """The store, clock and run options, which stay the same when the configuration is reloaded.
 
-    fast: a recording is played as fast as it can be calibrated; virtual: so are the ticks of a
-    virtual clock; epochs: after how many new ones a camera stops, 0 for never; start_condition:
-    kept with a series that begins.
+    fast: play recordings as fast as they can be calibrated; virtual: take the ticks of a virtual
+    clock as fast, too; epochs: the number of new epochs after which a camera stops, 0 for never;
+    start_condition: stored with a new series.
     """
 
     guard: StoreGuard
@@ -99,22 +99,22 @@ _PREVIEW_EVERY_S = 5.0
 _SHOW_EVERY_S = 0.5
 _SWITCH_GRACE_S = 20.0
 _VIRTUAL_PATIENCE_S = 60.0  # real seconds that a tick of a virtual clock waits for room
-_REMEMBERED = 200  # epochs, as many as a running series keeps
+_REMEMBERED = 200  # epochs, as many as a `RunningSeries` holds
 
 
 class SeriesRun:
-    """A series being taken: its keeper, its online estimate, its pipeline.
+    """A series that is being taken: its keeper, online estimate and pipeline.
 
-    limit: the number of its last epoch, 0 for none.
+    limit: the number of its last epoch, 0 for no limit.
     """
 
     def __init__(self, line: CameraLine, series: str, start: str, limit: int) -> None:
-        ground, plan = line.ground, replace(line.plan, series=series)
+        runtime, plan = line.runtime, replace(line.plan, series=series)
         self.plan = plan
         self.limit = limit
         self._line = line
         self.keeper = EpochKeeper(
-            plan, ground.guard, line.frames, self._kept, line.identity, start=start
+            plan, runtime.guard, line.frames, self._kept, line.identity, start=start
         )
         self.observer = self._make_observer()
         self.running = running_series(plan)
@@ -126,13 +126,13 @@ class SeriesRun:
             line.thermometers,
             plan.config.thermometers,
             self.keeper,
-            ground.clock,
+            runtime.clock,
             first=self.first,
             period_s=plan.config.period_s,
-            patience_s=0.0 if ground.fast else None,
-            trusted=ground.clock.trusted,
+            patience_s=0.0 if runtime.fast else None,
+            trusted=runtime.clock.trusted,
             observe=self._observe,
-            on_lost=ground.guard.lose,
+            on_lost=runtime.guard.lose,
         )
         self.drift: SeriesDrift | None = None
         self.last: dict[str, Any] = {}
@@ -140,68 +140,68 @@ class SeriesRun:
 
     @property
     def taken(self) -> int:
-        """The number of the last epoch that was taken over, 0 for none."""
+        """The number of the last epoch that entered the pipeline, 0 for none."""
         return self.pipeline.next_number - 1
 
     @property
     def full(self) -> bool:
-        """Whether it has all its epochs."""
+        """Whether all epochs up to the limit were taken."""
         return bool(self.limit) and self.taken >= self.limit
 
     def finish(self, grace_s: float) -> bool:
-        """Let all that was taken be calibrated and kept; False if that took too long."""
+        """Calibrate and store the remaining epochs; return False if that takes too long."""
         deadline = time.monotonic() + grace_s
         self.pipeline.drain(0.5 * grace_s)
         return self.pipeline.stop(max(0.1, deadline - time.monotonic()))
 
     def _make_observer(self) -> Any:
-        """Return the online estimate of the camera; None if it is only acquired."""
+        """Return the camera's online estimate; None if the camera is not calibrated."""
         plan = self.plan
         if plan.sensor is None or plan.testfield is None or plan.calibrator is None:
             return None
         if isinstance(plan.calibrator, Calibrator):
             from thermocald.analysis.online.observer import OnlineObserver
 
-            return OnlineObserver(plan.sensor, plan.testfield, self._tell)
+            return OnlineObserver(plan.sensor, plan.testfield, self._record)
         from thermocald.analysis.thermal.gauge import GaugeObserver
 
         plan.calibrator.remember(self.keeper.latest())
-        return GaugeObserver(plan.calibrator, self._tell)
+        return GaugeObserver(plan.calibrator, self._record)
 
-    def _tell(self, kind: str, text: str, utc: float, epoch: int) -> None:
+    def _record(self, kind: str, text: str, utc: float, epoch: int) -> None:
         log.warning("camera %s: %s", self.plan.name, text, extra={"event": kind})
-        self.keeper.tell(utc, kind, text, epoch)
+        self.keeper.record(utc, kind, text, epoch)
 
     def _observe(self, calibrated: CalibratedEpoch, in_order: bool) -> CalibratedEpoch:
-        """Adjust the epoch with what its series tells, then test it against those before."""
+        """Adjust an epoch together with its series, then test it against the earlier epochs."""
         seen = calibrated.epoch.observations
         adjusted = calibrated.adjustment
         columns: dict[str, float] = {}
         if self.running is not None and seen is not None:
             if in_order and self.first > 1 and not self.running.epochs:
                 self._remember()
-            hurried = self.pipeline.waiting() > 1 and not self._line.ground.fast
+            hurried = self.pipeline.waiting() > 1 and not self._line.runtime.fast
             try:
                 adjusted, columns = self.running.refine(
                     calibrated, self._weighed(seen), hurried=hurried
                 )
             except Exception:
-                # what breaks in the series must not cost an epoch that has a result of its own
-                log.exception("camera %s: the series was not adjusted", self.plan.name)
+                # an error in the series must not lose an epoch that has a result of its own
+                log.exception("camera %s: the series cannot be adjusted", self.plan.name)
                 self.running.reset()
                 adjusted, columns = calibrated.adjustment, {"series_restarted": 1.0}
             if "series_restarted" in columns:
-                self._tell(
+                self._record(
                     "series_restarted",
-                    "several epochs in a row contradict what the earlier ones of their series say "
-                    "of camera and targets; the common adjustment begins again",
+                    "several epochs in a row contradict the camera and targets of the earlier "
+                    "epochs of their series; the common adjustment starts again",
                     calibrated.epoch.frame_time,
                     calibrated.epoch.number,
                 )
         if self.observer is not None and in_order:
-            known = self.running
-            told = () if known is None else (known.tremble, known.field_variance)
-            columns |= self.observer.observe(calibrated, adjusted, *told)
+            running = self.running
+            noise = () if running is None else (running.tremble, running.field_variance)
+            columns |= self.observer.observe(calibrated, adjusted, *noise)
         return replace(calibrated, adjustment=adjusted, extra={**calibrated.extra, **columns})
 
     def _weighed(self, seen: Observations) -> Observations:
@@ -209,7 +209,7 @@ class SeriesRun:
         return self.plan.calibrator.weighed(seen)
 
     def _remember(self) -> None:
-        """After a restart, go on with the last epochs of the store."""
+        """Fill the running series with the last stored epochs, after a restart."""
         if self._remembered:
             return
         self._remembered = True
@@ -225,7 +225,7 @@ class SeriesRun:
             self.running.remember(alone, seen, reported)
 
     def _kept(self, acquired: AcquiredEpoch, row: dict[str, Any]) -> None:
-        """Tell outputs and the live state; the epoch is in the store already."""
+        """Pass a stored epoch on to the outputs and the live state."""
         line, name = self._line, self.plan.name
         report = {} if self.observer is None else self.observer.report()
         report |= {} if self.running is None else self.running.report()
@@ -245,7 +245,7 @@ class SeriesRun:
         now = time.monotonic()
         if now - self._shown >= _SHOW_EVERY_S:
             self._shown = now
-            live = line.ground.live
+            live = line.runtime.live
             live.write_epoch(name, self.last, acquired.calibrated, self.plan.testfield)
             if line.preview and now - self._previewed >= _PREVIEW_EVERY_S:
                 self._previewed = now
@@ -253,12 +253,12 @@ class SeriesRun:
 
 
 class CameraLine:
-    """One camera; what it takes is changed by one thread, the service's."""
+    """A camera and the series it takes; only the service's thread changes the series."""
 
     def __init__(
         self,
         plan: CameraPlan,
-        ground: Ground,
+        runtime: Runtime,
         thermometers: Thermometers,
         frames: FrameFolder,
         outputs: list[OutputLoop],
@@ -266,32 +266,32 @@ class CameraLine:
         *,
         preview: bool = False,
     ) -> None:
-        self.plan, self.ground, self.preview = plan, ground, preview
+        self.plan, self.runtime, self.preview = plan, runtime, preview
         self.thermometers, self.frames, self.outputs = thermometers, frames, outputs
-        self.checked: tuple[list[str], str] | None = None  # as of `check_frame`
+        self.checked: tuple[list[str], str] | None = None  # the result of `check_frame`
         self.run: SeriesRun | None = None
         self._checking = False
         self._started = False
         self._swap = threading.Lock()
         self.link = Link(
-            "camera", plan.name, plan.camera, ground.clock,
+            "camera", plan.name, plan.camera, runtime.clock,
             period_s=plan.config.period_s,
             on_event=self._event,
         )  # fmt: skip
         self.loop = DeviceLoop(
-            self.link, self._capture, ground.clock, plan.config.period_s, begin,
-            free_running=ground.fast and not ground.virtual, idle=lambda: not self.taking,
+            self.link, self._capture, runtime.clock, plan.config.period_s, begin,
+            free_running=runtime.fast and not runtime.virtual, idle=lambda: not self.taking,
         )  # fmt: skip
-        self.take(plan.config.series, ground.start_condition)
+        self.take(plan.config.series, runtime.start_condition)
 
     def identity(self) -> dict[str, Any]:
-        """Return what the camera and its thermometers say they are."""
-        told = self.thermometers.identity(self.plan.config.thermometers)
-        return {**self.link.identity(), **({"thermometers": told} if told else {})}
+        """Return the identities that the camera and its thermometers report."""
+        thermometers = self.thermometers.identity(self.plan.config.thermometers)
+        return {**self.link.identity(), **({"thermometers": thermometers} if thermometers else {})}
 
     @property
     def taking(self) -> bool:
-        """Whether frames are wanted."""
+        """Whether a series or a check needs frames."""
         return self.run is not None or self._checking
 
     def start(self) -> None:
@@ -302,9 +302,10 @@ class CameraLine:
         self.loop.start()
 
     def take(self, series: str | None, start: str = "", limit: int = 0) -> None:
-        """Go over to another series, None for none; raises ConfigurationError and changes nothing.
+        """Switch to another series, None for none; ConfigurationError leaves all unchanged.
 
-        The current epochs are finished first; frames that come meanwhile belong to the new one.
+        The epochs of the old series are finished first; frames that arrive meanwhile belong to the
+        new one.
         """
         run = None if series is None else SeriesRun(self, series, start, limit)
         self._replace(run, checking=False)
@@ -312,9 +313,12 @@ class CameraLine:
             run.pipeline.start()
 
     def check(self) -> None:
-        """Look at the next frame and keep none; `checked` then says what was found."""
+        """Check the next frame without storing it; `checked` then holds the result."""
         if not isinstance(self.plan.calibrator, Calibrator):
-            raise ConfigurationError(f"camera {self.plan.name!r}: a session needs its `testfield`")
+            raise ConfigurationError(
+                f"camera {self.plan.name!r}: the check needs its `testfield`; set it, or give "
+                "--no-check"
+            )
         self.checked = None
         self._replace(None, checking=True)
 
@@ -322,20 +326,20 @@ class CameraLine:
         with self._swap:
             old, self.run, self._checking = self.run, run, False
         if old is not None and self._started and not old.finish(_SWITCH_GRACE_S):
-            log.error("camera %s: its last epochs take too long to be kept", self.plan.name)
-        # only now: the calibrator is one for all series
+            log.error("camera %s: its last epochs take too long to be stored", self.plan.name)
+        # only now, since all series share the calibrator
         self._checking = checking
 
     def _capture(self) -> None:
-        ground, run = self.ground, self.run
-        # of a virtual clock each tick is an epoch, however long those before take
-        patience_s = _VIRTUAL_PATIENCE_S if ground.virtual else 1.0
+        runtime, run = self.runtime, self.run
+        # each tick of a virtual clock is an epoch, however long the earlier ones take
+        patience_s = _VIRTUAL_PATIENCE_S if runtime.virtual else 1.0
         if run is not None and (
-            run.full or (ground.fast and not run.pipeline.wait_for_room(patience_s))
+            run.full or (runtime.fast and not run.pipeline.wait_for_room(patience_s))
         ):
             return
         frame = self.plan.camera.capture()
-        if ground.fast:
+        if runtime.fast:
             self.thermometers.read_now(self.plan.config.thermometers)
         if self._checking:
             assert self.plan.calibrator is not None
@@ -348,34 +352,34 @@ class CameraLine:
             if run is None or run.full:
                 return
             run.pipeline.submit(frame)
-        if ground.epochs and run.taken - run.first + 1 >= ground.epochs:
+        if runtime.epochs and run.taken - run.first + 1 >= runtime.epochs:
             self.loop.stop()
 
     def waiting(self) -> int:
-        """Return how many epochs are on their way."""
+        """Return the number of epochs in the pipeline."""
         run = self.run
         return 0 if run is None else run.pipeline.waiting()
 
     def busy_s(self) -> float:
-        """Return for how long the pipeline has not finished one thing."""
+        """Return how long the pipeline has been working on one step, s."""
         run = self.run
         return 0.0 if run is None else run.pipeline.busy_s()
 
     def _event(self, utc: float, kind: str, text: str) -> None:
-        """Keep an event of the device, which belongs to the series being taken."""
+        """Store an event of the device, with the series being taken."""
         if self.run is None:
-            self.ground.guard.event(Event(utc, kind, text))
+            self.runtime.guard.event(Event(utc, kind, text))
         else:
-            self.run.keeper.tell(utc, kind, text)
+            self.run.keeper.record(utc, kind, text)
 
     def status(self) -> dict[str, Any]:
-        """Return the camera's part of what `thermocald status` shows."""
+        """Return the camera's part of the status document."""
         run = self.run
         pipeline = None if run is None else run.pipeline
         return {
             "series": "" if run is None else run.plan.series,
             "period_s": self.plan.config.period_s,
-            **self.link.status(self.loop.busy_s(), self.ground.hang_after_s),
+            **self.link.status(self.loop.busy_s(), self.runtime.hang_after_s),
             **self.loop.schedule.stats(),
             "lost": self.loop.lost + (0 if pipeline is None else pipeline.lost),
             "waiting": self.waiting(),

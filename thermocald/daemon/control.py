@@ -1,11 +1,11 @@
-"""The daemon's ear: a Unix socket in its runtime folder that takes one request per connection.
+"""The daemon's control socket: a Unix socket in its live folder, with one request per connection.
 
     → {"format": "thermocald-control/1", "do": "session start", "session": {…}}
     ← {"format": "thermocald-control/1", "ok": true, …}
     ← {"format": "thermocald-control/1", "ok": false, "error": "…", "exit_status": 2}
 
-Who may ask is a matter of the file: mode 0660, owner and group of the daemon. A request is one line
-of at most 64 KiB within two seconds; what is not understood changes nothing.
+The socket's mode, 0660, admits the daemon's user and group. A request is one line of at most
+64 KiB, sent within two seconds; an invalid request changes nothing.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ _LONGEST = 65536
 _REQUEST_S = 2.0
 _ANSWER_S = 60.0
 _BACKLOG = 64
-_AT_ONCE = 32  # connections that are served; more wait in the backlog
+_AT_ONCE = 32  # connections served; further ones wait in the backlog
 
 
 class DaemonBusy(DataError):
-    """A daemon listens, but did not answer: it may when it is asked again."""
+    """A daemon listens but did not answer; a second request may succeed."""
 
 
 class Request(BaseModel):
-    """What is asked: `session start` with a session, `session stop` with the camera whose ends.
+    """A request: `session start` with a session, or `session stop` with the session's camera.
 
-    `session status`: what is being taken; `retention`: delete frames that may go, now.
+    `session status`: report the sessions; `retention`: delete expired frames now.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -70,9 +70,9 @@ class Request(BaseModel):
 
 
 class ControlSocket:
-    """Listens in a thread of its own, and serves every connection in one.
+    """A server that listens in one thread and serves each connection in another.
 
-    answer(request) → what is reported, raises ThermocaldError.
+    answer(request): returns the answer's content or raises ThermocaldError.
     """
 
     def __init__(self, folder: Path, answer: Callable[[Request], dict[str, Any]]) -> None:
@@ -84,26 +84,26 @@ class ControlSocket:
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
 
     def open(self) -> None:
-        """Begin to listen; where that is not possible, the daemon goes on without."""
+        """Begin to listen; if that fails, log it: the daemon works without the socket."""
         channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with _short(self._folder) as path:
                 with contextlib.suppress(FileNotFoundError):
-                    os.unlink(path)  # of a daemon that was killed: the store's lock is ours
-                os.fchmod(channel.fileno(), 0o600)  # until the group is let in, too
+                    os.unlink(path)  # of a killed daemon, since this one holds the store's lock
+                os.fchmod(channel.fileno(), 0o600)  # nobody else may connect before the chmod
                 channel.bind(path)
                 os.chmod(path, 0o660)
             channel.listen(_BACKLOG)
         except OSError as error:
             channel.close()
-            log.warning("%s: no control socket: %s", self._folder, error)
+            log.warning("%s: the control socket cannot be opened: %s", self._folder, error)
             return
         self._socket = channel
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening; the file goes too."""
+        """Stop listening and delete the socket's file."""
         self._stop.set()
         if self._socket is None:
             return
@@ -124,7 +124,7 @@ class ControlSocket:
                     log.error("the control socket failed: %s", error)
                 return
             if not self._free.acquire(timeout=_REQUEST_S):
-                connection.close()  # who asked is told so by the end of the connection
+                connection.close()  # the client sees that the connection ends
                 continue
             threading.Thread(
                 target=self._serve_one, args=(connection,), name="control request", daemon=True
@@ -135,22 +135,22 @@ class ControlSocket:
             with connection:
                 try:
                     request = _parse(_line(connection, _LONGEST, _REQUEST_S))
-                    told = {"ok": True, **self._answer(request)}
+                    answer = {"ok": True, **self._answer(request)}
                 except ThermocaldError as error:
-                    told = {"ok": False, "error": str(error), "exit_status": error.exit_status}
+                    answer = {"ok": False, "error": str(error), "exit_status": error.exit_status}
                 connection.settimeout(_REQUEST_S)
-                document = jsonable({"format": FORMAT, **told})
+                document = jsonable({"format": FORMAT, **answer})
                 connection.sendall(json.dumps(document).encode() + b"\n")
-        except OSError as error:  # who asked has gone, or says nothing
+        except OSError as error:  # the client is gone or silent
             log.debug("control: %s", error)
         finally:
             self._free.release()
 
 
 def ask(folder: Path, do: str, **values: Any) -> dict[str, Any] | None:
-    """Ask the daemon whose live state is in a folder; None if nobody listens there.
+    """Send a request to the daemon with this live folder; None if no daemon listens.
 
-    Raises what the daemon refuses: UsageError, DataError, DeviceError.
+    Raises the daemon's refusal as UsageError, DataError or DeviceError.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC) as channel:
         try:
@@ -158,26 +158,27 @@ def ask(folder: Path, do: str, **values: Any) -> dict[str, Any] | None:
             with _short(folder) as path:
                 channel.connect(path)
             channel.sendall(json.dumps({"format": FORMAT, "do": do, **values}).encode() + b"\n")
-            told = json.loads(_line(channel, 100 * _LONGEST, _ANSWER_S))
+            answer = json.loads(_line(channel, 100 * _LONGEST, _ANSWER_S))
         except PermissionError as error:
             raise DataError(
-                f"{folder / _NAME}: you may not ask this daemon; join its group, or use sudo"
+                f"{folder / _NAME}: you are not permitted to use this daemon; join its group, or "
+                "use sudo"
             ) from error
         except (FileNotFoundError, NotADirectoryError, ConnectionRefusedError):
-            return None  # nobody listens
+            return None
         except (BlockingIOError, TimeoutError, ConnectionError) as error:
             raise DaemonBusy(
-                f"{folder / _NAME}: the daemon is there but does not answer: too many ask at once, "
-                "or it ended just now; ask again"
+                f"{folder / _NAME}: the daemon does not answer: it has too many requests, or was "
+                "just stopped; try again"
             ) from error
         except (OSError, ValueError):
             return None
-    if not isinstance(told, dict) or told.get("format") != FORMAT:
-        raise DataError(f"{folder / _NAME}: a daemon of another version runs there; restart it")
-    if told.get("ok"):
-        return told
-    kind = {2: UsageError, 3: DeviceError}.get(int(told.get("exit_status", 1)), DataError)
-    raise kind(str(told.get("error", "the daemon refused")))
+    if not isinstance(answer, dict) or answer.get("format") != FORMAT:
+        raise DataError(f"{folder / _NAME}: a daemon of another version is running; restart it")
+    if answer.get("ok"):
+        return answer
+    kind = {2: UsageError, 3: DeviceError}.get(int(answer.get("exit_status", 1)), DataError)
+    raise kind(str(answer.get("error", "the daemon refused the request")))
 
 
 def _parse(line: bytes) -> Request:
@@ -192,7 +193,7 @@ def _parse(line: bytes) -> Request:
 
 
 def _line(channel: socket.socket, longest: int, within_s: float) -> bytes:
-    """The bytes up to a line end; OSError if they do not come, UsageError if they do not end."""
+    """Read up to a line end; OSError if it does not come in time, UsageError if too long."""
     deadline, data = time.monotonic() + within_s, bytearray()
     while b"\n" not in data:
         if len(data) > longest:
@@ -209,7 +210,7 @@ def _line(channel: socket.socket, longest: int, within_s: float) -> bytes:
 
 @contextlib.contextmanager
 def _short(folder: Path) -> Iterator[str]:
-    """A path of the socket that fits into the 107 bytes of a socket address, however deep it is."""
+    """Yield a path of the socket that fits into the 107 bytes of a socket address."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield f"/proc/self/fd/{handle}/{_NAME}"
@@ -218,10 +219,10 @@ def _short(folder: Path) -> Iterator[str]:
 
 
 def enforce_retention(config: Config) -> list[str]:
-    """Have the running daemon delete what may go, or where none runs, do it; both log it."""
-    told = ask(find_state(config.store.path), "retention")
-    if told is not None:
-        return [str(sentence) for sentence in told["deleted"]]
+    """Delete expired frames through the running daemon, or directly; store and return events."""
+    answer = ask(find_state(config.store.path), "retention")
+    if answer is not None:
+        return [str(sentence) for sentence in answer["deleted"]]
     from thermocald.acquisition.frame_folder import FrameFolder
     from thermocald.daemon.store_guard import StoreGuard
     from thermocald.machine import machine_clock_trusted

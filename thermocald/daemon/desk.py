@@ -1,6 +1,7 @@
-"""A session as it is asked for and looked on at: taken here, or by a daemon that runs.
+"""A session as the command requests and follows it: in this process or by a running daemon.
 
-`--until-separated A,B`: the programme that separates two effects, and when it has.
+For `--until-separated A,B` it also plans the programme that separates two effects, and stops the
+session once they are separated.
 """
 
 from __future__ import annotations
@@ -37,17 +38,17 @@ if TYPE_CHECKING:
 _LOOK_EVERY_S = 0.5
 _WAIT_FOR_DAEMON_S = 300.0
 _LINE_EVERY_S = 10.0
-_EVERY = 15  # epochs between two looks
-_FEWEST = 45  # before anything can be seen
+_EVERY = 15  # epochs between two comparisons
+_FEWEST = 45  # epochs before the first comparison
 _BELOW_LIMIT_K = 1.0  # the thermostat overshoots
 
 
 def take_on_the_desk(
     config: Config, session: Session, say: Callable[[str], None], watch: Watch | None = None
 ) -> Config:
-    """Check, then take the epochs that are missing; returns the configuration that was used.
+    """Check, then take the missing epochs in this process; return the configuration used.
 
-    watch: ends the session when it has seen enough.
+    watch: ends the session when its effects are separated. Raises DataError if epochs are missing.
     """
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
@@ -72,8 +73,7 @@ def take_on_the_desk(
         done = _stored(config, session)
     if done < epochs and not (watch and watch.ended):
         raise DataError(
-            f"series {session.series} has {done} of {epochs} epochs; the same command goes on "
-            "from there"
+            f"series {session.series} has {done} of {epochs} epochs; repeat the command to continue"
         )
     return read
 
@@ -88,7 +88,7 @@ def _turn(station: Station, progress: Progress, watch: Watch | None) -> bool:
 
 
 def _prepare(config: Config, session: Session, done: int) -> Config:
-    """Return the configuration with one camera, its thermometers, and the series' name."""
+    """Return the configuration with the session's camera and series and its thermometers."""
     from thermocald.config import parse_config
     from thermocald.hal import load_driver
 
@@ -120,7 +120,8 @@ def _stored(config: Config, session: Session) -> int:
 
 
 def _check(config: Config, say: Callable[[str], None]) -> None:
-    """Take one frame and one reading; DataError says what is to be mended first."""
+    """Check one reading of each thermometer and one frame; raises DataError if the check fails."""
+    from thermocald.acquisition.calibrator import Calibrator
     from thermocald.acquisition.pipeline import check_frame
     from thermocald.daemon.plan import plan_cameras
     from thermocald.hal import SystemClock, open_device
@@ -131,8 +132,10 @@ def _check(config: Config, say: Callable[[str], None]) -> None:
             values = thermometer.read().values
         say(f"{one.name}: " + ", ".join(f"{k} {v:.2f} °C" for k, v in values.items()))
     plan = plan_cameras(config, clock)[0]
-    if plan.calibrator is None:
-        raise ConfigurationError(f"camera {plan.name!r}: a session needs its `testfield`")
+    if not isinstance(plan.calibrator, Calibrator):
+        raise ConfigurationError(
+            f"camera {plan.name!r}: the check needs its `testfield`; set it, or give --no-check"
+        )
     with plan.camera as camera:
         frame = camera.capture()
     found, why = check_frame(plan.name, plan.calibrator, frame)
@@ -146,33 +149,33 @@ def take_in_the_daemon(
     folder: Path, session: Session, wait: bool, say: Callable[[str], None],
     watch: Watch | None = None,
 ) -> None:  # fmt: skip
-    """Have a running daemon take the session, and look on."""
+    """Let a running daemon take the session, and report its progress if `wait`."""
     from thermocald.daemon.control import DaemonBusy, ask
 
-    told = ask(folder, "session start", session=session.model_dump(mode="json"))
-    if told is None:
-        raise DataError("the daemon ended just now; give the command again")
-    say(f"{session.camera}/{session.series}: taken by the daemon; Ctrl-C leaves it to that")
+    answer = ask(folder, "session start", session=session.model_dump(mode="json"))
+    if answer is None:
+        raise DataError("the daemon was just stopped; repeat the command")
+    say(f"{session.camera}/{session.series}: taken by the daemon, also after Ctrl-C")
     if not wait:
         return
     progress, seen, away_since = Progress(session.epochs, say), 0, 0.0
     while True:
         time.sleep(_LOOK_EVERY_S)
         try:
-            told = ask(folder, "session status")
+            answer = ask(folder, "session status")
         except DaemonBusy:
-            told = None
-        if told is None:
+            answer = None
+        if answer is None:
             if not away_since:
                 away_since = time.monotonic()
-                say("the daemon does not answer; it goes on when it is back")
+                say("the daemon does not answer; waiting for it")
             if time.monotonic() - away_since > _WAIT_FOR_DAEMON_S:
-                raise DataError("the daemon is gone; when it runs again the session goes on")
+                raise DataError("the daemon does not run; start it, and it continues the session")
             continue
         away_since = 0.0
-        one = told["sessions"].get(session.camera, {})
+        one = answer["sessions"].get(session.camera, {})
         if one.get("series") != session.series:
-            raise DataError("the daemon ended before the session began; give the command again")
+            raise DataError("the daemon stopped before the session began; repeat the command")
         for sentence in one["found"][seen:]:
             say(sentence)
         seen = max(seen, len(one["found"]))
@@ -187,9 +190,9 @@ def take_in_the_daemon(
 
 
 def only_camera(config: Config, camera: str | None = None) -> str:
-    """Return the camera that is asked for, or the only one of a configuration.
+    """Return the requested camera's name, or that of the only camera in a configuration.
 
-    Raises UsageError where it is not known, or there are others.
+    Raises UsageError if there is no such camera, or none is given and there are several.
     """
     names = [c.name for c in config.cameras]
     there = ", ".join(names) or "none"
@@ -204,21 +207,21 @@ def session_of(
     config: Config, camera: str | None, series: str, condition: str, epochs: int,
     programme: Path | None, check: bool,
 ) -> Session:  # fmt: skip
-    """Return the session that is asked for; UsageError, ConfigurationError for what cannot be."""
+    """Return the requested session; raises UsageError or ConfigurationError."""
     from pydantic import ValidationError
 
     from thermocald.daemon.session import Session
     from thermocald.files import read_yaml
 
-    asked: dict[str, Any] = {"camera": only_camera(config, camera), "series": series}
-    asked |= {"start": condition, "epochs": epochs, "check": check}
+    request: dict[str, Any] = {"camera": only_camera(config, camera), "series": series}
+    request |= {"start": condition, "epochs": epochs, "check": check}
     if programme is not None:
         steps = read_yaml(programme, ConfigurationError).get("programme")
         if not isinstance(steps, list) or not steps:
-            raise ConfigurationError(f"{programme}: must hold `programme:`, a list of steps")
-        asked["programme"] = steps
+            raise ConfigurationError(f"{programme}: must contain `programme:`, a list of steps")
+        request["programme"] = steps
     try:
-        return Session.model_validate(asked)
+        return Session.model_validate(request)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -226,7 +229,7 @@ def session_of(
 
 
 def listening_daemon(config: Config) -> Path | None:
-    """Return the live folder of the daemon that listens for this store, None without."""
+    """Return the live folder of the daemon that writes this store; None if none listens."""
     from thermocald.daemon.control import ask
     from thermocald.daemon.live_state import find_state
 
@@ -235,17 +238,20 @@ def listening_daemon(config: Config) -> Path | None:
 
 
 class Progress:
-    """Told a few times a second how a camera is doing; total: epochs, done: of an earlier run."""
+    """Prints a session's progress; total: its epochs; done: those of an earlier run."""
 
     def __init__(self, total: int, say: Callable[[str], None], done: int = 0) -> None:
         self._total = total
         self._say = say
         self._shown = done
-        self._told = float("-inf")
+        self._printed_at = float("-inf")
         self._paused = False
 
     def show(self, last: Mapping[str, Any], paused: str = "") -> None:
-        """last: the last epoch's row, as outputs get it; paused: why there are none, if so."""
+        """Print the progress, if there is any; called a few times a second.
+
+        last: the last epoch's row, as outputs receive it; paused: why the session is paused, or "".
+        """
         if paused and not self._paused:
             self._say(f"paused: {paused}")
         if self._paused and not paused:
@@ -264,12 +270,12 @@ class Progress:
             line += f"{last['status']}: {last['reason']}"
         now = time.monotonic()
         if sys.stderr.isatty():
-            # a longer line would leave its beginning on the screen
+            # a line that wraps could not be erased
             room = shutil.get_terminal_size().columns - 1
             sys.stderr.write(f"\r\x1b[K{line[:room]}")
             sys.stderr.flush()
-        elif now - self._told >= _LINE_EVERY_S or self._shown == self._total:
-            self._told = now
+        elif now - self._printed_at >= _LINE_EVERY_S or self._shown == self._total:
+            self._printed_at = now
             self._say(line)
 
 
@@ -277,11 +283,11 @@ def plan_separation(
     config: Config, session: Session, text: str, known: SeriesInput | None,
     say: Callable[[str], None], max_c: float | None, max_rate: float, max_duty: float,
 ) -> tuple[str, Session, Watch]:  # fmt: skip
-    """Return the programme that separates two effects, in words, and the session with it.
+    """Return the programme that separates two effects, as text, with its session and watch.
 
-    known: an earlier series of the camera, which tells how it warms, None without one; max_c: the
-    highest temperature °C that the user allows, None: the output's limit decides; max_rate: the
-    fastest rise K/min; max_duty: the largest share of time with heat.
+    text: the two effects; known: an earlier series of the camera, from which its warming is
+    estimated, or None; max_c: the highest temperature allowed, °C, None for the output's limit;
+    max_rate: the fastest rise, K/min; max_duty: the largest share of time with heat.
     """
     from thermocald.discovery.experiment import (
         Body,
@@ -293,7 +299,7 @@ def plan_separation(
     from thermocald.hal import load_driver
 
     if session.programme:
-        raise UsageError("--until-separated plans the programme: leave --programme out")
+        raise UsageError("--until-separated plans the programme; omit --programme")
     names = read_alternatives(text)
     heaters = [o for o in config.outputs if load_driver("output", o.driver).heats]
     if not heaters:
@@ -313,7 +319,7 @@ def plan_separation(
 
 
 def _describe(found: list[Experiment], names: tuple[str, str]) -> str:
-    """Return the programme as a file that `--programme` takes, with what is expected of it."""
+    """Return the best programme as a file for `--programme`, with its expected performance."""
     best = found[0]
     others = ", ".join(f"{e.name} {e.sigmas:.0f}" for e in found[1:])
     hottest = best.temperature.max()
@@ -331,7 +337,7 @@ def _describe(found: list[Experiment], names: tuple[str, str]) -> str:
 
 
 class Watch:
-    """Looks at the epochs taken so far, in a thread of its own, until two effects are separated."""
+    """Compares two effects by the epochs so far, in a thread, until they are separated."""
 
     def __init__(
         self, store: Path, session: Session, names: tuple[str, str],
@@ -347,11 +353,11 @@ class Watch:
 
     @property
     def ended(self) -> bool:
-        """Whether they are separated."""
+        """Whether the effects are separated."""
         return self.found is not None and self.found.separated
 
     def look(self, taken: int) -> bool:
-        """Return whether it is enough; taken: epochs so far. Never waits."""
+        """Return whether the effects are separated; taken: epochs so far. Does not wait."""
         if self._pending is not None and self._pending.done():
             try:
                 self.found = self._pending.result()
@@ -366,7 +372,7 @@ class Watch:
         return self.ended
 
     def close(self) -> None:
-        """Let the thread end, and say what was reached."""
+        """Wait for the thread to end, and print the result if the effects are not separated."""
         self._pool.shutdown(wait=True, cancel_futures=True)
         if not self.ended:
             reached = self.found.sentence if self.found else "too few epochs"

@@ -1,4 +1,4 @@
-"""One camera's epochs into the store: frame first, then the row, then the outputs are told."""
+"""Stores a camera's epochs: first the frame, then the row; then passes them on to the outputs."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _CATCH_UP_BATCH = 200
-_LATEST = 4000  # epochs, whose readings effects with a memory still feel
+_LATEST = 4000  # epochs whose readings still act on effects with a memory
 _DETAILED = 100
 
 
 class EpochKeeper:
-    """The Keeper of a camera's pipeline.
+    """The `Keeper` of a camera's pipeline.
 
-    on_kept: told every epoch after it was stored (or refused), with its row as outputs get it.
-    identity: what the camera says it is, asked when the series begins.
+    on_kept: called for each epoch after it was stored (or refused), with its row for the outputs;
+    identity: called for the camera's identity when the series begins.
     """
 
     def __init__(
@@ -61,9 +61,7 @@ class EpochKeeper:
         self._on_kept = on_kept
         self._identity = identity
         self._start = start
-        name = (plan.name, plan.series)
-        found = (s for s in guard.all_series() if (s.camera, s.name) == name)
-        self._series: StoredSeries | None = next(found, None)
+        self._series = guard.find(plan.name, plan.series)
         if self._series is not None:
             check_series(plan, self._series.testfield)
         self._backlog: list[Epoch] = []
@@ -77,23 +75,23 @@ class EpochKeeper:
             try:
                 self._series = self._guard.series(self._series)
             except StoreError as error:
-                log.debug("the series cannot be asked for now: %s", error)
+                log.debug("the series cannot be read now: %s", error)
         return self._series
 
     @property
     def first_number(self) -> int:
-        """The number with which acquisition goes on."""
+        """The number of the next epoch."""
         series = self.series
         return 1 if series is None else self._guard.last_epoch(series) + 1
 
-    def tell(self, utc: float, kind: str, text: str, epoch: int | None = None) -> None:
+    def record(self, utc: float, kind: str, text: str, epoch: int | None = None) -> None:
         """Store an event of the series."""
         series = self.series
-        known = None if series is None else series.id or None
-        self._guard.event(Event(utc, kind, text, known, epoch))
+        series_id = None if series is None else series.id or None
+        self._guard.event(Event(utc, kind, text, series_id, epoch))
 
     def _read(self, first: int, last: int | None = None, **how: bool) -> list[StoredEpoch]:
-        """Return some epochs of the series; none where they cannot be read, which is logged."""
+        """Read some epochs of the series; if they cannot be read, log it and return none."""
         series = self.series
         if series is None:
             return []
@@ -104,27 +102,28 @@ class EpochKeeper:
             return []
 
     def recent(self, count: int) -> Iterator[tuple[Epoch, Array, bool]]:
-        """Yield the last epochs with a result: observations and values (16,), and whether the
-        running series began again after it.
+        """Yield the last epochs with a result, with their values (16,) and a restart flag.
+
+        The flag states that the running series started again after the epoch.
         """
         for stored in self._read(max(1, self.first_number - count)):
             if stored.epoch.observations is not None and stored.result.status == "ok":
                 yield stored.epoch, stored.result.values, "series_restarted" in stored.extra
 
     def latest(self) -> Iterator[StoredEpoch]:
-        """Yield the last epochs as they are stored, the very last with all details."""
+        """Yield the last stored epochs, of which the most recent have all details."""
         last = self.first_number - 1
         detailed = max(0, last - _DETAILED)
         yield from self._read(last - _LATEST, detailed, details=False)
         yield from self._read(detailed + 1)
 
     def first_rows(self, count: int) -> list[dict[str, Any]]:
-        """Return the first epochs with a result that are stored, as rows for the outputs."""
+        """Return the first stored epochs with a result, as rows for the outputs."""
         found = (s for s in self._read(1, 20 * count) if s.result.status == "ok")
         return [result_row(self.plan, s.epoch, s.result, {}) for s in islice(found, count)]
 
     def keep(self, acquired: AcquiredEpoch) -> None:
-        """Keep an epoch; a deferred calibration is made up for later from its frame."""
+        """Store an epoch; a deferred calibration is done later from its frame."""
         assert acquired.epoch is not None
         calibrated = acquired.calibrated
         series = self._begin_series(acquired)
@@ -137,7 +136,7 @@ class EpochKeeper:
         extra = {
             key: value
             for name, value in acquired.frame.settings.items()
-            if (key := f"camera_{name}") not in epoch.temperatures  # of a thermometer `camera`
+            if (key := f"camera_{name}") not in epoch.temperatures  # a channel may have this name
         }
         path = None
         if self._frames.wanted(epoch.number, eventful) or deferred:
@@ -148,7 +147,7 @@ class EpochKeeper:
             extra |= calibrated.extra
             self._correct(path, calibrated)
         elif deferred and path is None:
-            result = EpochResult("frame_not_kept", "calibration deferred, the frame not kept")
+            result = EpochResult("frame_not_kept", "calibration deferred, but no frame stored")
         epoch = replace(epoch, frame=path)
         values = result_row(self.plan, epoch, result, extra)
         stored = self._guard.append(Row(series, epoch, result, extra, acquired.clock_trusted))
@@ -156,7 +155,7 @@ class EpochKeeper:
         self._on_kept(acquired, {**values, "stored": stored, "lost": self._guard.lost})
 
     def amend(self, calibrated: CalibratedEpoch) -> None:
-        """Keep a calibration made later; a frame that was kept only for it is deleted."""
+        """Store a deferred calibration; delete a frame that was stored only for it."""
         if self._series is None:
             return
         epoch = calibrated.epoch
@@ -166,7 +165,7 @@ class EpochKeeper:
                 self._series, epoch.number, result, epoch.observations, calibrated.extra
             )
         except StoreError as error:
-            # that the store is away was told once
+            # that the store is away was logged once
             level = logging.DEBUG if self._guard.away else logging.WARNING
             log.log(level, "the calibration of epoch %d waits: %s", epoch.number, error)
             self._searched_to = min(self._searched_to, epoch.number - 1)
@@ -180,7 +179,7 @@ class EpochKeeper:
             self._correct(frame, calibrated)
 
     def _correct(self, frame: Path | None, calibrated: CalibratedEpoch) -> None:
-        """Keep a frame a second time, as the steady camera had seen it; said once where not."""
+        """Store a frame again, as a camera without drift would take it; log a failure once."""
         if frame is None or self.plan.corrector is None:
             return
         try:
@@ -188,25 +187,25 @@ class EpochKeeper:
             jpeg = self.plan.corrector.correct(encoded, calibrated)
         except (ImageError, OSError) as error:
             if str(error) != self._uncorrected:
-                log.warning("camera %s: frames are not corrected: %s", self.plan.name, error)
+                log.warning("camera %s: frames cannot be corrected: %s", self.plan.name, error)
             self._uncorrected = str(error)
             return
         self._uncorrected = ""
         self._frames.keep_corrected(frame, jpeg)
 
     def backlog(self, below: int) -> Epoch | None:
-        """Return the oldest epoch that was kept uncalibrated and whose frame is still there."""
+        """Return the oldest epoch that was stored without calibration and still has its frame."""
         if self._series is None:
             return None
         try:
             while not self._backlog and self._search(below):
                 pass
         except StoreError as error:
-            log.warning("what is still to be calibrated cannot be read: %s", error)
+            log.warning("epochs with a deferred calibration cannot be read: %s", error)
         return self._backlog.pop(0) if self._backlog else None
 
     def _search(self, below: int) -> bool:
-        """Look through the next epochs of the store, each once; False if there are no more."""
+        """Search the next epochs of the store, each once; return False if there are no more."""
         series = self.series
         first = self._searched_to + 1
         if series is None or first >= below:
@@ -215,7 +214,7 @@ class EpochKeeper:
         if end < first:
             return False
         last = min(end, first + _CATCH_UP_BATCH - 1)
-        # passed over for good if they cannot be read: a damaged row is damaged every time
+        # not tried again if they cannot be read: a damaged row stays damaged
         self._searched_to = last
         for stored in self._guard.epochs(series, first, last, details=False):
             frame = stored.epoch.frame
@@ -226,7 +225,7 @@ class EpochKeeper:
         return True
 
     def _begin_series(self, acquired: AcquiredEpoch) -> StoredSeries:
-        """Return the series; make it with its first row, as soon as the store can be written."""
+        """Return the series; the store creates it with its first row, when it can be written."""
         if self._series is None:
             assert acquired.epoch is not None
             channels = acquired.epoch.temperatures
@@ -236,17 +235,16 @@ class EpochKeeper:
                 0, head, field, self._start, self._identity(), settings, utc
             )
             text = f"camera {self.plan.name}: series {self.plan.series} begins"
-            self.tell(utc, "series_begun", text, acquired.number)
+            self.record(utc, "series_begun", text, acquired.number)
         return self._series
 
 
 def result_row(
     plan: CameraPlan, epoch: Epoch, result: EpochResult | None, extra: Mapping[str, float]
 ) -> dict[str, Any]:
-    """One epoch as outputs get it: the columns of the CSV export, `device`, `series`, channels.
+    """Return an epoch's row for outputs: the CSV export's columns, `device`, `series`, channels.
 
-    temperature: °C, the reference's as read at `temperature_time`; numbers are NaN where there is
-    none.
+    temperature: °C, the reference thermometer's at `temperature_time`; missing numbers are NaN.
     """
     reference = next(iter(epoch.temperatures.values()), math.nan)
     row: dict[str, Any] = {

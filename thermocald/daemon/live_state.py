@@ -1,8 +1,8 @@
-"""What the daemon shows of itself: a folder of small files that others read and it never does.
+"""The daemon's live state: a folder of small files for other programs to read.
 
 `status.json` (format thermocald-status/1); per camera `<camera>.json`, the last epoch with image
-points and residuals, and `<camera>.jpg`, its frame made small. Under systemd the folder lies in
-memory (RUNTIME_DIRECTORY), otherwise next to the store.
+points and residuals, and `<camera>.jpg`, its reduced frame. Under systemd the folder is in memory
+(RUNTIME_DIRECTORY), otherwise next to the store.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _PAGE_BYTES = 4096
 
 
 class LiveState:
-    """Writes the folder; a disk that does not take it is logged once and otherwise ignored."""
+    """The folder of live files; a failure to write is logged once and otherwise ignored."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -48,7 +48,7 @@ class LiveState:
 
     @classmethod
     def beside(cls, store: Path) -> LiveState:
-        """Return the folder of the daemon that writes this store."""
+        """Return the live state of the daemon that writes a store."""
         runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
         return cls(Path(runtime) if runtime else _beside(store))
 
@@ -61,7 +61,7 @@ class LiveState:
         self, camera: str, row: Mapping[str, Any], calibrated: CalibratedEpoch | None,
         field: TestField | None,
     ) -> None:  # fmt: skip
-        """Replace a camera's last epoch: its row, targets and residuals."""
+        """Replace a camera's last epoch: row, targets and residuals."""
         document: dict[str, Any] = {"row": row}
         if calibrated is not None and field is not None:
             document["targets"] = _targets(calibrated, field)
@@ -76,14 +76,14 @@ class LiveState:
             self._write(f"{camera}.jpg", data)
 
     def remove(self) -> None:
-        """Take status.json away: nobody runs here any more."""
+        """Delete status.json, when the daemon stops."""
         try:
             (self.folder / "status.json").unlink(missing_ok=True)
         except OSError as error:
             log.debug("%s: %s", self.folder, error)
 
     def _write(self, name: str, data: bytes) -> None:
-        if name.endswith(".json"):  # with room to grow in place: blanks after a document are none
+        if name.endswith(".json"):  # room to grow in place: JSON allows trailing blanks
             data = data.ljust((len(data) // _PAGE_BYTES + 2) * _PAGE_BYTES)
         partial = self.folder / f".{name}.partial"
         try:
@@ -95,7 +95,7 @@ class LiveState:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
             if name.endswith(".json") and overwrite_json(self.folder / name, data):
-                return  # a status from before the disk was full would say that all is well
+                return  # an old status from before the disk was full would look healthy
             if not self._failed:
                 log.warning("%s: the status cannot be written: %s", self.folder, error)
             self._failed = True
@@ -124,7 +124,7 @@ def _preview(frame: Frame) -> bytes | None:
 
 
 def _targets(calibrated: CalibratedEpoch, field: TestField) -> dict[str, Any]:
-    """Return lists over the measured targets: name, x, y px, residuals px, rejected or not."""
+    """Return lists over the measured targets: name, x, y px, residuals px, whether rejected."""
     seen, result = calibrated.epoch.observations, calibrated.adjustment
     if seen is None or len(seen) != len(result.targets):
         return {}
@@ -148,7 +148,7 @@ def _without_secrets(value: Any) -> Any:
 
 
 def find_state(store: Path) -> Path:
-    """Return the folder of the daemon that writes a store, running or not."""
+    """Return the live folder of the daemon that writes a store, running or not."""
     beside = _beside(store)
     if (beside / "status.json").exists():
         return beside
@@ -165,7 +165,7 @@ def running_status(path: Path) -> dict[str, Any]:
     document = read_json(folder / "status.json")
     if not document:
         raise DataError(f"no daemon runs for {path} (there is no {folder}/status.json)")
-    # the daemon's own clock may be stepped; how old the file is tells the machine's alone
+    # the daemon's clock may be stepped, so the age is by the machine's clock alone
     age_s = time.time() - (folder / "status.json").stat().st_mtime
     document["age_s"] = max(0.0, age_s)
     if not Path(f"/proc/{document.get('pid', 0)}").exists():

@@ -1,6 +1,6 @@
-"""A configuration made into objects: devices, calibrators, the head of a series.
+"""Objects made from a configuration: devices, calibrators and the head of a series.
 
-And configurations that nobody writes: a rendered camera, a recording as devices.
+Also ready-made configurations: a rendered camera, and a recording as devices.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _UNKNOWN_PITCH_MM = 0.001
 
 @dataclass(frozen=True, eq=False)
 class CameraPlan:
-    """One camera of the configuration, ready to be started.
+    """A camera of the configuration, ready to be started.
 
-    series: the one being taken, empty for none; sensor, testfield, calibrator: None if its epochs
-    are only acquired; of a gauge the test field holds the control points, and there may be none;
-    extra: what the head of a series keeps besides; corrector: None where frames are kept as taken.
+    series: its current series, empty for none; sensor, testfield, calibrator: None if its epochs
+    are acquired without calibration; a gauge's test field holds its control points, if any; extra:
+    further entries for the head of a series; corrector: None if no corrected frames are stored.
     """
 
     config: CameraConfig
@@ -61,7 +61,7 @@ class CameraPlan:
 
 
 def plan_cameras(config: Config, clock: Clock) -> list[CameraPlan]:
-    """Build the cameras; nothing is opened. Raises ConfigurationError."""
+    """Plan the cameras without opening them; raises ConfigurationError."""
     return [_plan(config, camera, clock) for camera in config.cameras]
 
 
@@ -75,8 +75,8 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
         targets = read_testfield(one.testfield)
         if sensor is None:
             raise ConfigurationError(
-                f"camera {one.name!r}: a test field needs `sensor: {{width_px: …, height_px: …, "
-                "pixel_pitch_mm: …}}` too"
+                f"camera {one.name!r}: a test field also needs `sensor: {{width_px: …, "
+                "height_px: …, pixel_pitch_mm: …}`"
             )
     elif (scene := camera.known_scene()) is not None:
         targets, sensor = scene[1], sensor or scene[0]
@@ -97,7 +97,7 @@ def _plan(config: Config, one: CameraConfig, clock: Clock) -> CameraPlan:
 def _plan_gauge(
     one: CameraConfig, calibration: CalibrationConfig, camera: Camera, *, corrected: bool
 ) -> CameraPlan:
-    """Plan a camera that is predicted by its thermal model, and posed by control points."""
+    """Plan a camera whose thermal model predicts its calibration and control points its pose."""
     from thermocald.analysis.thermal.correction import FrameCorrector
     from thermocald.analysis.thermal.gauge import plan_gauge
     from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -121,12 +121,12 @@ def _plan_gauge(
 
 
 def _check_size(one: CameraConfig, camera: Camera, sensor: Sensor | None) -> None:
-    """Raise ConfigurationError if the sensor's size is not that of the driver's frames."""
+    """Raise ConfigurationError if the sensor and the driver's frames differ in size."""
     size = camera.frame_size()
     if sensor is not None and size is not None and size != (sensor.width, sensor.height):
         raise ConfigurationError(
-            f"camera {one.name!r}: sensor says {sensor.width}×{sensor.height} px and the driver's "
-            f"frames have {size[0]}×{size[1]} px (its width and height); both must be the same"
+            f"camera {one.name!r}: sensor has {sensor.width}×{sensor.height} px, but the driver's "
+            f"frames have {size[0]}×{size[1]} px (its width and height); make them equal"
         )
 
 
@@ -147,7 +147,7 @@ def adjustment_settings(calibration: CalibrationConfig) -> AdjustmentSettings:
 
 
 def running_series(plan: CameraPlan) -> RunningSeries | None:
-    """Return the camera's series as it is adjusted while it is taken; None if nothing is shared."""
+    """Return the running adjustment of the camera's series; None if no parameter is shared."""
     if not isinstance(plan.calibrator, Calibrator):
         return None
     assert plan.sensor is not None
@@ -165,14 +165,14 @@ def running_series(plan: CameraPlan) -> RunningSeries | None:
 
 
 def _held(one: CameraConfig, calibration: CalibrationConfig) -> InteriorOrientation | None:
-    """Start values where something is held at a value."""
+    """Return the start values, with fixed parameters at their values; None if none is fixed."""
     if not calibration.fixed:
         return None
     values: dict[str, float] = dict(calibration.fixed.items())
     if "c" not in values:
         if one.principal_distance_mm is None:
             raise ConfigurationError(
-                f"camera {one.name!r}: `fixed` needs principal_distance_mm too, or c among it"
+                f"camera {one.name!r}: `fixed` also needs principal_distance_mm, or c in `fixed`"
             )
         values["c"] = one.principal_distance_mm
     return InteriorOrientation.from_mapping(values)
@@ -185,7 +185,7 @@ def series_head(
     extra: dict[str, Any] = dict(plan.extra)
     sensor = plan.sensor
     if sensor is None:
-        # nothing is computed from it: the series is acquired only
+        # a placeholder: a series without calibration uses no sensor
         height, width = (1, 1) if frame.image is None else frame.image.shape
         sensor = Sensor(int(width), int(height), _UNKNOWN_PITCH_MM)
         extra["pixel_pitch_unknown"] = True
@@ -203,19 +203,19 @@ def series_head(
 
 
 def check_series(plan: CameraPlan, field: TestField) -> None:
-    """Raise ConfigurationError if a series that goes on would change its test field."""
+    """Raise ConfigurationError if a continued series would change its test field."""
     mine = plan.testfield
     if mine is not None and not (
         mine.names == field.names and np.array_equal(mine.points, field.points)
     ):
         raise ConfigurationError(
-            f"camera {plan.name!r}: series {plan.series!r} was begun with another test "
-            "field; give the series another name"
+            f"camera {plan.name!r}: series {plan.series!r} was begun with another test field; "
+            "choose another series"
         )
 
 
 def mock_config() -> Config:
-    """Return a camera and a thermometer without hardware."""
+    """Return the configuration of a simulated camera and thermometer."""
     return parse_config(
         {
             "store": {"path": "thermocald-mock.db"},
@@ -236,7 +236,7 @@ def mock_config() -> Config:
 
 
 def demo_config(folder: Path, seed: int) -> Config:
-    """Return a rendered camera and a thermometer, kept in `demo.db` of a folder."""
+    """Return the configuration of the demo, with its store `demo.db` in a folder."""
     config = mock_config().model_dump(mode="json", by_alias=True)
     config["store"] |= {"path": str(folder.absolute() / "demo.db"), "durable": False}
     config["frames"] |= {"folder": str(folder.absolute() / "frames")}
@@ -248,7 +248,10 @@ def demo_config(folder: Path, seed: int) -> Config:
 
 
 def recording_config(path: Path) -> Config:
-    """Return a recording as camera and thermometer; RecordingError where it cannot be played."""
+    """Return the configuration that plays a recording as camera and thermometer.
+
+    Raises RecordingError if it cannot be played.
+    """
     head = open_recording(path).head
     try:
         require_columns({"recorded": head.channels}, ConfigurationError)
@@ -284,5 +287,5 @@ def recording_config(path: Path) -> Config:
 
 
 def _name(text: str) -> str:
-    """Text as a configuration takes it for a name."""
+    """Convert a text to a valid name in a configuration."""
     return re.sub(r"[^A-Za-z0-9_.-]", "-", text).lstrip("_.-")[:64] or "camera"

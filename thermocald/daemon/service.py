@@ -1,11 +1,11 @@
-"""The process: signals, systemd, reload, status; the work is the station's.
+"""The daemon's process: signals, systemd, reload and status; the `Station` does the work.
 
-SIGTERM and SIGINT finish the current epoch; SIGHUP reads the configuration again, or says why not
-and goes on with the old one.
+SIGTERM and SIGINT stop the daemon after the current epoch. SIGHUP reloads the configuration; if it
+is invalid, the daemon logs why and continues with the old one.
 
-The web page of a daemon that was started by hand is its child, and never ends it; under systemd it
-is a unit of its own, with its own bound on memory: in the daemon's control group it could take what
-the daemon needs.
+The web page of a daemon that was started by hand is a child process and cannot stop it. Under
+systemd the page is a separate unit with a memory limit of its own: in the daemon's control group it
+could take the memory that the daemon needs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald import __version__
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
-from thermocald.daemon.camera_line import Ground
+from thermocald.daemon.camera_line import Runtime
 from thermocald.daemon.control import ControlSocket
 from thermocald.daemon.live_state import LiveState
 from thermocald.daemon.session import Sessions
@@ -35,6 +35,7 @@ from thermocald.daemon.systemd import notify, watchdog_interval_s
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import option_names
 from thermocald.names import WITH_VALUES
+from thermocald.numbers import counted
 from thermocald.store.series import Event
 
 if TYPE_CHECKING:
@@ -46,25 +47,25 @@ if TYPE_CHECKING:
     from thermocald.hal import Clock
 
 
-_NOT_SOONER_S = 10.0
+_RESTART_PAUSE_S = 10.0
 _PAGE_GRACE_S = 3.0
-_WRONG_CONFIGURATION = 2  # the exit status of a port in use, or of a token that cannot be used
-_REFUSED = "there is no page: its configuration or its port cannot be used (see the line above)"
+_WRONG_CONFIGURATION = 2  # the page's exit status if its port or token cannot be used
+_REFUSED = "there is no web page: its port or token cannot be used (see the line above)"
 _PRIVATE = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
 
 
 class DashboardProcess:
-    """`thermocald dashboard` for a store and a live folder."""
+    """The child process `thermocald dashboard` for a store and a live folder."""
 
     def __init__(self, store: Path, live: Path) -> None:
         self._store = store.absolute()
         self._live = live.absolute()
         self._child: subprocess.Popen[bytes] | None = None
         self._next_at = 0.0
-        self.why = ""  # why there is no page, empty while there is one or none is wanted
+        self.why = ""  # why the wanted page does not run, else empty
 
-    def keep(self, config: DashboardConfig) -> None:
-        """See that it runs; it is started at most every 10 s."""
+    def ensure_running(self, config: DashboardConfig) -> None:
+        """Start the process if it does not run, at most every 10 s."""
         if self.why == _REFUSED or os.environ.get("INVOCATION_ID"):
             return
         child = self._child
@@ -75,9 +76,9 @@ class DashboardProcess:
         if (child is not None and child.returncode is None) or time.monotonic() < self._next_at:
             return
         if child is not None:
-            self.why = f"the page ended ({child.returncode}); it is started again"
+            self.why = f"the page exited with status {child.returncode}; it is started again"
             log.warning(self.why)
-        self._next_at = time.monotonic() + _NOT_SOONER_S
+        self._next_at = time.monotonic() + _RESTART_PAUSE_S
         command = [sys.executable, "-m", "thermocald", "dashboard"]
         command += ["--store", str(self._store), "--live", str(self._live)]
         command += ["--host", config.host, "--port", str(config.port)]
@@ -87,13 +88,13 @@ class DashboardProcess:
             command += ["--token-file", str(config.token_file)]
         environment = {k: v for k, v in os.environ.items() if k not in _PRIVATE}
         try:
-            # a group of its own: Ctrl-C ends the daemon, which then ends the page
+            # a process group of its own: Ctrl-C stops the daemon, which then stops the page
             self._child = subprocess.Popen(command, env=environment, process_group=0)
         except OSError as error:
-            log.error("the dashboard cannot be started: %s", error)
+            log.error("the web page cannot be started: %s", error)
 
     def stop(self) -> None:
-        """End it."""
+        """Stop the process."""
         child = self._child
         if child is None or child.poll() is not None:
             return
@@ -111,16 +112,16 @@ _TURN_S = 0.25
 _STATUS_EVERY_S = 1.0
 _GRACE_S = 20.0
 _ANSWER_S = 45.0
-_SWITCH_INTERVAL_S = 0.0005  # of the interpreter: a tick must not wait 5 ms for a calculation
+_SWITCH_INTERVAL_S = 0.0005  # of threads: a tick must not wait 5 ms for a calculation
 
 
 class Service:
-    """One daemon in this process.
+    """A daemon in this process.
 
-    path: of the configuration, which SIGHUP reads again; until_finished: end when all recordings
-    have been played or all epochs taken; else it takes requests at its control socket; on_turn:
-    called in every turn, True ends the service; clock: a virtual machine's, on which rendered
-    devices take no time. Other arguments as `Station`.
+    path: the configuration file, which SIGHUP reloads; until_finished: stop when all recordings
+    have been played or all epochs taken, instead of serving requests at the control socket;
+    on_turn: called in every turn, stops the service by returning True; clock: a virtual clock, on
+    which rendered devices take no time. For the other arguments see `Runtime`.
     """
 
     def __init__(
@@ -154,22 +155,22 @@ class Service:
         self._wake = threading.Event()
         self._end = False
         self._reload = False
-        self._complained: list[str] = []
+        self._stalled: list[str] = []
         self._dashboard = DashboardProcess(config.store.path, self.live.folder)
         self._inbox: queue.SimpleQueue[tuple[Request, Future[dict[str, Any]]]] = queue.SimpleQueue()
 
     def run(self) -> bool:
-        """Work until told to end; True if everything let go, False if a device hangs.
+        """Work until stopped; return True, or False if a device hangs.
 
-        Raises ThermocaldError for what prevents the start.
+        Raises ThermocaldError if the daemon cannot start.
         """
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         self._guard = StoreGuard(self.config.store.path, durable=self.config.store.durable)
-        self._ground = Ground(self._guard, self.clock, self.live, **self._options)
+        self._runtime = Runtime(self._guard, self.clock, self.live, **self._options)
         done = False
         control = ControlSocket(self.live.folder, self._ask)
         try:
-            self._station = Station(self.config, self._ground)
+            self._station = Station(self.config, self._runtime)
             self._sessions = Sessions(self._guard, self.clock, self._station)
             if not self._until_finished:
                 self._sessions.resume(self._station)
@@ -178,7 +179,7 @@ class Service:
                 if not self._until_finished:
                     control.open()
                 log.info("thermocald %s runs", __version__, extra={"event": "started"})
-                self._tell("started", f"thermocald {__version__} started")
+                self._record("started", f"thermocald {__version__} started")
                 notify(f"READY=1\nSTATUS={self._line()}")
                 try:
                     self._loop()
@@ -186,9 +187,9 @@ class Service:
                     notify("STOPPING=1")
                     control.close()
                     done = self._station.stop(_GRACE_S)
-                    self._tell("stopped", "thermocald stopped")
+                    self._record("stopped", "thermocald stopped")
                     self._guard.flush()
-                    self.live.remove()  # before the page ends, which tells who looks at it
+                    self.live.remove()  # while the page still runs and can report it
                     self._dashboard.stop()
         finally:
             self._guard.close()
@@ -197,13 +198,15 @@ class Service:
 
     @property
     def lost(self) -> str:
-        """How many epochs were taken and not kept, and why the last; empty where none was."""
+        """The number of epochs that were taken but not stored and the last reason, or ""."""
         store = self._guard.status()
-        return f"{store['lost']} epochs were lost: {store['lost_why']}" if store["lost"] else ""
+        return (
+            f"{counted(store['lost'], 'epoch')} lost: {store['lost_why']}" if store["lost"] else ""
+        )
 
     @property
     def failed(self) -> str:
-        """Which cameras failed that were to be read to their end, and why; empty where none did."""
+        """The cameras that failed before they were read to their end, with reasons, or ""."""
         links = [line.link for line in self._station.cameras if self._until_finished]
         return "; ".join(f"{one.name}: {one.why}" for one in links if one.state == "failed")
 
@@ -224,11 +227,11 @@ class Service:
                 data = {"seconds": step.seconds, "adopted": step.adopted}
                 self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
                 if step.adopted:
-                    self._station.frames.restamp(step.seconds)  # they follow, too
+                    self._station.frames.restamp(step.seconds)
             if self.config.dashboard.enabled:
-                self._dashboard.keep(self.config.dashboard)
+                self._dashboard.ensure_running(self.config.dashboard)
             stalled = self._station.stalled()
-            self._complain(stalled)
+            self._report_stalled(stalled)
             if interval is not None and not stalled and now - fed >= min(interval, 1.0):
                 fed = now
                 notify("WATCHDOG=1")
@@ -243,7 +246,7 @@ class Service:
                 break
 
     def status(self) -> dict[str, Any]:
-        """Return what `thermocald status` shows."""
+        """Return the document that `thermocald status` prints."""
         return {
             "version": __version__,
             "pid": os.getpid(),
@@ -259,14 +262,14 @@ class Service:
         }
 
     def _ask(self, request: Request) -> dict[str, Any]:
-        """For the control socket's thread: have a request answered by the service's."""
+        """Pass a request from the control socket's thread to the service's; return the answer."""
         future: Future[dict[str, Any]] = Future()
         self._inbox.put((request, future))
         self._wake.set()
         try:
             return future.result(_ANSWER_S)
         except TimeoutError:
-            raise DataError("the daemon is busy; look at its status, and ask again") from None
+            raise DataError("the daemon is busy; look at its status and try again") from None
 
     def _answer_requests(self) -> None:
         while not self._inbox.empty():
@@ -276,9 +279,9 @@ class Service:
             except ThermocaldError as error:
                 future.set_exception(error)
             except Exception as error:
-                # whoever asks must not be able to end the daemon
+                # no request may stop the daemon
                 log.exception("a request could not be answered")
-                future.set_exception(DataError(f"the daemon could not: {error}"))
+                future.set_exception(DataError(f"the daemon could not answer: {error}"))
 
     def _answer(self, request: Request) -> dict[str, Any]:
         if request.session is not None:
@@ -290,7 +293,7 @@ class Service:
         return {"sessions": self._sessions.status()}
 
     def _line(self) -> str:
-        """Return the status line of `systemctl status`."""
+        """Return the status line for `systemctl status`."""
         parts = []
         for camera in self._station.cameras:
             last = {} if camera.run is None else camera.run.last
@@ -320,47 +323,47 @@ class Service:
         now_us = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
         notify(f"RELOADING=1\nMONOTONIC_USEC={now_us}")  # READY=1 ends it
         try:
-            text = self._change()
+            text = self._apply_configuration()
         except ThermocaldError as error:
-            text = f"the configuration was not read again, the old one stays: {error}"
+            text = f"the configuration cannot be reloaded, the old one stays in force: {error}"
             log.error("%s", text, extra={"event": "reload_failed"})
-            self._tell("reload_failed", str(error))
+            self._record("reload_failed", str(error))
         else:
             log.info(text, extra={"event": "reloaded"})
         notify(f"READY=1\nSTATUS={self._line()}")
 
-    def _change(self) -> str:
-        """Read the configuration again and go over to it; return what was done."""
+    def _apply_configuration(self) -> str:
+        """Read the configuration again and apply it; return the result in words."""
         config = self.config if self._path is None else load_config(self._path, option_names)
         if config.store != self.config.store:
-            log.warning("another store needs a restart; the old one is still used")
+            log.warning("store: a change takes effect after a restart; the old store is still used")
             config = config.model_copy(update={"store": self.config.store})
-        if config == self.config:
+        if config == self.config and not self._station.failed:
             return "the configuration has not changed"
-        Station(config, self._ground)  # what is wrong with it shows before the old one ends
+        Station(config, self._runtime)  # raises for a fault before the old one is stopped
         if not self._station.stop(_GRACE_S):
-            log.error("a device does not let go; it may not be there for a while")
-        # numbers go on after what the old station kept to its end
-        new = Station(config, self._ground)
+            log.error("a device does not close; it may be unavailable for a while")
+        # built only now: epoch numbers continue after the last one that the old station stored
+        new = Station(config, self._runtime)
         self._sessions.resume(new)
         logging.getLogger().setLevel(config.logging.level.upper())
         self.config, self._station = config, new
         new.start()
         text = "the configuration was read again"
-        self._tell("reloaded", text)
+        self._record("reloaded", text)
         return text
 
-    def _complain(self, stalled: list[str]) -> None:
+    def _report_stalled(self, stalled: list[str]) -> None:
         for text in stalled:
-            if text not in self._complained:
+            if text not in self._stalled:
                 log.error(text, extra={"event": "hung"})
-                self._tell("hung", text)
-        for text in self._complained:
+                self._record("hung", text)
+        for text in self._stalled:
             if text not in stalled:
-                log.info("%s no more", text, extra={"event": "hung_no_more"})
-        self._complained = stalled
+                log.info("%s no longer", text, extra={"event": "hung_no_more"})
+        self._stalled = stalled
 
-    def _tell(self, kind: str, text: str) -> None:
+    def _record(self, kind: str, text: str) -> None:
         self._guard.event(Event(self.clock.utc(), kind, text))
 
     @contextmanager

@@ -1,10 +1,10 @@
-"""Sessions of a running daemon: a camera takes a series of so many epochs, then goes back.
+"""Sessions of a running daemon: a camera takes a series of given length, then its former series.
 
-    asked for ─► checking (a look at one frame) ─► running ─► done | stopped
-                     └─► refused                     └─ the device is away: paused
+    requested ─► checking (one frame) ─► running ─► done | stopped
+                     └─► refused            └─ while the device is away: paused
 
-What was begun and ended stands in the store's events, so that a daemon that was killed goes on with
-its sessions when it starts again.
+The store's events record when a session begins and ends, so that a daemon that was killed continues
+its sessions when it is started again.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _NO_HEAT = ({"seconds": 1.0, "hold_c": None},)
 
 
 class Session(BaseModel):
-    """What is asked for: a camera of the configuration, a series, its start condition, its length.
+    """A request: a camera of the configuration, a series, its start condition and its length.
 
-    programme: steps of the heating outputs, from the first epoch on; check: look at a frame first.
+    programme: steps of the heating outputs, from the first epoch on; check: check a frame first.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -50,7 +50,7 @@ class Session(BaseModel):
     check: bool = True
 
     def steps(self, elapsed_s: float) -> list[dict[str, Any]]:
-        """Return what is left of the programme after so many seconds of it."""
+        """Return the rest of the programme after a time in seconds."""
         left: list[dict[str, Any]] = []
         for step in self.programme:
             seconds = step.seconds - max(0.0, elapsed_s)
@@ -62,7 +62,7 @@ class Session(BaseModel):
 
 @dataclass
 class _Progress:
-    """A session and how far it is; taken: the number of its last epoch, when it ended."""
+    """A session and its progress; taken: the number of its last epoch when it ended."""
 
     session: Session
     state: State
@@ -70,15 +70,16 @@ class _Progress:
     found: list[str] = field(default_factory=list)
     taken: int = 0
 
-    def told(self) -> dict[str, Any]:
-        asked = self.session.model_dump(mode="json", exclude={"programme", "check"})
+    def document(self) -> dict[str, Any]:
+        request = self.session.model_dump(mode="json", exclude={"programme", "check"})
         return {
-            **asked, "state": self.state, "why": self.why, "found": self.found, "taken": self.taken,
+            **request, "state": self.state, "why": self.why, "found": self.found,
+            "taken": self.taken,
         }  # fmt: skip
 
 
 class Sessions:
-    """All sessions of a daemon, at most one per camera; used by one thread, the service's."""
+    """The sessions of a daemon, at most one per camera; used only by the service's thread."""
 
     def __init__(self, guard: StoreGuard, clock: Clock, station: Station) -> None:
         self.station = station
@@ -105,7 +106,7 @@ class Sessions:
             log.warning("an event of a session cannot be read: %s", error)
 
     def resume(self, station: Station) -> None:
-        """Let a station that was just built go on with what its cameras were taking."""
+        """Continue the sessions with a station that was just built."""
         self.station = station
         for active in list(self._active.values()):
             try:
@@ -114,10 +115,13 @@ class Sessions:
                 else:
                     self._take(active.session)
             except ThermocaldError as error:
-                self._end(active, "stopped", f"it cannot go on: {error}")
+                self._end(active, "stopped", f"it cannot continue: {error}")
 
     def start(self, session: Session) -> dict[str, Any]:
-        """Begin a session, or go on with one that was stopped; raises what forbids it."""
+        """Begin a session, or continue a stopped one; return its status.
+
+        Raises UsageError, ConfigurationError or DataError if it cannot begin.
+        """
         line = self._line(session.camera)
         if session.camera in self._active:
             running = self._active[session.camera].session
@@ -130,25 +134,25 @@ class Sessions:
         if session.series == line.plan.config.series:
             raise UsageError(
                 f"camera {session.camera!r} takes series {session.series!r} all the time, by its "
-                "configuration; give the session another --series"
+                "configuration; choose another --series"
             )
-        for one in self._guard.all_series():
-            if (one.camera, one.name) != (session.camera, session.series):
-                continue
-            if session.start not in ("", one.start):
+        if (stored := self._guard.find(session.camera, session.series)) is not None:
+            if session.start not in ("", stored.start):
                 raise UsageError(
-                    f"series {one.name!r} was begun with --start {one.start!r}; choose another "
-                    "--series, or go on with that"
+                    f"series {stored.name!r} was begun with --start {stored.start!r}; give this "
+                    "--start, or choose another --series"
                 )
-            if (taken := self._guard.last_epoch(one)) >= session.epochs:
+            if (taken := self._guard.last_epoch(stored)) >= session.epochs:
                 raise DataError(
-                    f"series {one.name!r} has {taken} epochs already; choose another --series"
+                    f"series {stored.name!r} has {taken} epochs already; choose another --series"
                 )
         if session.programme:
             for other in self._active.values():
                 if other.session.programme:
-                    raise DataError(f"series {other.session.series!r} is using the heating")
-            self.station.heaters(session.steps(0.0))  # wrong steps show now
+                    raise DataError(
+                        f"series {other.session.series!r} uses the heating; wait until it ends"
+                    )
+            self.station.heaters(session.steps(0.0))  # raises for wrong steps
         active = _Progress(session, "checking")
         if session.check:
             self._check(active)
@@ -158,38 +162,38 @@ class Sessions:
         return self.status()[session.camera]
 
     def stop(self, camera: str) -> dict[str, Any]:
-        """End a camera's session before its time; raises DataError if it has none."""
+        """Stop a camera's session early; return its status; DataError if it has none."""
         if camera not in self._active:
             raise DataError(f"camera {camera!r} has no session")
         self._end(self._active[camera], "stopped", "it was stopped by hand")
         return self.status()[camera]
 
     def turn(self) -> None:
-        """Look whether a check is made, or a series complete."""
+        """Advance each session whose check is done or whose series is complete."""
         for name, active in list(self._active.items()):
             line = self.station.line(name)
             if line is None:
-                continue  # its end was told by `resume`
+                continue  # `resume` reported its end
             if active.state == "checking":
-                self._judge(line, active)
+                self._finish_check(line, active)
             elif line.run is not None and line.run.full and not line.waiting():
-                self._end(active, "done", f"all {active.session.epochs} epochs are taken")
+                self._end(active, "done", f"all {active.session.epochs} epochs were taken")
             elif line.link.state == "finished":
                 self._end(active, "stopped", line.link.why)
 
     def status(self) -> dict[str, dict[str, Any]]:
-        """Return by camera the session under way, or the last one that ended."""
-        told = {name: one.told() for name, one in self._ended.items()}
+        """Return {camera: its current session, else the last one that ended}."""
+        documents = {name: one.document() for name, one in self._ended.items()}
         for name, active in self._active.items():
-            line, document = self.station.line(name), active.told()
+            line, document = self.station.line(name), active.document()
             if line is not None and line.link.state in ("out", "failed"):
                 document.update(state="paused", why=line.link.why)
             if line is not None and line.run is not None and active.state == "running":
                 document.update(taken=line.run.taken, last=line.run.last)
-            told[name] = document
-        return told
+            documents[name] = document
+        return documents
 
-    def _judge(self, line: CameraLine, active: _Progress) -> None:
+    def _finish_check(self, line: CameraLine, active: _Progress) -> None:
         why = line.link.why
         if line.checked is not None:
             active.found, why = line.checked
@@ -213,13 +217,13 @@ class Sessions:
         session = active.session
         self._take(session)
         active.state = "running"
-        self._tell("session_begun", active, f"{session.epochs} epochs begin")
+        self._record("session_begun", active, f"a session of {session.epochs} epochs begins")
 
     def _take(self, session: Session) -> None:
         line = self._line(session.camera)
         line.take(session.series, session.start, session.epochs)
         if session.programme and line.run is not None:
-            # by epochs, not by the clock: a pause of the camera is a pause of the programme
+            # by epochs, not by the clock: the programme pauses with the camera
             elapsed_s = (line.run.first - 1) * line.plan.config.period_s
             self.station.heat(session.steps(elapsed_s))
 
@@ -238,9 +242,9 @@ class Sessions:
         except ThermocaldError as error:
             log.error("camera %s: %s", session.camera, error)
         kind = "session_refused" if state == "refused" else "session_ended"
-        self._tell(kind, active, why)
+        self._record(kind, active, why)
 
-    def _tell(self, kind: str, one: _Progress, text: str) -> None:
+    def _record(self, kind: str, one: _Progress, text: str) -> None:
         session = one.session
         about = f"camera {session.camera}, series {session.series}: {text}"
         log.info(about, extra={"device": session.camera, "event": kind})

@@ -1,7 +1,8 @@
-"""Whether a recording, a configuration or a store is sound, and what it is.
+"""Checks of a recording, a configuration or a store, with a summary of its content.
 
-And what is attached to a machine, as configuration; what configured devices give now. A device that
-is not certain (a serial port, an I2C bus: nobody knows what is on it) is shown as a comment.
+Also lists the devices attached to the machine, as stanzas of a configuration, and probes configured
+devices. An uncertain device (on a serial port or an I2C bus, which cannot be identified) is a
+comment.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ KINDS: tuple[Kind, ...] = ("camera", "thermometer", "output")
 
 @dataclass(frozen=True)
 class Probe:
-    """What one frame or reading of a configured device gave; error: why there is none."""
+    """The result of one frame or reading of a configured device; error: why there is none."""
 
     kind: Kind
     name: str
@@ -42,16 +43,16 @@ class Probe:
 
     @property
     def text(self) -> str:
-        """The probe for people, in one line."""
+        """The probe in one line."""
         shown = ", ".join(f"{key} {v}" for key, v in self.values.items() if v is not None)
         what = f"FAILED: {self.error}" if self.error else shown
         return f"{self.kind} {self.name} ({self.driver}), {self.took_s * 1e3:.0f} ms: {what}"
 
 
 def attached() -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the devices that are found, and notes on drivers that could not look.
+    """Return the attached devices, and notes on drivers that could not search.
 
-    Each device has `kind`, `driver`, and what `hal.Found` holds.
+    Each device has `kind`, `driver` and the fields of `hal.Found`.
     """
     found: list[dict[str, Any]] = []
     notes: list[str] = []
@@ -68,7 +69,7 @@ def attached() -> tuple[list[dict[str, Any]], list[str]]:
 
 
 def probe_devices(config: Config) -> list[Probe]:
-    """Take one frame of each camera and one reading of each thermometer; nothing is stored."""
+    """Take one frame from each camera and one reading from each thermometer; store nothing."""
     return [
         *(_probe("camera", device) for device in config.cameras),
         *(_probe("thermometer", device) for device in config.thermometers),
@@ -83,7 +84,7 @@ def _probe(kind: Kind, device: DeviceConfig) -> Probe:
             result = driver.capture() if kind == "camera" else driver.read()
             took_s = time.monotonic() - begin
     except Exception as error:  # noqa: BLE001
-        # a driver's own mistake is told like a fault, so that the other devices are tried too
+        # a bug in a driver is reported like a fault, so that the other devices are probed, too
         took_s = time.monotonic() - begin
         known = isinstance(error, ThermocaldError)
         why = str(error) if known else f"its driver failed: {type(error).__name__}: {error}"
@@ -102,7 +103,7 @@ def _probe(kind: Kind, device: DeviceConfig) -> Probe:
 
 
 def stanzas(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield lines of YAML; what is uncertain as comments."""
+    """Yield the stanzas of devices as lines of YAML; uncertain devices are comments."""
     import yaml
 
     if not found:
@@ -120,21 +121,21 @@ def stanzas(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             yield f"  {mark}- {text.strip()}"
 
 
-_SHOWN = 20  # lines of a kind
+_SHOWN = 20  # most lines of a kind
 _TRIED = 3  # epochs of a recording that are calibrated
 
 
 def examine(source: Path, probe: bool, say: Callable[[str], None]) -> dict[str, Any]:
-    """Read everything of a recording, a config.yaml or a store, and return what it is.
+    """Check a recording, a config.yaml or a store as a whole; return a summary.
 
-    probe: take one frame and one reading from every device of a configuration; say: is told what
-    takes long. The document's `lines` are for people. Raises the error of the first thing wrong,
-    of a store's rows none: they stand in `damaged`.
+    probe: take one frame or reading from every device of a configuration; say: prints a step that
+    takes long. `lines` is the summary as text. Raises the first error; damaged rows of a store
+    raise none, but are listed in `damaged`.
     """
     if not source.exists():
         raise DataError(f"{source}: does not exist")
     if _is_system(source):
-        raise DataError(f"{source}: is the system's; give a recording, a config.yaml, or a store")
+        raise DataError(f"{source}: belongs to the system; give a recording, config.yaml or store")
     if source.is_dir():
         kind, found = "recording", _examine_recording(source)
     elif source.suffix in (".yaml", ".yml"):
@@ -145,7 +146,7 @@ def examine(source: Path, probe: bool, say: Callable[[str], None]) -> dict[str, 
 
 
 def _is_system(path: Path) -> bool:
-    """Return whether a path leads into a file system of the kernel, which keeps nothing."""
+    """Return whether a path leads into a file system of the kernel, which stores nothing."""
     return path.resolve().parts[:2] in (("/", "proc"), ("/", "sys"), ("/", "dev"))
 
 
@@ -161,7 +162,7 @@ def _examine_recording(path: Path) -> dict[str, Any]:
     missing = [e for e in recording.epochs if e.frame is not None and not e.frame.is_file()]
     if missing:
         raise DataError(
-            f"{path}: {len(missing)} of {frames} frames of epochs.csv do not exist; the first "
+            f"{path}: {len(missing)} of {frames} frames in epochs.csv do not exist; the first "
             f"is {missing[0].frame}"
         )
     readings = {
@@ -173,7 +174,7 @@ def _examine_recording(path: Path) -> dict[str, Any]:
         *strange_photographs([e.frame for e in recording.epochs if e.frame is not None]),
         *calibration_doubts(recording),
     ]
-    sort = "a doubtful" if doubts else "a sound"
+    sort = "a doubtful" if doubts else "a valid"
     lines = [
         f"{path}: {sort} recording of camera {recording.camera.name}, series {recording.series}",
         f"  {len(columns)} epochs, {frames} frames, {len(recording.testfield)} targets",
@@ -195,16 +196,16 @@ def _examine_recording(path: Path) -> dict[str, Any]:
 
 
 def _name_doubts(recording: Recording) -> Iterator[str]:
-    """Yield which names of a recording no store can keep, and why."""
+    """Yield a doubt for each name of a recording that a store does not accept."""
     for what, name in (("camera", recording.camera.name), ("series", recording.series)):
         try:
             file_name(name, what, DataError)
         except DataError as error:
-            yield f"{error}; no store can keep it"
+            yield f"{error}; no store accepts it"
 
 
 def calibration_doubts(recording: Recording) -> list[str]:
-    """Return what is doubtful in the cameras that some epochs give, and in their test field."""
+    """Calibrate some epochs; return doubts about their interior orientation and test field."""
     from thermocald.acquisition.calibrator import Calibrator
     from thermocald.analysis.series.recorded import misplaced_doubts
     from thermocald.store.recording.sense import interior_doubts
@@ -230,16 +231,16 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
     from thermocald.hal import SystemClock, open_device, option_names
 
     config = load_config(path, option_names)
-    lines = [f"{path}: a sound configuration"]
+    lines = [f"{path}: a valid configuration"]
     for key, place in (("store.path", config.store.path), ("frames.folder", config.frames.folder)):
         if _is_system(place):
-            raise ConfigurationError(f"{path}: {key}: {place}: nothing can be kept there")
+            raise ConfigurationError(f"{path}: {key}: {place}: nothing can be stored there")
     devices: list[dict[str, Any]] = []
     clock = SystemClock()
     for kind in KINDS:
         for entry in getattr(config, f"{kind}s"):
             try:
-                device = open_device(kind, entry.driver, entry.options, clock)  # not opened
+                device = open_device(kind, entry.driver, entry.options, clock)  # built, not opened
             except ConfigurationError as error:
                 raise ConfigurationError(f"{path}: {kind} {entry.name}: {error}") from error
             devices.append({"kind": kind, "name": entry.name, "driver": entry.driver})
@@ -248,7 +249,7 @@ def _examine_config(path: Path, probe: bool) -> dict[str, Any]:
             lines += [f"  {kind} {entry.name}: warning: {text}" for text in device.warnings()]
     from thermocald.acquisition.calibrator import Calibrator
 
-    Thermometers(config, clock)  # whose channels must fit together
+    Thermometers(config, clock)  # raises for channels that conflict
     for plan in plan_cameras(config, clock):
         if plan.calibrator is not None and not isinstance(plan.calibrator, Calibrator):
             lines.append(f"  camera {plan.name}: {plan.calibrator.outlook()}")
@@ -271,8 +272,8 @@ def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
             {"camera": s.camera, "series": s.name, "last_epoch": store.last_epoch(s)}
             for s in store.all_series()
         ]
-    sound = "a damaged store" if found.damaged else "a sound store"
-    lines = [f"{path}: {sound} of {len(series)} series, {found.epochs} epochs"]
+    state = "a damaged store" if found.damaged else "an intact store"
+    lines = [f"{path}: {state} of {len(series)} series, {found.epochs} epochs"]
     lines += [f"  {s['camera']}/{s['series']}: up to epoch {s['last_epoch']}" for s in series]
     lines += [f"  {gap.text}" for gap in found.gaps[:_SHOWN]]
     if len(found.gaps) > _SHOWN:
@@ -280,8 +281,8 @@ def _examine_store(path: Path, say: Callable[[str], None]) -> dict[str, Any]:
     lines += [f"  damaged: {text}" for text in found.damaged[:_SHOWN]]
     if found.unfinished:
         lines.append(
-            "  the last write was cut off: its writer was killed before it was committed, or the "
-            "-wal file was cut off in copying, and more may be missing; the store is used without"
+            "  the last write was cut off and is ignored: its writer was killed before the commit, "
+            "or the -wal file was cut off in copying, and more may be missing"
         )
     return {
         "series": series,

@@ -1,10 +1,10 @@
-"""All that one configuration names, at work: device loops, pipelines, outputs, retention.
+"""A configuration at work: its device loops, pipelines, outputs and retention of frames.
 
     thermometer loops ─► readings ─┐
     camera loops ─► pipelines ─────┴─► keepers ─► store ─► outputs, live state
 
-Cameras and thermometers begin at the same time: with equal periods, frame and temperature are taken
-together.
+Cameras and thermometers start at the same time: with equal periods, frames and temperatures are
+taken together.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.acquisition.device_loop import DeviceLoop, OutputLoop
 from thermocald.acquisition.frame_folder import FrameFolder
 from thermocald.acquisition.thermometers import Thermometers
-from thermocald.daemon.camera_line import CameraLine, Ground
+from thermocald.daemon.camera_line import CameraLine, Runtime
 from thermocald.daemon.plan import plan_cameras
 from thermocald.errors import ConfigurationError
 from thermocald.hal import load_driver, open_device
@@ -35,13 +35,13 @@ _LEAD_S = 0.1
 
 
 class Station:
-    """Built from a configuration, started, stopped; raises ConfigurationError when built."""
+    """The devices of a configuration; the constructor raises ConfigurationError."""
 
-    def __init__(self, config: Config, ground: Ground) -> None:
-        self.config, self.ground = config, ground
-        clock = ground.clock
+    def __init__(self, config: Config, runtime: Runtime) -> None:
+        self.config, self.runtime = config, runtime
+        clock = runtime.clock
         self.frames = FrameFolder(config.frames)
-        self.logged = 0  # readings kept apart from epochs
+        self.logged = 0  # readings stored apart from epochs
         self._stop = threading.Event()
         self._started = False
         begin = clock.monotonic() + _LEAD_S
@@ -49,7 +49,7 @@ class Station:
         self.outputs = [self._output(one, one.options) for one in config.outputs]
         self.cameras = [
             CameraLine(
-                plan, ground, self.thermometers, self.frames, self.outputs, begin,
+                plan, runtime, self.thermometers, self.frames, self.outputs, begin,
                 preview=config.dashboard.enabled,
             )
             for plan in plan_cameras(config, clock)
@@ -60,7 +60,7 @@ class Station:
                 one.period_s, begin,
             )
             for one in config.thermometers
-            if not ground.fast
+            if not runtime.fast
         }  # fmt: skip
         self._loops = [*self._readers.values(), *(camera.loop for camera in self.cameras)]
         self._retention = threading.Thread(target=self._retain, name="retention", daemon=True)
@@ -77,7 +77,7 @@ class Station:
         self._started = True
 
     def stop(self, grace_s: float) -> bool:
-        """Finish the current epochs; False if a device or an output does not let go."""
+        """Finish the current epochs and stop; return False if a device or output hangs."""
         deadline = time.monotonic() + grace_s
         self._stop.set()
         for loop in self._loops:
@@ -90,37 +90,44 @@ class Station:
                 done &= camera.run.pipeline.stop(max(0.1, deadline - time.monotonic()))
         for output in self.outputs:
             done &= output.stop(max(0.1, min(2.0, deadline - time.monotonic())))
-        if self.ground.fast:
+        if self.runtime.fast:
             for link in self.thermometers.links.values():
                 link.close()
         self._retention.join(1.0)
         return done
 
     def stalled(self) -> list[str]:
-        """Return threads that have not come back for too long, or are gone, in words."""
+        """Return a sentence for each device and pipeline that hangs."""
         busy = [(loop.link.called, loop.busy_s()) for loop in self._loops]
         busy += [(f"pipeline of {camera.plan.name}", camera.busy_s()) for camera in self.cameras]
-        return [f"{name} hangs" for name, busy_s in busy if busy_s > self.ground.hang_after_s]
+        return [f"{name} hangs" for name, busy_s in busy if busy_s > self.runtime.hang_after_s]
+
+    @property
+    def failed(self) -> bool:
+        """Whether a device failed, which this station does not open again."""
+        links = [*self.thermometers.links.values(), *(output.link for output in self.outputs)]
+        links += [camera.link for camera in self.cameras]
+        return any(link.state == "failed" for link in links)
 
     @property
     def finished(self) -> bool:
-        """Whether no camera will give another epoch and all is kept."""
+        """Whether no camera will take another epoch and all epochs are stored."""
         return bool(self.cameras) and all(
             not camera.loop.alive and not camera.waiting() for camera in self.cameras
         )
 
     def _on_event(self, utc: float, kind: str, text: str) -> None:
-        """Store that a thermometer or an output went away or came back."""
-        self.ground.guard.event(Event(utc, kind, text))
+        """Store an event of a thermometer or an output."""
+        self.runtime.guard.event(Event(utc, kind, text))
 
     def line(self, camera: str) -> CameraLine | None:
-        """Return the camera of that name; None if the configuration has none."""
+        """Return the camera of this name; None if the configuration has none."""
         return next((line for line in self.cameras if line.plan.name == camera), None)
 
     def heaters(self, programme: Sequence[Mapping[str, Any]]) -> dict[int, OutputLoop]:
-        """Return {place among the outputs: a heating output with another programme}, not started.
+        """Return {index in `outputs`: a heating output with another programme}, not started.
 
-        Raises ConfigurationError if nothing heats, or the programme is not theirs.
+        Raises ConfigurationError if no output heats or an output rejects the programme.
         """
         found = {
             i: self._output(one, {**one.options, "programme": list(programme)})
@@ -132,7 +139,7 @@ class Station:
         return found
 
     def heat(self, programme: Sequence[Mapping[str, Any]]) -> None:
-        """Give the heating outputs another programme, from its beginning; raises as `heaters`."""
+        """Start another programme on the heating outputs; raises as `heaters` does."""
         for i, output in self.heaters(programme).items():
             old, self.outputs[i] = self.outputs[i], output
             if self._started:
@@ -140,12 +147,12 @@ class Station:
                 output.start()
 
     def _output(self, one: OutputConfig, options: Mapping[str, Any]) -> OutputLoop:
-        device = open_device("output", one.driver, options, self.ground.clock)
-        return OutputLoop(one.name, device, self.ground.clock, self._on_event)
+        device = open_device("output", one.driver, options, self.runtime.clock)
+        return OutputLoop(one.name, device, self.runtime.clock, self._on_event)
 
     def status(self) -> dict[str, Any]:
-        """Return a part of what `thermocald status` shows, JSON-able but for NaN."""
-        hang_after_s = self.ground.hang_after_s
+        """Return the devices' part of the status document."""
+        hang_after_s = self.runtime.hang_after_s
         return {
             "cameras": {camera.plan.name: camera.status() for camera in self.cameras},
             "thermometers": {
@@ -169,12 +176,12 @@ class Station:
             "frames": {
                 "keep": self.config.frames.keep,
                 "paused": self.frames.paused,
-                "ages_known": self.ground.clock.settled(),
+                "ages_known": self.runtime.clock.settled(),
             },
         }
 
     def _read(self, name: str) -> None:
-        """Read a thermometer, and store what belongs to no epoch."""
+        """Read a thermometer; store the reading if no epoch will contain it."""
         reading = self.thermometers.read(name)
         in_epochs = any(
             name in line.plan.config.thermometers
@@ -183,17 +190,17 @@ class Station:
             for line in self.cameras
         )
         if not in_epochs:
-            trusted = self.ground.clock.trusted()
-            self.ground.guard.reading(LoggedReading(name, reading.utc, reading.values, trusted))
+            trusted = self.runtime.clock.trusted()
+            self.runtime.guard.reading(LoggedReading(name, reading.utc, reading.values, trusted))
             self.logged += 1
 
     def retain(self) -> list[str]:
-        """Delete the frames that may go; return what was deleted, in sentences."""
-        clock = self.ground.clock
-        told = self.frames.enforce(clock.utc() if clock.settled() else None)
-        for text in told:
-            self.ground.guard.event(Event(clock.utc(), "frames_deleted", text))
-        return told
+        """Delete expired frames; return sentences on what was deleted."""
+        clock = self.runtime.clock
+        deleted = self.frames.enforce(clock.utc() if clock.settled() else None)
+        for text in deleted:
+            self.runtime.guard.event(Event(clock.utc(), "frames_deleted", text))
+        return deleted
 
     def _retain(self) -> None:
         while True:

@@ -1,10 +1,11 @@
-"""The store under hard conditions: a full disk loses observations before results, results wait in
-memory for a store that cannot be written, and the file is followed when it goes away underneath.
+"""The store under adverse conditions.
 
-A deleted file lives on in the process that has it open, and a deleted -wal or -shm file makes other
-processes see another state of the store: so all three are watched, what they held is brought to the
-path again, and the store is opened once more. A card that is no longer mounted leaves an empty
-folder of the system's disk: nothing is begun there, results wait for the card.
+On a full disk, observations are given up before results. Results wait in memory for a store that
+cannot be written. If the file is moved or deleted, the guard follows it: a deleted file remains in
+the process that has it open, and a deleted -wal or -shm file makes other processes see another
+state of the store. So all three files are watched, their content is restored at the path, and the
+store is opened again. A card that is no longer mounted leaves an empty folder of the system's disk:
+no store is created there, and results wait for the card.
 """
 
 from __future__ import annotations
@@ -41,9 +42,10 @@ log = logging.getLogger(__name__)
 
 
 class FollowedStore:
-    """An open store and its file; used under one lock. Raises StoreError.
+    """An open store that is followed when its file goes away; used under one lock.
 
-    events: gets what is to be stored about the file; notice: what happened to it, empty if nothing.
+    events: receives the events of the file; notice: what last happened to the file, or "". Raises
+    StoreError.
     """
 
     def __init__(self, path: Path, events: deque[Event], *, durable: bool = True) -> None:
@@ -61,7 +63,7 @@ class FollowedStore:
         self._require_mount()
         aside = _aside(self.path)
         if aside.exists() and not helper(self.path, "wal").exists():
-            os.replace(aside, helper(self.path, "wal"))  # killed while it was away
+            os.replace(aside, helper(self.path, "wal"))  # the daemon was killed in `close`
         self._file = StoreFile(self.path)
         self._mount = mount_point(self.path)
         tail = read_wal_tail(helper(self.path, "wal"))
@@ -74,14 +76,14 @@ class FollowedStore:
             raise
         self._file.remember_helpers()
         if self._file.names > 1:
-            text = f"the file has {self._file.names} names (hard links): write it under this alone"
+            text = f"the file has {self._file.names} names (hard links); write it only under this"
             self._note("store_linked", text)
         if tail.lost:
             many = "all transactions" if tail.lost < 0 else f"{tail.lost} transactions"
             text = f"its -wal file was damaged, {many} in it were lost; a copy is in {kept}"
             self._note("wal_damaged", text)
         elif tail.unfinished:
-            text = "the last write was cut off when its writer ended; it had not been committed"
+            text = "the last write was cut off when its writer ended; it was not committed"
             log.info("%s: %s", self.path, text, extra={"event": "wal_unfinished"})
             self._events.append(Event(time.time(), "wal_unfinished", text))
 
@@ -91,7 +93,7 @@ class FollowedStore:
         self._events.append(Event(time.time(), kind, f"{self.path.name}: {text}"))
 
     def _keep_damaged_wal(self) -> str:
-        """Copy the -wal file for who wants to look into it; return where."""
+        """Copy the damaged -wal file for examination; return the copy's path."""
         copy = self.path.with_name(f"{self.path.stem}-wal-damaged-{_stamp()}")
         try:
             shutil.copyfile(helper(self.path, "wal"), copy)
@@ -101,14 +103,14 @@ class FollowedStore:
 
     @property
     def in_place(self) -> bool:
-        """Whether what was committed is in the files that are at their paths."""
+        """Whether all commits are in the files at the store's paths."""
         return self._file.there and all(map(self._file.helper_there, HELPERS))
 
     def watch(self) -> bool:
-        """Look whether the files are where they were, and go on with what is there.
+        """Check that the files are in place; if not, restore them or open the new ones.
 
-        Returns whether the store at the path now holds all that was committed before; raises
-        StoreError where nothing can be opened there, and tries again when called again.
+        Returns whether the store at the path now holds all earlier commits. Raises StoreError if no
+        store can be opened there; the next call tries again.
         """
         try:
             if self.store.closed:
@@ -122,20 +124,18 @@ class FollowedStore:
             raise StoreError(str(error)) from error
 
     def _require_mount(self) -> None:
-        """Raise StoreError where the disk of the store is not mounted any more."""
+        """Raise StoreError if the store's disk is no longer mounted."""
         if is_unmounted(self.path, self._mount):
-            raise StoreError(
-                f"{self.path}: its disk is gone, {self._mount} is not mounted any more"
-            )
+            raise StoreError(f"{self.path}: its disk is gone, {self._mount} is no longer mounted")
 
     def _follow(self) -> bool:
         self._require_mount()
         file, copy = self._file, None
         covered = mount_point(self.path) != self._mount
         swapped = not covered and not file.deleted and _device(self.path) != file.identity[0]
-        # else what is in a -wal file that has no name any more would be lost with the connection;
-        # what is below another disk now is not found by its name; what was on another disk stays
-        # there, and cannot be read where that was pulled out
+        # a -wal file without a name would be lost with the connection: a checkpoint, or else a
+        # copy, saves its content. A store that another disk covers has no path, and is copied. A
+        # store on a disk that was exchanged stays there: a disk that was pulled out is unreadable
         emptied = False
         if not (swapped or file.deleted or covered):
             try:
@@ -146,27 +146,27 @@ class FollowedStore:
             copy = self._rescued()
         there, other = file.there, self.path.exists()
         if there:
-            text = "its -wal or -shm file was deleted; what it held was moved into the store"
+            text = "its -wal or -shm file was deleted; its content was moved into the store"
         elif file.deleted and not other:
-            text = "was deleted; it was written again with all that it held"
+            text = "was deleted; it was written again with its full content"
         else:
             gone = "replaced by another file" if file.deleted else "moved away"
             if covered or swapped:
                 gone = "on another disk than is mounted there now"
             what = ", which is used now" if file.deleted else "; the file at its path is used now"
-            rest = "" if copy is None else f"; what it held is in {copy}"
-            text = f"was {gone}{what if other else '; a new store was begun'}{rest}"
+            rest = "" if copy is None else f"; its content is in {copy}"
+            text = f"was {gone}{what if other else '; a new store was created'}{rest}"
         carried = there or (file.deleted and not other)
         self.close()
         make_folder(self.path.resolve().parent)
         if carried and copy is not None:
-            os.replace(copy, self.path.resolve())  # a link stays one
+            os.replace(copy, self.path.resolve())  # a link stays a link
         self._open()
         self._note("store_followed", text)
         return carried
 
     def _rescued(self) -> Path:
-        """Copy all that the open store holds beside where it was; return where."""
+        """Copy the open store's content to a file beside it; return the copy's path."""
         target = self.path.resolve()
         copy = target.with_name(f"{target.stem}-rescued-{_stamp()}.db")
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -174,10 +174,10 @@ class FollowedStore:
         return copy
 
     def close(self) -> None:
-        """Close the store and give its lock back; may be called twice.
+        """Close the store and release its lock; may be called twice.
 
-        If the files were not in place, the helper files at the path are removed too: they would be
-        taken for those of the next database there. Those of another store are left alone.
+        If the files were not in place, the helper files at the path are deleted, since the next
+        database there would take them for its own. The helper files of another store stay.
         """
         if self.store.closed:
             return
@@ -186,8 +186,8 @@ class FollowedStore:
         wal, aside = helper(self.path, "wal"), _aside(self.path)
         try:
             if foreign and wal.exists():
-                # SQLite deletes it by its name, and compares only the numbers of inodes: those of
-                # a card that was plugged in again are the same
+                # SQLite deletes the file by its name after comparing only inode numbers, which are
+                # the same on a card that was plugged in again
                 os.replace(wal, aside)
             self.store.close()
         except (OSError, StoreError) as error:
@@ -208,7 +208,7 @@ def _aside(path: Path) -> Path:
 
 
 def _device(path: Path) -> int:
-    """The disk on which a path lies, or would lie."""
+    """Return the number of the disk of a path, which need not exist."""
     return next(folder for folder in path.resolve().parents if folder.exists()).stat().st_dev
 
 
@@ -216,7 +216,7 @@ def _stamp() -> str:
     return time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
 
 
-# Results alone take about 1.2 kB an epoch: this is more than a day at one every 10 s.
+# results alone take about 1.2 kB an epoch: enough for more than a day at one every 10 s
 _RESERVE_BYTES = 16_000_000
 _ENOUGH_BYTES = 20_000_000
 _MOST_WITH_OBSERVATIONS = 100
@@ -225,7 +225,7 @@ _MOST_WAITING = 20_000
 
 @dataclass(eq=False)
 class Row:
-    """What is kept of one epoch."""
+    """An epoch to be stored."""
 
     series: StoredSeries
     epoch: Epoch
@@ -235,7 +235,7 @@ class Row:
     stored: bool = False  # committed, and in the file that is at the store's path
 
     def thin(self) -> Row:
-        """Return the same without observations, and of the covariance the standard deviations."""
+        """Return the row without observations and with the variances alone as covariance."""
         result = self.result
         if result is not None and result.covariance is not None:
             result = replace(result, covariance=np.diag(np.diag(result.covariance)))
@@ -243,38 +243,38 @@ class Row:
 
 
 class StoreGuard:
-    """An open store that does not give up; threads may share it.
+    """An open store whose writes wait and are repeated; threads may share it.
 
-    Raises StoreError only when it is opened.
+    Raises StoreError only when it is opened, if a method does not state otherwise.
     """
 
     def __init__(self, path: Path, *, durable: bool = True) -> None:
         self.path = path
-        self.lost = 0  # epochs that were taken and not kept, for whatever reason
+        self.lost = 0  # epochs that were taken but not stored, for any reason
         self._lost_at = -math.inf
         self._lost_why = ""
-        self.away = ""  # why the store cannot be written, empty while it can
+        self.away = ""  # why the store cannot be written, else empty
         self.thin = False
         self._waiting: deque[Row] = deque()
         self._events: deque[Event] = deque(maxlen=1000)
         self._readings: deque[LoggedReading] = deque(maxlen=_MOST_WAITING)
         self._lock = threading.RLock()
         self._series: dict[tuple[str, str], StoredSeries] = {}
-        self._known: Store | None = None  # whose series are in `_series`
+        self._series_store: Store | None = None  # the store of `_series`
         self._file = FollowedStore(path, self._events, durable=durable)
 
     @property
     def store(self) -> Store:
-        """The open store; another one after its file was followed, so read through the guard."""
+        """The open store, which is replaced when its file is followed: read through the guard."""
         return self._file.store
 
     @property
     def waiting(self) -> int:
-        """Epochs that wait in memory for a store that can be written."""
+        """The number of epochs that wait in memory to be stored."""
         return len(self._waiting)
 
     def close(self) -> None:
-        """Try once more to keep what waits, and close."""
+        """Try once more to store what waits, then close."""
         with self._lock:
             self.flush()
             while self._waiting:
@@ -282,15 +282,14 @@ class StoreGuard:
             self._file.close()
 
     def series(self, wanted: StoredSeries) -> StoredSeries:
-        """The series of that camera and name in the file that is open now; begun if need be."""
+        """Return the series of this camera and name in the open store; create it if missing."""
         key = (wanted.camera, wanted.name)
         with self._lock:
-            if self._known is not self.store:
-                self._known = self.store
+            if self._series_store is not self.store:
+                self._series_store = self.store
                 self._series.clear()
             if key not in self._series:
-                found = {(s.camera, s.name): s for s in self.store.all_series()}
-                self._series[key] = found.get(key) or self.store.create_series(
+                self._series[key] = self.find(*key) or self.store.create_series(
                     wanted.head,
                     wanted.testfield,
                     start=wanted.start,
@@ -303,19 +302,20 @@ class StoreGuard:
     def epochs(
         self, series: StoredSeries, first: int, last: int | None = None, *, details: bool = True
     ) -> list[StoredEpoch]:
-        """Some epochs, read at once: the file must not be followed to another one meanwhile."""
+        """Read some epochs at once, so that the store is not replaced meanwhile."""
         with self._lock:
             return list(self.store.epochs(series, first, last, details=details))
 
     def last_epoch(self, series: StoredSeries) -> int:
-        """Return the number of the last epoch kept, 0 if there is none."""
+        """Return the number of the last stored epoch, 0 if there is none."""
         with self._lock:
             return self.store.last_epoch(series) or 0
 
-    def all_series(self) -> list[StoredSeries]:
-        """Return all series, in the order in which they were begun."""
+    def find(self, camera: str, name: str) -> StoredSeries | None:
+        """Return a camera's series of this name, None if there is none."""
         with self._lock:
-            return self.store.all_series()
+            found = (s for s in self.store.all_series() if (s.camera, s.name) == (camera, name))
+            return next(found, None)
 
     def stored_events(self) -> list[Event]:
         """Return all events in the store, oldest first."""
@@ -323,7 +323,7 @@ class StoreGuard:
             return self.store.events()
 
     def append(self, row: Row) -> bool:
-        """Keep an epoch, now or when the store can be written again; whether it is stored."""
+        """Store an epoch now or when the store can be written; return whether it is stored."""
         with self._lock:
             self._waiting.append(row)
             self.flush()
@@ -337,7 +337,7 @@ class StoreGuard:
         observations: Observations | None,
         extra: Mapping[str, float],
     ) -> None:
-        """Keep a later calibration of an epoch; raises StoreError."""
+        """Store a later calibration of an epoch; raises StoreError."""
         with self._lock:
             self._watch()
             self.store.amend(
@@ -349,56 +349,56 @@ class StoreGuard:
             )
 
     def event(self, event: Event) -> None:
-        """Keep an event, now or when the store can be written again."""
+        """Store an event, now or when the store can be written again."""
         with self._lock:
             self._events.append(event)
             self._flush_events()
 
     def lose(self, why: str) -> None:
-        """Count an epoch that was taken and will not be kept, and tell of it."""
+        """Count an epoch that was taken but will not be stored, and report it."""
         self.lost += 1
         self._lost_at, self._lost_why = time.monotonic(), why
         log.error("an epoch is lost: %s", why, extra={"event": "epoch_lost"})
         self._events.append(Event(time.time(), "epoch_lost", why))
 
     def reading(self, reading: LoggedReading) -> None:
-        """Keep a reading that belongs to no epoch with the next `flush`; returns at once."""
+        """Queue a reading that belongs to no epoch, for the next `flush`."""
         self._readings.append(reading)
 
     def flush(self) -> None:
-        """Write what waits, oldest first, until the store refuses."""
+        """Write what waits, oldest first, until a write fails."""
         with self._lock:
             self._watch()
             while self._waiting:
                 row = self._waiting[0]
                 error = self._write(row)
-                if error is None or self._holds(row):
+                if error is None or self._is_committed(row):
                     if not self._file.in_place and not self._watch():
                         if self.away:
                             return
-                        continue  # it was written to a file that is gone: once more
+                        continue  # it was written to a file that is gone: write it again
                     self._waiting.popleft()
                     row.stored = True
-                    self._back()
-                elif self._takes_all_but(error):
+                    self._mark_back()
+                elif self._refuses_only_this(error):
                     self._waiting.popleft()
                     self.lose(f"epoch {row.epoch.number} of {row.series.camera}: {error}")
                 else:
-                    self._refused(error)
+                    self._hold_back(error)
                     return
             self._flush_events()
             self._flush_readings()
 
     def _watch(self) -> bool:
-        """Follow the file if it went away; whether what was committed is in the one at the path."""
+        """Follow the file if it went away; return whether the one at the path has all commits."""
         try:
             return self._file.watch()
         except StoreError as error:
-            self._out(error, time.time())
+            self._mark_out(error, time.time())
             return False
 
     def _write(self, row: Row) -> StoreError | None:
-        self._look_at_the_disk(row)
+        self._check_free_space(row)
         attempts = [row.thin()] if self.thin else [row, row.thin()]
         error: StoreError | None = None
         for attempt in attempts:
@@ -416,15 +416,15 @@ class StoreGuard:
                 return None
         return error
 
-    def _look_at_the_disk(self, row: Row) -> None:
+    def _check_free_space(self, row: Row) -> None:
         try:
             free = shutil.disk_usage(self.path.parent).free
         except OSError:
             return
         if not self.thin and free < _RESERVE_BYTES:
-            kind, what = "observations_paused", "results are kept, observations no more"
+            kind, what = "observations_paused", "results are stored, observations no longer"
         elif self.thin and free > _ENOUGH_BYTES:
-            kind, what = "observations_resumed", "observations are kept again"
+            kind, what = "observations_resumed", "observations are stored again"
         else:
             return
         self.thin = not self.thin
@@ -432,8 +432,8 @@ class StoreGuard:
         log.log(logging.WARNING if self.thin else logging.INFO, text, extra={"event": kind})
         self._events.append(Event(row.epoch.frame_time, kind, text))
 
-    def _holds(self, row: Row) -> bool:
-        """Return whether a row was committed before its file could be followed."""
+    def _is_committed(self, row: Row) -> bool:
+        """Return whether a row was committed before its file was followed."""
         number = row.epoch.number
         try:
             found = self.epochs(self.series(row.series), number, number, details=False)
@@ -441,10 +441,10 @@ class StoreGuard:
             return False
         return any(stored.epoch.frame_time == row.epoch.frame_time for stored in found)
 
-    def _takes_all_but(self, error: StoreError) -> bool:
-        """Return whether the store is well and it is this row that it does not take.
+    def _refuses_only_this(self, error: StoreError) -> bool:
+        """Return whether the store can be written, but not with the row of this error.
 
-        On a full disk a row may find no room where an event still does: that row waits.
+        On a full disk there may be room for an event but not for a row: then the row waits.
         """
         if self.away or isinstance(error, StoreFullError) or not self._flush_events():
             return False
@@ -454,21 +454,22 @@ class StoreGuard:
             return False
         return True
 
-    def _out(self, error: StoreError, utc: float) -> None:
+    def _mark_out(self, error: StoreError, utc: float) -> None:
         if not self.away:
             log.error("%s; results wait in memory", error, extra={"event": "store_out"})
             self._events.append(Event(utc, "store_out", str(error)))
         self.away = str(error)
 
-    def _refused(self, error: StoreError) -> None:
-        self._out(error, self._waiting[0].epoch.frame_time)
+    def _hold_back(self, error: StoreError) -> None:
+        """Let the rows wait; thin those beyond the latest 100, and lose the oldest of too many."""
+        self._mark_out(error, self._waiting[0].epoch.frame_time)
         last = -1 - _MOST_WITH_OBSERVATIONS
         if len(self._waiting) >= -last:
             self._waiting[last] = self._waiting[last].thin()
         if len(self._waiting) > _MOST_WAITING:
             self.lose(f"epoch {self._waiting.popleft().epoch.number}: too many wait: {error}")
 
-    def _back(self) -> None:
+    def _mark_back(self) -> None:
         if self.away:
             log.info("%s: can be written again", self.path, extra={"event": "store_back"})
             self.away = ""
@@ -477,7 +478,7 @@ class StoreGuard:
         while self._events:
             try:
                 event = self._events[0]
-                text = event.text.encode(errors="backslashreplace").decode()  # of a file's name
+                text = event.text.encode(errors="backslashreplace").decode()  # surrogates of names
                 self.store.add_event(replace(event, text=without_secrets(text)))
             except StoreError as error:
                 log.debug("an event waits: %s", error)
@@ -492,14 +493,14 @@ class StoreGuard:
         try:
             self.store.add_readings(batch)
         except StoreError as error:
-            self._out(error, batch[0].utc)
+            self._mark_out(error, batch[0].utc)
             return
         for _ in batch:
             self._readings.popleft()
-        self._back()
+        self._mark_back()
 
     def status(self) -> dict[str, Any]:
-        """Return the store's part of what `thermocald status` shows."""
+        """Return the store's part of the status document."""
         return {
             "path": str(self.path),
             "state": "out" if self.away else "results_only" if self.thin else "ok",

@@ -1,6 +1,6 @@
-"""systemd's side of the daemon: the journal with fields, and sd_notify(3).
+"""The daemon's interface to systemd: the journal with its fields, and sd_notify(3).
 
-Fields are THERMOCALD_DEVICE, THERMOCALD_EVENT, CODE_FILE …
+The fields are THERMOCALD_DEVICE, THERMOCALD_EVENT, CODE_FILE …
 Try: journalctl THERMOCALD_EVENT=device_out
 """
 
@@ -21,7 +21,7 @@ _FIELDS = {"device": "THERMOCALD_DEVICE", "event": "THERMOCALD_EVENT"}
 
 
 class JournalHandler(logging.Handler):
-    """Sends records to the journal's native socket (systemd.journal-fields(7))."""
+    """A handler that sends records to the journal's native socket (systemd.journal-fields(7))."""
 
     def __init__(self, path: str = _SOCKET) -> None:
         super().__init__()
@@ -44,13 +44,13 @@ class JournalHandler(logging.Handler):
                 fields[name] = str(value)
         message = b""
         for name, data in ((name, value.encode()) for name, value in fields.items()):
-            # a value of several lines has its length before it
+            # the length precedes a value of several lines
             size = b"\n" + struct.pack("<Q", len(data)) if b"\n" in data else b"="
             message += name.encode() + size + data + b"\n"
         try:
             self._socket.sendto(message, self._path)
         except OSError:
-            # no journal, or a message too long for a datagram: stderr is read by systemd too
+            # no journal, or a message too long for a datagram; systemd also reads stderr
             print(self.format(record), file=sys.stderr)  # noqa: T201
 
     def close(self) -> None:
@@ -76,7 +76,7 @@ def set_up_logging(level: str) -> None:
 
 
 def notify(message: str) -> bool:
-    """Send `KEY=value` lines to the service manager; False if there is none that listens."""
+    """Send `KEY=value` lines to the service manager; return False if none listens."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return False
@@ -93,7 +93,7 @@ def notify(message: str) -> bool:
 
 
 def watchdog_interval_s() -> float | None:
-    """How often the watchdog is to be fed, half of what systemd allows; None if there is none."""
+    """Return the interval for feeding the watchdog, half of systemd's limit; None without one."""
     pid = os.environ.get("WATCHDOG_PID", "")
     if pid and pid != str(os.getpid()):
         return None

@@ -248,6 +248,11 @@ def _movement(d: Discovery) -> Figure:
         pattern = U[:, keep] @ (v[0][keep] / np.sqrt(size[keep])) * s[0] / np.sqrt(len(r))
         misfit = np.sqrt(np.mean(np.einsum("tij,ej->eti", e.columns[seen], r) ** 2))
         drawn.append((float(misfit), np.einsum("tij,j->ti", e.columns[seen], pattern)))
+    T = e.averaged(e.history.temperature())
+    T = np.nan_to_num(T - np.nanmean(T))
+    rates = T @ _model(d.base_fit, 0) / max(float(T @ T), 1e-12)
+    reading_sd = e.thermometers[e.history.reference].noise
+    of_readings = reading_sd * float(np.sqrt(np.mean((e.columns[seen] @ rates) ** 2)))
     # a movement below the noise must not look large
     longest = max(float(np.linalg.norm(drawn[0][1], axis=1).max()), _noise_px(d, 0))
     frame = (e.source.sensor.width, e.source.sensor.height)
@@ -268,7 +273,8 @@ def _movement(d: Discovery) -> Figure:
             ", before and after the effects found, with the root mean square; one scale for both."
             if len(drawn) > 1
             else "; no effect was found that another recording would show."
-        ),
+        )
+        + f" Up to {of_readings:.3f} px of it is the noise of the readings, {reading_sd:.3f} K.",
         panels,
         columns=2,
     )

@@ -183,6 +183,34 @@ class ThermalModel:
             prediction.eop += self.exterior.as_array()
         return prediction
 
+    def influence(self, name: str, history: History) -> Array:
+        """Return what one of the effects adds to the interior orientation, (E, 10)."""
+        effect = next(e for e in self.effects if e.name == name)
+        prediction = Prediction.none(len(history.times))
+        catalogue.get(name).influence(history, effect.values, prediction)
+        return prediction.iop
+
+    def followers(self) -> list[Any]:
+        """Return one follower per drive, in order; None for a drive that needs all readings.
+
+        Called one after the other, they give the temperature that the rates follow.
+        """
+        return [catalogue.get(name).follower(values) for name, values in self.drives]
+
+    @property
+    def is_of_now(self) -> bool:
+        """Whether the first, the extreme and the last readings determine the effects.
+
+        They do not if a drive that looks ahead comes before another: it changes its past values.
+        """
+        for name, values in self.drives[:-1]:
+            delay = catalogue.get(name).delay
+            if delay and float(values[delay]) < 0:
+                return False
+        kinds = [catalogue.get(e.name) for e in self.effects]
+        signals = [kind for kind in kinds if not kind.is_drive]
+        return all(kind.of_now or not set(kind.linear) & set(IOP_NAMES) for kind in signals)
+
     def carried(self, linear: Array) -> Array:
         """Return the interior orientations (…, 10) for linear ones, in the distortion's basis."""
         return follow_angle(linear, self.interior.c) if self.distortion == "angle" else linear

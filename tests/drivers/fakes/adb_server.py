@@ -1,6 +1,6 @@
-"""An adb server on loopback with phones behind it: the protocol that adbutils speaks.
+"""An adb server on loopback with phones: the protocol that adbutils uses.
 
-Source: packages/modules/adb, OVERVIEW.TXT, SERVICES.TXT, SYNC.TXT. The laboratory uses the real adb
+Source: packages/modules/adb, OVERVIEW.TXT, SERVICES.TXT, SYNC.TXT. `make hil` uses the real adb
 server and a real adbd.
 """
 
@@ -29,7 +29,7 @@ OFFLINE = "device offline"
 
 
 def wait_little(monkeypatch) -> None:
-    """Look for photographs in shorter intervals, and have adbutils not wait at each connection."""
+    """Poll for photographs more often, and remove adbutils' pauses at each connection."""
     import adbutils._adb
     from thermocald_drivers import android
 
@@ -47,7 +47,7 @@ def photograph(
     size=(96, 64),
     zone=None,
 ) -> bytes:
-    """A JPEG with EXIF, exposed at `when` (s UTC; the phone's zone is UTC)."""
+    """Return a JPEG with EXIF, exposed at `when` (s UTC; the phone's zone is UTC)."""
     image = Image.fromarray(np.add.outer(np.arange(size[1]), np.arange(size[0])).astype(np.uint8))
     tags = Image.Exif()
     sub = tags.get_ifd(0x8769)
@@ -67,7 +67,7 @@ def photograph(
 
 @dataclass
 class FakePhone:
-    """Files, answers of the shell, and the camera's behaviour; every field is a knob."""
+    """A phone's files, shell answers and camera behaviour; tests set its fields."""
 
     state: str = "device"
     folder: str = "/sdcard/DCIM/Camera"
@@ -136,7 +136,7 @@ class FakePhone:
 
 
 class AdbServer(LineServer):
-    """`phones` by serial number; `listing` in place of theirs, as `adb devices` prints it."""
+    """A server with `phones` by serial number; `listing` replaces `adb devices`' output."""
 
     def __init__(self) -> None:
         self.phones: dict[str, FakePhone] = {}

@@ -1,4 +1,4 @@
-"""A web server and a mail server on loopback that keep what they are sent, and refuse on demand."""
+"""A web server and a mail server on loopback that record requests, and refuse on demand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class _Tcp(socketserver.ThreadingTCPServer):
     daemon_threads = False
 
     def handle_error(self, request, client_address):
-        """A client that leaves in the middle is not worth a traceback."""
+        """Ignore a client that disconnects: no traceback."""
 
 
 class _Started:
@@ -62,7 +62,7 @@ class WebServer(_Started):
 
 
 class MailServer(_Started):
-    """As much of SMTP as smtplib speaks; `letters` holds the text of each."""
+    """The part of SMTP that smtplib uses; `letters` holds the text of each e-mail."""
 
     def __init__(self, port=0, context=None):
         self.letters, self.logins, self.refuse_login = [], [], False

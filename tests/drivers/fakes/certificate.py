@@ -1,4 +1,4 @@
-"""A certificate for 127.0.0.1, signed by itself."""
+"""A self-signed certificate for 127.0.0.1."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 
 def own_certificate(folder):
-    """(certificate, key) as files; skips where openssl is not installed."""
+    """Return the files (certificate, key); skips if openssl is not installed."""
     if shutil.which("openssl") is None:
         pytest.skip("no openssl: apt-get install openssl")
     certificate, key = folder / "own.pem", folder / "own.key"
@@ -25,7 +25,7 @@ def own_certificate(folder):
 
 
 def own_context(folder):
-    """(certificate, what a server with it is given)."""
+    """Return (certificate, a server's TLS context with it)."""
     certificate, key = own_certificate(folder)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)

@@ -1,4 +1,4 @@
-"""Chips for the fake SMBus adapter: registers as the data sheets give them."""
+"""Chips for the fake SMBus adapter, with the registers of their data sheets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A server on loopback with a thread a connection: what the fakes of network devices share."""
+"""A server on loopback with a thread per connection, the base of fake network devices."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import threading
 
 
 class LineServer:
-    """Listens at `port`; a subclass serves each connection in `_serve`."""
+    """A server at `port`; a subclass serves each connection in `_serve`."""
 
     def __init__(self, name: str, port: int = 0) -> None:
         self._name = name
@@ -33,7 +33,7 @@ class LineServer:
             thread.start()
 
     def drop(self) -> None:
-        """Every line breaks, as when the network goes away."""
+        """Break all connections, as when the network fails."""
         for line in self._lines:
             with contextlib.suppress(OSError):
                 line.shutdown(socket.SHUT_RDWR)

@@ -1,6 +1,6 @@
-"""A broker that speaks as much of MQTT 3.1.1 as one publisher needs, and fails on demand.
+"""A broker with the part of MQTT 3.1.1 that one publisher needs, which fails on demand.
 
-The laboratory uses a real mosquitto; this one can withhold an acknowledgement or drop a line.
+`test_mosquitto` uses a real broker; this one can withhold an acknowledgement or break a connection.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from tests.drivers.fakes.line_server import LineServer
 
 
 class Broker(LineServer):
-    """`messages` holds (topic, payload, retain); the will of a line that broke is in it too."""
+    """A broker; `messages` holds (topic, payload, retain), also of a broken connection's will."""
 
     def __init__(self, port: int = 0, context: ssl.SSLContext | None = None) -> None:
         self._context = context

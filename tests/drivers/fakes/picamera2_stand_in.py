@@ -1,4 +1,4 @@
-"""A stand-in with picamera2's API: no pixels can be had without a Pi, so this is not libcamera."""
+"""A stand-in for picamera2, since libcamera delivers no frames without a Raspberry Pi."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Request:
 
 
 class StandIn:
-    """One camera; class attributes are the laboratory's knobs."""
+    """One camera; tests set its class attributes."""
 
     cameras = ({"Model": "imx219", "Id": "/base/soc/i2c0mux/i2c@1/imx219@10"},)
     sensor_resolution = (96, 64)
@@ -64,7 +64,7 @@ class StandIn:
         self.started = True
 
     def capture_metadata(self) -> dict:
-        """Of the next frame, as libcamera's own state is now."""
+        """Return the next frame's metadata by libcamera's current state."""
         return {**type(self).standing, **type(self).extra}
 
     def set_controls(self, controls: dict) -> None:

@@ -1,4 +1,4 @@
-"""An instrument at the far end of a pseudo terminal: a real tty for the driver."""
+"""An instrument at the other end of a pseudo terminal: a real tty for the driver."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import tty
 
 
 class Instrument:
-    """Answers commands with `answers[command]` (bytes, or a list used up one by one)."""
+    """An instrument that answers with `answers[command]` (bytes, or a list of successive ones)."""
 
     def __init__(self, answers: dict[bytes, bytes | list[bytes]] | None = None) -> None:
         self.answers = answers or {}
@@ -42,7 +42,7 @@ class Instrument:
                     self.send(answer.pop(0) if isinstance(answer, list) else answer)
 
     def unplug(self) -> None:
-        """The line goes away, as a USB adapter does."""
+        """Remove the tty, as when a USB adapter is unplugged."""
         os.write(self._stop_write, b"x")
         self._thread.join()
         for descriptor in (self.master, self.slave):

@@ -1,4 +1,4 @@
-"""An SMBus adapter with chips on it, in place of the kernel's, below smbus2's interface."""
+"""An SMBus adapter with chips, in place of the kernel's, below smbus2's interface."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def os_error(number: int) -> OSError:
 
 @dataclass
 class Chip:
-    """Registers by number (bytes as they go over the wire) and what happens on a write."""
+    """Registers by number (bytes in the order on the wire), and the effect of a write."""
 
     registers: dict[int, bytes] = field(default_factory=dict)
     on_write: Callable[[Chip, int, bytes], None] | None = None

@@ -11,7 +11,7 @@ CRC_TABLE_POLYNOMIAL = 0x8C
 
 
 class Sysfs:
-    """`root` is what the drivers are given as `sysfs`."""
+    """A tree; `root` is the drivers' option `sysfs`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -51,7 +51,7 @@ class Sysfs:
 
 
 def w1_slave(celsius: float, limits: str = "4b46") -> str:
-    """What w1_therm prints for a DS18B20 at 12 bits; the CRC by table, not by the driver's code."""
+    """Return w1_therm's text for a DS18B20 at 12 bits; the CRC is not by the driver's code."""
     raw = round(celsius * 16)
     pad = raw.to_bytes(2, "little", signed=True) + bytes.fromhex(limits + "7fff")
     pad += bytes([(0x10 - (raw & 0x0F)), 0x10])
@@ -61,7 +61,7 @@ def w1_slave(celsius: float, limits: str = "4b46") -> str:
 
 
 def w1_crc(data: bytes) -> int:
-    """Bit by bit from the most significant end of the reversed polynomial 0x31 (other form)."""
+    """Return the 1-wire CRC, bit by bit, by other code than the driver's."""
     crc = 0
     for byte in data:
         for bit in range(8):

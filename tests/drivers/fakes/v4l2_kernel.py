@@ -1,7 +1,7 @@
-"""A V4L2 capture device below linuxpy: the ioctls of one camera, its buffers in a plain file.
+"""A V4L2 capture device below linuxpy: the ioctls of one camera, with buffers in a file.
 
-The camera makes a frame every `period_s` into the oldest queued buffer, as a kernel driver does:
-buffers that nobody fetches stay filled with old frames, and frames without a buffer are lost.
+The camera writes a frame every `period_s` into the oldest queued buffer, like a kernel driver:
+buffers that are not dequeued keep old frames, and frames without a buffer are lost.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def fail(number: int) -> OSError:
 
 
 class FakeCamera:
-    """Controls: {id: [name, minimum, maximum, step, value]}."""
+    """A camera with controls {id: [name, minimum, maximum, step, value]}."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -116,7 +116,7 @@ class FakeCamera:
         self.streaming = False
 
     def made_by(self, now: float) -> int:
-        """The number of the first frame that the camera makes after an instant."""
+        """Return the number of the first frame after a time."""
         self._make_frames()
         return self._sequence + max(0, int((now - self._next_at) / self.period_s))
 
@@ -136,7 +136,7 @@ class FakeCamera:
     def _dqbuf(self, a) -> None:
         self._make_frames()
         if not self._filled:
-            time.sleep(0.001)  # a plain file is always ready: poll would spin
+            time.sleep(0.001)  # a regular file is always ready: poll would spin
             raise BlockingIOError(errno.EAGAIN, "try again")
         a.index, a.sequence, at, a.bytesused = self._filled.popleft()
         stamp = self.stamp(at)

@@ -1,9 +1,9 @@
-"""A camera at one time: interior orientation with covariance, and what can be done with it.
+"""A camera at one time: interior orientation with covariance, and its use.
 
-How far two cameras are apart: in their parameters, and in the image, by how much a fixed direction
-is seen elsewhere, over a grid of the whole image, as the cameras stand and after the rotation that
-brings them together best: what no orientation takes up (mrcal calls it the projection difference).
-The cameras count as independent of each other.
+Also the difference of two cameras: in their parameters, and in the image, as the shifts of fixed
+directions over a grid of the whole image, before and after the rotation that minimises them: the
+latter no exterior orientation absorbs (mrcal calls it the projection difference). The cameras count
+as independent of each other.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 class Camera(Result):
     """A camera at one time: its interior orientation with covariance.
 
-    sensor: size px and pixel pitch mm; temperature °C, NaN where none is known; values (10,),
-    covariance (10, 10): c, x0, y0 (mm), A1 … C2; extrapolated: by how many kelvin the temperature
-    lies outside what the model was fitted on, 0 inside.
+    sensor: size px and pixel pitch mm; temperature °C, NaN if unknown; values (10,), covariance
+    (10, 10): c, x0, y0 (mm), A1 … C2; extrapolated: by how many kelvin the temperature is outside
+    the range that the model was fitted on, 0 inside.
 
     >>> camera = tc.load_camera("camera.yaml").at(35.0)
     >>> camera.sd["c"] > 0
@@ -72,11 +72,11 @@ class Camera(Result):
 
     @property
     def sd(self) -> dict[str, float]:
-        """Standard deviations by name, 0 where a parameter was held."""
+        """Standard deviations by name, 0 for a parameter that was held."""
         return dict(zip(IOP_NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     def project(self, points: ArrayLike, pose: ExteriorOrientation | ArrayLike) -> Array:
-        """Project object points (n, 3) mm: image points (n, 2) px, NaN behind the camera.
+        """Project object points (n, 3) mm to image points (n, 2) px, NaN behind the camera.
 
         pose: omega, phi, kappa (rad), X0, Y0, Z0 (mm), as an ExteriorOrientation or six numbers.
 
@@ -85,7 +85,8 @@ class Camera(Result):
         (1, 2)
         """
         six = pose.as_array() if isinstance(pose, ExteriorOrientation) else pose
-        return project(self.sensor, self.values, np.asarray(six, dtype=float), points)
+        pose_values = _numbers(six, 6, "the pose")
+        return project(self.sensor, self.values, pose_values, _numbers(points, 3, "object points"))
 
     def rays(self, image_points: ArrayLike) -> Array:
         """Return the unit directions (n, 3) in the camera frame of image points (n, 2) px.
@@ -95,7 +96,7 @@ class Camera(Result):
         >>> tc.load_camera("camera.yaml").at(35.0).rays([[100.0, 100.0]]).shape
         (1, 3)
         """
-        return self.model.rays(image_points)
+        return self.model.rays(_numbers(image_points, 2))
 
     def undistort(self, image_points: ArrayLike, to: InteriorOrientation | None = None) -> Array:
         """Return image points (n, 2) px as a camera without distortion would have seen them.
@@ -109,29 +110,32 @@ class Camera(Result):
         target = to or InteriorOrientation(self.interior.c)
         (x, y), pitch = self.sensor.centre, self.sensor.pixel_pitch
         scale, shift = target.c / pitch, (x + target.x0 / pitch, y - target.y0 / pitch)
-        return ideal_points(self.sensor, self.values, image_points, (scale, -scale), shift)
+        points = _numbers(image_points, 2)
+        return ideal_points(self.sensor, self.values, points, (scale, -scale), shift)
 
     def as_seen_by(self, image_points: ArrayLike, other: InteriorOrientation) -> Array:
-        """Image points (n, 2) px as this camera would have seen them with another IOP."""
-        seen = directions(self.sensor, self.values, image_points)
+        """Return image points (n, 2) px as this camera would have seen them with another IOP."""
+        seen = directions(self.sensor, self.values, _numbers(image_points, 2))
         return project(self.sensor, other.as_array(), np.zeros(6), seen)
 
     def point_covariance(self, image_points: ArrayLike) -> Array:
-        """Covariance (n, 2, 2) px² of where a fixed direction is seen, from this IOP's."""
-        seen = directions(self.sensor, self.values, image_points)
+        """Return the covariance (n, 2, 2) px² of a fixed direction's image point from the IOP's."""
+        seen = directions(self.sensor, self.values, _numbers(image_points, 2))
         J = partials(self.sensor, self.values, np.zeros(6), seen)[1][..., :10]
         result: Array = np.einsum("ncp,pq,ndq->ncd", J, self.covariance, J)
         return result
 
     def object_error(self, distance_mm: float, image_points: ArrayLike | None = None) -> Array:
-        """Return the standard deviation (n,) mm, in place, on a plane at a distance, that the
-        interior orientation's makes.
+        """Return the standard deviation (n,) mm of points on a plane at a distance.
 
-        image_points (n, 2) px: by default corners, edge middles and centre, row by row.
+        It is that from the interior orientation alone. image_points (n, 2) px: by default corners,
+        edge middles and centre, row by row.
 
         >>> tc.load_camera("camera.yaml").at(35.0).object_error(10_000.0).shape
         (9,)
         """
+        if not distance_mm > 0:
+            raise UsageError(f"distance_mm is {distance_mm}; it must be above 0")
         points = image_grid(self.sensor) if image_points is None else image_points
         covariance = self.point_covariance(points) * self.sensor.pixel_pitch**2
         variance = np.trace(covariance, axis1=1, axis2=2)
@@ -141,10 +145,10 @@ class Camera(Result):
     def resect(
         self, control: TestField, seen: Observations, snooping_alpha: float = 0.001
     ) -> Adjustment:
-        """Return the pose that control points give, with this camera as it is known.
+        """Return the pose of this camera from control points, with its covariance as prior.
 
         snooping_alpha: error probability of a single test for gross errors, 0 for none. The
-        covariance (16, 16) of the result joins camera and pose; its status says why there is none.
+        covariance (16, 16) of the result is joint; its status and reason explain a missing pose.
         """
         from thermocald.photogrammetry.epoch.measuring import resect
 
@@ -160,17 +164,18 @@ class Camera(Result):
         plane: Plane | Line,
         sigma: ArrayLike = 0.0,
     ) -> tuple[Array, Array]:
-        """Return where image points (n, 2) px lie on a plane or a line, (n, 3) mm.
+        """Return the places (n, 3) mm of image points (n, 2) px on a plane or a line.
 
-        pose: of `resect`; sigma px. Also returns their joint covariance (3n, 3n): of image points,
-        camera, pose and plane. Raises GeometryError for rays that miss it.
+        pose: from `resect`; sigma: of the image points, px. Also returns their joint covariance
+        (3n, 3n), from image points, camera, pose and plane. Raises GeometryError for rays that miss
+        it.
         """
         from thermocald.photogrammetry.epoch.measuring import place_on
 
         return place_on(self.sensor, pose.values, pose.covariance, image_points, sigma, plane)
 
     def object_distance(self, other: Camera, distance_mm: float) -> Array:
-        """Distances (9,) mm on a plane between where this and another state puts the grid."""
+        """Return the distances (9,) mm on a plane between the image grids of this and another."""
         grid = image_grid(self.sensor)
         ours, theirs = (ideal_points(s.sensor, s.values, grid) for s in (self, other))
         result: Array = distance_mm * np.linalg.norm(ours - theirs, axis=1)
@@ -179,7 +184,7 @@ class Camera(Result):
     def opencv(self) -> tuple[Array, Array]:
         """Return OpenCV's camera matrix (3, 3) px and distortion (5,): k1, k2, p1, p2, k3.
 
-        Exact but where the model has an affinity C1 or a shear C2: then it is a fit over the image
+        Exact unless the model has an affinity C1 or a shear C2: then it is a fit over the image
         area, whose residual the files of `write` state.
 
         >>> K, distortion = tc.load_camera("camera.yaml").at(35.0).opencv()
@@ -193,12 +198,12 @@ class Camera(Result):
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(found[4:])
 
     def write(self, path: Path | str, format: str = "", comment: str = "") -> str:  # noqa: A002
-        """Write the camera for another program; returns how exact the file is.
+        """Write the camera for another program; return how exact the file is.
 
-        format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json; by default what the
-        file's name says: `ros.yaml`, or a suffix that one format has (`.xml`, `.json`, …); comment:
-        a line for its head, by default the temperature. Raises UsageError where the name says none
-        or several, GeometryError for a model without rays.
+        format: opencv, ros, colmap, mrcal, kalibr, metashape, aicon, json; by default the one that
+        the file's name tells: `ros.yaml`, or a suffix of a single format (`.xml`, `.json`, …);
+        comment: a line for the file's head, by default the temperature. Raises UsageError if the
+        name tells no format, or several, GeometryError for a model without rays.
 
         >>> tc.load_camera("camera.yaml").at(35.0).write("ros.yaml")
         'exact: both models give the same pixels'
@@ -213,7 +218,7 @@ class Camera(Result):
         return camera_files.write(self.model, target, chosen, covariance, comment, self.name)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the interior orientation with `sd_` of each parameter, as documents have it."""
+        """Return the interior orientation with `sd_` of each parameter, as in JSON documents."""
         found = {
             "camera": self.name,
             "temperature": self.temperature,
@@ -225,7 +230,7 @@ class Camera(Result):
         return document
 
     def lines(self) -> list[str]:
-        """Return the camera in lines for people."""
+        """Return the camera as readable lines."""
         at = "" if np.isnan(self.temperature) else f" at {self.temperature:g} °C"
         return [self.name + at] + [
             f"  {name:>3} = {with_sd(value, self.sd[name], PARAMETER_UNITS[name])}"
@@ -234,7 +239,7 @@ class Camera(Result):
         ]
 
     def plot(self) -> Figure:
-        """Draw what the distortion does to a grid of image points, px."""
+        """Draw the distortion of a grid of image points, px."""
         figure, axes = new_figure(1, panel=(5.0, 3.75))
         axis = axes[0, 0]
         width, height = self.sensor.width, self.sensor.height
@@ -248,8 +253,19 @@ class Camera(Result):
         return figure
 
 
+def _numbers(given: ArrayLike, columns: int, name: str = "image points") -> Array:
+    """Return an array (..., columns) of numbers. Raises UsageError for anything else."""
+    try:
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.ndim == 0 or found.shape[-1] != columns:
+        raise UsageError(f"{name}: must be an array (n, {columns}) of numbers")
+    return found
+
+
 def _format_of(path: Path) -> str:
-    """The format that a file's name says; UsageError where it says none, or several."""
+    """Return the format that a file's name tells. Raises UsageError for none, or several."""
     from thermocald.photogrammetry import camera_files
 
     if path.stem in camera_files.FORMATS:
@@ -258,20 +274,20 @@ def _format_of(path: Path) -> str:
     fitting = [name for name, known in camera_files.FORMATS.items() if known.suffix == suffix]
     if len(fitting) != 1:
         there = ", ".join(fitting or camera_files.FORMATS)
-        raise UsageError(f"{path}: say which format it shall have, format=…: {there}")
+        raise UsageError(f"{path}: the name does not tell the format; give format=…: {there}")
     return fitting[0]
 
 
-_GRID = 25  # points a side
+_GRID = 25  # points per side
 _IN_PX = ("c", "x0", "y0")
 
 
 @dataclass(frozen=True, eq=False)
 class CameraDifference(Result):
-    """Second minus first camera.
+    """The difference of two cameras, second minus first.
 
-    names: of both, for people; first, second: cameras; covariances: of their interior orientations
-    (10, 10), None where one is not known.
+    names: of both, as printed; first, second: cameras; covariances: of their interior orientations
+    (10, 10), None if unknown.
     """
 
     names: tuple[str, str]
@@ -289,27 +305,27 @@ class CameraDifference(Result):
         if abs(a.pixel_pitch / b.pixel_pitch - 1.0) > 1e-9:
             raise ConfigurationError(
                 f"{self.names[0]} has pixels of {a.pixel_pitch:g} mm, {self.names[1]} of "
-                f"{b.pixel_pitch:g} mm: say --pixel-pitch where a file does not hold it"
+                f"{b.pixel_pitch:g} mm: give --pixel-pitch for a file that does not state it"
             )
 
     @property
     def has_sd(self) -> bool:
-        """Whether both cameras have a covariance."""
+        """True if both cameras have a covariance."""
         return all(c is not None for c in self.covariances)
 
     @cached_property
     def shifts(self) -> Array:
-        """By how much each direction of the grid is seen elsewhere, (n, 2) px."""
+        """The shifts (n, 2) px of the image points of the grid's directions."""
         return self._moved(self._directions)
 
     @property
     def rms_px(self) -> float:
-        """The root of the mean square of the shifts' lengths."""
+        """The RMS of the shifts' lengths, px."""
         return _rms(self.shifts)
 
     @cached_property
     def turned_shifts(self) -> Array:
-        """The same after the rotation that makes them smallest, (n, 2) px."""
+        """The shifts (n, 2) px after the rotation that minimises them."""
         from scipy.optimize import least_squares  # 20 MB that a live daemon does not need
         from scipy.spatial.transform import Rotation
 
@@ -320,7 +336,7 @@ class CameraDifference(Result):
         return np.asarray(best.fun).reshape(-1, 2)
 
     def as_dict(self) -> dict[str, Any]:
-        """The result as `--json` has it."""
+        """Return what `--json` writes."""
         a, b = self.first.interior.as_array(), self.second.interior.as_array()
         known = [np.diag(c) for c in self.covariances if c is not None]
         sds = np.sqrt(known[0] + known[1]) if self.has_sd else None
@@ -349,7 +365,7 @@ class CameraDifference(Result):
         return document
 
     def lines(self) -> list[str]:
-        """The result for people."""
+        """Return the difference as readable lines."""
         found = self.as_dict()
         pitch = self.first.sensor.pixel_pitch
         lines = [f"{self.names[1]} minus {self.names[0]}"]
@@ -377,7 +393,7 @@ class CameraDifference(Result):
         return lines
 
     def plot(self) -> Figure:
-        """Draw by how much each direction is seen elsewhere, enlarged, over the image."""
+        """Draw the shifts over the image, enlarged."""
         sensor = self.first.sensor
         figure, axes = new_figure(1, 1, (5.0, 5.0 * sensor.height / sensor.width))
         axis = axes[0, 0]
@@ -398,12 +414,12 @@ class CameraDifference(Result):
         return directions(self.first.sensor, self.first.interior.as_array(), self._grid)
 
     def _moved(self, seen: Array) -> Array:
-        """Where the second camera sees directions (n, 3), from where the first sees the grid's."""
+        """Return the second camera's image points of directions (n, 3), minus the grid, px."""
         values = self.second.interior.as_array()
         return project(self.second.sensor, values, np.zeros(6), seen) - self._grid
 
     def _image_sds(self, worst: int) -> tuple[float, float]:
-        """Standard deviations px of the largest shift's length, and of the RMS."""
+        """Return the standard deviations px of the largest shift's length and of the RMS."""
         along_shifts = self.shifts / np.linalg.norm(self.shifts, axis=1)[:, None].clip(1e-300)
         weights = self.shifts / (len(self.shifts) * max(self.rms_px, 1e-300))
         largest = rms = 0.0
@@ -420,5 +436,5 @@ class CameraDifference(Result):
 
 
 def _rms(shifts: Array) -> float:
-    """Root of the mean square of lengths (n, 2)."""
+    """Return the RMS length of shifts (n, 2)."""
     return float(np.sqrt(np.mean(np.sum(shifts**2, axis=1))))

@@ -1,4 +1,4 @@
-"""Photographs of a test field: measured, and calibrated together or oriented one by one."""
+"""Photographs of a test field: measurement, and joint calibration or single orientation."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ if TYPE_CHECKING:
 _IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp"})
 _ASSUMED_PITCH = 0.001
 
-_POOR = 4.0  # times the residuals of the usual photograph
+_POOR = 4.0  # times the residuals of a typical photograph
 _FEWEST_TO_COMPARE = 4  # photographs
-_ENOUGH_TARGETS = 20  # for residuals that a pose of its own does not take up
+_ENOUGH_TARGETS = 20  # for residuals that the photograph's own pose does not absorb
 
 
 @dataclass(frozen=True, eq=False)
 class PhotographResult:
-    """One photograph: status `ok` where it has a pose, and the reason where it has none.
+    """A photograph with its pose; without one, status is not `ok` and has a reason.
 
-    points (n, 2) px: its image points; residuals (n, 2) px, measured minus adjusted; used (n,):
-    which took part. Empty where there is no pose.
+    points (n, 2) px: its image points; residuals (n, 2) px: measured minus adjusted; used (n,):
+    points that took part; all three are empty without a pose.
     """
 
     JSON: ClassVar = {
@@ -75,18 +75,18 @@ class PhotographResult:
 
     @property
     def time(self) -> str | None:
-        """When it was taken, as its EXIF says."""
+        """The time in its EXIF data, or None."""
         taken = moment_taken(Path(self.path))
         return None if taken is None else taken.isoformat()
 
     @property
     def n_rejected(self) -> int:
-        """How many targets were rejected."""
+        """The number of rejected targets."""
         return len(self.rejected)
 
     @property
     def pose(self) -> dict[str, float] | None:
-        """Its exterior orientation with `sd_` of each parameter, as a document has it."""
+        """The exterior orientation with `sd_` of each parameter, as in JSON documents."""
         if self.exterior is None:
             return None
         return with_sds(EOP_NAMES, self.exterior.as_array(), self.exterior_sd)
@@ -96,8 +96,8 @@ class PhotographResult:
 class Photographs:
     """The camera and its photographs.
 
-    status `ok` where the interior orientation was estimated; estimated: False where `interior` is
-    what was given and held; covariance (16, 16).
+    status: `ok` if the interior orientation was estimated; estimated: False if `interior` was given
+    and held; covariance (16, 16).
     """
 
     JSON: ClassVar = {
@@ -116,12 +116,12 @@ class Photographs:
 
     @property
     def n_photographs(self) -> int:
-        """How many there are."""
+        """The number of photographs."""
         return len(self.photographs)
 
     @property
     def orientation(self) -> dict[str, float] | None:
-        """The interior orientation, with `sd_` of what was estimated, as a document has it."""
+        """The interior orientation with `sd_` of estimated parameters, as in JSON documents."""
         if self.interior is None:
             return None
         free, values = self._estimated, self.interior.as_array()
@@ -130,7 +130,7 @@ class Photographs:
 
     @property
     def correlations(self) -> dict[str, Any] | None:
-        """Correlations of what was estimated of the interior orientation."""
+        """The correlations of the estimated parameters of the interior orientation."""
         if self.interior is None or not self.estimated:
             return None
         free = self._estimated
@@ -139,7 +139,7 @@ class Photographs:
 
     @property
     def _estimated(self) -> NDArray[np.int64]:
-        """Which parameters of the interior orientation were estimated."""
+        """The indices of the estimated parameters of the interior orientation."""
         return np.flatnonzero((self.covariance.diagonal()[:10] > 0) & self.estimated)
 
 
@@ -154,7 +154,7 @@ def calibrate_photographs(
     settings: AdjustmentSettings,
     advance: Callable[[int], None] | None,
 ) -> Photographs:
-    """Measure and calibrate photographs; a file that is not an image has a status and a reason."""
+    """Measure and calibrate photographs; a file that is no image gets a status and a reason."""
     measured: list[Observations | None] = []
     failures: dict[int, tuple[str, str]] = {}
     copies = find_copies(paths)
@@ -185,7 +185,7 @@ def calibrate_observations(
     camera: CameraSpec,
     settings: AdjustmentSettings,
 ) -> Photographs:
-    """Calibrate image points; failures: {position: (status, reason)} known beforehand."""
+    """Calibrate from image points; failures: {position: (status, reason)} of unusable ones."""
     sensor, failures = camera.sensor, dict(failures)
     seen = {k: o for k, o in enumerate(measured) if o is not None}
     usable = {k: o for k, o in seen.items() if k not in failures}
@@ -210,7 +210,7 @@ def calibrate_observations(
             reason = str(error)
     poses: dict[int, tuple[Mask, Array, ExteriorOrientation | None, Array]] = {}
     if together is None or reason:
-        # the camera is held as it was given
+        # the given camera is held
         status, interior, estimated = "held", camera.interior, False
         if settings.free:
             status = "weak_geometry"
@@ -254,7 +254,7 @@ def calibrate_observations(
 def _first_camera(
     o: Observations, testfield: TestField, camera: CameraSpec, settings: AdjustmentSettings
 ) -> InteriorOrientation:
-    """Return the camera that one photograph gives, to start from."""
+    """Return an initial camera from one photograph."""
     nominal = camera.principal_distance
     first = cold_start(camera.sensor, testfield, o, settings, nominal, camera.interior)
     start = first.interior or camera.interior
@@ -262,7 +262,7 @@ def _first_camera(
         points = testfield.points[o.targets]
         start = approximate_orientation(camera.sensor, points, o.points, nominal)[0]
     if not first.ok and camera.interior is None:
-        # Distortion from a weak photograph would only mislead the others.
+        # distortion from a weak photograph is a bad initial value for the others
         start = start.with_values(A1=0.0, A2=0.0, A3=0.0, B1=0.0, B2=0.0, x0=0.0, y0=0.0)
     return start
 
@@ -271,7 +271,7 @@ def _adjust_together(
     usable: Mapping[int, Observations], testfield: TestField, sensor: Sensor,
     interior: InteriorOrientation, settings: AdjustmentSettings,
 ) -> tuple[list[int], CommonInterior]:  # fmt: skip
-    """Adjust the photographs whose targets a pose explains; return which, and the result."""
+    """Adjust the photographs whose targets fit a pose; return their positions and the result."""
     rows, poses, fitting = [], [], []
     for k, o in usable.items():
         with suppress(GeometryError):
@@ -305,17 +305,17 @@ def _poor_ones(
         if own / usual > _POOR:
             why = (
                 f"residuals of {np.sqrt(np.mean(residuals[k] ** 2)):.2f} px, {own / usual:.0f} "
-                "times those of the other photographs: moved while exposed, or a board that was "
-                "bent; left out"
+                "times those of the other photographs: the camera moved during the exposure, or "
+                "the board was bent; left out"
             )
             poor[k] = ("large_residuals", why)
     return poor
 
 
 def images_of(given: Sequence[Path]) -> list[Path]:
-    """List files as given, folders as the images that they hold, by name.
+    """List files as given, and the images of folders by name.
 
-    Raises UsageError where there is none, for a file that is not there, and for one given twice.
+    Raises UsageError if there is none, and for a file that does not exist or is given twice.
     """
     images: list[Path] = []
     for path in given:
@@ -336,8 +336,9 @@ def images_of(given: Sequence[Path]) -> list[Path]:
 
 
 def unknown_camera(images: Sequence[Path], pixel_pitch: float | None) -> CameraSpec:
-    """A camera of which no file says anything, its image size that of most photographs; without
-    its pitch a pixel counts as 1 µm.
+    """Return a camera for photographs without a camera file; pitch None stands for 1 µm.
+
+    Its image size is that of most photographs. Raises ImageError if none can be read.
     """
     errors: list[ImageError] = []
     sizes: Counter[tuple[int, ...]] = Counter()

@@ -1,12 +1,12 @@
-"""Many image points of one camera undistorted at once, and images resampled to another camera.
+"""Undistortion of many image points of one camera, and resampling of images to another camera.
 
 `camera_model.rays` is exact for any point and any number of cameras. For a million points of one
-camera this is several times faster and as exact: a polynomial turns the radial distortion round
-well enough that two Newton steps are left, in blocks that stay in the processor's cache. Blocks in
-which that does not converge to 1e-9 px are given to `rays`, which says so where no answer exists.
+camera this module is several times faster and as exact: a polynomial inverts the radial distortion
+so well that two Newton steps are enough, in blocks that stay in the processor's cache. Blocks that
+do not converge to 1e-9 px are passed to `rays`, which raises an error if there is no solution.
 
-Images are resampled from one interior orientation to another by maps of `cv2.remap`, whose shifts
-are computed at nodes and interpolated between them: 1e-4 px from those of every pixel.
+Images are resampled from one interior orientation to another with maps for `cv2.remap`, whose
+shifts are computed at nodes and interpolated: within 1e-4 px of those computed for every pixel.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def image_grid(sensor: Sensor, size: int = 3) -> Array:
-    """Image points (size², 2) px from corner to corner, row by row from the top."""
+    """Return image points (size², 2) px from corner to corner, row by row from the top."""
     x = np.linspace(0.0, sensor.width - 1.0, size)
     y = np.linspace(0.0, sensor.height - 1.0, size)
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -40,10 +40,10 @@ def ideal_points(
     sensor: Sensor, iop: ArrayLike, image_points: ArrayLike,
     scale: tuple[float, float] = (1.0, 1.0), shift: tuple[float, float] = (0.0, 0.0),
 ) -> Array:  # fmt: skip
-    """Image points (n, 2) px → x̄/c, ȳ/c (n, 2): tangents of the angles to the optical axis, scaled
-    and shifted.
+    """Return x̄/c, ȳ/c (n, 2) of image points (n, 2) px, multiplied by `scale` and shifted.
 
-    Raises GeometryError for points beyond the radius at which the distortion folds back.
+    They are the tangents of the angles to the optical axis. Raises GeometryError for points beyond
+    the radius at which the distortion folds back.
     """
     i, points = np.asarray(iop, dtype=float), np.asarray(image_points, dtype=float)
     out, inverse = np.empty_like(points), _inverse_radial(sensor, i)
@@ -60,13 +60,13 @@ def ideal_points(
 
 
 def directions(sensor: Sensor, iop: ArrayLike, image_points: ArrayLike) -> Array:
-    """Image points (n, 2) px → where they look, (n, 3) in the camera frame, 1 in front of it."""
+    """Return the directions (n, 3) of image points (n, 2) px in the camera frame, with z = -1."""
     ideal = ideal_points(sensor, iop, image_points)
     return np.column_stack([ideal, np.full(len(ideal), -1.0)])
 
 
 def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
-    """Coefficients of r̄ = r (1 + a₁ r² + …), highest first; None where the distortion folds."""
+    """Return coefficients of r̄ = r (1 + a₁ r² + …), highest first; None if the distortion folds."""
     corner = np.hypot(sensor.width, sensor.height) * sensor.pixel_pitch / 2
     r = np.linspace(0.0, 1.1 * corner, 80)[1:]
     r2 = r * r
@@ -83,7 +83,7 @@ def _inverse_radial(sensor: Sensor, i: Array) -> Array | None:
 def _newton(sensor: Sensor, i: Array, points: Array, inverse: Array) -> tuple[Array, Array] | None:
     c, x0, y0, A1, A2, A3, B1, B2, C1, C2 = (float(v) for v in i)
     (cx, cy), p = sensor.centre, sensor.pixel_pitch
-    # contiguous, and about the principal point
+    # contiguous coordinates relative to the principal point
     xm, ym = points[:, 0] - (cx + x0 / p), (cy - y0 / p) - points[:, 1]
     xm *= p
     ym *= p
@@ -133,14 +133,14 @@ def _newton(sensor: Sensor, i: Array, points: Array, inverse: Array) -> tuple[Ar
 
 _RENEWED_PX = 0.05
 _CELL = 8  # px between the nodes at which maps are computed
-_CHECKED = 5  # points per row and column that say whether the maps still hold
+_CHECKED = 5  # points per row and column at which the validity of maps is checked
 _STRIP = 32 * _CELL  # rows whose maps are in memory at a time
 
 
 class Maps:
-    """Maps from a camera to a steady one; kept as long as they hold.
+    """Maps from a camera to a steady one, reused as long as they are valid.
 
-    steady (10,): its interior orientation, at `to` °C.
+    steady (10,): interior orientation of the steady camera, at `to` °C.
     """
 
     def __init__(self, sensor: Sensor, steady: Array, to: float) -> None:
@@ -164,9 +164,9 @@ class Maps:
         return self._maps
 
     def resample(self, image: NDArray[Any], values: Array) -> NDArray[Any]:
-        """Return an image (H, W) or (H, W, 3) of a camera (10,) as the steady one had seen it.
+        """Resample an image (H, W) or (H, W, 3) of a camera (10,) to the steady camera.
 
-        Nothing is kept and little memory is taken; what the camera did not see is black.
+        No map is stored, and little memory is used; what the camera did not see is black.
         """
         import cv2
 
@@ -177,7 +177,7 @@ class Maps:
         return out
 
     def _shifts(self, values: Array) -> NDArray[np.float32]:
-        """At the nodes, px."""
+        """Return the shifts at the nodes, px."""
         moved = project(self.sensor, values, np.zeros(6), self._directions) - self._nodes
         shifts: NDArray[np.float32] = moved.astype(np.float32).reshape(*self._shape, 2)
         return shifts
@@ -185,7 +185,7 @@ class Maps:
     def _rows(
         self, shifts: NDArray[np.float32], top: int, bottom: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The maps of some rows; top: a multiple of the nodes' distance."""
+        """Return the maps of some rows; top: a multiple of the nodes' distance."""
         import cv2
 
         part = shifts[top // _CELL : -(-bottom // _CELL) + 2]

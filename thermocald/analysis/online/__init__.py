@@ -1,1 +1,1 @@
-"""What is known of a camera while it runs."""
+"""The state of a camera while it runs: filter, equilibrium, and the series in progress."""

@@ -1,8 +1,8 @@
-"""Whether a camera is warm: how fast it drifts, and when it will be steady.
+"""Thermal equilibrium of a camera: how fast it drifts, and when it will be steady.
 
-The interior orientation of a static camera, given its exterior orientation, is known to hundredths
-of a pixel in every epoch. Its drift per minute is the slope of the last minutes; the time to steady
-comes from an exponential approach, whose time constant is averaged over what the data allow.
+The interior orientation of a static camera, given its exterior orientation, is determined to
+hundredths of a pixel in every epoch. Its drift per minute is the slope over the last minutes; the
+time to steady comes from an exponential approach, averaged over the plausible time constants.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 State = Literal["unknown", "drifting", "ready"]
 
 _FEWEST = 8
-_WINDOW_S = 180.0  # the least past that the drift is taken from; up to four times as much where a
-# straight line describes it
+# the shortest past for the drift; up to four times as long if a straight line describes it
+_WINDOW_S = 180.0
 _STEADY = 0.05  # px/min below which the camera counts as steady
-_GROUP_S = 1.0  # epochs nearer to each other are averaged
+_GROUP_S = 1.0  # epochs closer to each other are averaged
 _TAUS = 60
 _NARROWINGS = 6
-_WEIGHTY = 9  # points of the grid that carry the weight
+_WEIGHTY = 9  # points of a fine enough grid that have a weight above 1 %
 _SETTLED_SD = 2.0
 _CURVED_SD = 3.0
 _WORST_MISFIT = 3.0
@@ -33,7 +33,7 @@ _WORST_MISFIT = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Equilibrium:
-    """drift, sd_drift: px/min of (c, x0, y0) together; ready_in, sd_ready_in: s, NaN if unknown."""
+    """A thermal state; drift px/min of (c, x0, y0) together, ready_in s, NaN if unknown."""
 
     state: State
     drift: float = float("nan")
@@ -43,7 +43,7 @@ class Equilibrium:
 
     @property
     def sentence(self) -> str:
-        """For a person."""
+        """The state as a sentence."""
         if self.state == "unknown":
             return "not known yet"
         if self.state == "ready":
@@ -56,7 +56,7 @@ class Equilibrium:
 
 
 def _two_digits(value: float, sd: float) -> str:
-    """`1.1085 ± 0.0015`: to the second digit of the standard deviation."""
+    """Format a value to the second digit of its standard deviation, as `1.1085 ± 0.0015`."""
     if not (np.isfinite(sd) and sd > 0):
         return f"{value:.3g}"
     decimals = int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))
@@ -64,9 +64,9 @@ def _two_digits(value: float, sd: float) -> str:
 
 
 def slope(times: Array, values: Array, sds: Array) -> tuple[Array, Array]:
-    """Weighted straight line through values (n, k) with sds (n, k): slopes (k,) and sds (k,) per s.
+    """Fit straight lines to values (n, k) with sds (n, k); return slopes (k,) and sds (k,) per s.
 
-    The sds are scaled up where the line does not fit within them, never down.
+    The sds are scaled up if the line does not fit within them, never down.
     """
     w = 1.0 / sds**2
     mean_t = (w * times[:, None]).sum(0) / w.sum(0)
@@ -83,11 +83,11 @@ def slope(times: Array, values: Array, sds: Array) -> tuple[Array, Array]:
 def fit_approach(
     times: Array, values: Array, sds: Array, bound: float
 ) -> tuple[float, float, float] | None:
-    """Fit a + b·exp(-t/tau) to values (n,) at times (n,) s; None if nothing approaches.
+    """Fit a + b·exp(-t/tau) to values (n,) at times (n,) s; return None if there is no approach.
 
-    bound: speed per s below which it counts as steady. Returns s from the last epoch until it is
-    steady, with its sd, and the misfit: reduced chi-square. tau runs over a grid from a few epochs
-    to ten times the span; every tau is weighted by its likelihood.
+    bound: speed per s below which the camera counts as steady. Returns the time in s from the last
+    epoch until it is steady, its sd, and the misfit: reduced chi-square. tau runs over a grid from
+    a few epochs to ten times the span; every tau is weighted by its likelihood.
     """
     span = float(times[-1] - times[0])
     step = span / (len(times) - 1)
@@ -95,7 +95,7 @@ def fit_approach(
     w = 1.0 / sds**2
     mean = float(w @ values / w.sum())
     for narrowing in range(_NARROWINGS):
-        # chi-square, time to steady s and its variance for every tau, a and b at their best
+        # chi-square, time to steady s and its variance for every tau, with the best a and b
         E = np.exp(-(times - times[0]) / taus[:, None])
         D = E - (E @ w / w.sum())[:, None]
         see = D**2 @ w
@@ -107,7 +107,7 @@ def fit_approach(
         factor = max(1.0, float(chi2.min()) / max(len(times) - 3, 1))
         weight = np.exp(-0.5 * (chi2 - chi2.min()) / factor)
         if narrowing == 0 and weight[-1] > 0.25:
-            return None  # as good as a straight line: no end in sight
+            return None  # a straight line fits as well: the end cannot be predicted
         if np.sum(weight > 0.01) >= _WEIGHTY:
             break
         best = int(weight.argmax())
@@ -119,26 +119,26 @@ def fit_approach(
 
 
 class EquilibriumWatch:
-    """Watches (c, x0, y0) in px over a sliding window.
+    """A sliding window over (c, x0, y0) in px.
 
-    Epochs that follow each other within a second are averaged: at 20 Hz the cost of an epoch is
-    that of one per second, and does not grow.
+    Epochs within a second are averaged, so that the cost of an epoch at 20 Hz is that of one per
+    second, and constant.
     """
 
     def __init__(self) -> None:
-        # of each second: when it began, epochs, sum of their times, and (3, 8) of their weights,
-        # of weights times values, and of weights times gains
+        # per second: its begin, the number of epochs, the sum of their times, and the sums (3, 8)
+        # of weights, of weights times values, and of weights times gains
         self._past: deque[tuple[float, int, float, Array]] = deque()
 
     def clear(self) -> None:
-        """Start again, after a knock."""
+        """Start again after a knock."""
         self._past.clear()
 
     def add(self, time: float, values: Array, gain: Array, sds: Array) -> None:
-        """Add (c, x0, y0) of an epoch as a function of the exterior orientation that one assumes.
+        """Add (c, x0, y0) of an epoch as a function of the assumed exterior orientation.
 
         time s; values (3,) px at the exterior orientation 0; gain (3, 6): px per unit of the
-        exterior orientation; sds (3,) px of the epoch's noise, NaN for what is not estimated.
+        exterior orientation; sds (3,) px of the epoch's noise, NaN for a parameter that is held.
         """
         sums = np.column_stack([np.ones(3), values, gain]) / sds[:, None] ** 2
         begin, count, total = time, 1, time
@@ -150,10 +150,10 @@ class EquilibriumWatch:
             self._past.popleft()
 
     def assess(self, exterior: Array) -> Equilibrium:
-        """How steady the camera is, given its exterior orientation (6,) as it is known now.
+        """Assess how steady the camera is, given the present exterior orientation (6,).
 
-        All of the past is seen from the same exterior orientation: what was known of it at each
-        epoch improves with time, and would look like drift.
+        The same exterior orientation is used for all epochs: its estimate improves with time, which
+        would look like drift.
         """
         if len(self._past) < _FEWEST:
             return Equilibrium("unknown")
@@ -165,7 +165,7 @@ class EquilibriumWatch:
         if not good.any():
             return Equilibrium("unknown")
         values, sds = values[:, good], sds[:, good]
-        # from the longest past that straight lines describe, else from the window
+        # over the longest past that straight lines describe, or else over the window
         pasts = [times >= times[-1] - windows * _WINDOW_S for windows in (4.0, 2.0, 1.0)]
         for past in pasts:
             recent = past.copy()
@@ -181,7 +181,7 @@ class EquilibriumWatch:
         if speed - _SETTLED_SD * sd_speed < _STEADY:
             return Equilibrium("unknown", speed, sd_speed)
         along, sd_along = values @ direction, np.sqrt((sds**2) @ direction**2)
-        # from the longest past that one exponential describes: heating may just have begun
+        # over the longest past that one exponential describes: heating may have begun just now
         for past in pasts:
             if past.sum() < _FEWEST:
                 break
@@ -195,7 +195,7 @@ class EquilibriumWatch:
 
 
 def _straight(times: Array, values: Array, sds: Array) -> bool:
-    """Whether a parabola finds no curvature, of any of the columns (n, k), beyond 2 sd."""
+    """Return whether a parabola shows no significant curvature in any of the columns (n, k)."""
     t = (times - times.mean()) / max(float(np.ptp(times)), 1e-9)
     A = np.stack([np.ones_like(t), t, t * t], axis=1) / sds.T[..., None]
     transposed = np.swapaxes(A, 1, 2)

@@ -1,20 +1,20 @@
 """The recursive estimate of one camera: a Schmidt-Kalman filter over IOP, EOP and a thermal model.
 
 The state is the orientation at T₀ and the rates of c, x0, y0 per kelvin; every epoch's adjustment
-adds its information, so that after an hour a static camera's exterior orientation is known far
-better than from any single epoch. What an epoch says beyond what was expected is its innovation;
-its chi-square shows a knock, a slip of the principal point, another lens.
+adds its information, so that after an hour a static camera's exterior orientation is far more
+precise than from any single epoch. The difference of an epoch from its prediction is its
+innovation; its chi-square shows a knock, a slip of the principal point, another lens.
 
 The errors of the test field are the same in all epochs. They are considered, not estimated: their
-covariance with the state is carried along, so that they cancel in the innovations and stay in the
+covariance with the state is propagated, so that they cancel in the innovations and remain in the
 standard deviations of the estimate. With the design matrices A (parameters) and B (coordinates),
-the weights W and Q = (AᵀWA)⁻¹ an epoch errs by G e + K d, where G = QAᵀW, K = GB, e the noise and d
-the errors of the coordinates. The level of the noise is measured from the differences between the
-residuals of consecutive epochs, in which the errors of the field cancel; sigma0 would mix in how
-well the field's standard deviations are stated.
+the weights W and Q = (AᵀWA)⁻¹, the error of an epoch is G e + K d, where G = QAᵀW, K = GB, e is the
+noise and d the errors of the coordinates. The level of the noise is measured from the differences
+between the residuals of consecutive epochs, in which the errors of the field cancel; sigma0 also
+depends on how well the field's standard deviations are stated.
 
-The thermometer's noise counts as noise of the epoch, and while the temperature changes the
-prediction is trusted less: the camera may lag.
+The thermometer's noise counts as noise of the epoch. While the temperature changes, the prediction
+has a larger variance: the camera may lag.
 
 Sources: Schmidt (1966), Application of state-space methods to navigation problems, Advances in
 Control Systems 3 (consider states); innovation test: Bar-Shalom, Li and Kirubarajan (2001),
@@ -44,16 +44,16 @@ if TYPE_CHECKING:
 
 _MEMORY = 50  # epochs over which the level of the noise is averaged
 _LEAST_DEGREES = 10.0
-_MOVED_PX = 30.0  # from here on the partials are others
-_OTHER_LENS = 0.02  # of c: another lens, and partials that correlate otherwise
-_LOWEST, _HIGHEST = 0.05, 20.0  # of the measured over the stated variance of an image point
+_MOVED_PX = 30.0  # a movement beyond it needs new partials
+_OTHER_LENS = 0.02  # relative change of c that means another lens, and needs new partials
+_LOWEST, _HIGHEST = 0.05, 20.0  # bounds of measured over stated variance of an image point
 
 
 class FieldErrors:
-    """Splits the covariance of consecutive epochs before one test field.
+    """The errors of consecutive epochs, split into noise and errors of the test field.
 
     variances (3 T,): of the targets' coordinates, mm²; level: measured over stated variance of the
-    image points, the first epoch's σ₀² until two are there.
+    image points, that is the first epoch's σ₀² until there are two epochs.
     """
 
     def __init__(self, sensor: Sensor, testfield: TestField) -> None:
@@ -69,13 +69,12 @@ class FieldErrors:
     def split(
         self, adjustment: Adjustment, observations: Observations, field_variance: float = 1.0
     ) -> tuple[Array, Array]:
-        """How the 16 parameters of an epoch that has a result err, from its own adjustment.
+        """Split the errors of the 16 parameters of an epoch with a result.
 
-        adjustment: of these observations; its covariance tells which parameters are free;
-        field_variance: by what the stated covariance of the coordinates is to be multiplied.
-        Returns noise (16, 16): covariance from the image points alone, zero where held, and
-        influence (16, 3 T): of the coordinates of all T targets, per mm, zero for targets that the
-        epoch did not use.
+        adjustment: of these observations; parameters with a variance are free; field_variance:
+        factor of the stated covariance of the coordinates. Returns noise (16, 16): covariance from
+        the image points alone, zero for held parameters, and influence (16, 3 T): of the
+        coordinates of all T targets, per mm, zero for targets that the epoch did not use.
         """
         free = np.flatnonzero(np.diag(adjustment.covariance) > 0)
         used = observations.select(~np.isin(observations.targets, adjustment.rejected))
@@ -93,7 +92,7 @@ class FieldErrors:
         influence[np.ix_(free, rows)] = np.einsum("nui,nik->unk", G, B)
         self._measure_level(adjustment, used, influence.reshape(16, -1)[free], noise, information)
         if not self._compared:
-            # One epoch alone: its own residuals, which hold the field's errors too.
+            # a single epoch: its own residuals, which contain the field's errors, too
             redundancy = 2 * len(used) - len(free)
             own = min(max(adjustment.sigma0**2, _LOWEST), _HIGHEST)
             self.level = own if redundancy >= _LEAST_DEGREES else max(own, 1.0)
@@ -102,10 +101,10 @@ class FieldErrors:
         return covariance, influence.reshape(16, -1)
 
     def _design(self, values: Array) -> tuple[Array, Array]:
-        """Partials of all targets, at one orientation while the camera stays about there.
+        """Return partials of all targets, at one orientation as long as the camera stays near it.
 
-        Partials of every epoch's own values would differ by its noise, and a filter would take
-        these differences for information on the field.
+        Partials at every epoch's own values would differ by its noise, and a filter would use these
+        differences as information on the field.
         """
         points = self._field.points
         at = self._linearised
@@ -127,10 +126,10 @@ class FieldErrors:
         noise: Array,
         information: Array,
     ) -> None:
-        """Compare the residuals with those of the epoch before.
+        """Update the level of the noise from the residuals of this epoch and the one before.
 
-        influence (u, 3 T), noise (u, u) of the free parameters; information (u, u): that of the
-        image points alone.
+        influence (u, 3 T), noise (u, u): of the free parameters; information (u, u): of the image
+        points alone.
         """
         residuals = np.full((len(self._field), 2), np.nan)
         residuals[adjustment.targets] = adjustment.residuals
@@ -141,13 +140,13 @@ class FieldErrors:
             return
         both = np.isfinite(before[0][:, 0]) & np.isfinite(whitened[:, 0])
         u = float(len(influence))
-        # The weights hold the field too: only without it the trace is the number of unknowns.
+        # the weights include the field: only without it the trace is the number of unknowns
         overlap = min(float(np.sum(noise * information)), u)
         degrees = 2.0 * np.count_nonzero(both) - 2.0 * u + overlap
         if degrees < _LEAST_DEGREES:
             return
         found = float(np.sum((whitened[both] - before[0][both]) ** 2))
-        # Other targets in view: the field's errors shift the parameters by something else.
+        # with other targets in view, the field's errors shift the parameters differently
         shift = influence - before[1]
         found -= float(np.sum((shift * self.variances @ shift.T) * information))
         found = min(max(found / (2.0 * degrees), _LOWEST), _HIGHEST)
@@ -156,7 +155,7 @@ class FieldErrors:
 
 
 def _blocks(covariance: Array) -> Array:
-    """Covariances (n, 3), elements xx, yy, xy, as matrices (n, 2, 2)."""
+    """Return covariances (n, 3), with elements xx, yy, xy, as matrices (n, 2, 2)."""
     xx, yy, xy = covariance.T
     out: Array = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
     return out
@@ -166,25 +165,26 @@ Change = Literal["", "outlier", "knock", "slip", "wrong_lens", "change"]
 
 _WARM = (0, 1, 2)  # c, x0, y0 follow the temperature
 _BLOCKS: dict[Change, tuple[int, ...]] = {"slip": _WARM, "knock": tuple(range(10, 16))}
-_FAR = 1e4  # prior sd of what is not known, in sd of the first epoch
-_TRUSTED, _DOUBTFUL = 4.0, 2.0  # a rise of temperature from here on, in sd of a reading
+_FAR = 1e4  # prior sd of an unknown parameter, in sds of the first epoch
+_TRUSTED, _DOUBTFUL = 4.0, 2.0  # a larger rise of temperature, in sds of a reading, is so
 _FEW_READINGS = 5
 _THERMOMETER_SD = 0.05  # K
 _WANDER_PX = 0.003  # of c, x0, y0 per √epoch beyond the thermal model
-_LAG = 0.5  # share of a change of temperature that may reach the camera later
+_LAG = 0.5  # fraction of a change of temperature that may reach the camera later
 _ALPHA = 1e-6  # error probability of one test
-_HISTORY, _FEWEST = 100, 10  # epochs that show how much a camera moves anyway
-_USUAL, _BEYOND = 0.9, 3.0  # quantile of their chi-squares, and times that to be an event
+_HISTORY, _FEWEST = 100, 10  # epochs that show how much a camera usually moves
+_USUAL, _BEYOND = 0.9, 3.0  # quantile of their chi-squares, and the multiple of it for an event
 _RATE_SD_PX = 5.0  # prior sd of the rates per kelvin
-_UNKNOWN_STEP = 0.3  # K from epoch to epoch where there is no thermometer
+_UNKNOWN_STEP = 0.3  # K from epoch to epoch without a thermometer
 
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """One epoch against the expectation: chi-square, its bound, degrees of freedom, and what it is.
+    """The innovation test of an epoch: chi-square, its bound, degrees of freedom, and the change.
 
-    change: "" if the epoch is as expected; "outlier" for a first surprise, which is not taken in;
-    a surprise that stays is a knock (EOP), a slip (x0, y0, c), another lens, or some change.
+    change: "" if the epoch is as predicted; "outlier" for a first contradiction, which the filter
+    does not use; one that persists is a knock (EOP), a slip (x0, y0, c), another lens, or some
+    other change.
     """
 
     chi2: float
@@ -194,9 +194,9 @@ class Innovation:
 
 
 def chi2_quantile(p: float, dof: int) -> float:
-    """The chi-square quantile at probability p (Wilson and Hilferty 1931), to 4 % for dof ≥ 6.
+    """Return the chi-square quantile at probability p, to 4 % for dof ≥ 6.
 
-    scipy.stats would cost the daemon 22 MB.
+    By Wilson and Hilferty (1931), as scipy.stats would cost the daemon 22 MB.
     """
     from statistics import NormalDist
 
@@ -206,11 +206,11 @@ def chi2_quantile(p: float, dof: int) -> float:
 
 
 class OnlineFilter:
-    """The estimate, epoch after epoch.
+    """The recursive estimate, updated epoch by epoch.
 
-    common_variances (m,): of errors that all epochs have in common, in the units of the influence
-    that `update` is given. Attributes: epochs taken in; T0, last_temperature °C. All in the units
-    of CONVENTIONS §2.
+    common_variances (m,): of errors that all epochs share, in the units of the influence that
+    `update` is given. Attributes: epochs, the number used; T0, last_temperature °C. All in the
+    units of CONVENTIONS §2.
     """
 
     def __init__(self, sensor: Sensor, common_variances: Array) -> None:
@@ -231,7 +231,7 @@ class OnlineFilter:
         n, sd = len(free), np.sqrt(np.diag(adjustment.covariance))[free]
         self._scale = np.concatenate([sd, np.full(3, self.sensor.pixel_pitch)])
         self._warm = np.flatnonzero(np.isin(free, _WARM))
-        # what the scaled rates (3,) change the scaled free parameters (n,) by, per kelvin
+        # change of the scaled free parameters (n,) by the scaled rates (3,), per kelvin
         self._by_rate = np.zeros((n, 3))
         for k in self._warm:
             self._by_rate[k, free[k]] = self._scale[n + free[k]] / self._scale[k]
@@ -239,7 +239,7 @@ class OnlineFilter:
         self._P = np.zeros((n + 3, n + 3))
         self._P[:n, :n] = R + K * self._common @ K.T
         self._P[n:, n:] = np.eye(3) * _RATE_SD_PX**2
-        # Truth minus estimate against the common errors: what they did to the first epoch.
+        # covariance of truth minus estimate with the common errors, from the first epoch
         self._C = np.zeros((n + 3, len(self._common)))
         self._C[:n] = -K * self._common
         self._x = np.zeros(n + 3)
@@ -252,11 +252,11 @@ class OnlineFilter:
         self, adjustment: Adjustment, temperature: float, errors: tuple[Array, Array],
         tremble: Array | None = None,
     ) -> Innovation:  # fmt: skip
-        """Take an epoch in that has a result.
+        """Update the estimate with an epoch that has a result.
 
-        temperature: °C at the frame, NaN where it is not known: the last one then still holds;
-        errors: noise (16, 16) and common errors of the epoch, as of `FieldErrors.split`; tremble
-        (6, 6): covariance of the mount's movements about its mean, of the epochs so far.
+        temperature: °C at the frame; for NaN the last one is used; errors: noise (16, 16) and
+        influence of the common errors, from `FieldErrors.split`; tremble (6, 6): covariance of the
+        mount's movements about its mean, from the epochs so far.
         """
         free = np.flatnonzero(np.diag(adjustment.covariance) > 0)
         if not self.epochs or not np.array_equal(free, self._free):
@@ -279,7 +279,7 @@ class OnlineFilter:
         common = K * self._common
 
         def covariances() -> tuple[Array, Array]:
-            """Of the innovation (n, n), and of the state with it (n + 3, n)."""
+            """Return the covariances of the innovation (n, n), and of the state with it."""
             cross = self._P @ H.T + self._C @ K.T
             S: Array = H @ cross + K @ self._C.T @ H.T + common @ K.T + R
             return 0.5 * (S + S.T), cross
@@ -288,8 +288,8 @@ class OnlineFilter:
         chi2 = float(v @ np.linalg.solve(S, v))
         bound = chi2_quantile(1.0 - _ALPHA, n)
         if len(self._history) >= _FEWEST:
-            # A mount in the wind sways by more than the normal distribution has: what it did in a
-            # tenth of the epochs is nothing to report.
+            # a mount in the wind does not move normally: movements of a size that a tenth of the
+            # epochs show are no event
             bound = max(bound, _BEYOND * float(np.quantile(self._history, _USUAL)))
         self._history.append(chi2)
         change: Change = ""
@@ -298,7 +298,7 @@ class OnlineFilter:
             if self._surprised < 2:
                 return Innovation(chi2, bound, n, "outlier")
             change = self._name(adjustment, v, S)
-            # what the change has made untrue is forgotten
+            # parameters that the change may concern become unknown
             block = _BLOCKS.get(change, tuple(range(16)))
             rows = np.flatnonzero(np.isin(self._free, block))
             self._P[rows, rows] += _FAR**2
@@ -306,7 +306,7 @@ class OnlineFilter:
         self._surprised = 0
         gain: Array = np.asarray(np.linalg.solve(S, cross.T).T, dtype=np.float64)
         self._x = self._x + gain @ v
-        # Joseph's form, which stays positive where a change has opened the state
+        # Joseph's form stays positive definite even with the large variances after a change
         left = np.eye(len(self._x)) - gain @ H
         mixed = left @ self._C @ (gain @ K).T
         P = left @ self._P @ left.T - mixed - mixed.T + gain @ (common @ K.T + R) @ gain.T
@@ -314,31 +314,31 @@ class OnlineFilter:
         self._C = left @ self._C - gain @ common
         self.epochs += 1
         if tremble is not None:
-            # a knock is not judged by a movement that it is part of
+            # only now: the estimate of the movements already contains a knock in this epoch
             self._tremble = tremble
         return Innovation(chi2, bound, n, change)
 
     @property
     def rates(self) -> Array:
-        """Rates of c, x0, y0 mm/K."""
+        """Rates (3,) of c, x0, y0, mm/K."""
         result: Array = (self._x * self._scale)[len(self._free) :]
         return result
 
     @property
     def rates_covariance(self) -> Array:
-        """(3, 3) of `rates`, mm²/K²."""
+        """Covariance (3, 3) of `rates`, mm²/K²."""
         n = len(self._free)
         result: Array = self._P[n:, n:] * np.outer(self._scale[n:], self._scale[n:])
         return result
 
     def values(self) -> Array:
-        """(16,) the orientation at the last temperature; what is held keeps its value."""
+        """Return the orientation (16,) at the last temperature, with held parameters."""
         out = self._held.copy()
         out[self._free] += self._H() @ self._x * self._scale[: len(self._free)]
         return out
 
     def covariance(self) -> Array:
-        """(16, 16) of `values`, errors of the test field included; zero where held."""
+        """Return the covariance (16, 16) of `values`, test field included; zero if held."""
         H = self._H()
         s = self._scale[: len(self._free)]
         out = np.zeros((16, 16))
@@ -346,10 +346,10 @@ class OnlineFilter:
         return out
 
     def _read(self, temperature: float) -> None:
-        """The rise of temperature above T₀, 0 where the readings' noise explains it.
+        """Update the rise of temperature above T₀, which is 0 if the readings' noise explains it.
 
-        A camera at one temperature stays as it is whatever its rates: were the noise of the
-        readings taken for changes, unknown rates would hide every knock, and seem to be zero.
+        A camera at a constant temperature does not change, whatever its rates. If noise of the
+        readings counted as changes, unknown rates would hide every knock and be estimated as zero.
         """
         if np.isnan(self.T0):
             self.T0, self._readings = temperature, 1
@@ -368,7 +368,7 @@ class OnlineFilter:
             self.T0 += (temperature - self.T0) / self._readings
 
     def _scaled(self, errors: tuple[Array, Array]) -> tuple[Array, Array]:
-        """Noise (n, n) and influence (n, m) of the scaled free parameters."""
+        """Return noise (n, n) and influence (n, m) of the scaled free parameters."""
         s = self._scale[: len(self._free)]
         noise = errors[0].copy()
         noise[EOP, EOP] += self._tremble
@@ -377,14 +377,14 @@ class OnlineFilter:
         )
 
     def _H(self) -> Array:
-        """Scaled state → scaled free parameters, at the last temperature."""
+        """Return the matrix from scaled state to scaled free parameters at the last temperature."""
         return np.hstack([np.eye(len(self._free)), self._rise * self._by_rate])
 
     def _rate_moment(self) -> Array:
-        """E[r rᵀ] of the rates r as a column of scaled free parameters per kelvin, (n, n).
+        """Return E[r rᵀ] (n, n) of the rates r, in scaled free parameters per kelvin.
 
-        With the rates' own covariance in it: while they are unknown, a noisy thermometer must not
-        seem to determine them.
+        It includes the rates' own covariance: a noisy thermometer must not seem to determine rates
+        that are still unknown.
         """
         n = len(self._free)
         moment = np.outer(self._x[n:], self._x[n:]) + self._P[n:, n:]
@@ -392,7 +392,7 @@ class OnlineFilter:
         return result
 
     def _name(self, adjustment: Adjustment, v: Array, S: Array) -> Change:
-        """Which parameters, freed alone, explain the innovation."""
+        """Name the change by the parameters that explain the innovation if only they are free."""
         c = PARAMETER_NAMES.index("c")
         was = self.values()[c]
         if abs(adjustment.values[c] - was) > _OTHER_LENS * was:
@@ -407,5 +407,5 @@ class OnlineFilter:
             bound = chi2_quantile(1.0 - _ALPHA, max(1, len(v) - A.shape[1]))
             left[name] = float(rest @ weight @ rest) / bound
         best = min(left, key=lambda name: left[name])
-        # x0, y0 and the tilt are nearly the same thing: what explains, not what explains alone
+        # x0, y0 and the tilt are highly correlated: both may explain it, so the better one counts
         return best if left[best] < 1.0 or left[best] < 0.1 * max(left.values()) else "change"

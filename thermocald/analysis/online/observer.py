@@ -1,4 +1,4 @@
-"""What is reported about a camera while it runs: filter, innovation test, equilibrium."""
+"""Monitoring of a running camera: filter, innovation test, equilibrium."""
 
 from __future__ import annotations
 
@@ -27,17 +27,19 @@ _MOVED_AFTER = 5  # epochs in a row
 _SENTENCES = {
     "knock": "the camera was moved: its exterior orientation changed between two epochs",
     "slip": "the principal point or distance jumped: lens or sensor slipped",
-    "wrong_lens": "the principal distance is another one: another lens, or refocused",
+    "wrong_lens": "the principal distance is a different one: another lens, or refocused",
     "change": "the orientation changed in a way that is neither a knock nor a slip",
 }
 
 
-def given_exterior(values: Array, covariance: Array, unit: float) -> tuple[Array, Array, Array]:
-    """(c, x0, y0) of an epoch, to be seen from any exterior orientation.
+def condition_on_exterior(
+    values: Array, covariance: Array, unit: float
+) -> tuple[Array, Array, Array]:
+    """Condition (c, x0, y0) of an epoch on its exterior orientation.
 
-    values (16,), covariance (16, 16) of the epoch's noise; unit: mm that count as one, the pixel
+    values (16,), covariance (16, 16) of the epoch's noise; unit: of the results in mm, the pixel
     pitch. Returns values (3,), gain (3, 6) and sds (3,) as `EquilibriumWatch.add` takes them.
-    Errors of the test field are in both orientations alike and cancel.
+    Errors of the test field are the same in both orientations and cancel.
     """
     block = covariance[10:, 10:]
     cross = covariance[_IOP, 10:]
@@ -52,9 +54,9 @@ def given_exterior(values: Array, covariance: Array, unit: float) -> tuple[Array
 
 
 class OnlineObserver:
-    """Receives every calibrated epoch, in order.
+    """An observer of a running camera, which receives every calibrated epoch in order.
 
-    tell(kind, text, utc, epoch): called on a knock, a slip, another lens, a moved target.
+    tell(kind, text, utc, epoch): called for a knock, a slip, another lens, a moved target.
     """
 
     def __init__(
@@ -77,11 +79,11 @@ class OnlineObserver:
         self, calibrated: CalibratedEpoch, adjusted: Adjustment | None = None,
         tremble: Array | None = None, field_variance: float = 1.0,
     ) -> dict[str, float]:  # fmt: skip
-        """Take an epoch in; returns columns for the store.
+        """Observe an epoch; return columns for the store.
 
-        adjusted: its result given its series, by default that of the epoch by itself; tremble
-        (6, 6): covariance of the mount's movements about its mean, as the epochs up to this one
-        show it; field_variance: by what the stated covariance of the field is to be multiplied.
+        adjusted: the epoch's result within its series, by default its own result; tremble (6, 6):
+        covariance of the mount's movements about its mean, estimated from the epochs so far;
+        field_variance: factor of the stated covariance of the field.
         """
         epoch, adjustment = calibrated.epoch, adjusted or calibrated.adjustment
         temperature = next(iter(epoch.temperatures.values()), math.nan)
@@ -95,7 +97,7 @@ class OnlineObserver:
             self._tell(event, _SENTENCES[event], epoch.frame_time, epoch.number)
             self.watch.clear()
         if innovation.change != "outlier":
-            given = given_exterior(adjustment.values, errors[0], self._pitch)
+            given = condition_on_exterior(adjustment.values, errors[0], self._pitch)
             self.watch.add(epoch.frame_time, *given)
         self._equilibrium = self.watch.assess(self.filter.values()[10:])
         columns = {
@@ -113,7 +115,7 @@ class OnlineObserver:
         return columns
 
     def report(self) -> dict[str, Any]:
-        """For status and page: state, drift, time to steady, the estimate with its sds."""
+        """Return state, drift, time to steady and the estimates with sds, for status and page."""
         now = self._equilibrium
         report: dict[str, Any] = {
             "state": now.state,
@@ -135,9 +137,9 @@ class OnlineObserver:
         return report
 
     def _watch_targets(self, calibrated: CalibratedEpoch, adjusted: Adjustment) -> None:
-        """A target that is rejected again and again has moved, or its coordinates are wrong.
+        """Report a target that is rejected in several epochs in a row.
 
-        Of the epoch by itself, and not taken back by what its series knows of the field.
+        The epoch's own adjustment must reject it, and that in the series must not use it.
         """
         taken = np.isfinite(adjusted.residuals).all(axis=1)
         used = set(adjusted.targets[taken].tolist()) - set(adjusted.rejected)
@@ -153,5 +155,8 @@ class OnlineObserver:
             if self._rejected[row] >= _MOVED_AFTER:
                 self._reported.add(row)
                 name = self._field.names[row]
-                text = f"target {name} contradicts the others for {_MOVED_AFTER} epochs: it moved"
+                text = (
+                    f"target {name} has contradicted the others for {_MOVED_AFTER} epochs: it "
+                    "moved, or its coordinates are wrong"
+                )
                 self._tell("target_moved", text, epoch.frame_time, epoch.number)

@@ -1,16 +1,16 @@
-"""The series that is being taken: the estimator of `replay`, fed epoch by epoch.
+"""A series in progress: the estimator of `replay`, given one epoch after the other.
 
-Every epoch has a result of its own, with an exterior orientation of its own. What the epochs so far
-say of the targets is taken off it: where they are off, how well each is measured, which ones
-wander. Next to it stands the epoch's result in its series, as `replay` of the epochs so far finds
-it: one orientation for all of them, or one and the movements of the mount.
+Every epoch has a result of its own, with its own exterior orientation. It is corrected by what the
+epochs so far show of the targets: their offsets, how precisely each is measured, which ones wander.
+In addition the epoch has a result within its series, the same as `replay` of the epochs so far: one
+orientation for all of them, or one and the movements of the mount.
 
-The last epochs are kept and adjusted together again: after each of the first 120 where there is
-time, and at last after half as many as are kept. From then on an epoch costs the same and the
-memory stays the same however long the series is. What all epochs have in common (the level) follows
-from which targets are seen and which are rejected, and may be far less sure than a difference of
-two epochs. An epoch's own result is therefore carried to the level of the first one: the correction
-is what the epochs that are kept have changed by since they were reported.
+The last epochs are stored and adjusted together again: after each of the first 120 if there is
+time, and finally after half as many as are stored. From then on time per epoch and memory are
+constant, however long the series. What all epochs share (the level) depends on which targets are
+seen and rejected, and may be far less certain than the difference of two epochs. An epoch's own
+result is therefore reduced to the level of the first one: the correction is the change of the
+stored epochs' results since they were reported.
 """
 
 from __future__ import annotations
@@ -50,28 +50,30 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.series.field_motion import FieldMovement
     from thermocald.photogrammetry.series.result import Exterior, SeriesAdjustment
 
-_WINDOW = 200  # epochs that are kept
-_WINDOW_POINTS = 60_000  # image points of them: 2.4 MB
-_FEWEST = 101  # of them before a field of many targets
-_EACH = 120  # epochs, after each of which the series is adjusted again where there is time
-_OFTEN, _SELDOM = 0.1, 0.5  # shares of new epochs after which that is done otherwise
-_SOON = 0.05  # share for the series, whose own level moves with it, where there is time
-_MOST_TARGETS = 400  # seen in a series: the normal matrix of their offsets is a full one
-_TURNED_PX, _STAYS = 30.0, 2  # beyond one linearisation, and for so many epochs in a row
-_USUAL_TREMBLE_PX = 0.08  # the most that mounts of the real cameras do that were looked at
-_LEFT = 0.01  # of the error probability of the series' test of a point, for a second one
-_AGAINST = ("too_many_rejected", "global_test")  # what a series says of an epoch it contradicts
-_CARRIED = ("weak_geometry", "global_test")  # of epochs by themselves that a series may carry
-_MOST_SAID = 6  # targets by name
-_DOUBTED = 5  # epochs in a row that carry a result of their own and have none in the series
+_WINDOW = 200  # epochs that are held in memory
+_WINDOW_POINTS = 60_000  # image points of these epochs: 2.4 MB
+_FEWEST = 101  # epochs that are held even with many targets
+_EACH = 120  # first epochs, after each of which the series is adjusted again if there is time
+_OFTEN, _SELDOM = 0.1, 0.5  # fraction of new epochs after which it is adjusted again otherwise
+_SOON = 0.05  # the fraction for the series, whose level changes with it, if there is time
+_MOST_TARGETS = 400  # with offsets: their normal matrix is full
+_TURNED_PX, _STAYS = 30.0, 2  # beyond the linearisation, for so many epochs in a row
+_USUAL_TREMBLE_PX = 0.08  # the largest of the real cameras' mounts that were examined
+_LEFT = 0.01  # a second test of a point has this fraction of the series' error probability
+_AGAINST = ("too_many_rejected", "global_test")  # statuses of an epoch that contradicts its series
+_CARRIED = ("weak_geometry", "global_test")  # statuses of an epoch that its series may carry
+_MOST_SAID = 6  # targets that are named
+_DOUBTED = 5  # epochs in a row with a result of their own and none in the series
 
 _ESTIMATED = PARAMETER_NAMES[PRINCIPAL]
 
 
 @dataclass(eq=False)
 class _Kept:
-    """An epoch that is kept: observations on the grid, number, time s, temperature °C, the values
-    (16,) of its adjustment by itself and those reported, None where these are the same.
+    """A stored epoch.
+
+    grid: its observations; time s; temperature °C; alone (16,): its own values; reported (16,):
+    those that were reported, None if the same.
     """
 
     grid: ObservationGrid
@@ -84,8 +86,9 @@ class _Kept:
 
 @dataclass(frozen=True, eq=False)
 class _Epoch:
-    """One epoch in a series: status and reason, values (16,), covariance (16, 16) relative to the
-    series, sigma0, redundancy, rejected (T,), residuals (T, 2) px.
+    """An epoch's result in a series.
+
+    values (16,), covariance (16, 16) relative to the series, rejected (T,), residuals (T, 2) px.
     """
 
     status: str
@@ -100,9 +103,9 @@ class _Epoch:
 
 @dataclass(eq=False)
 class _Together:
-    """The kept epochs adjusted together.
+    """The joint adjustment of the stored epochs.
 
-    seen (t,): targets of the field that take part; moved: what of the field did.
+    seen (t,): targets of the field that take part; moved: movements of the field.
     """
 
     seen: Index
@@ -113,16 +116,16 @@ class _Together:
 
     @cached_property
     def known(self) -> KnownSeries:
-        """What they say of further epochs."""
+        """The part of the adjustment that applies to later epochs."""
         return KnownSeries.of(self.series, self.estimate, self.sample)
 
     @property
     def image_px(self) -> float:
-        """How far the mount moves in the image."""
+        """The size of the mount's movements in the image, px."""
         return image_px(self.sample.movement.covariance, self.estimate.system.design.at.A)
 
     def epoch(self, row: int, s: SeriesAdjustment | None = None) -> _Epoch:
-        """Return one of the epochs, or of a series whose epochs came later."""
+        """Return the result of one of the epochs, or of one of another series `s`."""
         s = s or self.sample
         return _Epoch(
             s.status[row], s.reasons[row], s.values[row], s.covariance[row], float(s.sigma0[row]),
@@ -130,7 +133,7 @@ class _Together:
         )  # fmt: skip
 
     def further(self, grid: ObservationGrid, epochs: int) -> _Epoch:
-        """Adjust an epoch that came later with what is known of its series."""
+        """Adjust a later epoch, given its series."""
         if self.moved:
             grid = taken_off(grid, self.moved, slice(-1, None))
         seen = grid.targets(self.seen)
@@ -139,10 +142,10 @@ class _Together:
 
 
 class RunningSeries:
-    """The epochs of one series as they come, in any order, one thread at a time.
+    """A series in progress, whose epochs may arrive in any order; not thread-safe.
 
-    exterior: as of `SeriesSettings`; offsets: one offset per target, with the test field's sigmas
-    as prior. epochs: how many were taken in since the start or the last reset.
+    exterior: as in `SeriesSettings`; offsets: estimate one offset per target, with the test field's
+    sigmas as prior. epochs: the number taken in since the start or the last reset.
     """
 
     def __init__(
@@ -163,7 +166,7 @@ class RunningSeries:
         self.reset()
 
     def reset(self, after: int = 0) -> None:
-        """Forget all: the epochs to come are another series; after: which epoch says so."""
+        """Start a new series; after: the epoch because of which it is started."""
         self.epochs, self._restarted = 0, after
         self._look_at = [0, 0]
         self._period, self._offsets = 0.0, False
@@ -176,9 +179,9 @@ class RunningSeries:
 
     @property
     def tremble(self) -> Array:
-        """Covariance (6, 6) of the exterior orientation by which the mount moves about its mean.
+        """Covariance (6, 6) of the mount's movements about its mean exterior orientation.
 
-        As long as the epochs do not show it, what mounts of cameras usually do.
+        A typical one until the epochs show it.
         """
         s = None if self._series is None else self._series.sample
         if s is not None and s.exterior != "per_epoch":
@@ -191,19 +194,19 @@ class RunningSeries:
 
     @property
     def field_variance(self) -> float:
-        """By what the stated covariance of the field's coordinates is to be multiplied."""
+        """The estimated factor of the stated covariance of the field's coordinates."""
         return 1.0 if self._series is None else self._series.series.field_variance
 
     @property
     def any(self) -> bool:
-        """Whether there is something that epochs share, and something of their own beside it."""
+        """True if epochs have both common parameters and parameters of their own."""
         s = self._asked
         return len(s.free) > 0 and (s.exterior != "per_epoch" or s.target_offsets)
 
     def remember(
         self, calibrated: CalibratedEpoch, seen: Observations, reported: Array | None = None
     ) -> None:
-        """Take an epoch in; reported (16,): of one from before the program was started again."""
+        """Store an epoch; reported (16,): its values, if they were reported before a restart."""
         epoch = calibrated.epoch
         self.epochs += 1
         self._kept.append(
@@ -220,10 +223,11 @@ class RunningSeries:
     def refine(
         self, calibrated: CalibratedEpoch, seen: Observations, *, hurried: bool = False
     ) -> tuple[Adjustment, dict[str, float]]:
-        """An epoch's own result given the epochs so far, and its result in the series as columns.
+        """Return an epoch's own result given the epochs so far, and its result in the series.
 
-        calibrated: the epoch by itself, which is returned as it is where it has no result; seen:
-        its observations with the sigmas with which they are adjusted; hurried: others wait.
+        The latter as columns for the store. calibrated: the epoch's own calibration, whose result
+        is returned unchanged if it failed; seen: its observations with the sigmas that are used;
+        hurried: whether further epochs are waiting.
         """
         alone = calibrated.adjustment
         carried = alone.status in _CARRIED and alone.interior is not None
@@ -240,10 +244,10 @@ class RunningSeries:
         self._away = 0
         self.remember(calibrated, seen)
         if alone.status == "global_test" and len(self._kept) < FEW_EPOCHS:
-            return alone, columns  # too few show whether the noise is larger than stated
-        own, whole = self._adjusted()
+            return alone, columns  # too few to show whether the noise is larger than stated
+        own, whole = self._adjust_newest()
         columns |= self._columns(whole)
-        if not carried:  # what is weak contradicts nothing
+        if not carried:  # what is carried contradicts nothing
             against = any(e is not None and e.status in _AGAINST for e in (own, whole))
             self._doubts = self._doubts + 1 if against else 0
         refined = alone
@@ -251,7 +255,7 @@ class RunningSeries:
             values = own.values - self._level
             self._kept[-1].reported = values
         elif carried and whole.status == "ok" and self._series is not None:
-            # too weak by itself, carried by its series: with what the series' level is sure to
+            # too weak by itself: its result in the series, plus the uncertainty of the level
             values, level = whole.values, np.diag(self._series.sample.level_sd**2)
             own = replace(whole, covariance=whole.covariance + level)
         else:
@@ -276,32 +280,32 @@ class RunningSeries:
         return refined, columns
 
     def report(self) -> dict[str, Any]:
-        """For status and page: how the camera's orientation is taken, and on how many epochs."""
+        """Return how the exterior orientation is modelled and on how many epochs, for status."""
         if self._series is None:
             return {}
         series, n, asked = self._series, len(self._kept), self._asked.exterior
         if series.sample.exterior == "mount":
-            said = f"the mount moves by {series.image_px:.3f} px about one orientation ({n} epochs)"
+            text = f"the mount moves by {series.image_px:.3f} px about one orientation ({n} epochs)"
         elif series.sample.exterior == "series":
             still = "the camera stands still" if asked == "auto" else "as configured"
-            said = f"{still}: one orientation for {n} epochs"
+            text = f"{still}: one orientation for {n} epochs"
         elif asked == "auto":
             good = int(series.estimate.system.good.sum())
-            said = (
+            text = (
                 f"each epoch has its own orientation until {FEWEST_EPOCHS} good epochs show "
                 f"whether the camera stands still; {good} so far"
             )
         else:
-            said = "each epoch has its own orientation, as configured"
+            text = "each epoch has its own orientation, as configured"
         if self._wrong.any():
             names = [self._field.names[t] for t in np.flatnonzero(self._wrong)[:_MOST_SAID]]
-            said += f"; left out, seen elsewhere than the test field says: {', '.join(names)}"
+            text += f"; left out as misplaced in the test field: {', '.join(names)}"
         if self._restarted:
-            said += f"; begun again after epoch {self._restarted}"
-        return {"orientation": said, "exterior": series.sample.exterior, "series_epochs": n}
+            text += f"; begun again after epoch {self._restarted}"
+        return {"orientation": text, "exterior": series.sample.exterior, "series_epochs": n}
 
     def _columns(self, whole: _Epoch) -> dict[str, float]:
-        """The epoch's result in its series, as columns for the store."""
+        """Return an epoch's result in its series as columns for the store."""
         if self._series is None or whole.status != "ok":
             return {}
         sd, level = np.sqrt(np.diag(whole.covariance)), self._series.sample.level_sd
@@ -316,9 +320,7 @@ class RunningSeries:
         return columns
 
     def _elsewhere(self, alone: Adjustment) -> bool:
-        """Whether the camera sees its targets elsewhere than in the last epoch: it was turned, by
-        far more than a knock that the movements of a mount take up.
-        """
+        """Return whether the targets have moved further in the image than a mount can move them."""
         if not self._kept:
             return False
         points = self._field.points[alone.targets]
@@ -328,25 +330,23 @@ class RunningSeries:
         )
         return bool(np.median(np.abs(here - there)) > _TURNED_PX)
 
-    def _adjusted(self) -> tuple[_Epoch | None, _Epoch]:
-        """The last epoch's own result, None where epochs share nothing that changes it, and that
-        in the series.
-        """
+    def _adjust_newest(self) -> tuple[_Epoch | None, _Epoch]:
+        """Return the newest epoch's own result, None if unchanged, and that in its series."""
         whole, newest = None, self._without_wrong(self._kept[-1].grid)
-        more = (newest.observed[0] & ~self._shown).any()  # targets that none of the others showed
+        more = (newest.observed[0] & ~self._shown).any()  # targets that no earlier epoch showed
         if self._series is not None and not more and self.epochs < self._look_at[1]:
             whole = self._series.further(newest, len(self._kept))
         if whole is None or whole.status in _AGAINST:
-            row = self._look()
+            row = self._adjust_all()
             assert self._series is not None
             whole = self._series.epoch(row)
             if not self._offsets:
                 return None, whole
-            if self._each is None and (last := self._own_looks()[0]) < self.epochs:
-                self._each = self._look_at_each(last)  # the program was started again
+            if self._each is None and (last := self._own_schedule()[0]) < self.epochs:
+                self._each = self._adjust_each(last)  # after a restart of the program
             due = self._each is None or self.epochs >= self._look_at[0]
             if due or whole.status in _AGAINST:
-                self._each = self._look_at_each()
+                self._each = self._adjust_each()
                 own = self._each.epoch(row)
                 return replace(own, rejected=own.rejected | self._gross()[row]), whole
         if self._each is None:
@@ -357,10 +357,10 @@ class RunningSeries:
         return replace(own, rejected=own.rejected | gross), whole
 
     def _gross(self) -> Mask:
-        """Image points (E, T) of the kept epochs that their series contradicts.
+        """Return which image points (E, T) of the stored epochs contradict their series.
 
-        One orientation for all of them, or a mount that moves by little, shows errors that an epoch
-        with an orientation of its own takes up.
+        One orientation for all of them, or small movements about it, reveals errors that an epoch's
+        own orientation absorbs.
         """
         assert self._series is not None
         s = self._series.sample
@@ -368,18 +368,16 @@ class RunningSeries:
 
     @property
     def _binds(self) -> bool:
-        """Whether the series has one orientation, or one and small movements about it."""
+        """True if the series has one orientation, or one and small movements about it."""
         return self._series is not None and self._series.sample.exterior != "per_epoch"
 
     def _again(self, share: float) -> int:
-        """The epoch at which all are adjusted together again."""
+        """Return the epoch at which all are adjusted together again."""
         full = len(self._kept) == self._kept.maxlen
         return self.epochs + max(int((_SELDOM if full else share) * len(self._kept)), 1)
 
-    def _laid_out(self) -> tuple[list[_Kept], ObservationGrid, Array, int]:
-        """The kept epochs in the order of their numbers, their observations, where an adjustment
-        starts (16,), and the row of the newest.
-        """
+    def _lay_out(self) -> tuple[list[_Kept], ObservationGrid, Array, int]:
+        """Return stored epochs by number, observations, initial values, and the newest's row."""
         newest, kept = self._kept[-1], sorted(self._kept, key=lambda k: k.number)
         grid = ObservationGrid(
             np.concatenate([k.grid.points for k in kept]),
@@ -388,10 +386,10 @@ class RunningSeries:
         start = np.median([k.alone for k in kept], axis=0)
         return kept, grid, start, next(i for i, k in enumerate(kept) if k is newest)
 
-    def _look(self) -> int:
-        """Adjust the kept epochs as `replay` does; the row of the newest among them."""
-        kept, grid, start, row = self._laid_out()
-        # as if the clock had never been set back
+    def _adjust_all(self) -> int:
+        """Adjust the stored epochs as `replay` does; return the row of the newest."""
+        kept, grid, start, row = self._lay_out()
+        # times as if the clock had never been set back
         time = np.array([k.time for k in kept])
         steps = np.diff(time)
         usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
@@ -402,7 +400,7 @@ class RunningSeries:
         s = replace(self._asked, drift_period=self._period, target_offsets=self._offsets)
         alone, c_px = np.array([k.alone for k in kept]), start[0] / self._sensor.pixel_pitch
         self._wrong = misplaced_targets(self._sensor, self._field, grid, alone)
-        while True:  # once, but where targets elsewhere drew the start to themselves
+        while True:  # a single pass, unless misplaced targets biased the initial values
             self._series = series = self._together(self._without_wrong(grid), start, s, ())
             drawn = find_misplaced(series.sample.offsets, c_px)
             if not drawn.any():
@@ -413,9 +411,9 @@ class RunningSeries:
         self._look_at[1] = self._again(share)
         if len(kept) < FEWEST_EPOCHS:
             return row
-        from thermocald.analysis.series.adjusted import still_field  # 2 MB
+        from thermocald.analysis.series.adjusted import correct_field  # late: it takes 2 MB
 
-        moved, still = still_field(
+        moved, still = correct_field(
             self._sensor, self._field, grid, series.sample, start,
             np.array([k.number for k in kept]), time,
         )  # fmt: skip
@@ -424,13 +422,11 @@ class RunningSeries:
         return row
 
     def _without_wrong(self, grid: ObservationGrid) -> ObservationGrid:
-        """Observations without targets that are elsewhere than the field has them."""
+        """Return observations without the targets that the field has misplaced."""
         return grid.reject(np.broadcast_to(self._wrong, grid.observed.shape))
 
-    def _own_looks(self) -> tuple[int, int]:
-        """The last and the next epoch at which all are adjusted by themselves: the same ones
-        however often the program is started.
-        """
+    def _own_schedule(self) -> tuple[int, int]:
+        """Return the last and next epoch of `_adjust_each`, the same ones after a restart."""
         if len(self._kept) == self._kept.maxlen:
             return self.epochs, self._again(_OFTEN)
         last = following = 1
@@ -438,28 +434,28 @@ class RunningSeries:
             last, following = following, following + max(int(_OFTEN * following), 1)
         return last, following
 
-    def _look_at_each(self, first: int | None = None) -> _Together:
-        """Adjust the kept epochs, or the first ones, with an orientation of their own."""
+    def _adjust_each(self, first: int | None = None) -> _Together:
+        """Adjust the stored epochs, or the first ones, each with an orientation of its own."""
         assert self._series is not None
-        kept, grid, start, _ = self._laid_out()
+        kept, grid, start, _ = self._lay_out()
         each = self._series
         if self._binds or first is not None:
             grid = taken_off(self._without_wrong(grid), each.moved).reject(self._gross())
             kept, grid = kept[:first], ObservationGrid(grid.points[:first], grid.weights[:first])
             s = replace(self._asked, exterior="per_epoch", drift_period=self._period)
             if self._binds:
-                # the series has tested every point: only what is far off is left to a second test
+                # the series has tested every point: a second test looks for large errors only
                 s = replace(s, snooping_alpha=_LEFT * s.snooping_alpha)
-            # epochs by themselves do not show how well the field is known
+            # such epochs do not determine the precision of the field
             each = self._together(grid, start, s, each.moved, self.field_variance)
-        # by how much the epochs as adjusted now differ from what was reported of them
+        # differences of the present results from the reported ones
         change = [
             now - then.reported
             for now, then, ok in zip(each.sample.values, kept, each.sample.ok, strict=True)
             if ok and then.reported is not None
         ]
         self._level = np.median(change, axis=0) if change else np.zeros(16)
-        self._look_at[0] = self._own_looks()[1]
+        self._look_at[0] = self._own_schedule()[1]
         return each
 
     def _together(

@@ -1,1 +1,1 @@
-"""The table of a series, and whether the camera moved in it."""
+"""The calibrated epochs of a series, and tests of drift."""

@@ -1,7 +1,7 @@
-"""A series adjusted together, as a table: at once, or in blocks where it is long.
+"""Joint adjustment of a series' epochs, at once or, if it is long, in blocks.
 
-The test field is then as if it had stood still: its movements are looked for in the residuals of a
-first adjustment, which a second one does without.
+Movements of the test field are detected in the residuals of a first adjustment. A second one uses
+observations that are corrected for them.
 """
 
 from __future__ import annotations
@@ -54,19 +54,19 @@ if TYPE_CHECKING:
     from thermocald.store.recording.head import Head
 
 
-def still_field(
+def correct_field(
     sensor: Sensor, testfield: TestField, grid: ObservationGrid, result: SeriesAdjustment,
     camera: Array, numbers: NDArray[np.int64], time_s: Array,
 ) -> tuple[tuple[FieldMovement, ...], ObservationGrid]:  # fmt: skip
-    """What moved in a series, and its observations without that.
+    """Return the movements of the test field in a series, and observations corrected for them.
 
-    result: of a first adjustment; camera (16,): where it is linearised; numbers, time_s (E,): the
-    epochs'.
+    result: of a first adjustment; camera (16,): where it is linearised; numbers, time_s (E,): of
+    the epochs.
     """
     if len(numbers) < FEWEST_EPOCHS:
         return (), grid
     at = linearise(sensor, testfield, camera[IOP], camera[EOP])
-    # what data snooping rejects after a knock is the board; single leaps are not
+    # points that snooping rejects after a knock show the board's movement; single spikes do not
     good = grid.observed & ~find_spikes(result.residuals, grid.observed)
     residuals = np.where(good[..., None], result.residuals, np.nan)
     ratio = result.noise_ratio if np.isfinite(result.noise_ratio) else 1.0
@@ -85,8 +85,8 @@ def still_field(
     return moved, taken_off(grid, moved) if moved else grid
 
 
-_SOME = 20_000  # epochs that tell the start values
-_LOOKED_AT = 60  # that tell where the targets are
+_SOME = 20_000  # epochs for the initial values
+_LOOKED_AT = 60  # epochs in which misplaced targets are searched
 _AS_READ = ("number", "frame_time", "temperature")
 
 
@@ -100,11 +100,11 @@ def table_of_series(
     jobs: int = 1,
     advance: Callable[[int], None] | None = None,
 ) -> Epochs:
-    """Return the series adjusted together, from the table of its epochs one by one.
+    """Adjust a series together, given its epochs calibrated one by one (`apart`).
 
-    start (16,): where the adjustment begins, by default the medians of the epochs one by one, of
-    which some must have a result. A series of more epochs than are adjusted at once goes in blocks,
-    on `jobs` processes, and tells `advance` how many epochs are done.
+    start (16,): initial values, by default the medians of `apart`, which must then have results. A
+    series too long to be adjusted at once is adjusted in blocks on `jobs` processes, and `advance`
+    receives the number of epochs done.
     """
     if start is None:
         rows = np.flatnonzero(apart.ok)
@@ -117,7 +117,7 @@ def table_of_series(
     wrong = np.flatnonzero(far)
 
     def left_out() -> Epochs:
-        """The table without targets that are wrong, which count as rejected."""
+        """Return the epochs without the misplaced targets, which count as rejected."""
         fewer = WithoutTargets(source, wrong)
         table = table_of_series(head, testfield, apart, fewer, settings, start, jobs, advance)
         counts = [grid.observed[:, wrong].sum(axis=1) for _, grid in source.blocks()]
@@ -130,29 +130,29 @@ def table_of_series(
     in_blocks = len(source) > together_at_most(len(testfield))
     if not in_blocks:
         source = grid = gathered(source, [slice(0, len(source))])
-    found = _adjusted(testfield, apart, start, source, settings, in_blocks, jobs, advance)
+    found = _adjust(testfield, apart, start, source, settings, in_blocks, jobs, advance)
     assert found.adjustment is not None
     c_px = start[0] / head.camera.sensor.pixel_pitch
     wrong = np.flatnonzero(find_misplaced(found.adjustment.offsets, c_px))
-    if len(wrong):  # they had drawn the start to themselves
+    if len(wrong):  # the initial values had been biased towards them
         return left_out()
     if in_blocks:
         return found
-    moved, still = still_field(
+    moved, still = correct_field(
         head.camera.sensor, testfield, grid, found.adjustment, start, apart.number,
         apart.frame_time,
     )  # fmt: skip
     if not moved:
         return found
-    return replace(_adjusted(testfield, apart, start, still, settings), field_movements=moved)
+    return replace(_adjust(testfield, apart, start, still, settings), field_movements=moved)
 
 
-def _adjusted(
+def _adjust(
     testfield: TestField, apart: Epochs, start: Array, source: ObservationBlocks,
     settings: SeriesSettings, in_blocks: bool = False, jobs: int = 1,
     advance: Callable[[int], None] | None = None,
 ) -> Epochs:  # fmt: skip
-    """Return the table of one adjustment of all epochs, which are one grid, or of a long series."""
+    """Adjust all epochs once, in a single grid or in blocks."""
     assert apart.head is not None
     sensor, whole_series = apart.head.camera.sensor, [slice(0, len(source))]
     camera = (
@@ -163,7 +163,7 @@ def _adjusted(
         whole = adjust_long_series(
             sensor, testfield, source, *camera, settings, jobs=jobs, advance=advance
         )
-        # the epochs that are known in full
+        # only a sample of the epochs has its covariances and residuals
         sample, sampled = whole.sample, whole.sampled
     else:
         grid = gathered(source, whole_series)
@@ -173,7 +173,7 @@ def _adjusted(
     def without(targets: NDArray[np.int64], quick: bool) -> Epochs:
         rough, fewer = replace(settings, exterior=sample.exterior), WithoutTargets(source, targets)
         if not quick:
-            return _adjusted(testfield, apart, start, fewer, rough, in_blocks, jobs)
+            return _adjust(testfield, apart, start, fewer, rough, in_blocks, jobs)
         rough = replace(rough, snooping_alpha=0.0, target_noise=False)
         windows, some = whole_series, apart
         if sampled is not None:
@@ -185,10 +185,10 @@ def _adjusted(
                 reasons=tuple(apart.reasons[i] for i in sampled),
             )
         kept = gathered(fewer, windows).reject(~sample.observed)
-        return _adjusted(testfield, some, start, kept, rough)
+        return _adjust(testfield, some, start, kept, rough)
 
     rows, groups = whole.rows, {}
-    # what the epoch itself said of a frame without a result says more than "no observations"
+    # the epoch's own reason is more specific than "no observations"
     for row in np.flatnonzero(~apart.ok).tolist():
         if rows.status[row] == "no_observations":
             rows.status[row], rows.reasons[row] = apart.status[row], apart.reasons[row]

@@ -1,4 +1,4 @@
-"""The course of one parameter over a series: whether it drifts, in numbers and in words."""
+"""The course of one parameter over a series, and whether it drifts."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 LEVEL = 0.01
-"""A change that chance gives more rarely is a drift."""
+"""Significance level: a change whose p-value is smaller is a drift."""
 
 
-_CARRIED = 0.5  # standard deviations of a change that an error of c may carry into it
+_CARRIED = 0.5  # error of a change due to c, in its standard deviations, that is reported
 
 
 def carried_by_c(share: float, changes: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Return how many of their sds changes may be off by what c is; empty where it is few for all.
+    """Return the errors of changes due to the uncertainty of c, in their sds; {} if all are small.
 
-    share: sd of c over c, as an image shows a change as a share of c; changes: with their sds.
+    share: sd of c over c (an image shows a change relative to c); changes: {name: (value, sd)}.
     """
     sds = {name: abs(v) * share / sd for name, (v, sd) in changes.items() if v and sd > 0}
     return sds if max(sds.values(), default=0.0) > _CARRIED else {}
@@ -31,13 +31,13 @@ class Course:
     """One parameter over a series, in its own unit.
 
     mean; scatter: standard deviation over the epochs; sd: stated by the adjustments, RMS; change:
-    of a straight line from the first to the last epoch, with sd_change; p: that chance gives as
-    much, corrected for the number of parameters; drifts: p below 1 %, with and without any single
-    group of targets; rests_on: the group without which there would be no drift;
-    per_kelvin, sd_per_kelvin, p_temperature: slope on the reference temperature, its standard
-    deviation and its p-value, corrected, NaN where that is constant or not known;
-    last_minus_first: between the first and the last epoch; sd_by_perspective: of that, if the
-    mount could stand anywhere in each: a mount that moves slowly is excluded no better.
+    of a straight line from the first to the last epoch, with sd_change; p: p-value of no change,
+    corrected for the number of parameters; drifts: p below 1 %, with and without any single group
+    of targets; rests_on: the group without which there would be no drift; per_kelvin,
+    sd_per_kelvin, p_temperature: slope on the reference temperature, its standard deviation and
+    corrected p-value, NaN if the temperature is constant or unknown; last_minus_first: with sd;
+    sd_by_perspective: sd of that difference if the mount could be anywhere in each epoch: a slow
+    movement of the mount cannot be excluded with a smaller one.
     """
 
     JSON: ClassVar = {
@@ -63,12 +63,12 @@ class Course:
 
     @property
     def moves(self) -> bool:
-        """Whether the camera moved: in time, or with its temperature."""
+        """True if the parameter changes with time or with the temperature."""
         return self.drifts or self.p_temperature < LEVEL
 
     @property
     def in_words(self) -> str:
-        """How much it moves, or `none`."""
+        """The significant change as text, or `none`."""
         if self.p_temperature < LEVEL:
             return self.movement
         if self.moves:
@@ -77,7 +77,7 @@ class Course:
 
     @property
     def movement(self) -> str:
-        """How much it moves: by the kelvin where it follows the temperature, else altogether."""
+        """The change as text: per kelvin if it follows the temperature, or else over the series."""
         if self.p_temperature < LEVEL:
             return signed(1e3 * self.per_kelvin, 1e3 * self.sd_per_kelvin, "µm/K")
         moved = signed(1e3 * self.last_minus_first, 1e3 * self.sd_last_minus_first, "µm")
@@ -85,12 +85,12 @@ class Course:
 
     @property
     def scatter_over_sd(self) -> float:
-        """How much more the parameter scatters than its standard deviations state."""
+        """The ratio of the scatter to the stated standard deviation."""
         return self.scatter / self.sd
 
 
 def table_of(drifts: Sequence[Course]) -> list[str]:
-    """A line for each parameter below a line of titles; nothing without parameters."""
+    """Return a line per parameter below a line of titles; [] without parameters."""
     titles = ("", "mean mm", "scatter µm", "sd µm", "ratio", "line µm ± sd",
               "last - first µm ± sd", "drift")  # fmt: skip
     rows = [

@@ -1,10 +1,10 @@
-"""Did the camera move in this series, and are its standard deviations true?
+"""Test of drift in a series, and of its stated standard deviations.
 
-A straight line in time per parameter, with the autocorrelation of its residuals taken into account,
-the study's test for drift of any shape, and the scatter of the epochs, with what the adjustment
-said of them. A drift is claimed only where
-chance gives its like in less than one series of a hundred, all parameters together (Holm), and
-where it does not rest on a single marker or target: a board that gives way is not the camera.
+For each parameter: a straight line in time that takes the autocorrelation of its residuals into
+account, the study's test for drift of any shape, and the scatter of the epochs beside the stated
+standard deviations. A drift is reported only if it is significant at 1 % for all parameters
+together (Holm), and does not depend on a single marker or target: the movement of a board is not
+one of the camera.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 _FEWEST = 10
-_LEAST_WARMING_K = 0.5  # below, the thermometer's own noise is all there is
-_MOST_VALUES = 100_000  # of a line: neighbours beyond that are averaged
+_LEAST_WARMING_K = 0.5  # a smaller change may be the thermometer's noise
+_MOST_VALUES = 100_000  # for a line: of more, neighbours are averaged
 _SUSPECTS = 5  # groups that are left out in turn
-_SHRUNK = 0.5  # of its change must go with a group that a parameter's drift rests on
+_SHRUNK = 0.5  # fraction of a change that must vanish without the group that a drift rests on
 
 
-def _thinned(*columns: Array) -> list[Array]:
-    """Means of neighbours where there are more values than a line needs; the rest left out."""
+def _thin(*columns: Array) -> list[Array]:
+    """Average neighbours if there are more values than a line needs; drop an incomplete mean."""
     n = len(columns[0])
     size = -(-n // _MOST_VALUES)
     if size == 1:
@@ -44,12 +44,11 @@ def _thinned(*columns: Array) -> list[Array]:
 
 
 def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
-    """Straight lines through the parameters that were estimated, p corrected for their number
-    (Holm).
+    """Fit straight lines to the estimated parameters; p is corrected for their number (Holm).
 
-    The p-value of no drift is that of `drift_test`, as in a study. Targets hidden at the end and
-    not at the beginning tilt the line by their coordinate errors: that part of the change's sd all
-    epochs share, and what it explains of the slow course is no drift.
+    The p-value of no drift is that of `drift_test`, as in a study. If targets are hidden at the end
+    but not at the beginning, their coordinate errors tilt the line. All epochs share that part of
+    the change's sd, and a slow change that it explains is no drift.
     """
     from scipy.stats import norm
 
@@ -60,7 +59,8 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
         values, sds = table.values[ok, column], table.sd[ok, column]
         if len(values) < _FEWEST or not np.isfinite(sds).all() or np.ptp(time) == 0:
             continue
-        t, y, sd = _thinned(time, values, sds)  # means err less than that, by one factor: p stays
+        # the sds of means are smaller by one factor, which does not change p
+        t, y, sd = _thin(time, values, sds)
         x = t - t.mean()
         slope = float(x @ y / (x @ x))
         noise = slope_noise(y, x, slope, times=t)
@@ -84,7 +84,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
 
 
 def courses(table: Epochs) -> list[Course]:
-    """How c, x0 and y0 changed over a series; those that were held are left out."""
+    """Return how c, x0 and y0 changed over a series; held parameters are left out."""
     ok = table.ok
     lines = _lines(table, IOP_NAMES[PRINCIPAL])
     have = np.flatnonzero(ok)[np.isfinite(table.temperature[ok])]
@@ -92,7 +92,7 @@ def courses(table: Epochs) -> list[Course]:
     if len(have) >= _FEWEST and np.ptp(temperature) >= _LEAST_WARMING_K:
         for name, line in lines.items():
             values = table.values[have, IOP_NAMES.index(name)]
-            t, y, times = _thinned(temperature, values, time)
+            t, y, times = _thin(temperature, values, time)
             t = t - t.mean()
             slope = float(y @ t / (t @ t))
             sd, p = slope_noise(y, t, slope).sd, slope_p_value(y, t, times)
@@ -100,7 +100,7 @@ def courses(table: Epochs) -> list[Course]:
 
     @cache
     def without(group: str) -> dict[str, Course]:
-        assert table.without is not None  # _single_support asks only then
+        assert table.without is not None  # as _single_support has checked
         left = table.without(table.groups[group], True)
         return _lines(left, tuple(lines)) if left.ok.sum() >= _FEWEST else {}
 
@@ -114,7 +114,7 @@ def courses(table: Epochs) -> list[Course]:
 
 
 def with_drifts(table: Epochs) -> Epochs:
-    """Return the epochs with their drifts, without a group of targets that alone makes one."""
+    """Return the epochs with their drifts; a group of targets that alone causes one is left out."""
     found = courses(table)
     moving = next((c.rests_on for c in found if c.rests_on), "")
     if not moving or table.without is None:
@@ -131,12 +131,12 @@ def with_drifts(table: Epochs) -> Epochs:
 def _single_support(
     table: Epochs, line: Course, lines_without: Callable[[str], dict[str, Course]]
 ) -> str | None:
-    """The group of targets that alone makes a parameter drift, or None.
+    """Return the group of targets that alone causes a parameter's drift, or None.
 
-    lines_without: all lines of the series without a group. Asked are those whose own residuals
-    wander most over the series. Without the group that is named the change must shrink by more than
-    half and no longer be significant, corrected as with it: a group whose absence only makes the
-    change less certain is not accused.
+    lines_without: returns all lines of the series without a group. The groups whose residuals
+    change most over the series are tried. Without the group the change must shrink by more than
+    half and no longer be significant, with the same correction: a group whose absence only makes
+    the change less certain does not cause it.
     """
     if table.without is None or table.adjustment is None or len(table.groups) < 3:
         return None

@@ -1,7 +1,7 @@
-"""The epochs of a series, calibrated: one row each, and what belongs to all of them.
+"""The calibrated epochs of a series: one row per epoch, and the results for the whole series.
 
-Comes from a recording or a store: epochs one by one as they were calibrated or stored, or all
-adjusted together from their observations (`adjusted`).
+They come from a recording or a store: calibrated one by one, as stored, or all adjusted together
+from their observations (`adjusted`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from thermocald.acquisition.calibrator import calibrated_epochs
 from thermocald.analysis.series.course import Course, carried_by_c, table_of
-from thermocald.errors import DataError, DriverMissing
+from thermocald.errors import DataError, DriverMissing, UsageError
 from thermocald.figures import BAND
 from thermocald.files import write_parts
 from thermocald.numbers import parameter_label, with_sd
@@ -49,16 +49,16 @@ if TYPE_CHECKING:
     Columns = dict[str, NDArray[np.integer] | Array | Sequence[str]]
 
 MATERIAL = 0.1
-"""Which sigma0 beyond 1 is worth a word."""
+"""Excess of sigma0 over 1 that is explained in the output."""
 CAUSES_OF_SIGMA0 = (
     "it can be the noise of the image points, a test field worse than stated, or a lens that the "
     "distortion does not describe"
 )
-_TESTS_A_FIELD = 18  # redundant coordinates of a level: 16 targets
-_SHOWN_SDS = 5.0  # of an affinity that the targets show
-_LEVEL_OF_FEW = 1.6  # error over sd of 12 to 14 targets whose field is 3 to 10 times worse
-_UNEVEN = 1.3  # times the noise in the middle
-_ROWS = 20_000  # of a table that are worked on at a time
+_TESTS_A_FIELD = 18  # redundancy of a level that tests the field: 16 targets
+_SHOWN_SDS = 5.0  # significance of an affinity that the targets show
+_LEVEL_OF_FEW = 1.6  # error over sd with 12 to 14 targets whose field is 3 to 10 times worse
+_UNEVEN = 1.3  # outer noise over that in the middle, which is reported
+_ROWS = 20_000  # of a table that are processed at a time
 
 
 BY_EPOCH = (
@@ -77,20 +77,19 @@ _DRAWN = ("c", "x0", "y0")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Epochs(Result):
-    """The calibrated epochs of a series; rows are epochs.
+    """The calibrated epochs of a series, one row per epoch.
 
     number, frame_time (E,) s UTC; temperature (E,) °C of the reference at the frame's time;
     values, sd (E, 16): the parameters c, x0, y0 (mm), A1 … C2, omega, phi, kappa (rad), X0, Y0, Z0
-    (mm) and their standard deviations, NaN where there is none; sigma0, n_observations, n_rejected
+    (mm) and their standard deviations, NaN without a result; sigma0, n_observations, n_rejected
     (E,); status, reasons: E words and sentences; exterior: `series`, `mount` or `per_epoch`;
-    level_sd (16,): of what all epochs have in common, NaN where it cannot be separated. Columns are
-    attributes too: `epochs.c`, `epochs.sd_c`.
+    level_sd (16,): of the level that all epochs share, NaN if it cannot be separated. Columns are
+    also attributes: `epochs.c`, `epochs.sd_c`.
 
-    drifts: what moved, and whether chance would give as much; left_out: targets found to move by
-    themselves; field_movements: boards and targets that moved, taken off the observations;
-    adjustment: of the series, None for epochs as a store keeps them; groups: {name: rows of the
-    test field} of what belongs together; without: the epochs without some targets (rows), quickly
-    or with all care.
+    drifts: the changes of the parameters and their significance; left_out: targets found to move by
+    themselves; field_movements: of boards and targets, for which observations are corrected;
+    adjustment: of the series, None for epochs as stored; groups: {name: rows of the test field} of
+    targets on a board; without: returns the epochs without some targets (rows), quickly or fully.
 
     >>> epochs = tc.open("M1").calibrate()
     >>> bool((epochs.sd_c[epochs.ok] > 0).all())
@@ -129,7 +128,7 @@ class Epochs(Result):
         return len(self.number)
 
     def __getattr__(self, name: str) -> Array:
-        """One column (E,): `c`, `x0`, … `Z0` and `sd_c`, …"""
+        """Return a column (E,): `c`, `x0`, … `Z0` or `sd_c`, …"""
         column = name.removeprefix("sd_")
         if column not in PARAMETER_NAMES:
             known = ", ".join(PARAMETER_NAMES)
@@ -139,7 +138,7 @@ class Epochs(Result):
         return values
 
     def part(self, rows: slice) -> Epochs:
-        """Some rows, without what belongs to the series as a whole."""
+        """Return some rows, without the results for the whole series."""
         return replace(
             self,
             **{name: getattr(self, name)[rows] for name in BY_EPOCH},
@@ -147,33 +146,35 @@ class Epochs(Result):
         )  # fmt: skip
 
     def parts(self) -> Iterator[Epochs]:
-        """Yield all rows, some thousand at a time."""
+        """Yield all rows, thousands at a time."""
         for first in range(0, max(len(self.number), 1), _ROWS):
             yield self.part(slice(first, first + _ROWS))
 
     @cached_property
     def ok(self) -> NDArray[np.bool_]:
-        """(E,): epochs with a result."""
+        """Which epochs (E,) have a result."""
         return np.fromiter((word == "ok" for word in self.status), bool, len(self.status))
 
     @property
     def time(self) -> NDArray[np.datetime64]:
-        """(E,): the frames' times, UTC, to the microsecond."""
+        """The frames' times (E,), UTC, to the microsecond."""
         return np.round(self.frame_time * 1e6).astype(np.int64).astype("datetime64[us]")
 
     @cached_property
     def covariance(self) -> Array:
-        """(E, 16, 16): of each epoch's parameters, NaN where it has no result.
+        """The covariance (E, 16, 16) of each epoch's parameters, NaN without a result.
 
-        Its diagonal is sd². Raises DataError for epochs as a store keeps them, and for a series
-        that is too long to keep them all; of such a one `adjustment.covariance` has a sample.
+        Its diagonal is sd². Raises DataError for epochs as stored, and for a series too long for
+        all its matrices; `adjustment.covariance` then has a sample.
         """
-        if self.adjustment is None or self.sampled is not None:
+        if self.sampled is not None:
             raise DataError(
-                "the covariance of every epoch is not kept of a series this long; "
+                "a series this long does not hold the covariance of every epoch; "
                 "adjustment.covariance has those of the epochs `sampled`"
-                if self.sampled is not None
-                else "these epochs are as the store keeps them: open its series and calibrate it"
+            )
+        if self.adjustment is None:
+            raise DataError(
+                "these epochs are as stored, without covariance: open the series and calibrate it"
             )
         out: Array = self.adjustment.covariance.copy()
         common = self.adjustment.settings.common
@@ -229,7 +230,7 @@ class Epochs(Result):
         if adjustment is not None and self.exterior == "series":
             from scipy.stats import chi2
 
-            # whether single epochs had another exterior orientation
+            # test of single epochs for another exterior orientation
             values = self.stillness[np.isfinite(self.stillness)]
             bound = float(chi2.ppf(1 - 0.01 / max(len(values), 1), 6))
             document["stood_still"] = {
@@ -241,7 +242,7 @@ class Epochs(Result):
         return converted
 
     def answer(self) -> str:
-        """Return how c, x0 and y0 move, or that they do not; what was calibrated without drifts."""
+        """Return how c, x0 and y0 change, if at all; without drifts, what was calibrated."""
         drawn = [course for course in self.drifts if course.name in _DRAWN]
         if not drawn:
             return super().answer()
@@ -257,11 +258,11 @@ class Epochs(Result):
     def lines(self) -> list[str]:
         """Return what `thermocald replay` prints."""
         document = self.as_dict()
-        stands = _EXTERIOR_WORDS[self.exterior]
+        exterior = _EXTERIOR_WORDS[self.exterior]
         calibrated = f"{document['ok']} of {document['epochs']} epochs calibrated"
         count = document["rejected"]
         rejected = f"{count} rejected observation{'' if count == 1 else 's'}"
-        out = [f"{calibrated}, exterior orientation {stands}, {rejected}"]
+        out = [f"{calibrated}, exterior orientation {exterior}, {rejected}"]
         if (sigma0 := document["sigma0"]) is not None:
             cause = ""
             if sigma0 > 1.0 + MATERIAL:
@@ -272,32 +273,32 @@ class Epochs(Result):
                         "field"
                     )
             out.append(
-                f"sigma0 {sigma0:.2f}: image points scatter that many times as much as "
-                f"their stated standard deviations say{cause}"
+                f"sigma0 {sigma0:.2f}: scatter of the image points over their stated standard "
+                f"deviations{cause}"
             )
         if (ratio := document["field_ratio"] or 1.0) > 1.0:
             out.append(
-                f"the targets are off by the same in all epochs, {ratio:.1f} times what the test "
-                "field's stated standard deviations allow: its coordinates, or a lens that the "
-                "distortion does not describe; the level is scaled by that"
+                f"the targets have the same errors in all epochs, {ratio:.1f} times what the test "
+                "field's stated standard deviations allow: wrong coordinates, or a lens that the "
+                "distortion does not describe; the level's standard deviations are scaled by that"
             )
         if few := document.get("level_tested_by_targets"):
             out.append(
-                f"{few} targets are too few to test the test field's coordinates: where these are "
-                f"worse than stated, the level is off by up to {_LEVEL_OF_FEW:g} times its "
-                "standard deviations; differences between epochs are not concerned"
+                f"{few} targets are too few to test the test field's coordinates: if these are "
+                f"worse than stated, the level is wrong by up to {_LEVEL_OF_FEW:g} times its "
+                "standard deviations; differences between epochs are not affected"
             )
         if outer := document["outer_noise"]:
             out.append(
-                "the outermost targets are as noisy as those in the image's middle times "
-                f"{outer['value']:.1f} ± {outer['sd']:.1f}; the weights follow that"
+                f"the outermost targets are {outer['value']:.1f} ± {outer['sd']:.1f} times as "
+                "noisy as those in the middle of the image; the weights follow that"
             )
         if held := document["held_affinity"]:
             label, micrometres = parameter_label(held["parameter"]), 1e3 * held["level_mm"]
             off = (
                 f"the level of {label} by {micrometres:.2f} µm, {held['sds']:.1f} of its standard "
             )
-            off += "deviations; differences between epochs are not concerned"
+            off += "deviations; differences between epochs are not affected"
             if shown := held.get("shown"):
                 differs = with_sd(shown["value"], shown["sd"])
                 out.append(
@@ -309,24 +310,24 @@ class Epochs(Result):
                 out.append(f"C1 and C2 are held: an affinity of {AFFINITY:g} would move {off}")
         if document["exterior_choice"]:
             out.append(f"--exterior {self.exterior}: {document['exterior_choice']}")
-        out += [f"{moved.sentence}; corrected for" for moved in self.field_movements]
+        out += [f"{moved.sentence}; corrected" for moved in self.field_movements]
         out += [
-            f"left out: target {name}, which moves by itself, and what belongs to it"
+            f"left out: target {name}, which moves by itself, and the targets on its board"
             for name in self.left_out
         ]
         out += table_of(self.drifts)
         if hang := document.get("changes_hang_on_c"):
             out.append(
-                f"the field shows c to {hang['c_known_to']:.2%} only, and changes are as wrong as "
-                f"c: they may be off by up to {hang['sds']:.1f} of their standard deviations; use "
-                "a field with depth whose coordinates are known better"
+                f"the field determines c only to {hang['c_known_to']:.2%}, and changes have the "
+                f"same relative error: up to {hang['sds']:.1f} of their standard deviations; use a "
+                "field with depth whose coordinates are known better"
             )
         if limits := [c for c in self.drifts if isfinite(c.sd_by_perspective)]:
             sds = ", ".join(f"{c.name} ± {1e3 * c.sd_by_perspective:.3f}" for c in limits)
             out.append(
-                f"a mount that moves more slowly than in {FASTEST_DRIFT_S / 60:.0f} min looks like "
-                "the camera; last - first by the perspective alone, whatever the mount does: "
-                f"{sds} µm"
+                f"movements of the mount slower than {FASTEST_DRIFT_S / 60:.0f} min cannot be "
+                "separated from the camera's; last - first by the perspective alone, whatever the "
+                f"mount does: {sds} µm"
             )
         reasons = [f"{w['status']}: {w['reason']}" for w in document["without_result"]]
         out += [f"{reasons.count(text)} × {text}" for text in sorted(set(reasons))]
@@ -340,7 +341,7 @@ class Epochs(Result):
         return out
 
     def _hang_on_c(self) -> dict[str, float] | None:
-        """Return how well c is known, and how many sds of a change that may make; None: few."""
+        """Return c's relative sd, and the largest error of a change due to it, in sds, or None."""
         if not self.drifts or not self.level_sd[0] > 0:
             return None
         share = float(self.level_sd[0] / np.nanmedian(self.values[self.ok, 0]))
@@ -350,10 +351,12 @@ class Epochs(Result):
         return {"c_known_to": share, "sds": max(sds.values())} if sds else None
 
     def plot(self, against: str = "time") -> Figure:
-        """Draw how c, x0 and y0 changed since the first epoch, µm, with 95 % of each epoch.
+        """Draw the changes of c, x0 and y0 since the first epoch, µm, with 95 % bars.
 
         against: `time` or `temperature`. Needs matplotlib (extra `report`).
         """
+        if against not in ("time", "temperature"):
+            raise UsageError(f"against is {against!r}; it must be time or temperature")
         ok = self.ok
         x = self.temperature[ok] if against == "temperature" else self.time[ok].astype(object)
         figure, axes = new_figure(len(_DRAWN))
@@ -377,15 +380,15 @@ class Epochs(Result):
         return figure
 
     def to_csv(self, path: Path | str) -> Path:
-        """Write what `thermocald export` writes, CONVENTIONS §4; returns the file's path."""
+        """Write what `thermocald export` writes (CONVENTIONS §4); return the file's path."""
         write_parts(Path(path), csv_text(part.columns() for part in self.parts()))
         return Path(path)
 
     @property
     def without_result(self) -> dict[str, int]:
-        """{reason: epochs without a result}, the commonest first.
+        """{reason: epochs without a result}, the most frequent first.
 
-        Reasons that differ in their numbers only are one, in the words of its commonest.
+        Reasons that differ only in their numbers are merged, with the most frequent one's text.
         """
         counts = Counter(self.reasons)
         del counts[""]
@@ -397,16 +400,16 @@ class Epochs(Result):
         return dict(sorted(alike.values(), key=lambda entry: -entry[1]))
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return a DataFrame: the columns of `to_csv` with `time`, the index is the epoch's number.
+        """Return a DataFrame with `time` and the columns of `to_csv`, indexed by epoch number.
 
-        Units stand in `attrs["units"]`. Raises DriverMissing without pandas.
+        Units are in `attrs["units"]`. Raises DriverMissing without pandas.
 
         >>> frame = tc.open("M1").calibrate().to_pandas()
         >>> units = frame.attrs.get("units")
         >>> frame.index.name, units.get("c")
         ('epoch', 'mm')
         """
-        pandas = _imported("pandas")
+        pandas = _import("pandas")
         frame = pandas.DataFrame({"time": self.time, **self.columns()}).set_index("epoch")
         frame.attrs["units"] = {n: u for n in frame.columns if (u := unit_of(str(n)))}
         return frame
@@ -414,15 +417,15 @@ class Epochs(Result):
     def to_xarray(self) -> xr.Dataset:
         """Return a Dataset on the axes `epoch` and `parameter`, with units as attributes.
 
-        Every column of `to_csv` is a variable of its own, `covariance` (epoch, parameter,
-        parameter_2) comes where `covariance` is known; coordinates are time and temperature. It can
-        be written as netCDF. Raises DriverMissing without xarray.
+        Every column of `to_csv` is a variable, also `covariance` (epoch, parameter, parameter_2) if
+        there is one; coordinates are time and temperature. The Dataset can be written as netCDF.
+        Raises DriverMissing without xarray.
 
         >>> data = tc.open("M1").calibrate().to_xarray()
         >>> data.c.units, tuple(data.covariance.dims)
         ('mm', ('epoch', 'parameter', 'parameter_2'))
         """
-        xarray = _imported("xarray")
+        xarray = _import("xarray")
         columns = self.columns()
         coordinates = {
             "epoch": columns.pop("epoch"),
@@ -462,15 +465,15 @@ class Epochs(Result):
 
 
 def unit_of(column: str) -> str:
-    """Return the unit of a column of `Epochs.columns`, "" where it has none."""
+    """Return the unit of a column of `Epochs.columns`, "" if it has none."""
     others = {"frame_time": "s", "temperature": "degC"}
     return others.get(column) or PARAMETER_UNITS.get(column.removeprefix("sd_"), "")
 
 
 def _held_affinity(adjustment: SeriesAdjustment) -> dict[str, Any] | None:
-    """Return the parameter whose level a held affinity moves by most sds; None below one.
+    """Return the parameter whose level a held affinity shifts most; None if by less than one sd.
 
-    It is the affinity that the targets show, with its difference and sd, or else `AFFINITY`.
+    The affinity is that which the targets show, with its difference and sd, or else `AFFINITY`.
     """
     held = adjustment.affinity
     if held is None or not held.names:
@@ -491,7 +494,7 @@ def _held_affinity(adjustment: SeriesAdjustment) -> dict[str, Any] | None:
     return found
 
 
-def _imported(module: str) -> Any:
+def _import(module: str) -> Any:
     import importlib
 
     try:
@@ -508,7 +511,7 @@ def calibrate_epochs(
     advance: Callable[[int], None] | None = None,
     jobs: int = 1,
 ) -> tuple[Epochs, list[Observations | None]]:
-    """Adjust epochs one by one; their table, and the observations for a series adjustment.
+    """Adjust epochs one by one; return them, and their observations for a series adjustment.
 
     temperature (E,): °C at the frames' times; jobs: processes.
     """
@@ -534,7 +537,7 @@ def calibrate_epochs(
 
 
 def csv_text(parts: Iterable[Columns], separator: str = ",", decimal: str = ".") -> Iterator[str]:
-    """Yield columns as CSV; numbers keep every digit, what is not known stays empty."""
+    """Yield columns as CSV, with every digit of the numbers; unknown values are empty."""
     for number, columns in enumerate(parts):
         text = io.StringIO()
         writer = csv.writer(text, delimiter=separator, lineterminator="\n")

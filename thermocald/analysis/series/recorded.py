@@ -1,6 +1,6 @@
-"""The table of a recording: its epochs one by one, then the series; a long one in blocks.
+"""The epochs of a recording or of a store's series, calibrated one by one and then as a series.
 
-And series in a store: a recording replayed into one, and the table of what is stored.
+A long series is adjusted in blocks. A recording can also be replayed into a store.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from thermocald.store.series import StoredSeries
 
 
-_STARTS = 25  # epochs of a long series that are calibrated by themselves, for a start
+_STARTS = 25  # epochs of a long series that are calibrated one by one for initial values
 
 
 def recorded_table(
@@ -52,12 +52,11 @@ def recorded_table(
     advance: Callable[[int], None] | None = None,
     jobs: int = 1,
 ) -> tuple[Epochs, Callable[[int], Observations | None]]:
-    """The table of a recording adjusted as one series, and what shows an epoch's observations.
+    """Adjust a recording as one series; return its epochs and a function for their observations.
 
-    Frames are measured where they are not. Of a series with observations that is too long to be
-    adjusted at once, only some epochs are calibrated by themselves. advance: receives how many
-    epochs are done; jobs: processes, with the same bits for any number. Raises DataError where no
-    epoch has a result.
+    Frames without observations are measured. If a series with observations is too long to be
+    adjusted at once, only some epochs are calibrated one by one. advance: receives the number of
+    epochs done; jobs: processes, without effect on any bit. Raises DataError without a result.
     """
     recording.head.require_calibrated(str(recording.path))
     adjusted = SeriesSettings.of(settings, exterior)
@@ -67,7 +66,7 @@ def recorded_table(
         start = _start(recording, recording.observations, calibrator)
         columns, E = recording.columns, len(recording)
         nothing, none = np.broadcast_to(np.nan, (E, 16)), np.broadcast_to(np.int64(0), (E,))
-        apart = Epochs(  # nobody has calibrated them one by one
+        apart = Epochs(  # these epochs are not calibrated one by one
             columns.numbers, columns.frame_time, _temperature(recording), nothing, nothing,
             nothing[:, 0], none, none, ("ok",) * E, ("",) * E, "per_epoch",
         )  # fmt: skip
@@ -87,10 +86,10 @@ def _start(
     observations: Callable[[int], Observations | None],
     calibrator: Calibrator,
 ) -> Array:
-    """Parameters (16,) to start from: medians over some epochs from first to last.
+    """Return initial parameters (16,): medians over some epochs from first to last.
 
-    Where each is too weak by itself, together they may carry the parameters, and each tells as much
-    of them as a start needs: c and A1. Raises DataError.
+    If every epoch is too weak by itself, only c and A1 are estimated: enough for initial values of
+    a series that may determine all parameters together. Raises DataError if no epoch has a result.
     """
     some = map(observations, spread_rows(len(source), _STARTS).tolist())
     seen = [points for points in some if points is not None and len(points)]
@@ -109,7 +108,7 @@ def _start(
 
 
 def misplaced_doubts(recording: Recording, rows: Index, values: Array) -> list[str]:
-    """Return what is doubtful in the places of targets, from some epochs' own cameras.
+    """Return doubts about the positions of targets, from the cameras of some epochs.
 
     rows (n,): the epochs; values (n, 16): their cameras.
     """
@@ -126,7 +125,7 @@ def misplaced_doubts(recording: Recording, rows: Index, values: Array) -> list[s
 
 
 def _temperature(source: Recording | StoredRecording) -> Array:
-    """Return the reference temperature (E,) °C at the frames' times, NaN where unknown."""
+    """Return the reference temperature (E,) °C at the frames' times, NaN if unknown."""
     reference = next(iter(source.head.channels), None)
     if reference is None:
         return np.full(len(source), np.nan)
@@ -143,14 +142,14 @@ def replay_into(
 ) -> Epochs:
     """Calibrate a recording's epochs into a store, from where an earlier replay stopped.
 
-    Returns the epochs with their drifts. jobs: processes; of a block of epochs that was
-    interrupted those that are stored are calibrated again, so that the others are as they would be.
+    Returns the epochs with their drifts. jobs: processes; the stored epochs of an interrupted block
+    are calibrated again, so that the block's other epochs are the same as without the interruption.
 
-    Raises StoreError; DataError where the store's series of this name is of something else.
+    Raises StoreError; DataError if the store's series of this name is of another recording.
     """
-    # A replay can be repeated: the end of the process must not lose anything, a power cut may.
+    # not durable: a replay can be repeated after a power cut; the end of the process loses nothing
     with Store.open(path, "append", durable=False) as store:
-        series = _series(store, recording, settings)
+        series = _open_series(store, recording, settings)
         last = store.last_epoch(series)
         calibrator = Calibrator.of_recording(recording, settings)
         stored = 0 if last is None else int(np.searchsorted(recording.columns.numbers, last + 1))
@@ -162,12 +161,13 @@ def replay_into(
                 result = EpochResult.from_adjustment(done.adjustment)
                 store.append(series, done.epoch, result, extra=done.extra)
             advance(1)
-        # while the store is open: targets are left out of a long series by reading it again
+        # inside `with`: to leave targets out of a long series, the store is read again
         source = StoredRecording(store, series)
         return with_drifts(table_of_stored(source, settings, exterior, jobs))
 
 
-def _series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
+def _open_series(store: Store, recording: Recording, settings: AdjustmentSettings) -> StoredSeries:
+    """Return the store's series of a recording, created if there is none."""
     wanted = {"exterior": "per_epoch", "free": list(settings.free)}
     for series in store.all_series():
         if (series.camera, series.name) != (recording.camera.name, recording.series):
@@ -180,7 +180,7 @@ def _series(store: Store, recording: Recording, settings: AdjustmentSettings) ->
         if series.settings.get("free") != wanted["free"]:
             raise UsageError(
                 f"{store.path}: series {series.name!r} was calibrated with --free "
-                f"{','.join(series.settings.get('free', []))}; keep to that, or use another store"
+                f"{','.join(series.settings.get('free', []))}; use the same, or another store"
             )
         return series
     return store.create_series(
@@ -191,7 +191,7 @@ def _series(store: Store, recording: Recording, settings: AdjustmentSettings) ->
 def table_of_stored(
     source: StoredRecording, settings: AdjustmentSettings, exterior: str, jobs: int = 1
 ) -> Epochs:
-    """Return the table of a series in an open store. Raises DataError where it has no epochs."""
+    """Return the epochs of a series in an open store. Raises DataError if it has none."""
     store, series, size = source.store, source.series, len(source)
     if size == 0:
         raise DataError(f"{store.path}: series {series.name!r} has no epochs")
@@ -212,7 +212,7 @@ def table_of_stored(
         source.columns.frame_time,
         _temperature(source),
         _parameters(source, "", known),
-        # those of a long series take as much memory as its values, and nothing else reads them
+        # they take as much memory as the values, and only stored epochs need them
         _parameters(source, "sd_", known)
         if exterior == "stored"
         else np.broadcast_to(np.nan, (size, 16)),

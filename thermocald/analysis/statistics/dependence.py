@@ -1,36 +1,36 @@
 """The dependence of a parameter on the temperature: correlation, significance, and slope.
 
-Pearson's r with the t-test as the reference has it (Elias et al. 2020, section 4.3), which counts
-every epoch as independent, and alongside it a test that holds for noise with a memory. The slope is
-fitted with the thermometer's noise counted. p-values are corrected for the number of parameters by
+Pearson's r is tested with the t-test, as in the reference (Elias et al. 2020, section 4.3), which
+counts every epoch as independent, and with a test that holds for noise with a memory. The fit of
+the slope includes the thermometer's noise. p-values are corrected for the number of parameters by
 Holm's method.
 
-Noise with a memory decides the standard deviation of a slope, and how many values a series is
-worth. The residuals of a straight line are modelled as first-order autoregressive plus white noise,
+Noise with a memory determines the standard deviation of a slope and the effective number of values.
+The residuals of a straight line are modelled as first-order autoregressive plus white noise,
 correlation at lag k = a·phi^k. Each model of a grid gives a slope by generalised least squares with
 its variance; the models are weighted by their restricted likelihood in the cosine domain (Whittle's
 approximation), which costs one cosine transform. The standard deviation is that of the mixture
-about the slope that is stated: it holds what each model says and how much the models disagree.
+about the stated slope: it contains the variance of each model and the differences between them.
 
-A short series does not decide between models, so their weights beforehand matter. They were chosen
-by simulation such that errors are about as large as the standard deviations. Over 150 epochs of a
-warm-up, or of heating and cooling, they are 0.9 of it for white noise, 0.9 to 1.0 for phi = 0.9,
-1.0 to 1.2 for phi = 0.97 on white noise of equal size; all that was tried with phi up to 0.97 lies
-between 0.65 and 1.35. Noise whose memory is more than a seventh of the series leaves an order of
-magnitude (1.3 to 1.5 for phi = 0.99); where that is likely, `too_short` is set.
+A short series does not decide between models, so their prior weights matter. They were chosen by
+simulation such that errors are about as large as the standard deviations. Over 150 epochs of a
+warm-up, or of heating and cooling, their ratio is 0.9 for white noise, 0.9 to 1.0 for phi = 0.9,
+1.0 to 1.2 for phi = 0.97 on white noise of equal size; in all cases tried with phi up to 0.97 it is
+between 0.65 and 1.35. If the memory exceeds a seventh of the series, the standard deviation is an
+order of magnitude (1.3 to 1.5 for phi = 0.99); if that is likely, `too_short` is set.
 
-Whether a parameter's variation is larger than its standard deviations explain the reference
-(section 4.1) asks with the two-sided moving variance over n consecutive measurements and the moving
-average of their squared standard deviations, by an F-test at each epoch, and gives the fraction of
-epochs at which it succeeds. Neighbouring windows have n-1 of n measurements in common, so these
-tests are not independent and their fraction has no p-value; `noise_models` gives one for the whole
-series. Of the correlations of the interior orientation it takes (section 4.3) the median of every
-coefficient over all epochs and both series, and calls their scatter the noise of the coefficients.
+The reference (section 4.1) tests whether a parameter varies more than its standard deviations
+explain: it compares the two-sided moving variance over n consecutive measurements with the moving
+average of their squared standard deviations by an F-test at each epoch, and states the fraction of
+epochs at which it succeeds. Neighbouring windows share n-1 of n measurements, so these tests are
+not independent and their fraction has no p-value; `noise_models` gives one for the whole series.
+For the correlations of the interior orientation it uses the median of every coefficient over all
+epochs and both series, and calls their scatter the noise of the coefficients (section 4.3).
 
 Sources: Whittle (1953), Estimation and information in stationary time series; Harville (1974),
 Biometrika 61, 383-385, for the restricted likelihood; Pyper & Peterman (1998), Can. J. Fish. Aquat.
-Sci. 55, 2127-2140, for the effective sample size; for a straight line through points whose both
-coordinates are measured with noise York, D.; Evensen, N. M.; López Martínez, M.; De Basabe Delgado,
+Sci. 55, 2127-2140, for the effective sample size; for a straight line with noise in both
+coordinates York, D.; Evensen, N. M.; López Martínez, M.; De Basabe Delgado,
 J. (2004): Unified equations for the slope, intercept, and standard errors of the best straight
 line. Am. J. Phys. 72, 367-375, for uncorrelated errors. With equal weights this is Deming's line.
 """
@@ -65,21 +65,21 @@ _LIKELY = (
     (1.0, 1.0, 0.22), (1.0, 5.0, 0.07), (1.0, 12.0, 0.01), (1.0, 30.0, 0.02),
     (0.5, 5.0, 0.14), (0.3, 30.0, 0.03), (0.7, 41.0, 0.14),
 )  # fmt: skip
-"""Coloured part, memory in epochs, weight beforehand; the others have what is left."""
-_SHORTEST, _LONGEST = 0.6, 200.0  # epochs of memory; longer series have longer ones
+"""Coloured part, memory in epochs, prior weight; the other models share the remaining weight."""
+_SHORTEST, _LONGEST = 0.6, 200.0  # epochs of memory; a longer series has memories up to its length
 _MEMORIES = 12
 _NEIGHBOURS = 5
-_ABOVE_NOISE = 6.0  # mean power of that many frequencies of x over the variance of its noise
-_LONG_MEMORY = 0.15  # of the series
+_ABOVE_NOISE = 6.0  # mean power of so many frequencies of x over the variance of its noise
+_LONG_MEMORY = 0.15  # fraction of the series
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlopeNoise:
-    """The noise of a series and what it makes of the slope on `x`.
+    """The noise of a series and its effect on the slope on `x`.
 
-    sd: of the slope; n_effective: independent values that determine it as well; lag_one:
-    correlation of the noise of neighbouring epochs; too_short: the memory is so long against the
-    series that the sd is an order of magnitude only.
+    sd: of the slope; n_effective: equivalent number of independent values; lag_one: correlation of
+    the noise of neighbouring epochs; too_short: the memory is so long compared to the series that
+    the sd is only an order of magnitude.
     """
 
     sd: float
@@ -90,11 +90,11 @@ class SlopeNoise:
 
 @lru_cache(maxsize=8)
 def _models(longest: float) -> tuple[Array, Array, Array, Array]:
-    """φ, coloured part, memory and weight beforehand (g,) of the models."""
+    """Return φ, coloured part, memory and prior weight (g,) of the models."""
     memories = np.geomspace(_SHORTEST, longest, _MEMORIES)
     tau, coloured = grid(memories, _COLOURED)
     rest = 1.0 - _WHITE - sum(weight for *_, weight in _LIKELY)
-    fading = np.maximum(tau, _SHORTEST) ** -0.3  # the longer, the rarer
+    fading = np.maximum(tau, _SHORTEST) ** -0.3  # longer memories are less probable
     weight = np.where(tau > 0, rest * fading / fading[1:].sum(), _WHITE)
     tau = np.append(tau, [m for _, m, _ in _LIKELY])
     coloured = np.append(coloured, [a for a, *_ in _LIKELY])
@@ -106,15 +106,15 @@ def _models(longest: float) -> tuple[Array, Array, Array, Array]:
 def slope_noise(
     y: Array, x: Array, slope: float, sd_x: float = 0.0, times: Array | None = None
 ) -> SlopeNoise:
-    """The standard deviation of `slope`, a straight line's through x, y (n,), and its noise.
+    """Estimate the noise about a straight line through x, y (n,), and the sd of its `slope`.
 
-    Finite values; n ≥ 4; sd_x: noise of x; times (n,): evenly spaced by default; the noise forgets
-    in a gap as it does between epochs.
+    Values are finite, n ≥ 4; sd_x: noise of x; times (n,): evenly spaced by default; the noise
+    decorrelates in a gap as between epochs.
     """
     n = len(y)
     at = Frequencies.of(n, times)
     u, r = at.coefficients(x), at.coefficients(y - slope * x)
-    # Frequencies at which x is its own noise say nothing of the slope.
+    # frequencies at which x is only noise do not determine the slope
     power = u * u
     around = np.convolve(power, np.full(_NEIGHBOURS, 1.0 / _NEIGHBOURS), "same")[: len(u)]
     known = around >= min(_ABOVE_NOISE * sd_x**2, float(around.max()))
@@ -129,7 +129,7 @@ def slope_noise(
     freedom = max(len(r) - 3, 1)
     off = product / information
     variance = float(plausible @ (left / freedom / information + off**2))
-    # Geometric: models that a short series cannot exclude would rule an arithmetic mean.
+    # geometric: models that a short series cannot exclude would dominate an arithmetic mean
     inflation = np.exp(plausible @ np.log(spectrum @ uu / uu.sum()))
     return SlopeNoise(
         float(np.sqrt(variance)),
@@ -142,11 +142,11 @@ def slope_noise(
 def _regressed(
     at: Frequencies, spectrum: Array, uu: Array, ur: Array, rr: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Regress r on u by generalised least squares under each model of the noise (g,).
+    """Regress r on u by generalised least squares under each noise model (g,).
 
-    spectrum (g, m): the models'; uu, ur, rr (m,): sums of squares and products of the coefficients
-    of u and r. Returns the weighted product with r, the information on the slope, which is their
-    ratio, the squares that the line leaves, and -2 log restricted likelihood.
+    spectrum (g, m): of the models; uu, ur, rr (m,): sums of squares and products of the
+    coefficients of u and r. Returns the weighted product of u and r, the information on the slope
+    (their ratio is the slope), the residuals' weighted squares, and -2 log restricted likelihood.
     """
     weight = 1.0 / spectrum
     information = np.maximum(weight @ uu, np.finfo(float).tiny)
@@ -158,23 +158,23 @@ def _regressed(
 
 
 _ITERATIONS = 100
-_CONVERGED = 1e-7  # of the slope's standard deviation
+_CONVERGED = 1e-7  # fraction of the slope's standard deviation
 
 
 def fit_straight_line(
     x: Array, y: Array, sd_x: ArrayLike, sd_y: ArrayLike, extra_variance_y: float = 0.0
 ) -> tuple[float, float, float]:
-    """Best straight line through x, y (n,) with standard deviations of both, scalars or (n,).
+    """Fit a straight line to x, y (n,) with standard deviations of both, scalars or (n,).
 
     extra_variance_y: scatter of y about the line that neither sd explains. Returns the slope, its
-    sd (that of the stated sds, not scaled), and chi-square of the residuals with n - 2 degrees of
+    sd (from the stated sds, not scaled), and the chi-square of the residuals with n - 2 degrees of
     freedom. Raises ValueError for fewer than 3 points or constant x.
     """
     if len(x) < 3 or not np.ptp(x) > 0:
         raise ValueError("a straight line needs three points and x that varies")
     var_x = np.square(np.asarray(sd_x, dtype=float))
     var_y = np.square(np.asarray(sd_y, dtype=float)) + extra_variance_y
-    # About the means: the intercept far outside the data would cost the digits of the slope.
+    # about the means: an intercept far outside the data would cost digits of the slope
     u0, v0 = x - float(np.mean(x)), y - float(np.mean(y))
     slope = float(np.dot(u0, v0) / np.dot(u0, u0))
     for _ in range(_ITERATIONS):
@@ -197,19 +197,19 @@ def fit_straight_line(
 
 _CHANCE = 0.01
 _UNUSUAL = 3.0  # times the median sd of an epoch
-_FEW = 30  # epochs: fewer do not show their own noise
+_FEW = 30  # fewer epochs do not show their own noise
 
 
 @dataclass(frozen=True, slots=True)
 class Dependence:
-    """One parameter against one temperature; slope in parameter units per K.
+    """The dependence of a parameter on a temperature; slope in parameter units per K.
 
-    p_naive counts all n epochs as independent; p_value holds whatever the autocorrelation of the
-    noise; n_effective: independent values that the epochs are worth; sd_slope holds thermometer
-    noise, the adjustments' sds, scatter beyond both and autocorrelation; misfit: scatter over what
-    the two noises explain; too_short: the noise remembers so much of the series that sd_slope is an
-    order of magnitude only; p_naive_holm, p_holm: p_naive, p_value corrected for the number of
-    parameters, NaN where there is one.
+    p_naive counts all n epochs as independent; p_value holds for any autocorrelation of the noise;
+    n_effective: equivalent number of independent epochs; sd_slope includes thermometer noise, the
+    adjustments' sds, scatter beyond both and autocorrelation; misfit: scatter over that expected
+    from both noises; too_short: the memory of the noise is so long that sd_slope is only an order
+    of magnitude; p_naive_holm, p_holm: p_naive, p_value corrected for the number of parameters, NaN
+    if not corrected.
     """
 
     JSON: ClassVar = {
@@ -231,10 +231,10 @@ class Dependence:
 
 
 def slope_p_value(values: Array, temperature: Array, times: Array | None = None) -> float:
-    """Two-sided p-value of no linear dependence, whatever the memory of the noise.
+    """Return the two-sided p-value of no linear dependence, for noise of any memory.
 
-    times (n,): evenly spaced by default. The t-test of the slope by generalised least squares, its
-    largest p-value over the noise models.
+    It is the largest over the noise models of the t-test of a slope by generalised least squares.
+    times (n,): evenly spaced by default.
     """
     from scipy.stats import t
 
@@ -251,11 +251,11 @@ def slope_p_value(values: Array, temperature: Array, times: Array | None = None)
 def dependence(
     values: Array, sds: Array, temperature: Array, temperature_sd: float, times: Array | None = None
 ) -> Dependence:
-    """Correlation and slope of values (n,) with sds (n,) on temperature (n,) °C.
+    """Estimate correlation and slope of values (n,) with sds (n,) on temperature (n,) °C.
 
-    All finite, in order of time; temperature_sd: noise of the thermometer, K; times (n,) s, evenly
-    spaced by default: noise forgets in a gap. Raises ValueError for
-    fewer than 4 epochs, or where values or temperature are constant.
+    All are finite and in order of time; temperature_sd: noise of the thermometer, K; times (n,) s:
+    evenly spaced by default; noise decorrelates in a gap. Raises ValueError for fewer than 4
+    epochs, or if values or temperature are constant.
     """
     from scipy.stats import chi2, t
 
@@ -269,15 +269,15 @@ def dependence(
     slope, sd_slope, square = fit_straight_line(temperature, values, temperature_sd, sds)
     misfit = float(np.sqrt(square / (n - 2)))
     if square > chi2.isf(_CHANCE, n - 2):
-        # What the line does not explain is scatter of the parameter, not of the thermometer. Not
-        # done for what is chance: weight taken from the thermometer's noise flattens the line.
+        # scatter about the line is the parameter's, not the thermometer's; only if significant, as
+        # a smaller weight of the thermometer's noise flattens the line
         unexplained = (misfit**2 - 1) * float(
             np.mean(np.square(sds)) + (slope * temperature_sd) ** 2
         )
         slope, sd_slope, _ = fit_straight_line(
             temperature, values, temperature_sd, sds, unexplained
         )
-    # An epoch with few targets left is no part of the noise of the others.
+    # an epoch with few targets does not show the noise of the others
     usual = sds <= _UNUSUAL * float(np.median(sds))
     those: slice | Mask = usual
     if usual.all() or not np.ptp(temperature[usual]) > 0:
@@ -301,7 +301,7 @@ def dependence(
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values corrected for their number: Holm (1979), step-down."""
+    """Correct p-values for their number by Holm's step-down method (1979)."""
     p = np.asarray(p_values, dtype=float)
     order = np.argsort(p, kind="stable")
     stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
@@ -311,9 +311,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def correlation_matrix(columns: Sequence[Array]) -> Array:
-    """Pearson's r of each column (n,) with each (k, k); NaN for constant columns.
+    """Return Pearson's r (k, k) of all pairs of columns (n,); NaN for constant columns.
 
-    Epochs where either value is NaN are left out pair by pair.
+    For each pair, epochs with a NaN in either column are left out.
     """
     k = len(columns)
     matrix = np.full((k, k), np.nan)
@@ -334,25 +334,25 @@ def correlation_matrix(columns: Sequence[Array]) -> Array:
 
 
 _CHUNK = 1 << 15
-# A window is broken by gaps when it lasts this much longer than n regular measurements.
+# a window that lasts this much longer than n regular measurements has a gap
 _STRETCH = 1.5
 
 
 def moving(values: Array, window: int, statistic: Callable[..., Any], **options: int) -> Array:
-    """Return a statistic of `window` consecutive values (n,) → (n - window + 1,).
+    """Return a statistic (n - window + 1,) of every `window` consecutive values of (n,).
 
-    statistic: np.mean, or np.var and its options.
+    statistic: np.mean, or np.var with its options.
     """
     if len(values) < window:
         return np.empty(0)
     views = np.lib.stride_tricks.sliding_window_view(values, window)
-    # In chunks: running sums would cancel where the drift is large against the noise.
+    # in chunks: running sums would lose digits if the drift is large compared to the noise
     parts = (views[start : start + _CHUNK] for start in range(0, len(views), _CHUNK))
     return np.concatenate([statistic(part, axis=1, **options) for part in parts])
 
 
 def unbroken_windows(time_s: Array, window: int) -> NDArray[np.int64]:
-    """First indices of the windows of consecutive measurements that no gap breaks."""
+    """Return the first indices of the windows of consecutive measurements without a gap."""
     n = len(time_s)
     if n < window:
         return np.empty(0, dtype=np.int64)
@@ -364,15 +364,15 @@ def unbroken_windows(time_s: Array, window: int) -> NDArray[np.int64]:
 def moving_f_test(
     values: Array, sds: Array, redundancy: Array, time_s: Array, window: int, alpha: float
 ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int32]]:
-    """The reference's F-test at every epoch.
+    """Make the reference's F-test at every epoch.
 
     values, sds (n,): parameter and its standard deviations, finite; redundancy (n,): degrees of
-    freedom of each standard deviation (those of its adjustment); time_s (n,): finds gaps; window:
+    freedom of each standard deviation (those of its adjustment); time_s (n,): to find gaps; window:
     odd number of measurements; alpha: level of the one-sided test. The squared standard deviations
-    of a window carry the sum of its redundancies as degrees of freedom. Returns the epochs (m,)
-    that are window centres; (m,) ratios of the moving variance over the moving mean of the squared
-    standard deviations; the critical ratios, above which the variance is significantly the greater
-    one; the degrees of freedom of the mean squared standard deviations.
+    of a window have the sum of its redundancies as degrees of freedom. Returns, each (m,), the
+    epochs at window centres; the ratios of the moving variance to the moving mean of the squared
+    standard deviations; the critical ratios, above which the variance is significantly greater; the
+    degrees of freedom of the mean squared standard deviations.
     """
     from scipy.stats import f
 
@@ -381,7 +381,7 @@ def moving_f_test(
     starts = unbroken_windows(time_s, window)
     degrees = np.rint(moving(redundancy, window, np.mean)[starts] * window)
     degrees_sd = np.maximum(degrees, 0).astype(np.int32)
-    # one quantile for every number of degrees that occurs, looked up
+    # one quantile for every number of degrees that occurs
     different = np.flatnonzero(np.bincount(degrees_sd))
     quantiles = np.zeros(int(different.max(initial=0)) + 1)
     quantiles[different] = f.isf(alpha, window - 1, np.maximum(different, 1.0))
@@ -392,10 +392,10 @@ def moving_f_test(
 
 @dataclass(frozen=True, eq=False)
 class IopCorrelations:
-    """Median (10, 10) and noise (10, 10) of the coefficients; 0 where a parameter is held fixed.
+    """The correlations of the interior orientation: median and noise (10, 10), 0 if held fixed.
 
     noise: standard deviation of a coefficient over the epochs, within its series; largest: the
-    largest deviation from the median; epochs: how many matrices were used.
+    largest deviation from the median; epochs: number of matrices used.
     """
 
     JSON: ClassVar = {"largest": "largest_deviation"}
@@ -407,7 +407,7 @@ class IopCorrelations:
 
 
 def correlations_of(covariances: Array) -> Array:
-    """Covariances (n, k, k) → correlations; 0 for parameters held fixed, 1 on the diagonal."""
+    """Return the correlations of covariances (n, k, k); 0 for held parameters, diagonal 1."""
     sd = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
     inverse = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
     r = covariances * inverse[..., :, None] * inverse[..., None, :]
@@ -417,7 +417,7 @@ def correlations_of(covariances: Array) -> Array:
 
 
 def median_correlations(series: list[Array]) -> IopCorrelations | None:
-    """Medians over the correlation matrices (n_i, k, k) of several series, None without any."""
+    """Return medians over the correlation matrices (n_i, k, k) of series; None without any."""
     matrices = [m for m in series if len(m)]
     if not matrices:
         return None

@@ -1,22 +1,21 @@
-"""Models of a series' noise, and whether it drifts beyond noise of whatever size and memory.
+"""Models of a series' noise, and tests of drift that hold for noise of any size and memory.
 
-Noise is a sum of first-order autoregressive parts: white noise with one beside it, φ up to 0.995,
-or with flicker noise, 1/f to 1/f^1.6, whose parts have memories evenly spread in their logarithm
-(van der Ziel 1950, Physica 16). The coefficients of the cosine transform of a stationary series are
-nearly independent, with its spectrum as variances (Whittle's approximation); a likelihood costs one
-transform. Of long series the high frequencies, which hold nothing of the slow noise, are pooled,
-and the last epochs are left out, a few of ten thousand, where that makes a length with small
-factors: the transform of a year of prime length takes 400 MB.
+Noise is a sum of first-order autoregressive parts: white noise plus one part with φ up to 0.995, or
+white plus flicker noise, 1/f to 1/f^1.6, whose parts have logarithmically spaced memories (van der
+Ziel 1950, Physica 16). The coefficients of the cosine transform of a stationary series are nearly
+independent, with its spectrum as variances (Whittle's approximation), so a likelihood costs one
+transform. In long series the high frequencies, which do not contain slow noise, are pooled. The
+last epochs, a few of ten thousand, are left out if that gives a length with small factors: the
+transform of a year of prime length takes 400 MB.
 
-*Drift* asks whether the slow part (periods longer than two windows) is larger than the fast part,
-continued to low frequencies, allows: an F-test for each noise model. The size σ is taken from the
-fast part, so noise beyond the stated standard deviations is not drift. *Excess* asks whether the
-series varies more than its stated standard deviations explain, whatever its memory.
+*Drift*: is the slow part (periods longer than two windows) larger than the fast part, continued to
+low frequencies, allows? This is an F-test for each noise model. The size σ is estimated from the
+fast part, so noise beyond the stated standard deviations is not drift. *Excess*: does the series
+vary more than its stated standard deviations explain, whatever its memory?
 
-A test that must hold whatever the noise is takes the largest p-value over the models. Models that
-the data exclude should not count: the p-value of each is combined, by Fisher's method, with the
-model's own likelihood ratio. The tests therefore reject in at most the stated fraction of driftless
-series.
+A test that has to hold for any noise uses the largest p-value over the models. Models that the data
+exclude should not count, so the p-value of each is combined, by Fisher's method, with the model's
+likelihood ratio. The tests therefore reject at most the stated fraction of series without drift.
 
 Sources: Whittle (1953), Estimation and information in stationary time series; Berger and Boos
 (1994), J. Am. Stat. Assoc. 89, 1012-1016; Müller and Watson (2017), Low-frequency econometrics
@@ -39,10 +38,10 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array, Mask
 
 
-# Beyond this many low frequencies, which carry the slow correlation, neighbours are pooled.
+# beyond this many low frequencies, which contain the slow noise, neighbours are pooled
 _SINGLE_FREQUENCIES = 2000
 _POOLED_FREQUENCIES = 1000
-_ANY_LENGTH = 200_000  # epochs: up to here a transform is cheap whatever their number
+_ANY_LENGTH = 200_000  # epochs: up to here a transform of any length is cheap
 _SMALL_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31)
 
 _PHI = (0.2, 0.4, 0.6, 0.75, 0.85, 0.92, 0.95, 0.97, 0.985, 0.995)
@@ -50,18 +49,18 @@ _COLOURED = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
 
 
 _FLICKER = (1.0, 1.3, 1.6)  # exponents of 1/f
-_MEMORIES = 0.4 * 3.0 ** np.arange(10)  # epochs, of the parts of flicker noise
+_MEMORIES = 0.4 * 3.0 ** np.arange(10)  # of the parts of flicker noise, in epochs
 
-_GAP = 3.0  # usual intervals between neighbours: a longer one ends a stretch
+_GAP = 3.0  # an interval that is longer by this factor than usual is a gap, which ends a stretch
 _TYPICAL_PHI = 0.97
 
 
 NoiseModels = tuple["Array", "Array"]
-"""Noises of unit variance: φ (P,) of autoregressive parts, their shares (g, P) of the variance."""
+"""Noise models of unit variance: φ (P,) of the parts, and their shares (g, P) of the variance."""
 
 
 def mixtures(phi: Array, coloured: Array) -> NoiseModels:
-    """White noise with a coloured part of the variance (g,) that has φ (g,)."""
+    """Return models of white noise plus a coloured part of the variance (g,) with φ (g,)."""
     parts, column = np.unique(np.append(0.0, phi), return_inverse=True)
     shares = np.zeros((len(phi), len(parts)))
     shares[:, column[0]] = 1.0 - coloured
@@ -70,13 +69,13 @@ def mixtures(phi: Array, coloured: Array) -> NoiseModels:
 
 
 def grid(first: ArrayLike, coloured: ArrayLike) -> tuple[Array, Array]:
-    """All pairs of two lists, and before them white noise (0, 0)."""
+    """Return all pairs of two lists, preceded by white noise (0, 0)."""
     firsts, parts = (g.ravel() for g in np.meshgrid(first, coloured))
     return np.append(0.0, firsts), np.append(0.0, parts)
 
 
 def _models() -> NoiseModels:
-    """Autoregressive noise, and flicker noise, whose parts have these weights, beside white."""
+    """Return white noise with autoregressive, and with flicker noise, in several proportions."""
     phi, mixed = mixtures(*grid(_PHI, _COLOURED))
     shape = np.array([_MEMORIES ** (a - 1.0) for a in _FLICKER])
     shape /= shape.sum(axis=1, keepdims=True)
@@ -89,17 +88,17 @@ def _models() -> NoiseModels:
 
 
 MODELS = _models()
-"""The models that tests run through."""
+"""The noise models of the tests."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frequencies:
-    """The cosine coefficients of a series with gaps, pooled at high frequencies, lowest first.
+    """The frequencies of a series with gaps, lowest first, pooled at the high ones.
 
-    pieces: the rows of each stretch without a gap; contrasts (K - 1, K): orthonormal combinations
-    of the stretches' scaled means; pauses (K, K): from the end of one to the begin of another, in
-    intervals; order: of the coefficients by frequency; starts (m,): the first coefficient of each
-    pool; count (m,): how many; mean (m,) rad, 0 for a contrast.
+    pieces: rows of each stretch without a gap; contrasts (K - 1, K): orthonormal combinations of
+    the stretches' scaled means; pauses (K, K): between the end of one and the beginning of another,
+    in intervals; order: of the coefficients by frequency; starts, count (m,): first coefficient and
+    size of each pool; mean (m,): its mean frequency, rad, 0 for a contrast.
     """
 
     pieces: tuple[slice, ...]
@@ -112,7 +111,7 @@ class Frequencies:
 
     @classmethod
     def of(cls, n: int, times: Array | None = None) -> Frequencies:
-        """The frequencies of n values at times (n,), evenly spaced by default."""
+        """Return the frequencies of n values at times (n,), evenly spaced by default."""
         pieces, pauses = _pieces(n, times)
         lengths = [p.stop - p.start for p in pieces]
         each = [np.arange(1, size) / size for size in lengths]
@@ -135,7 +134,7 @@ class Frequencies:
         return replace(found, contrasts=np.linalg.eigh(flat @ slow @ flat.T)[1].T @ flat)
 
     def means_covariance(self, phi: float) -> Array:
-        """Covariance (K, K) of the stretches' means, times √length, of noise of unit variance."""
+        """Return the covariance (K, K) of the stretches' means times √length, for unit variance."""
         if phi == 0.0:
             return np.eye(len(self.pieces))
         size = np.array([p.stop - p.start for p in self.pieces], dtype=float)
@@ -148,7 +147,7 @@ class Frequencies:
         return np.asarray(between)
 
     def coefficients(self, y: Array) -> Array:
-        """Orthonormal coefficients of a series about its mean, without the constant one."""
+        """Return the orthonormal coefficients of a series about its mean, without the constant."""
         sizes = np.array([p.stop - p.start for p in self.pieces])
         means = np.array([y[p].mean() for p in self.pieces])
         slow = self.contrasts @ (means * np.sqrt(sizes))
@@ -156,11 +155,11 @@ class Frequencies:
         return np.asarray(every[self.order])
 
     def sums(self, power: Array) -> Array:
-        """Sums (m,) of something per coefficient."""
+        """Sum values per coefficient over the pools (m,)."""
         return power if len(self.starts) == len(power) else np.add.reduceat(power, self.starts)
 
     def spectra(self, models: NoiseModels) -> Array:
-        """Mean variances (g, m) of the coefficients of noises of unit variance."""
+        """Return the mean variances (g, m) of the coefficients for models of unit variance."""
         (phis, shares), phi = models, models[0][:, None]
         parts = (1 - phi**2) / (1 + phi**2 - 2 * phi * np.cos(self.mean))
         for part, one in zip(parts, phis.tolist(), strict=True):
@@ -170,7 +169,7 @@ class Frequencies:
 
 
 def _pieces(n: int, times: Array | None) -> tuple[tuple[slice, ...], Array]:
-    """The stretches between gaps, and the pauses (K, K) between them in intervals."""
+    """Return the stretches between gaps, and the pauses (K, K) between them in intervals."""
     whole = (slice(0, _with_small_factors(n)),)
     if times is None or n < 3:
         return whole, np.zeros((1, 1))
@@ -191,9 +190,9 @@ def _pieces(n: int, times: Array | None) -> tuple[tuple[slice, ...], Array]:
 
 
 def cosines(y: Array) -> Array:
-    """Orthonormal cosine coefficients of a series (n,) about its mean, without the constant one.
+    """Return the orthonormal cosine coefficients of a series (n,), without the constant one.
 
-    n - 1 of them, fewer where a long series is cut to a length with small factors.
+    There are n - 1, or fewer if a long series is cut to a length with small factors.
     """
     from scipy.fft import dct
 
@@ -203,7 +202,7 @@ def cosines(y: Array) -> Array:
 
 @lru_cache(maxsize=64)
 def _with_small_factors(n: int) -> int:
-    """The largest number up to n without a prime factor above 31; n itself where it is small."""
+    """Return the largest number up to n without a prime factor above 31; a small n itself."""
     if n <= _ANY_LENGTH:
         return n
     for found in range(n, 0, -1):
@@ -217,7 +216,7 @@ def _with_small_factors(n: int) -> int:
 
 
 def largest_p_value(p: Array, deviance: Array) -> float:
-    """The largest combined p-value over the models.
+    """Return the largest combined p-value over the models.
 
     p (g,): of the test under each model; deviance (g,): -2 log likelihood of each.
     """
@@ -227,25 +226,25 @@ def largest_p_value(p: Array, deviance: Array) -> float:
 
 
 _LEAST_VALUES = 8
-_FIRST_BAND = 4  # low frequencies of the first band; the next have four times as many
+_FIRST_BAND = 4  # low frequencies of the first band; each further one has four times as many
 _WIDENING = 4
 _LEAST_FAST = 4
-_JUMP = 6.0  # sd of the increments; noise never does that
+_JUMP = 6.0  # sds of the increments, which noise does not reach
 _MOST_JUMPS = 0.1  # of the epochs
 _NORMAL_MEDIAN = 0.6745  # of |x| of a standard normal x
-_MEDIAN_SD = 1.5  # times 1/√n: relative sd of that median over third differences of white noise
-_NOTHING = 1e-200  # variance of a series that does not scatter at all
+_MEDIAN_SD = 1.5  # times 1/√n: relative sd of that median for third differences of white noise
+_NOTHING = 1e-200  # stands for the variance of a series without scatter
 
 
 @dataclass(frozen=True, slots=True)
 class DriftTest:
-    """One p-value for the whole series, without windows.
+    """The test of drift of a whole series, without windows.
 
     p_value: of no drift, that is of noise of any size and memory; p_excess: of no variation beyond
     the stated sds, whatever the memory; variance_ratio: variance of the series over its mean
     squared sd; noise_ratio, sd_noise_ratio: scatter between neighbouring epochs over the stated
-    sds; epochs: how many were used; p_holm, p_excess_holm: the p-values corrected for the number of
-    parameters, NaN where there is one.
+    sds; epochs: number used; p_holm, p_excess_holm: the p-values corrected for the number of
+    parameters, NaN if not corrected.
     """
 
     JSON: ClassVar = {"p_value": "p"}
@@ -270,14 +269,14 @@ def drift_test(
     """Test a series for drift, and for variation beyond its standard deviations.
 
     values, sds (n,): parameter and its standard deviations, finite, in order of time; redundancy
-    (n,): degrees of freedom of each standard deviation; window: epochs, what changes more slowly
-    than two of them is slow; times (n,): evenly spaced by default; noise forgets in a gap. None for
-    fewer than 8 epochs or constant values.
+    (n,): degrees of freedom of each standard deviation; window: epochs; changes slower than two
+    windows are slow; times (n,): evenly spaced by default; noise decorrelates in a gap. Returns
+    None for fewer than 8 epochs or constant values.
     """
     n = len(values)
     if n < _LEAST_VALUES or not np.ptp(values) > 0:
         return None
-    # By one sd for all: those of single epochs fluctuate, and a large drift would with them.
+    # one sd for all: those of single epochs fluctuate, and so would a large drift over them
     standardised = (values - values.mean()) / np.sqrt(np.mean(sds**2))
     standardised = _without_spikes(standardised)
     calm = _without_jumps(standardised)
@@ -286,7 +285,7 @@ def drift_test(
     power = at.sums(whole**2)
     single = int(np.argmax(at.count > 1)) if at.count[-1] > 1 else len(at.count)
     bands = _bands(n, window, at)
-    # the first coefficients of a line and a parabola
+    # the low-frequency coefficients of a line and a parabola
     t = np.arange(n, dtype=float) if times is None else times
     t = 2.0 * (t - t[0]) / max(float(t[-1] - t[0]), 1e-9) - 1.0
     trend = np.stack([at.coefficients(t**k)[:single] for k in (1, 2)], axis=1)
@@ -298,7 +297,7 @@ def drift_test(
         )
         for band in bands
     ]
-    # From third differences, to which a drift of a thousand sds adds nothing, by their median.
+    # the median of third differences, which a drift of a thousand sds does not change
     third = np.abs(np.diff(values, n=3)) / sds[1:-2]
     noise_ratio = float(np.median(third)) / (_NORMAL_MEDIAN * np.sqrt(20.0))
     mean_square = float(np.mean(sds**2))
@@ -313,18 +312,18 @@ def drift_test(
 
 
 def _few_far(distance: Array, steps: Array) -> Mask:
-    """Mark the distances (m,) that are far by the scatter of the increments (n - 1,) of a series.
+    """Mark distances (m,) that are large for the scatter of a series' increments (n - 1,).
 
-    None where they are many: then they are noise.
+    None is marked if there are many: then they are noise.
     """
     far: Mask = np.abs(distance) > _JUMP * mad_sd(steps - np.median(steps))
     return far if far.sum() <= _MOST_JUMPS * (len(steps) + 1) else np.zeros_like(far)
 
 
 def _without_spikes(y: Array) -> Array:
-    """The series with single epochs that contradict both neighbours set between them: no drift."""
+    """Return the series with single epochs that contradict both neighbours replaced: no drift."""
     out = y.copy()
-    # the middle one of three neighbours
+    # the median of three neighbours
     between = np.minimum(y[:-2], y[1:-1])
     np.maximum(between, np.minimum(np.maximum(y[:-2], y[1:-1]), y[2:]), out=between)
     inner = out[1:-1]
@@ -334,9 +333,9 @@ def _without_spikes(y: Array) -> Array:
 
 
 def _without_jumps(y: Array) -> Array:
-    """The series with its sudden steps taken out: they would pass as noise with a memory.
+    """Return the series without its sudden steps, which would count as noise with a memory.
 
-    Many are noise themselves, of few values: rounded, or to and fro.
+    Many steps are noise themselves, of few distinct values: rounded, or alternating.
     """
     steps = np.diff(y)
     middle = np.median(steps)
@@ -345,7 +344,7 @@ def _without_jumps(y: Array) -> Array:
 
 
 def _bands(n: int, window: int, at: Frequencies) -> list[int]:
-    """Ends of the slow bands, as positions in the pooled spectrum; at least one."""
+    """Return the ends of the slow bands, as positions in the pooled spectrum; at least one."""
     most = max(2, n // window)
     ends = [min(_FIRST_BAND, most)]
     while ends[-1] * _WIDENING <= most:
@@ -357,9 +356,9 @@ def _bands(n: int, window: int, at: Frequencies) -> list[int]:
 def _slow_against_fast(
     power: Array, high: Array, at: Frequencies, models: Array, band: int
 ) -> float:
-    """p-value of the slow band, continued from the fast one under models (g, m).
+    """Return the p-value of the slow band, predicted from the fast one under models (g, m).
 
-    power (m,): of the series; high: of its calm part beyond the band.
+    power (m,): of the series; high: that beyond the band, of the series without jumps.
     """
     from scipy.stats import f
 
@@ -374,9 +373,9 @@ def _slow_against_fast(
 
 
 def _without_trend(power: Array, first: Array, trend: Array, band: int) -> Array:
-    """Power beyond a band without what a trend leaks into it; first (k,): of single frequencies.
+    """Return the power beyond a band without a trend's leakage; first (k,): single frequencies.
 
-    Cosines end flat; a drift that does not is a line and a parabola more, which are taken out.
+    Cosines end flat, but a drift need not: a line and a parabola are removed.
     """
     power, high = power[band:].copy(), first[band:]
     if len(high) > 2:
@@ -388,12 +387,12 @@ def _without_trend(power: Array, first: Array, trend: Array, band: int) -> Array
 def _excess(
     power: Array, fast: Array, at: Frequencies, models: Array, band: int, redundancy: float
 ) -> float:
-    """p-value of the variance of the standardised series, which the sds say is 1."""
+    """Return the p-value of the variance of the standardised series, 1 if the sds are right."""
     from scipy.stats import f
 
     deviance = (fast[band:] / models[:, band:]).sum(axis=1)
     deviance = deviance + np.log(models[:, band:]) @ at.count[band:]
-    # A sum of squares of unequal variances: Satterthwaite's degrees of freedom.
+    # a sum of squares of unequal variances: Satterthwaite's degrees of freedom
     expected = models @ at.count
     degrees = expected**2 / (models**2 @ at.count)
     return largest_p_value(

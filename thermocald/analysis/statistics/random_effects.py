@@ -1,14 +1,14 @@
-"""Specimens of one type: their mean, how much they differ, and a new one shrunk towards them.
+"""Specimens of one type: their mean, the scatter between them, and a new one shrunk towards them.
 
 Specimen i has the true values θᵢ = μ + uᵢ, uᵢ ~ N(0, Σ), and an estimate bᵢ with covariance Cᵢ. The
 variances of u come from Paule and Mandel's equation (1982), one parameter at a time; correlations
-from the standardised differences, shrunk towards none as Schäfer and Strimmer (2005) do, since ten
-specimens cannot tell a full matrix. Everything is normal and conjugate: no sampling.
+from the standardised differences, shrunk towards zero after Schäfer and Strimmer (2005), since ten
+specimens cannot determine a full matrix. Everything is normal and conjugate: no sampling.
 
-What few specimens leave open in Σ is part of what is stated: it adds to the covariance of a new
-specimen (Kackar and Harville 1984), and intervals are those of a mixture over what Σ may be. It
-holds for each parameter; for a sum of two whose differences correlate strongly, and where the new
-specimen says next to nothing itself, 95 % were 93 % with ten specimens.
+The uncertainty of Σ from few specimens is included: it adds to the covariance of a new specimen
+(Kackar and Harville 1984), and intervals are those of a mixture over the possible Σ. This holds for
+each parameter; for a sum of two parameters whose differences are highly correlated, and a new
+specimen with next to no information of its own, 95 % were 93 % with ten specimens.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ _FEWEST = 2
 _FEWEST_FOR_CORRELATIONS = 4
 _ROUNDS = 60
 _STEP = 0.05
-_NODES = 49  # of the mixture over what Σ may be
+_NODES = 49  # of the mixture over Σ
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shrunk:
-    """A specimen's values with what its type says of them.
+    """A specimen's values shrunk towards its type.
 
-    values (k,), covariance (k, k); own: the information (k, k) of its own observations; push (k,):
-    what moves the values away from the mean; correlations (k, k): the part of the covariance that
-    the errors of Σ's correlations make.
+    values (k,), covariance (k, k); own (k, k): the information of its own observations; push (k,):
+    the gradient that moves the values away from the mean; correlations (k, k): the part of the
+    covariance from the errors of Σ's correlations.
     """
 
     values: Array
@@ -47,10 +47,10 @@ class Shrunk:
     correlations: Array
 
     def interval(self, direction: Array, level: float = 0.95) -> tuple[float, float, float]:
-        """Value, low and high of direction·θ at a confidence level; direction (k,).
+        """Return value, low and high of direction·θ at a confidence level; direction (k,).
 
-        A mixture over what Σ may be times, given few specimens: freedom / χ² of that freedom. It
-        moves the value as well as its variance, as a small Σ estimated by chance shrinks too much.
+        The interval is that of a mixture over factors of Σ, distributed as freedom / χ². A factor
+        changes the value, not only its variance: a Σ too small by chance shrinks too much.
         """
         from scipy.optimize import brentq
         from scipy.special import chdtri, ndtr
@@ -65,21 +65,21 @@ class Shrunk:
         value = float(direction @ self.values)
         sds = np.sqrt(np.maximum(variances, 1e-300))
 
-        def missed(half: float) -> float:
+        def excess(half: float) -> float:
             low, high = ((value + end - middles) / sds for end in (-half, half))
             return float(np.mean(ndtr(high) - ndtr(low))) - level
 
         furthest = float(np.max(np.abs(value - middles) + 40 * sds))
-        half = float(brentq(missed, 0.0, furthest, xtol=1e-9 * furthest))
+        half = float(brentq(excess, 0.0, furthest, xtol=1e-9 * furthest))
         return value, value - half, value + half
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """A type: mean (k,), its covariance (k, k), Σ `between` (k, k).
+    """A type: mean (k,) with covariance (k, k), and Σ: `between` (k, k).
 
-    correlation_variance (k, k): expected square of the error of each correlation in Σ; freedom:
-    of Σ.
+    correlation_variance (k, k): expected squared error of each correlation in Σ; freedom: degrees
+    of freedom of Σ.
     """
 
     mean: Array
@@ -95,11 +95,11 @@ class Population:
         return covariance
 
     def posterior(self, values: Array, information: Array, gradient: Array | None = None) -> Shrunk:
-        """A new specimen from its own estimate and what little it knows.
+        """Return a new specimen from its own estimate, shrunk towards the type.
 
-        values (k,): its estimate, any number where it knows nothing; information (k, k): the
-        inverse of its covariance, zero where it knows nothing; gradient (k,): of its own
-        observations at `values`, where these are not their optimum.
+        values (k,): its estimate, any number for an undetermined parameter; information (k, k): the
+        inverse of its covariance, zero for an undetermined parameter; gradient (k,): of its own
+        observations at `values`, if these are not their optimum.
         """
         known = np.where(np.diag(information) > 0, values, 0.0)
         push = information @ (known - self.mean) + (0.0 if gradient is None else gradient)
@@ -111,8 +111,8 @@ class Population:
             step: Array = (self.mean + other @ push - found) / _STEP
             return step
 
-        # what Σ's own errors do to the values, after Kackar and Harville (1984): of its variances,
-        # and of its correlations
+        # effect of the errors of Σ on the values, after Kackar and Harville (1984): of its
+        # variances, and of its correlations
         size = len(found)
         sd = np.sqrt(np.diag(self.between))
         scatter, correlations = np.zeros((size, size)), np.zeros((size, size))
@@ -132,7 +132,7 @@ class Population:
 
 
 def population(values: Array, covariances: Array) -> Population:
-    """The type of M specimens, from estimates (M, k) and their covariances (M, k, k).
+    """Estimate the type of M specimens from their values (M, k) and covariances (M, k, k).
 
     Raises DataError for fewer than two specimens.
     """
@@ -146,7 +146,7 @@ def population(values: Array, covariances: Array) -> Population:
     standard = (values - mean) * np.sqrt(weight)
     correlation, error = _shrunk_correlation(standard)
     between = correlation * np.sqrt(np.outer(variance, variance))
-    # the mean's covariance: of the specimens' scatter and of their own noise
+    # covariance of the mean: from the specimens' scatter and their own noise
     share = weight / weight.sum(axis=0)
     total = between[None] + covariances
     mean_covariance = np.einsum("ij,ijk,ik->jk", share, total, share)
@@ -154,10 +154,10 @@ def population(values: Array, covariances: Array) -> Population:
 
 
 def odd_specimens(values: Array, covariances: Array) -> Array:
-    """The probability (M,) that a specimen of the type is as far from the others as each is.
+    """Return the probabilities (M,) that a specimen of the type is as far off as each one is.
 
-    Each against a type made without it; of its parameters the farthest counts, corrected for their
-    number.
+    Each is compared with the type of the others; its most distant parameter counts, corrected for
+    the number of parameters.
     """
     from scipy.stats import t
 
@@ -173,7 +173,7 @@ def odd_specimens(values: Array, covariances: Array) -> Array:
 
 
 def _paule_mandel(values: Array, noise: Array) -> float:
-    """The variance between specimens with which their weighted squares have their expectation."""
+    """Return the variance between specimens that gives their weighted squares the expected sum."""
     low, high = 0.0, float(np.var(values, ddof=1)) * 4 + 1e-300
 
     def excess(variance: float) -> float:
@@ -190,7 +190,7 @@ def _paule_mandel(values: Array, noise: Array) -> float:
 
 
 def _posterior(prior: Array, information: Array) -> Array:
-    """(P⁻¹ + N)⁻¹ for a prior (k, k) that may be singular."""
+    """Return (P⁻¹ + N)⁻¹ for a prior P (k, k) that may be singular."""
     scale = np.sqrt(np.maximum(np.diag(prior), 1e-300))
     p, n = prior / np.outer(scale, scale), information * np.outer(scale, scale)
     found = np.linalg.solve(np.eye(len(p)) + p @ n, p) * np.outer(scale, scale)
@@ -199,7 +199,7 @@ def _posterior(prior: Array, information: Array) -> Array:
 
 
 def _shrunk_correlation(standard: Array) -> tuple[Array, Array]:
-    """Correlations (k, k) of (M, k) standardised values, shrunk towards none; their error²."""
+    """Return correlations (k, k) of standardised values (M, k), shrunk to 0, and squared errors."""
     count, size = standard.shape
     z = standard - standard.mean(axis=0)
     spread = np.sqrt((z**2).sum(axis=0) / (count - 1))

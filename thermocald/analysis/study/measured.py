@@ -1,11 +1,11 @@
-"""A measured series as the study reads it: columns of numbers, whoever calibrated the epochs.
+"""A measured series as the study reads it: columns of calibrated values, from any source.
 
-Only epochs with a result are rows; what the others lacked is counted by reason. Standard deviations
-are those that one epoch adds to its series: what all epochs have in common (the exterior
-orientation, the test field) cancels in every comparison between epochs.
+Only epochs with a result are rows; the others are counted by reason. Standard deviations are those
+of an epoch within its series: errors that all epochs share (exterior orientation, test field)
+cancel in every comparison between epochs.
 
-Unless `exterior="per_epoch"` all epochs are adjusted together from their observations. With it a
-store's series is read as it was stored, column by column, with a sample of its covariance matrices.
+All epochs are adjusted together from their observations, unless `exterior="per_epoch"`. Then a
+store's series is read as stored, column by column, with a sample of its covariance matrices.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thermometer:
-    """One channel at the times of the frames: values (E,) °C, NaN where missing; noise sd K."""
+    """A channel at the frames' times: values (E,) °C, NaN if missing; sd: noise K."""
 
     name: str
     values: Array
@@ -50,9 +50,9 @@ class Thermometer:
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """A piece of the image around one target, in the first and the last frame that exist.
+    """A section of the image around one target, in the first and the last frame that exist.
 
-    first, last: image files; first_epoch, last_epoch: their numbers; centre: px in the first.
+    first, last: image files; first_epoch, last_epoch: epoch numbers; centre: px in the first frame.
     """
 
     target: str
@@ -67,15 +67,14 @@ class Clip:
 class MeasuredSeries:
     """The epochs with a result of one series of one camera.
 
-    label: what the study treats as one camera; name: the series; number (E,), time_s (E,): s since
-    the first epoch of the series; thermometers: the first is the reference; values (E, 10): IOP;
-    sds (E, 10): NaN where held fixed; sigma0, redundancy (E,); correlations (m, 10, 10) of the IOP
-    in the adjustments of the epochs, of a sample where a series is long;
-    exterior: how the exterior orientation was estimated, choice: why; without_result: {reason:
-    epochs}; start_utc: s UTC of the first epoch, 0 where it has no date; image_noise_ratio: noise
-    of the image points found over the one stated, NaN where epochs were adjusted one by one;
-    field_movements: boards and targets that moved, taken off the observations; doubts: what cannot
-    have been meant in what was recorded.
+    label: what the study treats as one camera; name: of the series; number (E,); time_s (E,): s
+    since the first epoch of the series; thermometers: the first is the reference; values (E, 10):
+    IOP; sds (E, 10): NaN if held fixed; sigma0, redundancy (E,); correlations (m, 10, 10): of the
+    IOP in the epochs' adjustments, a sample if the series is long; exterior: how the exterior
+    orientation was estimated; choice: why; without_result: {reason: epochs}; start_utc: s UTC of
+    the first epoch, 0 if it has no date; image_noise_ratio: estimated over stated noise of the
+    image points, NaN if epochs were adjusted one by one; field_movements: boards and targets that
+    moved, for which the observations are corrected; doubts: implausible recorded data.
     """
 
     label: str
@@ -105,7 +104,7 @@ class MeasuredSeries:
 
     @cached_property
     def free(self) -> tuple[str, ...]:
-        """The IOP that were estimated, in their order."""
+        """The IOP that were estimated, in the order of `IOP_NAMES`."""
         return tuple(n for n in IOP_NAMES if bool(np.any(self.column(n)[1] > 0)))
 
     @cached_property
@@ -114,18 +113,18 @@ class MeasuredSeries:
         return np.array([np.mean(self.column(name)[0]) for name in IOP_NAMES])
 
     def column(self, name: str) -> tuple[Array, Array]:
-        """Return the values and standard deviations (E,) of one IOP, not to be written to."""
+        """Return the values and standard deviations (E,) of one IOP; do not write to them."""
         k = IOP_NAMES.index(name)
         return np.ascontiguousarray(self.values[:, k]), np.ascontiguousarray(self.sds[:, k])
 
     @property
     def reference(self) -> Thermometer | None:
-        """The reference thermometer, if there is one."""
+        """The reference thermometer, or None."""
         return self.thermometers[0] if self.thermometers else None
 
     @property
     def interval_s(self) -> float:
-        """Median time between epochs, NaN for a single one."""
+        """Median time between epochs, s; NaN for a single epoch."""
         return float(np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
 
 
@@ -133,12 +132,12 @@ _MOST_MATRICES = 5000
 
 
 def refuse_copies(series: Sequence[MeasuredSeries]) -> None:
-    """Raise DataError where two series hold the same epochs."""
+    """Raise DataError if two series have the same epochs."""
     for i, one in enumerate(series):
         for other in series[:i]:
             if len(one) > 1 and len(one) == len(other) and np.array_equal(one.values, other.values):
                 raise DataError(
-                    f"{one.source} holds the same epochs as {other.source}; give each series once"
+                    f"{one.source} has the same epochs as {other.source}; give each series once"
                 )
 
 
@@ -151,11 +150,11 @@ def measured_series(
 ) -> MeasuredSeries:
     """Return calibrated epochs as the study reads them.
 
-    table: of the series, adjusted together or as they were stored; observations: what an epoch
-    (from 0) shows; label: what the study treats as one camera; thermometer_sd K, by default from
-    the readings. Raises DataError where no epoch has a result.
+    table: the series, adjusted together or as stored; observations: those of an epoch (row from 0);
+    label: what the study treats as one camera; thermometer_sd K: by default estimated from the
+    readings. Raises DataError if no epoch has a result.
     """
-    ok, without_result = _assessed(table)
+    ok, without_result = _find_results(table)
     if not ok.any():
         lost = ", ".join(f"{n} × {reason}" for reason, n in without_result.items())
         raise DataError(f"{source.title}: no epoch has a result ({lost or 'it has no epochs'})")
@@ -193,10 +192,10 @@ def measured_series(
     )  # fmt: skip
 
 
-def _assessed(table: Epochs) -> tuple[NDArray[np.bool_], dict[str, int]]:
-    """Return which epochs have every number that others have, and {reason: epochs without result}.
+def _find_results(table: Epochs) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    """Return which epochs have a complete result, and {reason: epochs without one}.
 
-    A covariance matrix at the edge of singularity can have negative variances, that is not an sd.
+    A nearly singular covariance matrix can have negative variances, which have no square root.
     """
     ok = table.ok
     lost = sorted((word, n) for word, n in Counter(table.status).items() if word != "ok")
@@ -214,7 +213,7 @@ def _clip(
     ok: NDArray[np.bool_],
     observations: Callable[[int], Observations | None],
 ) -> Clip | None:
-    """Return a clip about the target nearest to the centre that both ends show; None without."""
+    """Return a clip around the most central target that both ends show; None if there is none."""
     ends = source.framed(ok)
     if len(ends) != 2 or not all(frame.is_file() for _, frame in ends):
         return None

@@ -1,19 +1,19 @@
 """Effects of a drifting interior orientation on an object plane parallel to the sensor.
 
-The plane lies at a distance in front of the projection centre; a point is where the ray of an image
-point meets it, (X, Y) mm in camera axes. First-order errors: distances of a bivariate normal
-variable (Hoyt 1947, Proc. IRE 35, 652-657).
+The plane is at a distance in front of the projection centre; a point is the intersection of an
+image point's ray with it, (X, Y) mm in camera axes. First-order errors are the lengths of a
+bivariate normal variable (Hoyt 1947, Proc. IRE 35, 652-657).
 
-Monte-Carlo: sets of IOP are drawn from a normal distribution with given standard deviations and
-correlations; every image point of a grid is projected with every set on a plane parallel to the
-sensor, and its distance to the expected point is clustered (Elias et al. 2020, sections 3.2 and
-4.4). Drawing, projection and clustering go through the sets in chunks, so memory does not grow with
-their number. Seeded: the same seed gives the same sets, whatever the chunks.
+Monte-Carlo simulation: sets of IOP are drawn from a normal distribution with given standard
+deviations and correlations; every image point of a grid is projected with every set onto the plane,
+and its distance from the expected point is clustered (Elias et al. 2020, sections 3.2 and 4.4).
+Sets are processed in chunks, so memory does not grow with their number. The same seed gives the
+same sets, whatever the chunks.
 
-It answers for the drawn distribution only. IOP that drift with the temperature are not normally
-distributed, and x0 and y0 that drift together are drawn with the adjustments' correlation. So every
-epoch's interior orientation itself is taken too, against three that a user may hold fixed: that of
-the first epoch, the mean of the series, the last.
+The simulation holds for the drawn distribution only. IOP that drift with the temperature are not
+normally distributed, and x0 and y0 that drift together are drawn with the adjustments' correlation.
+Therefore every epoch's interior orientation itself is also compared with three that a user may hold
+fixed: that of the first epoch, the mean of the series, and that of the last.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _ANGLES = 720
 
 
 def shares_within(axes: Array, distance: ArrayLike) -> Array:
-    """P(|d| < distance) (k, m) of centred bivariate normal errors d, for distances (m,) mm.
+    """Return P(|d| < distance), (k, m), of centred bivariate normal errors d; distance (m,) mm.
 
     axes (k, 2): standard deviations along the two axes of each point's ellipse, mm.
     """
@@ -64,7 +64,7 @@ def shares_within(axes: Array, distance: ArrayLike) -> Array:
 
 
 def mean_and_largest(axes: Array, draws: int) -> tuple[Array, Array]:
-    """E|d| (k,) mm, and the expected largest |d| among `draws` independent errors; axes (k, 2)."""
+    """Return E|d| (k,) mm and the expected largest |d| of `draws` errors; axes (k, 2)."""
     from scipy.special import ellipe
 
     small, large = np.sort(axes, axis=1).T
@@ -78,12 +78,12 @@ def mean_and_largest(axes: Array, draws: int) -> tuple[Array, Array]:
 
 
 def on_plane(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: float) -> Array:
-    """Image points (k, 2) px → points (k, 2) mm on the plane; GeometryError where no ray exists."""
+    """Project image points (k, 2) px to the plane (k, 2) mm. Raises GeometryError without a ray."""
     return distance_mm * ideal_points(sensor, iop, points)
 
 
 def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: float) -> Array:
-    """∂(X, Y)/∂iop (k, 2, 10) of image points (k, 2) px: mm per unit of each IOP."""
+    """Return ∂(X, Y)/∂iop (k, 2, 10) of image points (k, 2) px, mm per unit of each IOP."""
     plane = on_plane(sensor, iop, points, distance_mm)
     object_points = np.column_stack([plane, np.full(len(plane), -distance_mm)])
     _, by_parameter, by_object = partials(sensor, iop, np.zeros(6), object_points)
@@ -94,16 +94,16 @@ def plane_jacobian(sensor: Sensor, iop: ArrayLike, points: Array, distance_mm: f
 _CHUNK = 1024
 _SAMPLE = 1500
 _STEPS = 30
-_CONVERGED = 1e-12  # of the distance: 1e-8 mm at 10 m
+_CONVERGED = 1e-12  # fraction of the distance: 1e-8 mm at 10 m
 
 
 @dataclass(frozen=True, eq=False)
 class MonteCarlo:
-    """Distances on the plane, per grid point (k,), mm.
+    """The distances on the plane from a Monte-Carlo simulation, per grid point, mm.
 
-    image_points (k, 2) px; expected (k, 2) mm; counts (k, m+1): sets per cluster, limits
+    image_points (k, 2) px; expected (k, 2) mm; counts (k, m+1): sets per cluster with the limits
     `clusters_mm`; mean, largest (k,); mean_error (k, 2): second-order bias; covariance (k, 2, 2)
-    mm²; sample (s, k, 2): errors of the first sets; folded: sets without a ray, left out.
+    mm²; sample (s, k, 2): errors of the first sets; folded: sets left out as they have no ray.
     """
 
     sets: int
@@ -122,7 +122,7 @@ class MonteCarlo:
 
     @property
     def fractions(self) -> Array:
-        """Fraction of all distances per cluster (m+1,)."""
+        """Fraction of all distances in each cluster (m+1,)."""
         return np.asarray(self.counts.sum(axis=0) / self.counts.sum())
 
     @property
@@ -137,17 +137,17 @@ class MonteCarlo:
 
 
 def draw_root(sds: Array, correlation: Array) -> Array:
-    """A matrix (k, 10) with rootᵀ root = the covariance of sds (10,) and correlation (10, 10).
+    """Return a root (k, 10) of the covariance from sds (10,) and correlation (10, 10).
 
     k is the number of parameters with sd > 0, so that held ones cost nothing. A correlation matrix
-    that element-wise medians left indefinite is taken to the nearest by its eigenvalues, its
-    diagonal restored.
+    that element-wise medians made indefinite loses its negative eigenvalues, and its diagonal is
+    restored.
     """
     free = np.flatnonzero(sds > 0)
     r = correlation[np.ix_(free, free)]
     values, vectors = np.linalg.eigh(0.5 * (r + r.T))
-    # The symmetric root: unlike other roots it depends neither on the signs nor on the order of the
-    # eigenvectors, so that nearly the same matrix gives nearly the same draws.
+    # unlike other roots, the symmetric one depends neither on the signs nor on the order of the
+    # eigenvectors: nearly the same matrix gives nearly the same draws
     factor = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     factor /= np.linalg.norm(factor, axis=1, keepdims=True)
     root = np.zeros((len(free), len(sds)))
@@ -165,9 +165,9 @@ def simulate_errors(
 ) -> MonteCarlo:
     """Draw IOP about `iop` (10,) and cluster the errors on the plane.
 
-    sds (10,) in the units of the IOP, correlation (10, 10); progress receives how many sets were
-    done. The processes that project them give the same bits for any number. Raises GeometryError
-    where the expected point of a grid point does not exist.
+    sds (10,) in the units of the IOP, correlation (10, 10); progress receives the number of sets
+    done. The result is the same, bit for bit, with any number of processes. Raises GeometryError if
+    a grid point has no expected point, or if fewer than two sets have rays.
     """
     points, sets = image_grid(sensor, settings.grid), settings.sets
     root = draw_root(sds, correlation)
@@ -184,7 +184,7 @@ def simulate_errors(
         for done in range(0, sets, _CHUNK)
     )
     for drawn, ok, part_counts, part_largest, part_sums, first_errors in in_order(
-        _simulated, (project, iop, root, limits), draws, settings.jobs
+        _simulate, (project, iop, root, limits), draws, settings.jobs
     ):
         folded += drawn - ok
         counts += part_counts
@@ -209,16 +209,17 @@ def simulate_errors(
     )  # fmt: skip
 
 
-def _simulated(
-    known: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]
+def _simulate(
+    common: tuple[_PlaneErrors, Array, Array, Array], draws: tuple[Array, int]
 ) -> tuple[int, int, NDArray[np.int64], Array, Array, Array]:
-    """Simulate sets from standard normal numbers (n, r); of how many a sample still needs them.
+    """Simulate a chunk of sets.
 
-    known: the projection, the mean IOP (10,), the root (r, 10) of their covariance, the clusters.
-    Returns how many sets were drawn and how many have rays; counts, largest as in `MonteCarlo`;
-    sums (k, 6) of distances, errors, their squares and product; errors (s, k, 2) of the sample.
+    common: the projection, the mean IOP (10,), the root (r, 10) of their covariance, the clusters;
+    draws: standard normal numbers (n, r), and how many sets the sample still needs. Returns the
+    numbers of sets drawn and of sets with rays; counts, largest as in `MonteCarlo`; sums (k, 6) of
+    distances, errors, their squares and product; errors (s, k, 2) of the sample.
     """
-    (project, iop, root, limits), (normal, wanted) = known, draws
+    (project, iop, root, limits), (normal, wanted) = common, draws
     dx, dy, ok = project(iop + normal @ root)
     if not ok.all():
         dx, dy = dx[:, ok], dy[:, ok]
@@ -237,7 +238,7 @@ def _simulated(
 def plane_errors(
     sensor: Sensor, iop: Array, sets: Array, points: Array, distance_mm: float
 ) -> Array:
-    """Errors (n, k, 2) mm of image points (k, 2) px under sets (n, 10) against `iop` (10,)."""
+    """Return errors (n, k, 2) mm of image points (k, 2) px for sets (n, 10); NaN without rays."""
     dx, dy, ok = _PlaneErrors(sensor, iop, points, distance_mm)(sets)
     errors = np.stack([dx.T, dy.T], axis=-1)
     errors[~ok] = np.nan
@@ -245,10 +246,10 @@ def plane_errors(
 
 
 class _PlaneErrors:
-    """Errors of fixed image points under many sets of IOP.
+    """The errors of fixed image points for many sets of IOP.
 
     The ideal point of each set starts at its first-order value, where its Jacobian is evaluated
-    once; two or three steps then are enough. A general inversion would start at the image point.
+    once, so that two or three steps are enough. A general inversion would start at the image point.
     """
 
     def __init__(self, sensor: Sensor, iop: Array, points: Array, distance_mm: float) -> None:
@@ -260,17 +261,17 @@ class _PlaneErrors:
         self._tolerance = _CONVERGED * iop[0]
         self._ideal = self.expected * scale
         by_iop = plane_jacobian(sensor, iop, points, distance_mm) * scale
-        # x̄ = X c / D: its own dependence on c joins that of the plane point.
+        # x̄ = X c / D depends on c also directly, not only through X
         by_iop[:, :, 0] += self.expected / distance_mm
         self._by_iop = by_iop
 
-    # a set that folds the image may run away; it has no rays
+    # a set that folds the image may diverge; it has no rays
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def __call__(self, sets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Sets (n, 10) → errors in X and Y (k, n) mm, and which sets have rays at all (n,)."""
+        """Return the errors in X and Y (k, n) mm of sets (n, 10), and which sets (n,) have rays."""
         sets = np.asfortranarray(sets)
         step = (sets - self._iop).T
-        # (k, n, 1): the camera model has one point of each camera at a time
+        # (k, n, 1): one point per camera at a time, as the camera model broadcasts
         x = (self._ideal[:, :1] + self._by_iop[:, 0] @ step)[..., None]
         y = (self._ideal[:, 1:] + self._by_iop[:, 1] @ step)[..., None]
         xm, ym = self._mm[:, 0, None, None], self._mm[:, 1, None, None]
@@ -294,18 +295,18 @@ class _PlaneErrors:
 
 
 REFERENCES = ("first", "mean", "last")
-"""The interior orientations that are held fixed, by name."""
+"""Names of the interior orientations that are held fixed."""
 
-_MOST_EPOCHS = 2000  # of one series, spread evenly
+_MOST_EPOCHS = 2000  # per series, evenly spread
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Errors on the plane along the path, all series together, against one fixed orientation.
+    """The errors on the plane over all epochs of all series, relative to a fixed orientation.
 
     reference: first, mean or last; fractions (m+1,): of the distances of all epochs and image
-    points per cluster; mean mm; mean_largest: mean over the image points of their largest, mm;
-    epochs: how many were used.
+    points in each cluster; mean mm; mean_largest: mean of the image points' largest distances, mm;
+    epochs: number used.
     """
 
     JSON: ClassVar = {"mean": "mean_mm", "mean_largest": "mean_of_maxima_mm"}
@@ -323,10 +324,10 @@ def trajectories(
     size: int,
     clusters_mm: Sequence[float],
 ) -> tuple[Trajectory, ...]:
-    """The path of one camera against its first, mean and last interior orientation.
+    """Compare one camera's epochs with its first, mean and last interior orientation.
 
-    size: image points per row and column; each series has a path and references of its own. Raises
-    GeometryError where a reference has no ray for an image point.
+    size: image points per row and column; each series has references of its own. Raises
+    GeometryError if a reference has no ray for an image point.
     """
     found = []
     series = [one for one in series if len(one) > 1]
@@ -354,7 +355,7 @@ def trajectories(
 
 
 def correlations_over_time(series: Sequence[MeasuredSeries]) -> Array:
-    """Pearson's r (10, 10) of the IOP over the epochs, about each series' own mean.
+    """Return Pearson's r (10, 10) of the IOP over the epochs, about each series' own mean.
 
     NaN for parameters that were held or did not change.
     """
@@ -364,8 +365,7 @@ def correlations_over_time(series: Sequence[MeasuredSeries]) -> Array:
         within = []
         for one in series:
             values = one.column(name)[0] if name in one.free else np.full(len(one), np.nan)
-            values -= values.mean()
-            within.append(values)
+            within.append(values - values.mean())  # a single epoch's column is no copy
         columns.append(within[0] if len(within) == 1 else np.concatenate(within))
     rows = [IOP_NAMES.index(name) for name in every]
     matrix = np.full((len(IOP_NAMES), len(IOP_NAMES)), np.nan)

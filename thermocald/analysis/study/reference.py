@@ -1,9 +1,9 @@
-"""The reference's figures alongside ours: the presets, simulated, adjusted, and studied.
+"""Comparison with the reference: its figures beside ours, from simulated, adjusted presets.
 
-Numbers are quoted from section 4 of Elias, Eltner, Liebold and Maas (2020), Sensors 20, 643. The
-presets put in what the reference reports of the drift (principal point, principal distance, σ₀);
-what comes out at the other end, errors in object space, correlations, significance, is computed.
-Two series per camera, as there.
+Figures are quoted from section 4 of Elias, Eltner, Liebold and Maas (2020), Sensors 20, 643. The
+presets simulate the drift that the reference reports (principal point, principal distance, σ₀); the
+errors in object space, correlations and significance are results. There are two series per camera,
+as in the reference.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from thermocald.analysis.study.study import CameraStudy
 
     _Row = tuple[str, str, str, float, float, float]
-    """As a Comparison, without its camera."""
+    """The fields of a Comparison after `camera`."""
 
 
 SERIES = (("M1", 1), ("M2", 2))
@@ -38,14 +38,14 @@ SERIES = (("M1", 1), ("M2", 2))
 
 @dataclass(frozen=True, slots=True)
 class Quoted:
-    """The figures of a camera that the reference quotes; None where its text does not.
+    """The figures of a camera that the reference quotes; None if its text does not.
 
     below: percentage of errors below 1.5 cm; mean_cm, maxima_cm: mean error and mean of the nine
-    maxima; direction: where the principal point goes as it warms up; opposed: x0 and y0 run
-    against each other (r near -1); B_follows, sigma0_follows: whether the decentring and σ₀ are
-    highly correlated with the temperature; far: what it says of errors from 5 to 10 cm; moved_px,
-    c_mm: principal point and distance; focus_mm: depth of field at 1 m; sigma0_ratio: at the
-    highest temperature over the first.
+    maxima; direction: of the principal point's shift during warming; opposed: x0 and y0 change in
+    opposite directions (r near -1); B_follows, sigma0_follows: whether the decentring distortion
+    and σ₀ are highly correlated with the temperature; far: the reference's word on errors from 5 to
+    10 cm; moved_px, c_mm: changes of principal point and distance; focus_mm: change of the depth of
+    field at 1 m; sigma0_ratio: σ₀ at the highest temperature over the first.
     """
 
     below: float | None
@@ -73,8 +73,10 @@ QUOTED = {
         None, 1.1, 4.5, "lower left", None, True, True, "unlikely", sigma0_ratio=3.5
     ),
 }
-"""By preset. "Strong correlations between temperature and decentring for the RPi camera and the LG
-Nexus 5"; "σ₀ of the S8 and the RPi highly correlated with the temperature but not of the Nexus 5";
+"""The quoted figures by preset.
+
+"Strong correlations between temperature and decentring for the RPi camera and the LG Nexus 5"; "σ₀
+of the S8 and the RPi highly correlated with the temperature but not of the Nexus 5";
 "errors up to 10 cm are likely" (S8, cold), "deviations of more than 5 cm are unlikely" (warm; the
 RPi "similar"), "errors > 10 cm appeared hardly ever" (all). Table 7 itself is not quoted beyond
 that."""
@@ -85,18 +87,18 @@ _DIRECTIONS = {
     "lower left": (-180.0, -90.0),
 }
 """Bounds of the direction in degrees, from right (0) towards up."""
-_STRONG, _WEAK = 0.7, 0.5  # |r| that counts as strong or high, and below which it is not
-_UNLIKELY = 1.0  # per cent of all errors, at most
-_LIKELY = 5.0  # per cent, at least
+_STRONG, _WEAK = 0.7, 0.5  # |r| from which a correlation is strong, and below which it is not
+_UNLIKELY = 1.0  # at most so many per cent of all errors
+_LIKELY = 5.0  # at least so many per cent of all errors
 
 _CLOSE = 0.98
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One figure of the reference alongside ours; text is how the reference puts it.
+    """A figure of the reference and ours; text: as the reference states it.
 
-    low, high: what counts as reproduced.
+    low, high: bounds within which ours counts as reproduced.
     """
 
     JSON: ClassVar = {"text": "reference", "low": "", "high": "", "reproduced": "reproduced"}
@@ -111,16 +113,14 @@ class Comparison:
 
     @property
     def reproduced(self) -> bool:
-        """Return whether ours lies within the bounds."""
+        """True if our figure is within the bounds."""
         return self.low <= self.ours <= self.high
 
 
 def reference_studies(
     settings: StudySettings, advance: Callable[[int], None] = lambda _: None
 ) -> list[CameraStudy]:
-    """The study of every preset, whose two series are simulated to a recording, read again, and
-    adjusted; the f-number is each camera's own.
-    """
+    """Study every preset with its own f-number, from two series simulated, read and adjusted."""
     studies = []
     for preset in QUOTED:
         measured = []
@@ -131,7 +131,7 @@ def reference_studies(
                 recording = open_recording(path)
                 table, seen = recorded_table(recording, AdjustmentSettings(), "series")
                 one = measured_series(recording, table, seen, preset)
-                # The folder is gone when the study is read.
+                # the folder no longer exists when the study is read
                 source = f"preset {preset}, series {name}, seed {seed}"
                 measured.append(replace(one, source=source))
                 advance(1)
@@ -141,15 +141,15 @@ def reference_studies(
 
 
 def compare(camera: CameraStudy) -> list[Comparison]:
-    """Hold what the study found against what the reference says of this preset."""
+    """Compare the study of a preset with the figures of the reference."""
     quoted, mc, series = QUOTED[camera.label], camera.montecarlo, camera.series
     if mc is None:
         return []
-    # what moved, how far, and where to
+    # changes of the interior orientation
     changes = [one.deviations for one in series]
     pitch = series[0].series.sensor.pixel_pitch
     px = np.mean([np.hypot(d["x0"].change, d["y0"].change) / pitch for d in changes])
-    # where the principal point stands at its farthest, degrees from right towards up
+    # direction of the principal point's largest shift, degrees from right towards up
     steps = []
     for one in series:
         path = one.series.values[:, 1:3] - one.series.values[0, 1:3]
@@ -189,7 +189,7 @@ def compare(camera: CameraStudy) -> list[Comparison]:
     for name in ("c", "x0", "y0"):
         share = float(np.mean([one.significance[name].success_ratio for one in series]))
         rows.append((f"F-test of {name}, success ratio", "", "near 1", share, 0.9, np.inf))
-    # all classes of Table 7 of which the text speaks, means and maxima
+    # the classes of Table 7 that the text mentions, means and maxima
     percent = (100 * mc.fractions).tolist()
     rows += _about("errors below 1.5 cm at 10 m", "%", quoted.below, percent[0], 3.0)
     if quoted.far == "likely":
@@ -207,7 +207,7 @@ def compare(camera: CameraStudy) -> list[Comparison]:
 def _about(
     quantity: str, unit: str, quote: float | None, ours: np.floating | float, bound: float
 ) -> list[_Row]:
-    """Compare a quoted number, with how much ours may differ; nothing where it is not quoted."""
+    """Return the row of a quoted figure, [] if not quoted; bound: how far ours may differ."""
     if quote is None:
         return []
     return [(quantity, unit, f"{quote:g}", float(ours), quote - bound, quote + bound)]

@@ -1,10 +1,9 @@
-"""One measured series studied: deviations, significance, temperature dependence.
+"""The study of one measured series: deviations, significance, temperature dependence.
 
-What cannot be computed is None, and `notes` says why.
+A result that cannot be computed is None, and `notes` gives the reason.
 
 Deviations are last minus first of every parameter, the path of the principal point, and the
-displacement of image points when everything in front of the camera stands still (Elias et al. 2020,
-Table 2 and Figures 3 to 6).
+displacement of the image points of a static scene (Elias et al. 2020, Table 2 and Figures 3 to 6).
 
 Depth of field by the exact formulas of the thin lens (Luhmann et al. 2014, section 3.1.2): with the
 hyperfocal distance H = f²/(N u) + f, focused at s, sharp from s (H - f)/(H + s - 2f) to
@@ -43,10 +42,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """Last minus first value with its standard deviation, the largest departure, the range.
+    """The change of a parameter over a series.
 
-    largest: signed, from the first value; range: largest minus smallest value; both tell a camera
-    that comes back from one that never left, and of noise alone they are some sds as well.
+    change: last minus first value; largest: signed, from the first value; range: largest minus
+    smallest value. The latter two, some sds from noise alone, reveal a camera that returned.
     """
 
     first: float
@@ -59,15 +58,15 @@ class Deviation:
 
     @property
     def returned(self) -> bool:
-        """Return whether it went much farther than it ended: `change` alone would hide it."""
+        """True if the parameter changed by much more than `change`, which would hide it."""
         return abs(self.largest) > max(1.5 * abs(self.change), 6 * self.sd_change)
 
 
 def deviation(values: Array, sds: Array) -> Deviation | None:
-    """Deviation of a column (n,) with its standard deviations (n,); NaN epochs are left out.
+    """Return the deviation of a column (n,) with standard deviations (n,); NaN epochs are left out.
 
-    The first and the last epoch are taken as independent, which they are when the standard
-    deviations hold what one epoch adds to its series. None where fewer than two values are left.
+    The first and the last epoch count as independent, as they are if the standard deviations
+    contain only the noise of an epoch within its series. Returns None for fewer than two values.
     """
     have = np.flatnonzero(np.isfinite(values))
     if len(have) < 2:
@@ -86,15 +85,15 @@ def deviation(values: Array, sds: Array) -> Deviation | None:
 
 
 def sd_of_sigma0(sigma0: Array, redundancy: Array) -> Array:
-    """Standard deviation of the standard deviation of unit weight: sigma0 / √(2 r)."""
+    """Return the standard deviation of sigma0: sigma0 / √(2 r)."""
     return np.asarray(sigma0 / np.sqrt(2 * np.maximum(redundancy, 1.0)))
 
 
 def image_displacement(sensor: Sensor, first: Array, later: Array, points: Array) -> Array:
-    """Move image points (k, 2) px of a still scene as the IOP change from first to later.
+    """Return the displacement of a static scene's image points (k, 2) px by a change of the IOP.
 
     first (10,), later (10,) or (n, 10); returns px (k, 2) or (n, k, 2), y down. Raises
-    GeometryError where the first IOP have no ray for a point.
+    GeometryError if the first IOP have no ray for a point.
     """
     scene = directions(sensor, first, points)
     seen = project(sensor, later, np.zeros((*later.shape[:-1], 6)), scene)
@@ -102,18 +101,18 @@ def image_displacement(sensor: Sensor, first: Array, later: Array, points: Array
 
 
 def circle_of_confusion(sensor: Sensor) -> float:
-    """The blur still taken as sharp, mm: 1/2000 of the image diagonal, two to three pixels here."""
+    """Return the largest blur that counts as sharp, mm: 1/2000 of the image diagonal, 2 to 3 px."""
     return float(np.hypot(sensor.width, sensor.height)) * sensor.pixel_pitch / 2000
 
 
 def depth_of_field(
     principal_distance: float, focus_distance: float, f_number: float, confusion: float
 ) -> tuple[float, float]:
-    """Return from where to where a lens focused at `focus_distance` is sharp, all mm.
+    """Return the near and far limits between which a lens focused at `focus_distance` is sharp, mm.
 
-    Focused beyond the hyperfocal distance it is sharp to infinity. The principal distance stands
-    for the focal length, which it exceeds by f²/s: 0.4 % at 1 m for these lenses. Raises ValueError
-    for lengths that are not positive.
+    A lens focused beyond the hyperfocal distance is sharp to infinity. The principal distance is
+    used as the focal length, which it exceeds by f²/s: 0.4 % at 1 m for these lenses. Raises
+    ValueError for lengths that are not positive.
     """
     f, s = principal_distance, focus_distance
     if min(f, f_number, confusion) <= 0 or s <= f:
@@ -133,11 +132,11 @@ _LEAST_DEPENDENCE = 4
 
 @dataclass(frozen=True, slots=True)
 class StudySettings:
-    """The choices of a user; lengths mm, temperatures K.
+    """The options of a study; lengths in mm, temperatures in K.
 
-    window, alpha: of the F-test; sets, seed, distance_mm, grid, clusters_mm: of the Monte-Carlo;
-    focus_mm, f_number, confusion_mm: of the depth of field, None: 1/2000 of the image diagonal;
-    thermometer_sd: None takes it from the readings themselves; jobs: processes that simulate.
+    window, alpha: of the F-test; sets, seed, distance_mm, grid, clusters_mm: of the Monte-Carlo
+    simulation; focus_mm, f_number, confusion_mm (None: 1/2000 of the image diagonal): of the depth
+    of field; thermometer_sd: None estimates it from the readings; jobs: processes that simulate.
     """
 
     window: int = 31
@@ -156,11 +155,11 @@ class StudySettings:
 
 @dataclass(frozen=True, eq=False)
 class Significance:
-    """The moving F-test of one parameter, summed up, and the test for the whole series.
+    """The moving F-test of one parameter in summary, and the drift test of the whole series.
 
-    success_ratio over `tests` epochs, `left_out` had no window; degrees of freedom of the
-    variance and (median) of the mean squared sd; critical: median; course (k, 2): time s, ratio of
-    the variances, thinned for drawing; drift: None where there is none.
+    success_ratio: over `tests` epochs; left_out: epochs without a window; degrees of freedom of the
+    variance and (median) of the mean squared sd; critical: median; course (k, 2): time s and ratio
+    of the variances, thinned for drawing; drift: None if it cannot be tested.
     """
 
     JSON: ClassVar = {"critical": "critical_ratio", "course": "", "drift": "drift_test"}
@@ -178,9 +177,7 @@ class Significance:
 
 @dataclass(frozen=True, eq=False)
 class ChannelStudy:
-    """One thermometer: the dependence of every free parameter and of sigma0 on it, none with a
-    `reason` where the temperature says nothing.
-    """
+    """The dependence of free parameters and sigma0 on a thermometer, or the `reason` for none."""
 
     thermometer: Thermometer
     dependences: Mapping[str, Dependence]
@@ -189,7 +186,7 @@ class ChannelStudy:
 
 @dataclass(frozen=True, slots=True)
 class FocusChange:
-    """Depth of field at the first and the last epoch, mm, and the change with its sd."""
+    """The depth of field at the first and the last epoch, mm, and its change with sd."""
 
     JSON: ClassVar = {
         "change": "change_mm", "sd_change": "sd_change_mm", "confusion": "confusion_mm",
@@ -208,10 +205,10 @@ class FocusChange:
 class SeriesStudy:
     """The study of one series.
 
-    deviations: by IOP, `sigma0`, and thermometer; grid, displacement (k, 2) px: image
-    points of a still scene, first to last epoch, y down; columns, matrix (n, n): Pearson's r among
-    free IOP, sigma0 and thermometers; noise_ratio: scatter between neighbouring epochs over the
-    stated standard deviations, NaN where it was not found.
+    deviations: of the IOP, `sigma0` and the thermometers; grid, displacement (k, 2) px: image
+    points of a static scene and their shifts from the first to the last epoch, y down; columns,
+    matrix (n, n): Pearson's r among free IOP, sigma0 and thermometers; noise_ratio: scatter between
+    neighbouring epochs over the stated standard deviations, NaN if it could not be estimated.
     """
 
     series: MeasuredSeries
@@ -228,7 +225,7 @@ class SeriesStudy:
 
 
 def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy:
-    """Study one series; never raises for data, but says what they do not allow."""
+    """Study one series. Never raises because of data; `notes` states what they do not allow."""
     notes = _circumstances(series)
     every = {name: deviation(*series.column(name)) for name in series.free}
     every["sigma0"] = deviation(series.sigma0, sd_of_sigma0(series.sigma0, series.redundancy))
@@ -239,9 +236,9 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
     channels = tuple(_channel(series, t) for t in series.thermometers)
     notes += [c.reason for c in channels if c.reason]
     notes += [
-        f"Slopes of {', '.join(short)} on {c.thermometer.name}: the noise remembers more than a "
-        "seventh of the series, which is too short for their standard deviations; take those as an "
-        "order of magnitude."
+        f"Slopes of {', '.join(short)} on {c.thermometer.name}: the noise is correlated over more "
+        "than a seventh of the series, which is too short for their standard deviations; take "
+        "those as an order of magnitude."
         for c in channels
         if (short := [parameter_label(n) for n, d in c.dependences.items() if d.too_short])
     ]
@@ -253,7 +250,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
                 series.sensor, series.values[0], series.values[-1], grid
             )
         except GeometryError as error:
-            notes.append(f"The movement of the image cannot be computed: {error}.")
+            notes.append(f"The displacement of the image cannot be computed: {error}.")
     names = (*series.free, "sigma0", *(t.name for t in series.thermometers))
     columns = [
         *(series.column(name)[0] for name in series.free),
@@ -261,7 +258,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
         *(t.values for t in series.thermometers),
     ]
     focus = _focus(series, settings, deviations, notes)
-    # over all parameters, root mean
+    # root mean square over all parameters
     ratios = [one.drift.noise_ratio for one in significance.values() if one.drift is not None]
     noise_ratio = float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan")
     return SeriesStudy(
@@ -271,7 +268,7 @@ def study_series(series: MeasuredSeries, settings: StudySettings) -> SeriesStudy
 
 
 def _circumstances(series: MeasuredSeries) -> list[str]:
-    """Return what a reader must know of the series before its numbers."""
+    """Return notes on the series that a reader needs before its results."""
     notes = []
     lost = sum(series.without_result.values())
     if lost:
@@ -286,8 +283,8 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
             count = int(gaps.sum())
             notes.append(
                 f"The series has {count} gap{'s' if count > 1 else ''}, the longest of "
-                f"{float(steps.max()):.3g} s at an interval of {series.interval_s:.3g} s; windows "
-                "across them are not tested; in them the noise loses its memory as between epochs."
+                f"{float(steps.max()):.3g} s at an interval of {series.interval_s:.3g} s. Windows "
+                "across gaps are not tested; the noise decorrelates in a gap as between epochs."
             )
     held = [name for name in IOP_NAMES if name not in series.free]
     if held:
@@ -297,11 +294,11 @@ def _circumstances(series: MeasuredSeries) -> list[str]:
         )
     if series.choice:
         notes.append(f"Exterior orientation: {series.exterior} ({series.choice}).")
-    notes += [f"The test field moved: {m.sentence}; corrected for." for m in series.field_movements]
+    notes += [f"The test field moved: {m.sentence}; corrected." for m in series.field_movements]
     if series.exterior == "per_epoch":
         notes.append(
-            "Every epoch has an exterior orientation of its own: its movements and the principal "
-            "point's are separated only weakly, and the standard deviations say so."
+            "Every epoch has an exterior orientation of its own: its movements and those of the "
+            "principal point are weakly separated, which the standard deviations include."
         )
     if not series.thermometers:
         notes.append("The series has no temperature: no dependence on it can be computed.")
@@ -344,10 +341,10 @@ def _significance(
 
 
 def _channel(series: MeasuredSeries, thermometer: Thermometer) -> ChannelStudy:
-    """All parameters against one thermometer, or why there is nothing to say."""
+    """Return the dependence of all parameters on one thermometer, or why there is none."""
     name, sd = thermometer.name, thermometer.sd
     finite = np.isfinite(thermometer.values)
-    # No copies of a year of epochs where none is missing.
+    # a slice avoids copies of a year of epochs if no reading is missing
     have = slice(None) if finite.all() else finite
     t = thermometer.values[have]
     reason = ""
@@ -384,7 +381,7 @@ def _focus(
     notes: list[str],
 ) -> FocusChange | None:
     if "c" not in deviations:
-        notes.append("The principal distance did not change or was held: no change of focus.")
+        notes.append("The principal distance was held or has one value only: no change of focus.")
         return None
     confusion = settings.confusion_mm or circle_of_confusion(series.sensor)
     c = deviations["c"]
@@ -400,8 +397,8 @@ def _focus(
     change = last - first
     if not np.isfinite(change):
         notes.append(
-            f"Focused at {settings.focus_mm / 1000:g} m everything up to infinity is sharp: the "
-            "depth of field has no end that could change."
+            f"Focused at {settings.focus_mm / 1000:g} m, everything up to infinity is sharp: the "
+            "depth of field has no far limit that could change."
         )
         return None
     slope = (nudged - first) / (c.first * 1e-6)

@@ -1,7 +1,7 @@
-"""The study of one or several cameras: section 4 of Elias et al. 2020 for one's own.
+"""The study of one or several cameras: section 4 of Elias et al. 2020 for the user's own cameras.
 
-Series with one label are one camera: their correlations are pooled, and one Monte-Carlo is drawn
-from both. The reference treats a cold- and a warm-started camera as two; so do labels.
+Series with the same label are one camera: their correlations are pooled for a single Monte-Carlo
+simulation. The reference treats a cold- and a warm-started camera as two; use two labels for that.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """The same covariance propagated to first order, per grid point (k,), mm.
+    """The covariance of the Monte-Carlo simulation propagated to first order, per grid point, mm.
 
-    covariance (k, 2, 2) mm²; mean; expected_largest: of as many draws as the Monte-Carlo had;
-    fractions (m+1,): of the clusters over all points.
+    covariance (k, 2, 2) mm²; mean (k,); expected_largest (k,): for the number of draws of the
+    simulation; fractions (m+1,): of the clusters over all points.
     """
 
     covariance: Array
@@ -52,12 +52,12 @@ class FirstOrder:
 
 @dataclass(frozen=True, eq=False)
 class CameraStudy:
-    """One camera (label): its series, and what they say together.
+    """The study of one camera (label) from its series.
 
-    iop (10,): mean over the series; sds (10,): standard deviations over time, 0 where held, pooled
-    over the series; correlations: within the adjustments, None where no epoch has a covariance
-    matrix; over_time (10, 10): of the parameters over the epochs; trajectories: what the camera's
-    own path does in object space, empty where it cannot be computed.
+    iop (10,): mean over the series; sds (10,): standard deviations over time, pooled over the
+    series that estimate a parameter, 0 if none does; correlations: within the adjustments, None if
+    no epoch has a covariance matrix; over_time (10, 10): correlations of the parameters over the
+    epochs; trajectories: the camera's own drift in object space, empty if it cannot be computed.
     """
 
     label: str
@@ -74,7 +74,7 @@ class CameraStudy:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """All cameras of one command."""
+    """The studies of all cameras."""
 
     settings: StudySettings
     cameras: tuple[CameraStudy, ...]
@@ -85,7 +85,7 @@ def study(
     settings: StudySettings | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Study:
-    """Study every camera; `progress` receives how many sets of IOP were simulated."""
+    """Study every camera; `progress` receives the number of IOP sets simulated."""
     s = settings or StudySettings()
     count = Counter((one.label, one.name) for one in series)
     series = [
@@ -112,17 +112,17 @@ def study_camera(
     notes: list[str] = []
     studies = tuple(study_series(one, settings) for one in series)
     iop = np.mean([one.mean for one in series], axis=0)
-    squares, degrees = np.zeros(10), 0
+    squares, degrees = np.zeros(10), np.zeros(10)
     for one in series:
-        if len(one) > 1:
-            for name in one.free:
-                squares[IOP_NAMES.index(name)] += np.var(one.column(name)[0]) * len(one)
-            degrees += len(one) - 1
-    sds = np.sqrt(squares / max(degrees, 1))
+        for name in one.free:
+            k = IOP_NAMES.index(name)
+            squares[k] += np.var(one.column(name)[0]) * len(one)
+            degrees[k] += len(one) - 1
+    sds = np.sqrt(squares / np.maximum(degrees, 1))
     correlations = median_correlations([one.correlations for one in series])
     if correlations is None:
         notes.append(
-            "No epoch has a covariance matrix: correlations within the adjustments are not known."
+            "No epoch has a covariance matrix: correlations within the adjustments are unknown."
         )
     montecarlo = first_order = None
     if correlations is None or not (sds > 0).any():
@@ -152,7 +152,7 @@ def study_camera(
         paths = trajectories(series, settings.distance_mm, settings.grid, settings.clusters_mm)
     except GeometryError as error:
         paths = ()
-        notes.append(f"The camera's path cannot be projected on the plane: {error}.")
+        notes.append(f"The camera's drift cannot be projected onto the plane: {error}.")
     return CameraStudy(
         label, studies, iop, sds, correlations, montecarlo, first_order,
         correlations_over_time(series), paths, tuple(notes),

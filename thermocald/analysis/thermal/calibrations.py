@@ -1,10 +1,9 @@
-"""A thermal model from calibrations at several temperatures, as those have who own a board.
+"""A thermal model from calibrations at several temperatures, for instance with a calibration board.
 
 Each calibration gives an interior orientation with its covariance; together they give the interior
 orientation at T₀ and the rates of c, x0, y0 by generalised least squares (Koch, Parameter
-Estimation and Hypothesis Testing in Linear Models, 3.2). What the model does not move (distortion,
-affinity) is one value, or follows the
-angle, and the test of the sum of squares says whether that holds.
+Estimation and Hypothesis Testing in Linear Models, 3.2). Parameters without a rate (distortion,
+affinity) are constant, or the distortion follows the angle; the sum of squares tests that.
 """
 
 from __future__ import annotations
@@ -47,8 +46,9 @@ _LEAST_SPAN_K = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """One calibration: camera, covariance (10, 10) of its interior orientation, when its
-    photographs were taken as the camera wrote it, and at which temperature °C, None if unknown.
+    """A calibration: a camera with the covariance (10, 10) of its interior orientation.
+
+    moments: of its photographs, as the camera wrote them; temperature: °C, None if unknown.
     """
 
     path: Path
@@ -60,17 +60,17 @@ class Calibration:
     temperature: float | None
 
     def span(self, clock: DeviceClock) -> Array:
-        """Return when the photographs were taken, s UTC; DataError where no file said it."""
+        """Return when the photographs were taken, s UTC. Raises DataError if that is not stored."""
         if not self.moments:
             raise DataError(
-                f"{self.path}: does not say when its photographs were taken; say their "
+                f"{self.path}: does not state when its photographs were taken; give their "
                 f"temperature: 21.5={self.path}"
             )
         return clock.utc(list(self.moments), lambda _: str(self.path))
 
 
 def is_calibration(path: Path) -> bool:
-    """Return whether a file is a document of `calibrate`, or a camera that it wrote."""
+    """Return whether a file is a document of `calibrate` or a camera that it wrote."""
     try:
         with path.open(encoding="utf-8") as file:
             return path.suffix == ".json" and '"thermocald-ca' in file.read(200)
@@ -79,12 +79,12 @@ def is_calibration(path: Path) -> bool:
 
 
 def read_calibration(path: Path, temperature: float | None = None) -> Calibration:
-    """Read what `calibrate` wrote with `--json` or `--camera-out`; ConfigurationError names it."""
+    """Read what `calibrate` wrote (`--json`, `--camera-out`). ConfigurationError names the file."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:
         raise ConfigurationError(f"{path}: cannot be read: {cause}") from cause
-    if document.get("format") != FORMAT:
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
         found = camera_files.read(path)
         if found.covariance is None:
             raise ConfigurationError(f"{path}: the camera has no covariance: it cannot be weighted")
@@ -109,7 +109,7 @@ def read_calibration(path: Path, temperature: float | None = None) -> Calibratio
 
 
 def with_log(calibration: Calibration, log: TemperatureLog, clock: DeviceClock) -> Calibration:
-    """Give a calibration the mean temperature of its photographs; DataError outside the log."""
+    """Return a calibration with its photographs' mean temperature; DataError outside the log."""
     times = calibration.span(clock)
     readings = interpolate_readings(times, log.times, next(iter(log.channels.values())))
     if not np.isfinite(readings).all():
@@ -123,11 +123,11 @@ def fit_calibrations(
     temperature_sd: float = 0.1,
     channel: str = "temperature",
 ) -> ThermalCamera:
-    """Fit interior orientation and rates; temperature_sd K: of each calibration's temperature.
+    """Fit interior orientation and rates to calibrations.
 
-    An effect is missing where the model leaves more than the stated covariances allow.
-
-    Raises DataError for too few or too narrow temperatures, UsageError for cameras that differ.
+    temperature_sd K: of each calibration's temperature. An effect is missing if the residuals are
+    larger than the stated covariances allow. Raises DataError for temperatures too few or too close
+    together, UsageError for cameras that differ or a calibration without a temperature.
     """
     T = np.array([_known(c) for c in calibrations])
     first = calibrations[0]
@@ -136,8 +136,8 @@ def fit_calibrations(
         _require_alike(first, other, free)
     if np.ptp(T) < _LEAST_SPAN_K:
         raise DataError(
-            f"the calibrations lie between {T.min():.1f} and {T.max():.1f} °C: a thermal model "
-            "needs two temperatures at least, better 20 K apart"
+            f"the calibrations are all between {T.min():.1f} and {T.max():.1f} °C: a thermal model "
+            "needs at least two temperatures, preferably 20 K apart"
         )
     at = round(float(T.mean()), 1) if T0 is None else T0
     rated = [i for i, k in enumerate(free) if IOP_NAMES[k] in RATED]
@@ -149,9 +149,9 @@ def fit_calibrations(
     for basis in BASES:
         M = np.eye(10) if basis == "image" else distortion_along(mean)
         M = M[np.ix_(free, free)]
-        # ∂ parameters of each calibration / ∂ (interior, rates), which take A and B along
+        # ∂ parameters of each calibration / ∂ (interior, rates); M makes the distortion follow c
         A = np.vstack([np.hstack([np.eye(len(M)), (t - at) * M[:, rated]]) for t in T])
-        found_in[basis] = _adjusted(A, y, blocks, M[:, rated], temperature_sd)
+        found_in[basis] = _adjust(A, y, blocks, M[:, rated], temperature_sd)
     distortion, sure = choose_basis({basis: s for basis, (_, _, s) in found_in.items()})
     x, covariance, square = found_in[distortion]
     redundancy = len(y) - len(x)
@@ -196,13 +196,13 @@ def _known(calibration: Calibration) -> float:
     if calibration.temperature is None:
         raise UsageError(
             f"{calibration.path}: at which temperature? Write 21.5={calibration.path}, or give the "
-            "--log of the thermometer"
+            "thermometer's --log"
         )
     return calibration.temperature
 
 
 def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
-    """Raise UsageError for another sensor, or other parameters that were estimated or held."""
+    """Raise UsageError if the sensor, the estimated parameters or the held values differ."""
     if other.camera.sensor != first.camera.sensor:
         raise UsageError(f"{other.path}: is of another sensor than {first.path}")
     own = np.flatnonzero(np.diag(other.covariance) > 0)
@@ -215,12 +215,12 @@ def _require_alike(first: Calibration, other: Calibration, free: Index) -> None:
         )
 
 
-def _adjusted(
+def _adjust(
     A: Array, y: Array, blocks: list[Array], by_rate: Array, temperature_sd: float
 ) -> tuple[Array, Array, float]:
-    """Estimate the unknowns; also returns their covariance and the sum of squares that is left."""
+    """Estimate the unknowns; also return their covariance and the residuals' sum of squares."""
     slope = np.zeros(len(by_rate))
-    for _ in range(2):  # what the temperature's sd does is known with the rates
+    for _ in range(2):  # the effect of the temperature's sd depends on the rates
         moved = temperature_sd**2 * np.outer(slope, slope)
         weight = np.linalg.inv(block_diag(*(block + moved for block in blocks)))
         covariance = np.asarray(np.linalg.inv(A.T @ weight @ A), dtype=float)
@@ -232,7 +232,7 @@ def _adjusted(
 
 
 def _rms(model: ThermalModel, calibration: Calibration, temperature: float) -> float:
-    """Return by how much the images of a calibration and of the model differ, px."""
+    """Return the RMS difference between the images of a calibration and of the model, px."""
     values = model.interior.as_array() + (temperature - model.T0) * model.rate_vector
     values = model.carried(values)
     camera = CameraModel(model.sensor, InteriorOrientation.from_array(values))

@@ -1,8 +1,8 @@
-"""A thermal camera fitted to the series of a camera, or the type to those of several cameras.
+"""Fits of a thermal camera to the series of one camera, and of a type to those of several cameras.
 
-A type is the mean of several specimens, and how much they differ. Its standard deviation is that of
-one more specimen: scatter between the cameras, and how well their mean is known. It is what a user
-has who did not calibrate, and the prior of one who measured at a few temperatures.
+A type is the mean of several specimens and the scatter between them. Its standard deviations are
+those of one more specimen: they contain the scatter and the uncertainty of the mean. A type serves
+a user who did not calibrate, and is the prior for a camera measured at few temperatures.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.statistics.random_effects import Population, population
-from thermocald.analysis.thermal.prediction_test import predicted_error
+from thermocald.analysis.thermal.prediction_test import NORMAL_95, predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
 from thermocald.errors import DataError
@@ -30,17 +30,14 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 
-_NORMAL_95 = 1.959964
-
-
 def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
-    """The type model of several cameras' models, which must have one structure and one T₀.
+    """Return the type model of several cameras' models, which must share one structure and one T₀.
 
-    DataError for fewer than two, or for models that are not alike.
+    Raises DataError for fewer than two models, or for models that are not alike.
     """
     if len(models) < 2:
         raise DataError("a type model needs at least two cameras")
-    # what happened to one camera at one time is nothing of the type
+    # an event of one camera is no property of the type
     models = [
         replace(m, effects=tuple(e for e in m.effects if not catalogue.get(e.name).is_event))
         for m in models
@@ -76,15 +73,16 @@ def type_model(models: Sequence[ThermalModel], name: str) -> ThermalModel:
 
 
 def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> ThermalCamera:
-    """A camera that was measured at few temperatures, fitted with what its type says of the rest.
+    """Fit a camera that was measured at few temperatures, with its type as prior.
 
-    Non-linear parameters, which few temperatures may not show at all, have the type's as a prior
-    within the adjustment; all others are shrunk afterwards. Raises DataError.
+    Non-linear parameters, which few temperatures may not determine at all, have the type's values
+    as priors in the adjustment; all others are shrunk towards the type afterwards. Raises
+    DataError.
 
-    `fitted["type"]` holds weights {rate or effect's parameter: the fraction of it that is the
-    type's}. 1 where its recordings say nothing of the parameter, so that value and standard
-    deviation are the type's; near 0 where they say all. It is the variance of the parameter over
-    its variance among the cameras of the type.
+    `fitted["type"]` holds weights {rate or effect's parameter: fraction that comes from the type}:
+    the parameter's variance over its variance among the cameras of the type. A weight is 1 if the
+    recordings do not determine the parameter, so that its value and standard deviation are the
+    type's, and near 0 if they determine it fully.
     """
     require_type(kind)
     sd = {e.name: e.sds for e in kind.effects}
@@ -101,7 +99,7 @@ def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> Therma
         if f"{e.name}.{key}" not in priors
     ]
     fitted = fit_thermal_model(series, kind.effects, kind.T0, False, fixed, priors, kind.distortion)
-    model = shrunk_to_type(fitted.model, kind, priors)
+    model = shrink_to_type(fitted.model, kind, priors)
     names = [n for n in _names(kind) if not n.startswith("interior.") and kind.sd(n) > 0]
     weights = {n: min(1.0, (model.sd(n) / kind.sd(n)) ** 2) for n in names}
     about = {"name": kind.camera, "cameras": len(kind.fitted_on), "weights": weights}
@@ -109,23 +107,23 @@ def fit_with_type(series: Sequence[ReducedSeries], kind: ThermalModel) -> Therma
 
 
 def require_type(kind: ThermalModel) -> None:
-    """DataError where a model is not that of a type."""
+    """Raise DataError for a model that is not a type's."""
     if kind.covariance is None or len(kind.fitted_on) < 2 or not all(
         "camera" in one for one in kind.fitted_on
     ):  # fmt: skip
         raise DataError(f"{kind.name or kind.camera} is not a type model (`fit --type` writes one)")
 
 
-def shrunk_to_type(
+def shrink_to_type(
     model: ThermalModel,
     kind: ThermalModel,
     priors: Mapping[str, tuple[float, float]] | None = None,
 ) -> ThermalModel:
-    """A camera that was measured at few temperatures, with what its type says of the rest.
+    """Combine the model of a camera that was measured at few temperatures with its type.
 
-    model: its own fit; kind: of `type_model`, with the same T₀ and effects; priors: what its fit
-    has already of the type, {name: (value, sd)}. The standard deviations are such that 95 % lie
-    within 1.96 of them, few specimens or not.
+    model: its own fit; kind: the type from `type_model`, with the same T₀ and effects; priors: the
+    type's values that the fit has already used, {name: (value, sd)}. The standard deviations are
+    scaled so that 95 % lie within 1.96 of them even with few specimens.
     """
     names = _names(kind)
     require_type(kind)
@@ -151,7 +149,7 @@ def shrunk_to_type(
     values = np.array([model.value(name) for name in names])
     gradient = np.zeros(len(names))
     for name, (value, prior_sd) in (priors or {}).items():
-        # the type counts once: what the fit knew of it is taken out again
+        # the type must count once: the fit's prior is removed
         at = names.index(name)
         information[at, at] -= 1.0 / prior_sd**2
         gradient[at] = (values[at] - value) / prior_sd**2
@@ -162,7 +160,7 @@ def shrunk_to_type(
     wider = np.ones(len(names))
     for i in np.flatnonzero(sd > 0):
         value, low, _ = new.interval(np.eye(len(names))[i])
-        wider[i] = (value - low) / (_NORMAL_95 * sd[i])
+        wider[i] = (value - low) / (NORMAL_95 * sd[i])
     return _with_values(
         model, names, new.values, new.covariance * np.outer(wider, wider), str(kind.camera)
     )
@@ -196,23 +194,23 @@ def _names(model: ThermalModel) -> tuple[str, ...]:
 def fit_camera(
     series: Sequence[ReducedSeries], listed: Sequence[ModelEffect], T0: float | None
 ) -> ThermalCamera:
-    """Fit one camera; of several series each is also predicted from a fit to the others."""
+    """Fit one camera; each of several series is also predicted from a fit to the others."""
     camera = fit_thermal_model(series, listed, T0)
     model, fitted = camera.model, camera.fitted or {}
-    held = []
+    errors = []
     for k, left_out in enumerate(series if len(series) > 1 else ()):
         rest = [s for i, s in enumerate(series) if i != k]
         others = fit_thermal_model(
             rest, model.effects, model.T0, search=False, distortion=model.distortion
         )
-        held.append(predicted_error(others.model, left_out, fitted["series"][k].thermometer_sd))
-    return replace(camera, fitted={**fitted, "prediction_test": held})
+        errors.append(predicted_error(others.model, left_out, fitted["series"][k].thermometer_sd))
+    return replace(camera, fitted={**fitted, "prediction_test": errors})
 
 
 def fit_type(
     series: Sequence[ReducedSeries], listed: Sequence[ModelEffect], T0: float | None, name: str
 ) -> ThermalCamera:
-    """Fit each of several cameras, and what their type is: the model of one more specimen."""
+    """Fit each of several cameras and return their type: the model of one more specimen."""
     cameras = list(dict.fromkeys(s.source.camera for s in series))
     if T0 is None:
         T0 = round(float(np.mean([s.history.temperature().mean() for s in series])), 1)

@@ -1,8 +1,8 @@
-"""Control points of a gauge: surveyed coordinates, and where they were seen.
+"""Control points of a gauge: surveyed coordinates and image points.
 
-Read from a CSV, from the GeoJSON of a GNSS receiver, and from pyorc's camera configuration.
-Coordinates of UTM or a national grid have seven digits before the comma: an origin is subtracted
-before anything is computed, and kept.
+They are read from a CSV, from the GeoJSON of a GNSS receiver, or from pyorc's camera configuration.
+Coordinates of UTM or a national grid have seven digits before the decimal point: an origin is
+subtracted before anything is computed, and stored.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.epoch.adjustment import Adjustment
 
 UNITS = {"mm": 1.0, "m": 1000.0}
-"""Lengths that control points and planes may be given in, in mm."""
+"""Units of control points and planes, in mm."""
 
-_LEAST_EXTENT_MM = 50.0  # of a gauge's points: metres read as mm, or degrees, lie nearer together
+_LEAST_EXTENT_MM = 50.0  # of a gauge's points; it is smaller for metres read as mm, or for degrees
 _LEAST_OF_A_GRID_MM = 1000.0  # of points more than a hundred times as far from the origin
-_LARGEST_EXTENT_MM = 2e6  # beyond it mm were read as metres
-_FITS = 3.0  # sigma0 of points that were mirrored back
-_ROUND_MM = 1e6  # coordinates count from a round number near the points
-_SURVEYED_MM = 20.0  # a GNSS receiver with corrections, where nothing is said
+_LARGEST_EXTENT_MM = 2e6  # it is larger for mm read as metres
+_FITS = 3.0  # largest sigma0 of a pose that fits after mirroring
+_ROUND_MM = 1e6  # the origin is rounded to this
+_SURVEYED_MM = 20.0  # a GNSS receiver with corrections, if no standard deviation is given
 _CLICKED_PX = 1.0
 # receivers' names of columns and properties
 _NAMES: dict[str, tuple[str, ...]] = {
@@ -52,10 +52,10 @@ _NAMES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class ControlPoints:
-    """Surveyed points and where they were seen.
+    """Surveyed points and their image points.
 
-    field: coordinates in mm from `origin` (3,) mm; seen: image points px, none where the file has
-    none; unit: of the file; assumed: what it does not say, in a sentence.
+    field: coordinates in mm from `origin` (3,) mm; seen: image points px, empty if the file has
+    none; unit: of the file; assumed: a sentence on standard deviations that the file lacks.
     """
 
     field: TestField
@@ -66,10 +66,10 @@ class ControlPoints:
 
     @classmethod
     def read(cls, path: Path, unit: str) -> ControlPoints:
-        """Read a CSV with target, X, Y, Z, sX, sY, sZ and, where they were seen, x, y, sx, sy (px);
-        kind, code and diameter as in a test field. GeoJSON and pyorc's JSON are in metres.
+        """Read control points from a CSV in a unit, mm or m, or from GeoJSON or pyorc's JSON in m.
 
-        unit: of the coordinates, mm or m. Raises DataError naming file, line and column.
+        The CSV has target, X, Y, Z, sX, sY, sZ, optionally image points x, y, sx, sy (px), and
+        kind, code and diameter as in a test field. Raises DataError naming file, line and column.
         """
         if path.suffix.lower() in (".json", ".geojson"):
             return _from_json(path)
@@ -80,8 +80,9 @@ class ControlPoints:
         cls, names: list[str], points: Array, sigmas: ArrayLike, unit: str, where: str,
         seen: tuple[Array, Array] | None = None, assumed: str = "", **looks: Any,
     ) -> ControlPoints:  # fmt: skip
-        """Build from coordinates (n, 3) in a unit, with standard deviations; seen: image points and
-        theirs, (n, 2) px each, NaN where a point was not seen.
+        """Build control points from coordinates (n, 3) in a unit, with standard deviations.
+
+        seen: image points and their standard deviations, (n, 2) px each, NaN for a point not seen.
         """
         scale = UNITS[unit]
         if not names:
@@ -118,7 +119,7 @@ class ControlPoints:
         return cls(field, image, origin, unit, assumed)
 
     def pose(self, camera: Camera, snooping_alpha: float = 0.001) -> Adjustment:
-        """Return the pose of a camera by where the points were seen; DataError says why not."""
+        """Resect a camera from the image points. Raises DataError with the reason if it fails."""
         seen, sensor = self.seen, camera.sensor
         pose = camera.resect(self.field, seen, snooping_alpha)
         why = f"the control points give no pose ({pose.status}): {pose.reason}"
@@ -148,7 +149,7 @@ def _from_table(path: Path, unit: str) -> ControlPoints:
         if (found := next((n for n in names if n in table.columns), None)) is not None
     }
     for wanted in ("target", "X", "Y", "Z", "sX", "sY", "sZ"):
-        if wanted not in there:  # the table says it best
+        if wanted not in there:  # raises the table's error
             Table(path, (wanted,), DataError)
     if clicked := "x" in there:
         Table(path, ("x", "y", "sx", "sy"), DataError)
@@ -201,10 +202,10 @@ def _from_json(path: Path) -> ControlPoints:
         raise
     except KeyError as error:
         raise DataError(
-            f"{path}: is no sound JSON of control points: {error} is missing"
+            f"{path}: is not valid JSON of control points: {error} is missing"
         ) from error
-    except (TypeError, ValueError, IndexError) as error:
-        raise DataError(f"{path}: is no sound JSON of control points: {error}") from error
+    except (AttributeError, TypeError, ValueError, IndexError) as error:
+        raise DataError(f"{path}: is not valid JSON of control points: {error}") from error
     raise DataError(f"{path}: is neither pyorc's camera configuration (gcps) nor GeoJSON")
 
 
@@ -212,7 +213,7 @@ def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:
     gcps = document["gcps"]
     points = np.array(gcps["dst"], dtype=float)
     image = np.array(gcps["src"], dtype=float)
-    if points.ndim != 2 or points.shape[1] == 2:  # on the water
+    if points.ndim != 2 or points.shape[1] == 2:  # points on the water, at level z_0
         points = np.column_stack([points, np.full(len(points), float(gcps["z_0"]))])
     if len(image) != len(points):
         raise DataError(
@@ -221,7 +222,7 @@ def _from_pyorc(document: dict[str, Any], where: str) -> ControlPoints:
     names = [f"gcp{i}" for i in range(len(points))]
     assumed = (
         f"{where} has no standard deviations: {_SURVEYED_MM:g} mm for coordinates and "
-        f"{_CLICKED_PX:g} px for clicks are taken"
+        f"{_CLICKED_PX:g} px for image points are assumed"
     )
     seen = (image, np.full(image.shape, _CLICKED_PX))
     return ControlPoints.build(names, points, _SURVEYED_MM / 1000, "m", where, seen, assumed)
@@ -251,7 +252,7 @@ def _from_features(document: dict[str, Any], where: str) -> ControlPoints:
                 f"{where}: the coordinates look like degrees; write them in metres: UTM, or a "
                 "national grid"
             )
-    assumed = f"{where}: {missing} points without standard deviations: {_SURVEYED_MM:g} mm is taken"
+    assumed = f"{where}: {missing} points without standard deviations: {_SURVEYED_MM:g} mm assumed"
     seen = np.array(image).reshape(-1, 2)
     return ControlPoints.build(
         names, points, sigmas, "m", where, (seen, np.full(seen.shape, _CLICKED_PX)),

@@ -1,16 +1,15 @@
-"""Correcting what was measured before: image points and images as one steady camera had seen them.
+"""Correction of image points and images to what one steady camera would have seen.
 
 A point that was measured at some time becomes the point that the camera would have measured at the
 model's reference temperature (or another): through its ray, with the interior orientation that the
-temperature log gives for that time. The error left over comes from the model's parameters, as far
-as they do not cancel between both temperatures, and from the thermometer. Tables of points come of
-a file or on standard input.
+temperature log gives for that time. The remaining error comes from the model's parameters, as far
+as they do not cancel between both temperatures, and from the thermometer. Tables of points are read
+from a file or from standard input.
 
-Frames of a camera at work are resampled to what it would have seen at T₀: a program that knows one
-camera then takes those of a cold morning and of a hot day alike. The JPEG has EXIF, and in its
-comment, as JSON, the camera at T₀ in OpenCV's terms and the pose, with standard deviations. Those
-of the camera are the frame's own: what is wrong with the camera of now goes into the resampled
-frame as it is.
+Frames of a camera in use are resampled to what it would have seen at T₀, so that a program with a
+single calibration processes those of a cold morning and of a hot day alike. The JPEG has EXIF; its
+comment holds, as JSON, the camera at T₀ in OpenCV's terms and the pose, with standard deviations.
+The camera's are those of the frame's own camera, whose errors enter the resampled frame unchanged.
 """
 
 from __future__ import annotations
@@ -60,14 +59,12 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 
-_SAMPLE = 997  # points of an image that tell how much it is corrected
+_SAMPLE = 997  # points of an image at which the size of the correction is computed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corrected:
-    """points (n, 2) px as they would have been; sds (n, 2) px of the correction; temperature (n,)
-    °C; extrapolated (n,) K outside what the model was fitted on.
-    """
+    """Corrected image points (n, 2) px with sds (n, 2) px; extrapolated (n,) K beyond the fit."""
 
     points: Array
     sds: Array
@@ -84,13 +81,13 @@ def correct_points(
     temperature_sd: float = 0.0,
     extrapolate: bool = False,
 ) -> Corrected:
-    """Image points (n, 2) px measured at times (n,) s → as at temperature `to` (default T₀).
+    """Correct image points (n, 2) px measured at times (n,) s to a temperature `to` (default T₀).
 
-    temperature_sd K: of a reading of the log. DataError for times outside the log.
+    temperature_sd K: of a reading of the log. Raises DataError for times outside the log.
     """
     unique, place = np.unique(times, return_inverse=True)
     require_inside(log, times)
-    steady, along = _course(camera, log, unique, to, temperature_sd, extrapolate)
+    steady, along = _predict(camera, log, unique, to, temperature_sd, extrapolate)
     sensor = camera.model.sensor
     r = rays(sensor, along.values[place], points[:, None, :])
     direction = (r / -r[..., 2:])[:, 0]
@@ -115,9 +112,10 @@ def require_inside(log: TemperatureLog, times: Array) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageCorrection:
-    """For one image: maps, and values (10,) of its camera, that turn it into one at the wanted
-    temperature; temperature °C; largest and rms shift px; left_over: rms sd px of the correction,
-    both over a grid of points; extrapolated K.
+    """The correction of one image: maps, and the values (10,) of its camera to resample it with.
+
+    temperature °C; rms_px, largest_px: shift of a sample of points; left_over_px: its RMS sd;
+    extrapolated K.
     """
 
     JSON: ClassVar = {
@@ -143,9 +141,9 @@ def image_corrections(
     temperature_sd: float = 0.0,
     extrapolate: bool = False,
 ) -> list[ImageCorrection]:
-    """One correction per time; arguments and errors as those of `correct_points`."""
+    """Return one correction per time; arguments and errors as in `correct_points`."""
     require_inside(log, times)
-    steady, along = _course(camera, log, times, to, temperature_sd, extrapolate)
+    steady, along = _predict(camera, log, times, to, temperature_sd, extrapolate)
     sensor = camera.model.sensor
     maps = Maps(sensor, steady, camera.model.T0 if to is None else to)
     pixels = np.linspace(0, sensor.width * sensor.height - 1, _SAMPLE).astype(int)
@@ -173,11 +171,11 @@ def image_corrections(
     return found
 
 
-def _course(
+def _predict(
     camera: ThermalCamera, log: TemperatureLog, times: Array, to: float | None,
     temperature_sd: float, extrapolate: bool,
 ) -> tuple[Array, Along]:  # fmt: skip
-    """Return the steady camera (10,) at a temperature, and the camera at some times against it."""
+    """Return the steady camera (10,) at a temperature, and the camera at times relative to it."""
     target = camera.model.T0 if to is None else to
     along = camera.along(
         log.times, log.channels, times, extrapolate, relative_to=target,
@@ -190,9 +188,9 @@ _QUALITY = 95  # of a JPEG: its losses are below the noise of a camera
 
 
 class FrameCorrector:
-    """Makes the corrected frames of one camera.
+    """A corrector of one camera's frames.
 
-    camera: its name; origin (3,) mm: what the pose's coordinates count from.
+    camera: its name; origin (3,) mm: of the pose's coordinates.
     """
 
     def __init__(self, thermal: ThermalCamera, camera: str, origin: Sequence[float]) -> None:
@@ -202,10 +200,10 @@ class FrameCorrector:
         self._maps: Maps | None = None
 
     def correct(self, encoded: bytes, calibrated: CalibratedEpoch) -> bytes:
-        """Return a frame as the steady camera had seen it: a JPEG.
+        """Return a frame as the steady camera would have seen it, as a JPEG.
 
-        encoded: a JPEG or PNG. Raises ImageError for what cannot be decoded or has another size,
-        and where the epoch has no camera.
+        encoded: a JPEG or PNG. Raises ImageError if it cannot be decoded or has another size, or if
+        the epoch has no camera.
         """
         result = calibrated.adjustment
         if result.interior is None:
@@ -248,13 +246,15 @@ class FrameCorrector:
 
 
 STANDARD_INPUT = Path("-")
-_CHUNK = 1 << 22  # bytes at once: a year of rows has to fit into memory
+_CHUNK = 1 << 22  # bytes read at once: a year of rows need not fit into memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowBlock:
-    """Some rows: header; lines (n,) in the file, the header's is 1; rows as text; times (n,) s UTC;
-    values (n, k) of the further columns that were asked for; refused: (line, reason) of others.
+    """A block of rows of a CSV.
+
+    lines (n): numbers, the header's is 1; rows: fields as text; times (n,) s UTC; values (n, k):
+    the other requested columns; refused: (line, reason) of unusable rows.
     """
 
     header: list[str]
@@ -265,7 +265,7 @@ class RowBlock:
     refused: list[tuple[int, str]]
 
     def kept(self, wanted: NDArray[np.bool_], reason: str) -> RowBlock:
-        """The rows that are wanted (n,), the others refused for a reason."""
+        """Return the block with the wanted (n,) rows only; the others are refused for a reason."""
         where = np.flatnonzero(wanted).tolist()
         refused = [(line, reason) for line, ok in zip(self.lines, wanted, strict=True) if not ok]
         return RowBlock(
@@ -279,9 +279,9 @@ def row_blocks(
 ) -> Iterator[RowBlock]:
     """Read a CSV with a column `time` and others, a block at a time; `-` is standard input.
 
-    Of standard input a block is what has come in. clock: of times without a zone. Raises DataError
-    for a column that is missing and for times whose zone nobody says; rows that cannot be read are
-    refused by themselves.
+    A block of standard input is what has arrived. clock: for times without a zone. Raises DataError
+    for a missing column and for times whose zone is not given; a row that cannot be read is refused
+    on its own.
     """
     header: list[str] = []
     line = empty = 0
@@ -304,9 +304,9 @@ def row_blocks(
 def first_times(
     path: Path, clock: DeviceClock | None = None
 ) -> tuple[list[str], tuple[float, float] | None]:
-    """Return the columns of a CSV and the span s UTC of its first rows.
+    """Return the columns of a CSV and the time span, s UTC, of its first rows.
 
-    Of standard input, which is read once, nothing is known beforehand.
+    Returns [] and None for standard input, which can be read only once.
     """
     if path == STANDARD_INPUT:
         return [], None
@@ -316,7 +316,7 @@ def first_times(
 
 
 def seconds_of(text: str, clock: DeviceClock) -> float:
-    """Return a time that a user wrote, s UTC; DataError where it is none."""
+    """Return a time that a user wrote, s UTC. Raises DataError if it is not a time."""
     try:
         moment = _moment(text)
     except ValueError:
@@ -327,7 +327,7 @@ def seconds_of(text: str, clock: DeviceClock) -> float:
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
-    """Lists of whole lines: what has come in, of a file some megabytes."""
+    """Yield lists of whole lines: what has arrived on standard input, or megabytes of a file."""
     standard = path == STANDARD_INPUT
     errors = "replace" if standard else "strict"
     rest = b""

@@ -1,18 +1,17 @@
-"""A camera at work, before no test field: its thermal model predicts it, control points pose it.
+"""A camera in use, without a test field: its thermal model predicts it, control points pose it.
 
     readings ─► predicted interior orientation, with covariance ─┐
     frame ─► control points in the image ────────────────────────┴─► resection ─► row of the store
 
-One more kind of calibrator, which the daemon's pipeline runs as it runs the others. Nothing is
-calibrated, and no row has the status `ok`: a study or a fit must not take for measured what a model
-has said.
+It is a calibrator, which the daemon's pipeline runs like the others. But nothing is calibrated, and
+no row has the status `ok`, so that a study or a fit does not take a prediction for a measurement.
 
-    predicted      interior orientation, there are no control points
-    resected       and the pose that they give, with the predicted camera as prior
-    last_pose      they are hidden or too few: the last pose, with what the mount may have moved
-    outside_range  predicted beyond the temperatures of the fit, with widened covariance, or not at
-                   all where that is too far
-    no_temperature the reading is too old, or there was none
+    predicted      interior orientation only: there are no control points
+    resected       also the pose from the control points, with the predicted camera as prior
+    last_pose      control points hidden or too few: the last pose, with the mount's possible motion
+    outside_range  beyond the temperatures of the fit: predicted with widened covariance, or not at
+                   all if too far
+    no_temperature the last reading is too old, or there is none
 """
 
 from __future__ import annotations
@@ -55,11 +54,11 @@ if TYPE_CHECKING:
     from thermocald.epoch import Epoch
     from thermocald.store.series import StoredEpoch
 
-_FEWEST = 3  # control points, with an earlier pose
-_CONFIRMED = 2  # epochs in a row that show another pose
+_FEWEST = 3  # control points, if there is an earlier pose
+_CONFIRMED = 2  # epochs in a row that must show another pose
 _MOVED_CHI2 = 38.3  # six degrees of freedom, one in a million
-_SUDDEN_K = 2.0  # between two frames: by less a model that lacks an effect is not off by much
-_UNMODELLED_PX = 0.05  # of a control point from frame to frame: light, air, the template
+_SUDDEN_K = 2.0  # change between two frames below which a missing effect has little influence
+_UNMODELLED_PX = 0.05  # error of a control point from frame to frame: light, air, the template
 _USUAL = {
     "predicted": "predicted by its thermal model",
     "resected": "predicted by its thermal model, posed by control points",
@@ -68,10 +67,9 @@ _USUAL = {
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A pose as it was resected: what later frames are compared with.
+    """A resected pose, with which later frames are compared.
 
-    time s; predicted: the camera then; eop (6,) and its covariance (6, 6); seen: the control points
-    then.
+    time s; predicted: the camera then; eop (6,) with covariance (6, 6); seen: control points used.
     """
 
     time: float
@@ -83,9 +81,10 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class Movement:
-    """A turn (3,) rad about the camera's axes and a shift (3,) mm since a time, with covariance.
+    """A movement of the camera since a time.
 
-    sudden: whether it came from one frame to the next, at one temperature.
+    values (6,): turn about the camera's axes (3,) rad and shift (3,) mm, with covariance; sudden:
+    whether it happened from one frame to the next, at one temperature.
     """
 
     since: float
@@ -95,11 +94,11 @@ class Movement:
 
     @property
     def chi2(self) -> float:
-        """Chi-square with six degrees of freedom of no movement."""
+        """Test statistic of no movement: chi-square with six degrees of freedom."""
         return float(self.values @ np.linalg.solve(self.covariance, self.values))
 
     def sentence(self) -> str:
-        """Return turn and shift in words."""
+        """Return turn and shift as a sentence."""
         sd = np.sqrt(np.diag(self.covariance))
         turn, shift = (np.linalg.norm(self.values[k]) for k in (slice(0, 3), slice(3, 6)))
         sd_turn, sd_shift = (np.linalg.norm(sd[k]) for k in (slice(0, 3), slice(3, 6)))
@@ -107,15 +106,15 @@ class Movement:
             f"the camera was moved: it turned by {math.degrees(turn):.4f} ± "
             f"{math.degrees(sd_turn):.4f}° and shifted by {shift:.1f} ± {sd_shift:.1f} mm"
             + ("; turn and shift can hardly be separated here" if sd_shift > shift else "")
-            + ("" if self.sudden else "; not at once: a model that lacks an effect looks alike")
+            + ("" if self.sudden else "; it was not sudden: a missing effect looks the same")
         )
 
 
 class GaugeCalibrator:
-    """Predicts and poses the epochs of one camera, one after the other.
+    """A calibrator that predicts and poses the epochs of one camera in turn.
 
-    control, finder: control points and what measures them, None without; mount_sd_deg: how much the
-    mount turns about each axis in an hour, as a random walk, NaN where that is not known.
+    control, finder: the control points and what measures them, or None; mount_sd_deg: the random
+    walk of the mount about each axis, ° in an hour, NaN if unknown.
     """
 
     def __init__(
@@ -134,16 +133,16 @@ class GaugeCalibrator:
         self._mount = math.radians(mount_sd_deg)
         self._alpha = snooping_alpha
         self.pose: Pose | None = None
-        """The last one that control points gave."""
+        """The last pose from control points."""
         self._reference: Pose | None = None
         self._still: Pose | None = None
         self._moved: list[Pose] = []
         self._number = 0
         self.movement: Movement | None = None
-        """What the last epoch showed, where that was a movement of the camera."""
+        """The movement of the camera that the last epoch showed, if any."""
 
     def outlook(self) -> str:
-        """Return in words what the control points promise, of the reference frame."""
+        """Describe the control points, and the pose that they give in the reference frame."""
         if not len(self.testfield):
             return "no control points: the interior orientation alone"
         text = f"{len(self.testfield)} control points"
@@ -162,12 +161,12 @@ class GaugeCalibrator:
         )
 
     def reset(self) -> None:
-        """Look for the control points anew."""
+        """Forget where the control points were, so that they are searched for anew."""
         if self._finder is not None:
             self._finder.reset()
 
     def remember(self, stored: Iterable[StoredEpoch]) -> None:
-        """Go on from earlier epochs: their readings, and the last pose."""
+        """Restore the state from stored epochs: their readings and the last pose."""
         for one in stored:
             self.predictor.take(one.epoch.temperature_time, one.epoch.temperatures)
             self._number = one.epoch.number
@@ -188,7 +187,7 @@ class GaugeCalibrator:
     def calibrate(
         self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None = None
     ) -> CalibratedEpoch:
-        """Predict the camera of an epoch, and pose it. Never raises for data."""
+        """Predict and pose the camera of an epoch. Never raises because of data."""
         self.predictor.take(epoch.temperature_time, epoch.temperatures)
         in_order = epoch.number > self._number
         self._number = max(self._number, epoch.number)
@@ -223,7 +222,7 @@ class GaugeCalibrator:
     def _measured(
         self, epoch: Epoch, image: NDArray[Any] | EncodedImage | None
     ) -> tuple[Epoch, Observations | None, str]:
-        """The epoch with its control points, the same, and why there are none."""
+        """Return an epoch with its control points, these alone, and why there are none."""
         self.movement = None
         if self._finder is None or epoch.observations is not None:
             return epoch, epoch.observations, "no control point is seen"
@@ -247,11 +246,11 @@ class GaugeCalibrator:
             return self._unposed("predicted", "", now)
         if seen is None or len(seen) < _FEWEST:
             count = 0 if seen is None else len(seen)
-            return self._without(epoch, now, seen, f"{count} control points are seen ({why})")
+            return self._without_pose(epoch, now, seen, f"{count} control points are seen ({why})")
         start = None if self.pose is None else self.pose.eop
         result = self._resected(now, seen, start)
         if not result.ok:
-            return self._without(epoch, now, seen, f"{result.status}: {result.reason}")
+            return self._without_pose(epoch, now, seen, f"{result.status}: {result.reason}")
         assert result.exterior is not None
         keep = seen.select(~np.isin(seen.targets, result.rejected))
         pose = Pose(
@@ -270,7 +269,8 @@ class GaugeCalibrator:
             self.sensor, camera.interior, camera.covariance, self.testfield, seen, start,
             self._alpha,
         )  # fmt: skip
-        if not result.ok and start is not None and len(seen) > _FEWEST:  # it was turned by much
+        # the last pose is a bad start if the camera was turned by a large angle
+        if not result.ok and start is not None and len(seen) > _FEWEST:
             again = self._resected(now, seen, None)
             return again if again.ok else result
         return result
@@ -283,16 +283,16 @@ class GaugeCalibrator:
         covariance[IOP, IOP] = camera.covariance
         return replace(blank, interior=camera.interior, covariance=covariance)
 
-    def _without(
+    def _without_pose(
         self, epoch: Epoch, now: PredictedCamera, seen: Observations | None, why: str
     ) -> Adjustment:
-        """The last pose with what the mount may have done since; the camera alone before any."""
+        """Return the last pose, widened by what the mount may have moved; without one, no pose."""
         last = self.pose
         targets = np.empty(0, dtype=np.int64) if seen is None else seen.targets
         if last is None:
             return self._unposed("predicted", f"no pose so far: {why}", now)
         hours = max(epoch.frame_time - last.time, 0.0) / 3600.0
-        still = "; as if the mount had stood still since, for its movement is not known"
+        still = "; the mount is taken not to have moved since, as its movement is not known"
         if math.isfinite(self._mount):
             still = f"; the mount may have moved for {hours:.2f} h"
         result = self._unposed("last_pose", why + still, now)
@@ -305,7 +305,7 @@ class GaugeCalibrator:
         )  # fmt: skip
 
     def _watch(self, pose: Pose) -> None:
-        """Compare with the reference; two epochs in a row that moved make it a movement."""
+        """Compare a pose with the reference; two different poses in a row are a movement."""
         if self._reference is None:
             self._reference = self._still = pose
             return
@@ -316,7 +316,7 @@ class GaugeCalibrator:
             return
         self._moved.append(pose)
         if len(self._moved) >= _CONFIRMED:
-            # two frames, one after the other, that show a movement which is not of heat
+            # the step between two consecutive frames shows whether it was sudden, not thermal
             then, now = self._still or self._reference, self._moved[0]
             step = self.compare(then, now)
             warmer = now.predicted.camera.temperature - then.predicted.camera.temperature
@@ -326,10 +326,10 @@ class GaugeCalibrator:
             self._moved.clear()
 
     def compare(self, then: Pose, now: Pose) -> Movement | None:
-        """Return how the camera moved between two poses, None where too few points are in both.
+        """Return the camera's movement between two poses; None if they share too few points.
 
-        Of the same points the errors of their coordinates cancel, and so does what the model is
-        off by at both times; image noise, the rates' error and a past that fades are left.
+        The same points are used, so the errors of their coordinates cancel, as do errors that the
+        model has at both times. Image noise, the rates' errors and an unknown past remain.
         """
         both = np.intersect1d(then.seen.targets, now.seen.targets)
         if len(both) < _FEWEST:
@@ -350,7 +350,7 @@ class GaugeCalibrator:
         return Movement(now.time, gain @ moved, inverse + drift @ drift.T)
 
     def _change_root(self, before: PredictedCamera, after: PredictedCamera) -> Array:
-        """A root (10, n) of the covariance of what is predicted of a change of the camera."""
+        """Return a root (10, n) of the covariance of the camera's predicted change."""
         change_k = after.camera.temperature - before.camera.temperature
         thermal = self.thermal
         rows = [k for k, n in enumerate(thermal.parameters) if n.startswith("rates.")]
@@ -367,9 +367,9 @@ class GaugeCalibrator:
 
 
 class GaugeObserver:
-    """Tells what happens at a gauge: the status of its rows when it changes, and movements.
+    """An observer that reports a gauge's events: changes of its rows' status, and movements.
 
-    tell(kind, text, utc, epoch).
+    tell(kind, text, utc, epoch) takes the events.
     """
 
     def __init__(
@@ -379,7 +379,7 @@ class GaugeObserver:
         self._status = self._reason = ""
 
     def observe(self, calibrated: CalibratedEpoch, *_: object) -> dict[str, float]:
-        """Take an epoch in; nothing more is to be stored of it. A gauge has no series to adjust."""
+        """Observe an epoch; returns no columns to store, as a gauge has no series to adjust."""
         epoch, result = calibrated.epoch, calibrated.adjustment
         if (moved := self._gauge.movement) is not None:
             self._tell("camera_moved", moved.sentence(), moved.since, epoch.number)
@@ -390,7 +390,7 @@ class GaugeObserver:
         return {}
 
     def report(self) -> dict[str, Any]:
-        """For status and page."""
+        """Return the state for status.json and the page."""
         return {"state": self._status, "sentence": self._reason or _USUAL.get(self._status, "")}
 
 
@@ -398,7 +398,7 @@ def plan_gauge(
     thermal: ThermalCamera, control: Path | None, unit: str, reference: Path | None,
     mount_sd_deg: float | None, snooping_alpha: float,
 ) -> tuple[GaugeCalibrator, list[float]]:  # fmt: skip
-    """Return the calibrator of a gauge, and the origin of its coordinates, mm."""
+    """Return the calibrator of a gauge and the origin (3,) of its coordinates, mm."""
     mount = math.nan if mount_sd_deg is None else mount_sd_deg
     if control is None:
         return GaugeCalibrator(thermal, mount_sd_deg=mount), [0.0, 0.0, 0.0]
@@ -407,8 +407,8 @@ def plan_gauge(
     if reference is None:
         if not any(given.field.codes):
             raise ConfigurationError(
-                f"{control}: no control point has a code; `control_reference` names the frame in "
-                "which x, y are those of natural points"
+                f"{control}: no control point has a code; set `control_reference` to the frame in "
+                "which x, y of the natural points were measured"
             )
         model = thermal.model
         known = CameraSpec(model.camera, model.sensor, interior=model.interior)
@@ -427,6 +427,6 @@ def plan_gauge(
 
 
 def _matching(seen: Observations) -> Array:
-    """Standard deviations (n, 2) px from frame to frame: what all frames share is not in them."""
+    """Return standard deviations (n, 2) px from frame to frame, without errors in common."""
     own = seen.quality.get(MATCHING_SD)
     return seen.sigmas if own is None else np.stack([own, own], axis=1)

@@ -1,12 +1,12 @@
-"""The level of a thermal model: its interior orientation at T₀ and each series' orientation.
+"""The level of a thermal model: interior orientation at T₀, exterior orientation of each series.
 
-The drifts say nothing of it and are taken off: every target's mean over a series, compared with
-the model's projection, is adjusted for the interior orientation that all series share and one
-exterior orientation of each. The affinity is as stated, or none, unless the targets show another
-one; that it is not known better counts in the covariance.
+The drifts do not contribute and are removed. Each target's mean over a series, compared with the
+model's projection, determines the interior orientation that all series share and one exterior
+orientation per series. The affinity is the stated one, or none, unless the targets contradict it;
+its uncertainty is in the covariance.
 
-Of targets that a user says have moved it is known when, and by how much against the camera that the
-others show.
+If the user names targets that have moved, the time and the vector of their movement are estimated,
+relative to the camera that the other targets determine.
 """
 
 from __future__ import annotations
@@ -40,16 +40,17 @@ if TYPE_CHECKING:
 
 AFFINITY_SD = 3e-3  # of C1 and C2: fx and fy of phones differ by 1e-4 to 3e-3
 _AFFINITY = [IOP_NAMES.index("C1"), IOP_NAMES.index("C2")]
-_SHOWN = 13.8  # of χ² with two degrees of freedom, 0.1 %: below it C1 and C2 are as stated
+_SHOWN = 13.8  # χ² with two degrees of freedom, 0.1 %: below it C1 and C2 keep the stated values
 _ITERATIONS = 8
 
 
-def series_means(
+def average_residuals(
     series: ReducedSeries, prediction: Prediction
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Weighted mean of measured minus predicted (T, 2) px, its weights (T, 2), who moved (T,).
+    """Return the weighted mean of measured minus predicted image points (T, 2) px.
 
-    Of targets that move, what was before counts.
+    Also returns its weights (T, 2), and which targets (T,) the model moves; of these only the
+    epochs before their movement count.
     """
     T = len(series.source.field)
     total, weight = np.zeros((T, 2)), np.zeros((T, 2))
@@ -63,14 +64,14 @@ def series_means(
     points = series.source.grid.points
     for part in chunks(*points.shape[:2]):
         w = use[part]
-        left = np.where(w > 0, points[part] - projected(series, prediction, part), 0.0)
+        left = np.where(w > 0, points[part] - project_targets(series, prediction, part), 0.0)
         total += np.einsum("etc,etc->tc", w, left)
         weight += w.sum(axis=0)
     return total / np.where(weight > 0, weight, 1.0), weight, moved
 
 
-def projected(series: ReducedSeries, prediction: Prediction, part: slice) -> Array:
-    """The model's image points (e, T, 2) px of some epochs."""
+def project_targets(series: ReducedSeries, prediction: Prediction, part: slice) -> Array:
+    """Return the model's image points (e, T, 2) px of some epochs."""
     still = series.source.field.points
     points = prediction.points(still, part) if prediction.moves_points else still
     return project(series.source.sensor, prediction.iop[part], prediction.eop[part], points)
@@ -81,9 +82,9 @@ def estimate_level(
 ) -> tuple[tuple[ThermalModel, ...], Array]:
     """Estimate the level from the targets' means, by Gauss-Newton.
 
-    models: one per series, with a start; interior: whether the interior orientation is estimated
-    too, or the series' orientation alone. Returns the models with both, and the covariance
-    (10, 10) that the test field's coordinates give the interior orientation.
+    models: one per series, with initial values; interior: estimate the interior orientation too,
+    not only the series' exterior orientations. Returns the models with both, and the covariance
+    (10, 10) that the test field's coordinates add to the interior orientation.
     """
     n = len(IOP_NAMES) if interior else 0
     shared = models[0].interior.as_array()
@@ -108,7 +109,7 @@ def estimate_level(
         for k, (s, m) in enumerate(zip(series, models, strict=True)):
             now = placed(m, k)
             prediction = now.predict(s.history, s.source.field)
-            mean, weight, _ = series_means(s, prediction)
+            mean, weight, _ = average_residuals(s, prediction)
             at = linearise(s.source.sensor, s.source.field, prediction.iop.mean(axis=0), eops[k])
             columns = np.concatenate([np.arange(n), n + 6 * k + np.arange(6)])
             A = at.A[:, :, 10 - n :]
@@ -141,29 +142,29 @@ def estimate_level(
 
 _GROSS = 6.0  # standard deviations from the neighbours in time
 _WINDOW = 9
-_MARGIN = 16.0  # χ² beyond what a search may find by chance
+_MARGIN = 16.0  # χ² in excess of what a search finds by chance
 
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """time s; vector (3,) mm with covariance, zeros where nothing moved."""
+    """A step of targets: time s; vector (3,) mm with covariance, zeros if none was found."""
 
     time: float
     vector: Array
     covariance: Array
 
     def effect(self, listed: ModelEffect) -> ModelEffect:
-        """The effect that names the targets, with when and by how much they moved."""
+        """Return the effect that names the targets, with the time and vector of their movement."""
         kind = catalogue.get(listed.name)
         time = {n: self.time for n, p in kind.nonlinear.items() if p.role == "event"}
         vector = dict(zip(kind.linear, self.vector.tolist(), strict=True))
         return ModelEffect(listed.name, {**listed.values, **vector, **time})
 
 
-def moved_targets(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
-    """A step of some targets by one vector; others: the series reduced without them.
+def estimate_step(others: ReducedSeries, rows: NDArray[np.int64]) -> Moved:
+    """Estimate the step of some targets by one vector; others: the series reduced without them.
 
-    What the rays cannot see stays 0 and has no variance.
+    A direction that the rays do not determine stays 0 and has no variance.
     """
     grid = others.source.grid
     left = grid.points[:, rows] - others.at.predicted[rows]

@@ -1,4 +1,4 @@
-"""A fitted thermal camera in lines for people."""
+"""A fitted thermal camera as readable lines."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 
 _UNSEEN = 0.5
-"""From which weight of the type on a parameter is called the type's."""
+"""A parameter with a larger weight of the type counts as the type's."""
 _UNKNOWN = {"": (math.nan, math.nan)}
 
 
 def model_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return the lines of a document of `thermocald fit`, the first the camera's name."""
+    """Return the lines for a document of `thermocald fit`; the first is the camera's name."""
     lines = [str(document["camera"])]
     low, high = next(iter((document["validity"] or _UNKNOWN).values()))
     T0 = f"T0 = {document['reference_temperature']:g} °C"
@@ -34,14 +34,14 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
     elif document.get("effect_missing") and document.get("calibrations"):
         lines.append(
             f"  the calibrations differ by {document['sigma0']:.1f} times what their standard "
-            "deviations allow: more than c, x0, y0 moves with temperature, or not in a straight "
-            f"line\n  fitted from {low:g} to {high:g} °C, {T0}; standard deviations are widened by "
-            "that"
+            "deviations allow: parameters other than c, x0, y0 change with temperature, or the "
+            f"change is not linear\n  fitted from {low:g} to {high:g} °C, {T0}; standard "
+            "deviations are widened by that"
         )
     elif document.get("effect_missing"):
         cause = "an effect is missing"
         if document.get("trembles"):
-            cause += ", or the mount moves, as all targets jump together from epoch to epoch"
+            cause += ", or the mount moves: all targets jump together from epoch to epoch"
         lines.append(
             f"  {cause}: the model leaves {document['misfit_px']:.3f} px in smooth "
             f"trajectories ({document['significance_sigmas']:.0f} standard deviations); "
@@ -58,30 +58,30 @@ def model_lines(document: Mapping[str, Any]) -> list[str]:
         )
     elif sure is not None and sure < SURE:
         lines.append(
-            "  the distortion is taken to follow the angle while c changes; the data cannot tell "
-            f"it from one that keeps its place in the image ({abs(sure):.1f} sd)"
+            "  the distortion is assumed to follow the angle while c changes; the data cannot "
+            f"distinguish it from one that keeps its place in the image ({abs(sure):.1f} sd)"
         )
     if "type" in document:
         kind = document["type"]
-        lines.append(f"  with what {kind['cameras']} cameras of the type {kind['name']} say of it")
+        lines.append(f"  combined with the type {kind['name']} ({kind['cameras']} cameras)")
         if unseen := [name for name, weight in kind["weights"].items() if weight > _UNSEEN]:
             lines.append(
                 f"  these recordings show little of {', '.join(unseen)}: value and standard "
-                "deviation are the type's; record the way between two temperatures, too"
+                "deviation are the type's; record the change between two temperatures, too"
             )
     for name, rate in document["rates"].items():
         shown = with_sd(1e3 * rate["value"], 1e3 * rate.get("sd", math.nan), "µm/K")
         lines.append(f"  {name:>4}: {shown}")
     if hang := document.get("rates_hang_on_c"):
         lines.append(
-            f"  the field hardly shows c (to {hang['c_known_to']:.2%}), and the rates hang on it: "
-            "they may be off by several of their standard deviations; use a field with depth, as "
-            "three walls that meet"
+            f"  the field hardly determines c (to {hang['c_known_to']:.2%}), and the rates depend "
+            "on it: they may be wrong by several of their standard deviations; use a field with "
+            "depth, such as three walls that meet"
         )
     if seldom := document.get("read_seldom"):
         lines.append(
-            f"  {', '.join(seldom['effects'])}: the temperature turns between two readings, and "
-            "how is not known: times may be off by several standard deviations; read the "
+            f"  {', '.join(seldom['effects'])}: how the temperature turns between two readings is "
+            "not known, and times may be wrong by several standard deviations; read the "
             "thermometer more often"
         )
     for effect in document["effects"]:

@@ -1,11 +1,11 @@
-"""Places in metres from image points of a camera that warms and cools: what a gauge is there for.
+"""Places in metres from image points of a camera that warms and cools: the purpose of a gauge.
 
 Control points that were seen once give the pose. At every other time the camera is that of its
-thermal model, corrected by what the control points have said of it; the mount is taken to stand
-still. Each place has the covariance of its image point, of camera and pose together, of the
-thermometer and of the plane, and stands beside the place that the same camera would have given
-without the thermal model, as it was when the control points were seen. Places on staffs and
-profiles at one time are where the water touches them: together they are its level.
+thermal model, corrected by what the control points determine; the mount is assumed not to move.
+Each place has the covariance of its image point, of camera and pose jointly, of the thermometer and
+of the plane. It is listed beside the place that the camera at the time of the control points would
+have given, without the thermal model. Places on staffs and profiles at one time are where the water
+touches them: together they give its level.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 
-_FARTHEST = 100.0  # extents of the control points, to the surface
-_CONTRADICTED = 1e-3  # probability of heights that differ so much
+_FARTHEST = 100.0  # largest distance of the surface, in extents of the control points
+_CONTRADICTED = 1e-3  # heights whose differences are less probable contradict each other
 
 
 def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
-    """Read where the points lie: `level` (and `sd`) of a water, `plane`, `line`, or `profile`.
+    """Read the surface of the points: the water's `level` (and `sd`), `plane`, `line` or `profile`.
 
-    In the unit and the coordinates of the control points. Raises ConfigurationError.
+    It is given in the unit and the coordinates of the control points. Raises ConfigurationError.
     """
     surface = _read_surface(path, control)
     points = control.field.points
@@ -60,8 +60,8 @@ def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     if away > _FARTHEST * extent > 0:
         unit = UNITS[control.unit]
         raise ConfigurationError(
-            f"{path}: lies {away / unit:.0f} {control.unit} from control points that extend over "
-            f"{extent / unit:.0f} {control.unit}: both need the same coordinates and unit"
+            f"{path}: is {away / unit:.0f} {control.unit} away from control points that extend "
+            f"over {extent / unit:.0f} {control.unit}: both need the same coordinates and unit"
         )
     return surface
 
@@ -71,8 +71,8 @@ def _read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     kinds = [k for k in ("level", "plane", "line", "profile") if k in document]
     if len(kinds) != 1 or set(document) - {*kinds, "sd", "sd_tilt_deg"}:
         raise ConfigurationError(
-            f"{path}: one of level, plane, line, profile is needed, and sd, sd_tilt_deg may "
-            f"follow; found: {', '.join(document)}"
+            f"{path}: one of level, plane, line, profile is needed, optionally with sd and "
+            f"sd_tilt_deg; found: {', '.join(document)}"
         )
     scale = UNITS[control.unit]
     sd = scale * _number(path, document, "sd")
@@ -87,7 +87,7 @@ def _read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     kind, way = ("plane", "normal") if "plane" in document else ("line", "direction")
     parts = document[kind]
     if not isinstance(parts, dict) or set(parts) != {"point", way}:
-        raise ConfigurationError(f"{path}, {kind}: holds point: [X, Y, Z] and {way}: [a, b, c]")
+        raise ConfigurationError(f"{path}, {kind}: needs point: [X, Y, Z] and {way}: [a, b, c]")
     point = scale * _vector(path, parts, "point") - control.origin
     along = _vector(path, parts, way)
     size = float(np.linalg.norm(along))
@@ -100,10 +100,10 @@ def _read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
 
 def _profile(path: Path, given: Any) -> Array:
     if not isinstance(given, list) or len(given) < 2:
-        raise ConfigurationError(f"{path}, profile: holds at least two points [X, Y, Z], in order")
+        raise ConfigurationError(f"{path}, profile: needs at least two points [X, Y, Z], in order")
     points = np.array([_vector(path, {"profile": point}, "profile") for point in given])
     if not np.linalg.norm(np.diff(points, axis=0), axis=1).all():
-        raise ConfigurationError(f"{path}, profile: the same point stands there twice in a row")
+        raise ConfigurationError(f"{path}, profile: the same point is given twice in a row")
     return points
 
 
@@ -129,9 +129,9 @@ def _vector(path: Path, document: dict[str, Any], key: str) -> Array:
 
 @dataclass(frozen=True)
 class Level:
-    """The water's level at a time (s UTC): the weighted mean of `places` heights, with its sd.
+    """The water level at a time (s UTC): the weighted mean of `places` heights, with its sd.
 
-    sigma0: by how much the heights differ, over their standard deviations; 0 of a single place.
+    sigma0: scatter of the heights over their standard deviations; 0 for a single place.
     """
 
     time: float
@@ -142,7 +142,7 @@ class Level:
 
     @property
     def contradicted(self) -> bool:
-        """Return whether the heights differ by more than their standard deviations explain."""
+        """True if the heights differ by more than their standard deviations explain."""
         freedom = self.places - 1
         return freedom > 0 and float(chdtrc(freedom, freedom * self.sigma0**2)) < _CONTRADICTED
 
@@ -152,9 +152,9 @@ class Places(Result):
     """Places of image points.
 
     names (n); points (n, 3) in the unit and the coordinates of the control points, with their joint
-    covariance (3n, 3n); without (n, 3): as the camera of the control points' time would have it;
-    pose: the resection; temperatures (n,) °C, NaN where none is known; times (n,) s UTC; levels:
-    of the water, where places on a staff or a profile tell them.
+    covariance (3n, 3n); without (n, 3): without thermal correction, from the camera at the control
+    points' time; pose: the resection; rejected: control points left out; temperatures (n,) °C, NaN
+    if unknown; times (n,) s UTC; levels: of the water, if the places are on a staff or a profile.
     """
 
     names: list[str]
@@ -175,7 +175,7 @@ class Places(Result):
 
     @property
     def shift_mm(self) -> Array:
-        """The distance (n,) mm by which the thermal correction moves each place."""
+        """Distances (n,) mm by which the thermal correction moves the places."""
         shift: Array = np.linalg.norm(self.points - self.without, axis=1) * UNITS[self.unit]
         return shift
 
@@ -251,19 +251,18 @@ def measure_places(
     rows: Sequence[RowBlock],
     extrapolate: bool = False,
 ) -> Places:
-    """Measure where image points lie on a plane or a line, each at its own time.
+    """Measure the places of image points on a surface, each at its own time.
 
-    when: s UTC, the control points' time; rows: of the image points, their values (n, 4) x, y and
-    standard deviations, px. Raises DataError where there is no pose or no temperature,
-    GeometryError for rays that miss.
+    when: s UTC, the control points' time; rows: the image points, with values (n, 4) x, y and their
+    sds, px. Raises DataError without a pose or temperature, GeometryError for rays that miss.
     """
     observed = np.concatenate([b.values for b in rows])
     times = np.concatenate([b.times for b in rows])
     names = [r.get("name") or str(n) for b in rows for n, r in zip(b.lines, b.rows, strict=True)]
     if not len(observed):
-        raise DataError("there is no image point to be measured")
+        raise DataError("there is no image point to measure")
     if not len(control.seen):
-        raise DataError("the control points have no x, y, sx, sy: where were they seen?")
+        raise DataError("the control points have no x, y, sx, sy: add their image points, px")
     require_inside(log, np.append(times, when))
     noise = camera.reading_sd
     then = camera.along(log.times, log.channels, [when], extrapolate, temperature_sd=noise)
@@ -281,7 +280,7 @@ def measure_places(
     if not (inside := sensor.contains(image, -1.0)).all():
         row = int(np.argmin(inside))
         raise DataError(
-            f"image point {names[row]} at {image[row, 0]:.0f}, {image[row, 1]:.0f} px lies outside "
+            f"image point {names[row]} at {image[row, 0]:.0f}, {image[row, 1]:.0f} px is outside "
             f"the camera's {sensor.width} × {sensor.height} px"
         )
     scale = UNITS[control.unit]
@@ -301,18 +300,18 @@ def _utc(time: float) -> datetime:
 def _levels(
     points: Array, covariance: Array, moments: Array, member: NDArray[np.int64]
 ) -> tuple[Level, ...]:
-    """Average the heights of each time, weighted, with what they have in common."""
+    """Average the heights of each time, weighted by their joint covariance."""
     found = []
     for k, time in enumerate(moments.tolist()):
         rows = np.flatnonzero(member == k)
         Z, C = points[rows, 2], covariance[np.ix_(3 * rows + 2, 3 * rows + 2)]
-        if not (C.diagonal() > 0).all():  # along a horizontal line there is no height to be read
+        if not (C.diagonal() > 0).all():  # places on a horizontal line determine no height
             continue
         weights = np.linalg.pinv(C, hermitian=True)
         variance = 1.0 / float(weights.sum())
         level = variance * float((weights @ Z).sum())
         left, freedom = Z - level, len(rows) - 1
-        squares = max(float(left @ weights @ left), 0.0)  # rounding may leave less
+        squares = max(float(left @ weights @ left), 0.0)  # rounding may make it negative
         sigma0 = math.sqrt(squares / freedom) if freedom else 0.0
         found.append(Level(time, level, math.sqrt(variance), len(rows), sigma0))
     return tuple(found)

@@ -1,15 +1,15 @@
-"""The test of a thermal model on a series that it was not fitted on.
+"""The test of a thermal model on a series that it was not fitted to.
 
-Only what belongs to the series is estimated again: its level (one orientation, and a constant
-offset per target, since a field's coordinates are not perfect) and what its effects call fresh (a
-phase; an event, which no model can foresee). All drifts are the model's. What is left of the image
-points is compared with the noise floor: image noise, and what the thermometer's noise, and the
-times at which it was read, do to the prediction. The 95 % bands hold the model's own uncertainty
-too; of a model that misses an effect no band is stated.
+Only what is specific to the series is estimated: its level (one exterior orientation, and a
+constant offset per target, since a field's coordinates are not perfect) and what its effects
+declare as fresh (a phase; an event, which no model can foresee). All drifts are the model's. The
+residuals of the image points are compared with the noise floor: image noise, and the error of the
+prediction from the thermometer's noise and reading times. The 95 % bands also include the model's
+own uncertainty; for a model that misses an effect no band is stated.
 
-How a prediction depends on the model's parameters and on the readings is known epoch by epoch;
-parameters (22,) are the camera's 16, three scales of the field's coordinates, and a displacement in
-mm. An amplitude keeps its size, and an event its own height and time.
+The 22 parameters of an epoch, with derivatives by the model's parameters and by the readings, are
+the camera's 16, three scales of the field's coordinates, and a displacement in mm. An amplitude
+keeps its size, an event its own height and time.
 """
 
 from __future__ import annotations
@@ -19,9 +19,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.analysis.thermal.level import estimate_level, moved_targets, projected, series_means
-from thermocald.analysis.thermal.terms import event_worth
-from thermocald.analysis.thermal.thermal_model import targets_of
+from thermocald.analysis.thermal.level import (
+    average_residuals,
+    estimate_level,
+    estimate_step,
+    project_targets,
+)
+from thermocald.analysis.thermal.thermal_model import event_threshold, targets_of
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.photogrammetry.camera.camera_model import (
     PARAMETER_NAMES,
@@ -56,10 +60,10 @@ _COLUMNS = (*PARAMETER_NAMES, "scale_X", "scale_Y", "scale_Z", "dX", "dY", "dZ")
 def derivatives(
     history: History, field: TestField, model: ThermalModel, names: Sequence[str]
 ) -> Array:
-    """Return ∂ parameters / ∂ numbers of the model (E, 22, q), by central differences."""
+    """Return ∂ epoch's parameters / ∂ model's parameters (E, 22, q), by central differences."""
     found = []
     for name in names:
-        group, key = name.split(".", 1)
+        group, key = name.rsplit(".", 1)
         value = model.value(name)
         step = 1e-3 * max(abs(value), 1e-6)
         if group != "rates" and (searched := catalogue.get(group).nonlinear.get(key)):
@@ -79,9 +83,9 @@ def derivatives(
 def _weights(
     model: ThermalModel, name: str = "", coefficients: Mapping[str, float] | None = None
 ) -> Array:
-    """Weights (22,) of an effect's signal, or of the temperature: the rates.
+    """Return the weights (22,) of an effect's signal, or of the temperature (the rates).
 
-    The distortion follows what moves c, about T₀.
+    The distortion follows c, linearised at T₀.
     """
     weights = np.zeros(len(_COLUMNS))
     if coefficients is None:
@@ -93,11 +97,11 @@ def _weights(
     return np.concatenate([moved, weights[10:]])
 
 
-_ROUNDS = 3  # phases and events look for each other
+_ROUNDS = 3  # phases and events depend on each other
 
 
-def with_own(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
-    """Give the model the phases and events of a series, whose T₀ and reference are the model's."""
+def fit_own_effects(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
+    """Return the model with the phases and events of a series with the model's T₀ and reference."""
     listed = {e.name: e for e in model.effects if catalogue.get(e.name).seen_in == "trajectory"}
     own = [e for e in listed if Term(e).is_separate]
     if not own:
@@ -105,16 +109,16 @@ def with_own(model: ThermalModel, series: ReducedSeries) -> ThermalModel:
     fitter = HypothesisFitter([series])
     for e in own:
         if catalogue.get(e).is_event:
-            listed[e] = _nothing(listed[e])
+            listed[e] = _without_event(listed[e])
     for _ in range(_ROUNDS):
         for name in own:
-            find = _phase if catalogue.get(name).is_periodic else _event
+            find = _fit_phase if catalogue.get(name).is_periodic else _find_event
             listed[name] = find(fitter, model, listed, name)
     return replace(model, effects=tuple(listed.get(e.name, e) for e in model.effects))
 
 
-def _nothing(effect: ModelEffect) -> ModelEffect:
-    """An event that did not happen."""
+def _without_event(effect: ModelEffect) -> ModelEffect:
+    """Return an effect whose event did not happen."""
     return replace(
         effect, values={**effect.values, **dict.fromkeys(catalogue.get(effect.name).linear, 0.0)}
     )
@@ -123,7 +127,7 @@ def _nothing(effect: ModelEffect) -> ModelEffect:
 def _known(
     fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect]
 ) -> tuple[Fit, Array]:
-    """A fit of some effects, and their coefficients as the model has them, px-scaled."""
+    """Return a fit of some effects, and the model's coefficients of them, px-scaled."""
     fit = fitter.fit([make_known_term(e.name, e.values, 1) for e in listed.values()])
     scale = fitter.series[0].scale
     x = fit.coefficients.copy()
@@ -140,10 +144,10 @@ def _known(
     return fit, x
 
 
-def _phase(
+def _fit_phase(
     fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect], name: str
 ) -> ModelEffect:
-    """A cycle with the phase that fits best, its amplitude as it is."""
+    """Return a cycle with the phase that fits best and an unchanged amplitude."""
     fit, x = _known(fitter, model, listed)
     block = next(b for b in fit.blocks if b.term >= 0 and fit.terms[b.term].effect == name)
     (whole, c, _), index = fit.reduced[0], fit.designs[0][2]
@@ -162,10 +166,10 @@ def _phase(
     return replace(listed[name], values={**listed[name].values, key: best})
 
 
-def _event(
+def _find_event(
     fitter: HypothesisFitter, model: ThermalModel, listed: dict[str, ModelEffect], name: str
 ) -> ModelEffect:
-    """An event where it explains most, or none."""
+    """Return an event at the time where it explains most, or none if it is not significant."""
     fit, x = _known(fitter, model, {n: e for n, e in listed.items() if n != name})
     effect, kind = listed[name], catalogue.get(name)
     linear = tuple(n for n in kind.linear if n in effect.values)
@@ -179,22 +183,23 @@ def _event(
     gain = np.einsum("gi,gi->g", rest, heights)
     best = int(np.argmax(gain))
     series = fitter.series[0]
-    if gain[best] <= event_worth(series, len(linear)):
-        return _nothing(effect)
+    if gain[best] <= event_threshold(series, len(linear)):
+        return _without_event(effect)
     units = series.scale[[COLUMNS.index(p) for p in candidate.parameters]]
     values = dict(zip(linear, (heights[best] / units).tolist(), strict=True))
     time = float(0.5 * (series.times[best] + series.times[best + 1]))
     return replace(effect, values={**effect.values, **values, candidate.name: time})
 
 
-_BAND = 1.959964  # standard deviations that hold 95 %
+NORMAL_95 = 1.959964  # standard deviations of a 95 % band
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedError:
-    """The errors of one series: rms_px of measured minus predicted image points, floor_px: what
-    noise alone would leave, coverage: fraction of the coordinates inside their 95 % band, NaN where
-    the model misses an effect and no band is stated; object_mm: the rms on a plane at 10 m.
+    """The errors of the prediction of one series.
+
+    rms_px: of measured minus predicted image points; floor_px: expected from noise alone; coverage:
+    fraction of coordinates in their 95 % bands, NaN if none is stated; object_mm: RMS at 10 m.
     """
 
     name: str
@@ -207,9 +212,9 @@ class PredictedError:
 def predicted_error(
     model: ThermalModel, series: ReducedSeries, thermometer_sd: float
 ) -> PredictedError:
-    """Predict a series; thermometer_sd K of a reading.
+    """Predict a series and compare it with the measured points; thermometer_sd K: of a reading.
 
-    ConfigurationError for another camera, DataError without the model's reference thermometer.
+    Raises ConfigurationError for another camera, DataError without its reference thermometer.
     """
     source = series.source
     if source.sensor != model.sensor or source.camera != model.camera:
@@ -224,18 +229,15 @@ def predicted_error(
     model = _of_series(model, series, rows)
     history = series.readings_history
     prediction = model.predict(history, source.field)
-    mean, _, _ = series_means(series, prediction)
-    whole = slice(0, len(history.times))
+    mean, _, _ = average_residuals(series, prediction)
     weights = series.weights[..., :2]
-    points = source.grid.points
     used = weights > 0
+    whole = slice(0, len(history.times))
+    residuals = source.grid.points - project_targets(series, prediction, whole)
     if len(rows):
-        # a target that moves is not a gross error where it moves
-        used[:, rows] = (source.grid.weights[:, rows, :2] > 0) & (
-            np.abs(np.nan_to_num(points[:, rows] - projected(series, prediction, whole)[:, rows]
-                                 - mean[rows])) < 1.0
-        )  # fmt: skip
-    residuals = points - projected(series, prediction, whole)
+        # the step of a moved target is no gross error
+        near = np.abs(np.nan_to_num(residuals[:, rows] - mean[rows])) < 1.0
+        used[:, rows] = (source.grid.weights[:, rows, :2] > 0) & near
     residuals = np.where(used, residuals, 0.0)
     residuals = residuals - residuals.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
     # ∂ image points / ∂ parameters (T, 2, 22): camera, scales of the field, a displacement
@@ -249,14 +251,14 @@ def predicted_error(
     coverage = float("nan")
     if not model.misses_an_effect:
         bands = floor + _variance(A, _parameters(series, model))
-        coverage = float(np.mean(np.abs(residuals[used]) <= _BAND * np.sqrt(bands[used])))
+        coverage = float(np.mean(np.abs(residuals[used]) <= NORMAL_95 * np.sqrt(bands[used])))
     scale = source.sensor.pixel_pitch / model.interior.c * 10_000.0
     floor_px = float(np.sqrt(np.mean(floor[used])))
     return PredictedError(source.series or source.name, rms, floor_px, coverage, rms * scale)
 
 
 def _as_fitted(model: ThermalModel, series: ReducedSeries) -> ReducedSeries:
-    """The series with the model's T₀ and reference, whichever column stands first."""
+    """Return the series with the model's T₀ and reference, whichever column comes first."""
     history = series.history
     reference = next(iter(model.validity), history.reference)
     if reference not in history.readings:
@@ -269,11 +271,11 @@ def _as_fitted(model: ThermalModel, series: ReducedSeries) -> ReducedSeries:
 
 
 def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int64]) -> ThermalModel:
-    """The model with what belongs to the series: orientation, phases, events."""
+    """Return the model with the series' exterior orientation, phases and events."""
     others = without_targets(series, rows) if len(rows) else series
-    model = with_own(model, others)
+    model = fit_own_effects(model, others)
     if len(rows):
-        moved = moved_targets(others, rows)
+        moved = estimate_step(others, rows)
         effects = tuple(
             moved.effect(e) if catalogue.get(e.name).seen_in == "targets" else e
             for e in model.effects
@@ -285,15 +287,15 @@ def _of_series(model: ThermalModel, series: ReducedSeries, rows: NDArray[np.int6
 
 
 def _variance(A: Array, covariance: Array) -> Array:
-    """Variances (E, T, 2) px² of the image points from parameters' covariances (E, 22, 22)."""
+    """Propagate parameters' covariances (E, 22, 22) to variances (E, T, 2) px² of image points."""
     return np.asarray(np.einsum("tcp,epq,tcq->etc", A, covariance, A, optimize=True))
 
 
 def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: float) -> Array:
-    """Covariance (E, 22, 22) of an epoch's parameters, relative to the series' mean.
+    """Return the covariance (E, 22, 22) from the thermometers, relative to the series' mean.
 
-    It comes from the readings' errors, carried through each effect's operator, and from what their
-    times leave open.
+    Contains the readings' errors, propagated through each effect's operator, and what their times
+    leave unresolved.
     """
     history = series.readings_history
     jump = series.thermometers[history.reference].slope_jump(history.times)
@@ -323,7 +325,7 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
     for (c, a, S), mean_s in zip(operators, means, strict=True):
         for (d, b, R), mean_r in zip(operators, means, strict=True):
             if a != b:
-                continue  # of another thermometer
+                continue  # independent thermometers
             shared = np.asarray(S.multiply(R).sum(axis=1)).ravel()
             shared = shared - S @ mean_r - R @ mean_s + mean_s @ mean_r
             covariance += thermometer_sd**2 * shared[:, None, None] * np.outer(c, d)
@@ -333,11 +335,11 @@ def _thermometers(series: ReducedSeries, model: ThermalModel, thermometer_sd: fl
 
 
 def _parameters(series: ReducedSeries, model: ThermalModel) -> Array:
-    """Covariance (E, 22, 22) from the model's drift parameters; the level is the series' own."""
+    """Return the covariance (E, 22, 22) from the model's drift; the level is the series' own."""
     history = series.readings_history
     if model.covariance is None:
         return np.zeros((len(history.times), 22, 22))
-    own = set()  # the numbers that a series has of its own
+    own = set()  # parameters that every series has of its own
     for e in model.effects:
         kind = catalogue.get(e.name)
         own |= {f"{e.name}.{n}" for n in (*kind.fresh, *(kind.linear if kind.is_event else ()))}

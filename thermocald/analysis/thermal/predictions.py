@@ -1,8 +1,8 @@
 """Predictions of a thermal camera, at a time or along a log, as a document and as lines.
 
-The log of temperatures is a logger's, a recording's or a store's. A camera is steady from the time
-after which no point of the image, seen on a plane at the working distance, lies further from where
-the end of the history puts it than the wanted error.
+The temperature log comes from a logger, a recording or a store. A camera is steady from the time
+after which every image point, projected onto a plane at the working distance, stays within the
+wanted error of its position at the end of the history.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ def read_model_log(
     options: LogOptions | None = None,
     near: tuple[float, float] | None = None,
 ) -> TemperatureLog:
-    """Read a log for a model; T is the column that the options name, else the model's reference,
-    else the first.
+    """Read the temperature log for a model.
 
-    path: a logger's file, the folder or `epochs.csv` of a recording, or a store; near: as
-    `read_log` takes it. Raises ConfigurationError where the log is of another camera's recording.
+    The reference is the column that the options name, else the model's reference, else the first.
+    path: a logger's file, a recording's folder or `epochs.csv`, or a store; near: as in `read_log`.
+    Raises ConfigurationError for the recording of another camera.
     """
     options = options or LogOptions()
     reference = next(iter(thermal.model.validity), None)
     wanted = options.temperatures[0] if options.temperatures else None
     if is_store(path):
-        log, camera = _stored(path, wanted)
+        log, camera = _read_store(path, wanted)
     else:
         folder = path if path.is_dir() else path.parent
         camera = None
@@ -73,16 +73,16 @@ def read_model_log(
     return log.with_reference(wanted or reference)
 
 
-def _stored(source: Path, wanted: str | None) -> tuple[TemperatureLog, CameraSpec]:
-    """The readings of all series of one camera in the order of time, and the camera.
+def _read_store(source: Path, wanted: str | None) -> tuple[TemperatureLog, CameraSpec]:
+    """Read the readings of all series of a store's only camera, in order of time, and the camera.
 
-    Raises DataError for a channel that is not there or a source without readings, StoreError where
-    several cameras are in it.
+    Raises DataError for an unknown channel or a store without readings, StoreError for a store with
+    several cameras.
     """
     with open_source(source) as store:
         every = store.all_series()
         if len({(s.camera, s.identity.get("station")) for s in every}) != 1:
-            store.find_series()  # says what there is
+            store.find_series()  # raises an error that lists the series
         names = list(dict.fromkeys(name for s in every for name in s.head.channels))
         if wanted is not None and wanted not in names:
             raise DataError(
@@ -100,18 +100,18 @@ def _stored(source: Path, wanted: str | None) -> tuple[TemperatureLog, CameraSpe
     table = table[:, np.isfinite(table[0])]
     if not table.shape[1]:
         raise DataError(f"{path}: holds no temperatures")
-    # a reading that belongs to two epochs is one reading
+    # two epochs may have the same reading
     _, rows = np.unique(table[0], return_index=True)
     table = table[:, rows]
     return TemperatureLog(table[0], dict(zip(names, table[1:], strict=True))), camera
 
 
 def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> tuple[float | None, Array]:
-    """Find from when on the camera is steady enough, s since the start.
+    """Find the time from which the camera is steady enough, s since the start.
 
-    Returns None where the history ends before that: one that still moves by more than a tenth of
-    the wanted error over its last tenth has not shown its end. Also returns the worst point's
-    distance (E,) mm from where it ends. Raises DataError for fewer than ten times.
+    Returns None if the history ends before: if it still moves by more than a tenth of the wanted
+    error during its last tenth, its end is not the steady state. Also returns the distance (E,) mm
+    of the worst point from its final position. Raises DataError for fewer than ten times.
     """
     if len(along) < 10:
         raise DataError("a warm-up needs a history of at least 10 times")
@@ -131,8 +131,8 @@ def warm_up(along: Along, distance_mm: float, wanted_mm: float) -> tuple[float |
 class Prediction(Result):
     """The prediction of a thermal camera.
 
-    thermal: the camera; document: what `predict` writes with `--json`; said: what it prints; state:
-    of a camera at one temperature, else None.
+    thermal: the camera; document: what `predict --json` writes; said: the lines that it prints;
+    state: the camera at a single temperature, else None.
     """
 
     thermal: ThermalCamera
@@ -149,12 +149,12 @@ class Prediction(Result):
         return self.said
 
     def plot(self) -> Figure:
-        """Draw the camera's distortion at its temperature, else its drift with temperature."""
+        """Draw the distortion at the single temperature, or else the drift with temperature."""
         return self.thermal.plot() if self.state is None else self.state.plot()
 
 
 def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> Prediction:
-    """Say what a camera is, and what its uncertainty and drift mean on a plane at `distance` m."""
+    """Describe a camera, and its uncertainty and drift on a plane at `distance` m."""
     error = camera.object_error(distance * 1000.0)
     reference = thermal.at(thermal.model.T0, extrapolate=True)
     moved = camera.object_distance(reference, distance * 1000.0)
@@ -174,7 +174,7 @@ def describe_camera(thermal: ThermalCamera, camera: Camera, distance: float) -> 
 
 
 def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool) -> Prediction:
-    """Predict the camera along a log, a row a reading."""
+    """Predict the camera along a log, one row per reading."""
     along = thermal.along(
         log.times, log.channels, extrapolate=extrapolate,
         temperature_sd=thermal.thermometer_sd or 0.0,
@@ -199,7 +199,7 @@ def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool
 
 
 def check_prediction(thermal: ThermalCamera, inputs: Sequence[SeriesInput]) -> Prediction:
-    """Hold measured series against what the model predicts of them."""
+    """Compare measured series with the model's prediction of them."""
     found, lines = [], []
     series = [reduce_series(s, strict=False) for s in inputs]
     for s in series:
@@ -226,8 +226,9 @@ def check_prediction(thermal: ThermalCamera, inputs: Sequence[SeriesInput]) -> P
 def advise_warm_up(
     thermal: ThermalCamera, programme: Path, camera: Path | None, distance: float, wanted: float
 ) -> Prediction:
-    """Say how long the camera needs within a programme until it is steady to `wanted` mm at
-    `distance` m; camera: its file, which says how it warms.
+    """Predict how long the camera takes within a programme to be steady to `wanted` mm.
+
+    distance: of the plane, m; camera: the device's file, which describes how it warms.
     """
     usual = CameraDevice(thermal.model.camera, thermal.model.sensor)
     device = usual if camera is None else read_camera_device(camera)
@@ -248,7 +249,7 @@ def advise_warm_up(
         "temperature_at_end": float(along.temperatures[-1]),
     }
     if steady_from is None:
-        said = "does not come to rest within this programme: let it run longer"
+        said = "does not become steady within this programme: use a longer one"
     else:
         said = f"is steady to {wanted:g} mm at {distance:g} m after {steady_from:.0f} s"
     worst = f"(up to {document['error_at_begin_mm']:.1f} mm before)"

@@ -1,9 +1,9 @@
-"""The camera that a thermal model predicts from a thermometer's readings, as they come.
+"""The camera that a thermal model predicts from a thermometer's readings, as they arrive.
 
-What happened before the first reading and within a gap is not known, and effects with a memory
-still feel it. A second camera has therefore come through the unknown time warmer, by as much as
-temperatures change in such a time; how far apart both are is one standard deviation of what is not
-known. It fades as the memories do, whichever effects the model has.
+The temperatures before the first reading and within a gap are unknown, but effects with a memory
+depend on them. A second camera is therefore predicted that was warmer during the unknown time, by
+one standard deviation of the change of temperature in such a time. The difference between the two
+cameras is one standard deviation of what is unknown. It fades as the memories of the effects do.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
     from thermocald.analysis.thermal.thermal_camera import LiveCamera, ThermalCamera
     from thermocald.arrays import Array
 
-_LONG_S = 30 * 86400.0  # after so long at one temperature everything has settled
-_DAY_S = 6 * 3600.0  # temperatures farther apart in time have little in common
-_USUAL_RANGE_K = 20.0  # of a model that does not say on what it was fitted
-_CHANGED_S = 60.0  # in which a camera came from elsewhere to where it is
-GAP_S = 120.0  # between readings a straight line will do
-_BACK_S = 10.0  # a clock that is set back by less makes a reading late, not unknown
+_LONG_S = 30 * 86400.0  # after this long at one temperature everything has settled
+_CORRELATED_S = 6 * 3600.0  # temperatures further apart in time are hardly correlated
+_USUAL_RANGE_K = 20.0  # for a model that does not state its range of temperature
+_CHANGED_S = 60.0  # in which the second camera reaches the first reading
+GAP_S = 120.0  # longest gap that a straight line bridges
+_BACK_S = 10.0  # a reading that is early by less is ignored; by more, the clock was set back
 _REMEMBERED = 4000  # readings
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedCamera:
-    """A camera as it is predicted: `camera`, with the covariance of model, thermometer and past.
+    """A predicted camera, whose covariance includes model, thermometer and unknown past.
 
-    age_s: of its last reading; temperature_sd: K, of its temperature, with what a reading's age and
-    the limits of the fit add; unknown (10,): what the unknown past adds, one standard deviation,
-    and unknown_px, the largest of it in the image; far: whether it is so far outside the
-    temperatures of the fit that nothing should be predicted.
+    age_s: of the last reading; temperature_sd: K, of its temperature, including a reading's age and
+    the excess over the limits of the fit; unknown (10,): one standard deviation due to the unknown
+    past, and unknown_px, its largest effect in the image; far: whether the temperature is so far
+    outside those of the fit that nothing should be predicted.
     """
 
     camera: Camera
@@ -53,11 +53,11 @@ class PredictedCamera:
 
 
 class Predictor:
-    """Follows the readings of one camera's thermometers."""
+    """A predictor that follows the readings of one camera's thermometers."""
 
     def __init__(self, thermal: ThermalCamera) -> None:
         self.thermal = thermal
-        # beyond the temperatures of the fit it is judged here, tick by tick and without a warning
+        # `at` checks the range of temperature itself, for each epoch and without a warning
         self._free = replace(thermal, model=replace(thermal.model, validity={}))
         named = (e.values.get("channel") for e in thermal.model.effects)
         self._channels = tuple(dict.fromkeys(str(c) for c in named if c))
@@ -68,7 +68,7 @@ class Predictor:
         self._across: Array | None = None
 
     def take(self, time: float, readings: Mapping[str, float]) -> None:
-        """Take readings {channel: °C}, the first is the reference; failed ones are NaN or missing.
+        """Take readings {channel: °C}, the reference first; failed ones are NaN or missing.
 
         time: s UTC.
         """
@@ -78,7 +78,7 @@ class Predictor:
         if self._recent and time <= (last := self._recent[-1][0]):
             if time > last - _BACK_S:
                 return
-            self._pair = None  # the clock was set back: how long ago all was is not known
+            self._pair = None  # the clock was set back: the age of earlier readings is unknown
             self._recent.clear()
         self._since_begin += 1
         if self._pair is not None and self._pair[0].keeps_all and self._since_begin > _REMEMBERED:
@@ -92,13 +92,13 @@ class Predictor:
         self._now = (self._pair[0].update(time, row), self._pair[1].update(time, row))
 
     def at(self, time: float) -> PredictedCamera | None:
-        """Return the camera of now (time: s UTC), None before the first reading."""
+        """Return the camera at a time, s UTC; None before the first reading."""
         if self._now is None:
             return None
         camera, other = self._now
         read = self._recent[-1][0]
         age = max(time - read, 0.0)
-        if self._recent[0][0] < time < read - _BACK_S:  # an epoch that had to wait
+        if self._recent[0][0] < time < read - _BACK_S:  # an epoch that was processed late
             times = [t for t, _ in self._recent]
             rows = {n: np.array([row[n] for _, row in self._recent]) for n in self._recent[0][1]}
             camera, age = self._free.along(times, rows, [time])[0], 0.0
@@ -118,12 +118,12 @@ class Predictor:
         return PredictedCamera(now, age, spread, unknown, shift, far)
 
     def settled(self) -> Camera:
-        """Return the camera of a temperature that nothing is known of, with its covariance."""
+        """Return the steady camera at T₀, with the covariance of an unknown temperature."""
         T = self.thermal.model.T0
         return self._free.at(T, self._change(math.inf), dict.fromkeys(self._channels, T) or None)
 
     def _row(self, readings: Mapping[str, float]) -> dict[str, float] | None:
-        """The reference and the channels that the model names; None where one was not read yet."""
+        """Return the reference and the model's channels; None if one has not been read yet."""
         reference = next(iter(readings), None)
         if reference is None:
             return None
@@ -143,7 +143,7 @@ class Predictor:
         self._pair[1].update(time - _CHANGED_S, warmer)
 
     def _begin_again(self) -> None:
-        """Follow the last readings only, for a model that asks for all that there are."""
+        """Start again from the last readings, for a model that would need all readings."""
         kept = list(self._recent)[_REMEMBERED // 2 :]
         self._begin(*kept[0])
         assert self._pair is not None
@@ -152,11 +152,11 @@ class Predictor:
                 one.update(time, row)
 
     def _cross_gap(self, time: float, row: dict[str, float]) -> None:
-        """Lead the other camera through a gap that was warmer than the line across it."""
+        """Update the second camera through a gap, warmer than the straight line across it."""
         assert self._pair is not None
         last, before = self._recent[-1]
         gap = time - last
-        # a line that is held at both ends leaves most to its middle
+        # both ends are known: the deviation is largest in the middle
         self._pair[1].update(last + 0.1 * gap, self._warmer(before, 0.5 * gap))
         self._pair[1].update(time - 0.1 * gap, self._warmer(row, 0.5 * gap))
 
@@ -164,16 +164,16 @@ class Predictor:
         return {name: value + self._change(seconds) for name, value in row.items()}
 
     def _change(self, seconds: float) -> float:
-        """Return by how much a temperature changes in a time, K: one standard deviation."""
+        """Return the standard deviation of a temperature's change in a time, K."""
         v = self.thermal.validity
         spread = (_USUAL_RANGE_K if v is None else v.high - v.low) / math.sqrt(12.0)
-        return spread * math.sqrt(-math.expm1(-2.0 * seconds / _DAY_S))
+        return spread * math.sqrt(-math.expm1(-2.0 * seconds / _CORRELATED_S))
 
     def _largest_px(self, values: Array, shift: Array) -> float:
-        """Return by how much a change of the interior orientation moves an image point at most."""
+        """Return the largest shift of an image point, px, for a change of interior orientation."""
         if not shift.any():
             return 0.0
-        if self._across is None:  # where corners and edges look, hardly changed by temperature
+        if self._across is None:  # rays of a grid, which temperature hardly changes
             sensor = self.thermal.model.sensor
             across = rays(sensor, values, image_grid(sensor))
             self._across = across / -across[:, 2:]

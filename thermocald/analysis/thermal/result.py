@@ -1,11 +1,10 @@
-"""A fitted hypothesis as a thermal model, with the covariance of all its numbers.
+"""A fitted hypothesis as a thermal model, with the covariance of all its parameters.
 
-What the model leaves is tested absolutely, and enlarges the covariance. The noise of image and
-thermometer is known without the model: from what a free camera per epoch leaves, and from the
-readings' own roughness. Smooth trajectories that are left beyond it are an effect that the model
-lacks. Its time series is known as far as it was not absorbed: taken as a random time series with
-the power that it has in each order of cosines, it is carried into the unknowns, and into the
-interior orientation that the model predicts.
+The model's residuals are tested against noise that is estimated without the model: image noise from
+the residuals of a free camera per epoch, thermometer noise from the roughness of the readings.
+Smooth trajectories beyond that noise mean that the model lacks an effect. They show this effect as
+far as the fit has not absorbed it; as a random time series with the power that they have in each
+order of cosines they enter the covariance of the unknowns and of the predicted orientation.
 """
 
 from __future__ import annotations
@@ -17,8 +16,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from thermocald.analysis.series.course import carried_by_c
-from thermocald.analysis.thermal.level import AFFINITY_SD, estimate_level, projected, series_means
-from thermocald.analysis.thermal.terms import unknowns_of
+from thermocald.analysis.thermal.level import (
+    AFFINITY_SD,
+    average_residuals,
+    estimate_level,
+    project_targets,
+)
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
@@ -31,6 +34,7 @@ from thermocald.photogrammetry.series.normals import chunks
 from thermocald.physics import catalogue
 from thermocald.physics.formula import is_formula, known_together
 from thermocald.physics.model import RATED, ModelEffect, ThermalModel
+from thermocald.thermal.hypothesis import coefficients_of
 from thermocald.thermal.movement import detect_tremble
 from thermocald.thermal.scan import examine
 from thermocald.thermal.series import COLUMNS
@@ -47,22 +51,22 @@ if TYPE_CHECKING:
     from thermocald.thermal.series import ReducedSeries
 
 
-# of the image noise: a rest that is significant but smaller widens the covariance, and leaves the
-# 95 % bands what they say
+# fraction of the image noise: a smaller misfit, even if significant, only widens the covariance;
+# the 95 % bands stay valid
 _MATERIAL = 0.2
-_FEWEST = 30  # epochs, of one series or of the short ones together, that a test needs
-_FEWEST_TO_CARRY = 6  # epochs whose rest can be carried into the covariance, tested or not
+_FEWEST = 30  # epochs that the test needs, in one series or in the short ones together
+_FEWEST_TO_CARRY = 6  # epochs whose misfit can be propagated into the covariance, tested or not
 
 
 def examine_rest(
     fitter: HypothesisFitter, fit: Fit, free: list[int]
 ) -> tuple[dict[str, Any], Array, Array]:
-    """Test what the model leaves in every series, in the short ones together.
+    """Test the smooth misfit of the model in every series; short series are tested jointly.
 
-    free: columns of the interior orientation that take the rest up. Returns whether an effect is
-    missing, None where a series was not examined and no other misses one, with the RMS px of the
-    smooth rest and its significance, of the worst series; and what the rest adds to the covariance
-    of the fit's unknowns (K + L, K + L) and of the interior orientation (10, 10), px-scaled.
+    free: columns of the interior orientation that absorb the misfit. Returns a verdict: whether an
+    effect is missing (None if a series could not be tested and no other lacks one), RMS px and
+    significance of the misfit in the worst series; and what the misfit adds to the covariances of
+    the fit's unknowns (K + L, K + L) and of the interior orientation (10, 10), px-scaled.
     """
     size = len(fit.covariance)
     unknowns, parameters = np.zeros((size, size)), np.zeros((len(free), len(free)))
@@ -72,7 +76,7 @@ def examine_rest(
         s: examine(fitter, fit, s) for s, count in enumerate(epochs) if count >= _FEWEST_TO_CARRY
     }
     short = [s for s in tests if epochs[s] < _FEWEST]
-    # the short ones tested as one, in standard deviations
+    # the joint test of the short series, in standard deviations
     scores = [tests[s].scores for s in short]
     free_scores = sum(a.size for a in scores)
     total = sum(float(np.sum(a**2)) for a in scores)
@@ -102,9 +106,9 @@ def examine_rest(
 
 
 def _power(a: Adequacy) -> Array:
-    """Second moments (ORDERS, D, D) of the rest's amplitudes along the directions.
+    """Return second moments (ORDERS, D, D) of the misfit's amplitudes along the directions.
 
-    An order that the fit has absorbed is as strong as its stronger neighbour.
+    An order that the fit may have absorbed is taken to be as strong as its stronger neighbour.
     """
     along = a.amplitudes @ np.linalg.pinv(a.directions).T
     own = np.sum(along**2, axis=1)
@@ -118,7 +122,7 @@ def _power(a: Adequacy) -> Array:
 
 
 def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power: Array) -> Array:
-    """Return what the rest of one series may have done to the fit's unknowns (K + L, K + L)."""
+    """Return the covariance (K + L, K + L) that one series' misfit adds to the fit's unknowns."""
     X, V, places = fitter.tangent(fit, fit.searched, series)
     _, _, B = fit.weightings[series].scan(a.trajectories[:, :, None], a.directions, (X, V))
     T = np.eye(len(fit.covariance))[places]
@@ -127,17 +131,17 @@ def _carried(fitter: HypothesisFitter, fit: Fit, series: int, a: Adequacy, power
     return total
 
 
-_SELDOM = 0.05  # of a reading's interval that the course between two of them makes of a delay
+_SELDOM = 0.05  # bias of a delay by curvature between readings, over their interval
 _INTERIOR = [COLUMNS.index(n) for n in IOP_NAMES]
 _EXTERIOR = [COLUMNS.index(n) for n in EOP_NAMES]
 
 
 @dataclass(frozen=True, slots=True)
 class SeriesFit:
-    """The fit of one series: RMS px of the image points, thermometer's noise K, what
-    the noise of both leaves, px.
+    """The fit of one series, with the RMS of its image residuals.
 
-    means: on how many means of epochs a long series was fitted, and the RMS is of; else None.
+    thermometer_sd: K; means: the number of epoch means of a long series, to which fit and RMS
+    refer, else None; noise_px: the RMS expected from the noise of image and thermometer.
     """
 
     JSON: ClassVar = {"left_over": "left_over_in_noise"}
@@ -151,7 +155,7 @@ class SeriesFit:
 
     @property
     def left_over(self) -> float:
-        """The RMS over what noise alone leaves."""
+        """The ratio of the RMS to that expected from noise alone."""
         return self.rms_px / self.noise_px
 
 
@@ -159,7 +163,7 @@ def _effect(
     e: ModelEffect, k: int, fitter: HypothesisFitter, fit: Fit, unknowns: Unknowns,
     growth: NoiseGrowth | None, moved: Sequence[Moved],
 ) -> ModelEffect:  # fmt: skip
-    """One effect with the values of series k."""
+    """Return an effect of the model with the values of series k."""
     kind = catalogue.get(e.name)
     if kind.seen_in == "noise":
         assert growth is not None
@@ -170,7 +174,7 @@ def _effect(
     own = next(t for t in fit.terms if t.effect == e.name).values(k)
     values = {**e.values, **dict.fromkeys((n for n in kind.linear if n in e.values), 0.0)}
     for name, value in (own or {}).items():
-        if kind.nonlinear[name].role == "event":  # it lies anywhere between two frames
+        if kind.nonlinear[name].role == "event":  # anywhere between two frames: take the middle
             times = fitter.series[k].times
             before = max(int(np.searchsorted(times, float(value) - 1e-6)) - 1, 0)
             value = float(0.5 * (float(value) + times[before]))
@@ -190,9 +194,9 @@ def _covariance(
     fitter: HypothesisFitter, fit: Fit, first: ReducedSeries, numbers: Unknowns, unknowns: Array,
     parameters: Array,
 ) -> tuple[list[str], Array]:  # fmt: skip
-    """Return names and covariance of interior, drifts, and the first series' own numbers.
+    """Return names and covariance of interior orientation, drifts and the first series' unknowns.
 
-    unknowns, parameters: what the rest adds, as of `examine_rest`.
+    unknowns, parameters: the covariances that `examine_rest` adds.
     """
     n, size = len(_INTERIOR), len(fit.covariance)
     Q = scaled_inverse(_joint_normal(fitter, fit))[: n + size, : n + size]
@@ -206,7 +210,7 @@ def _covariance(
 
 
 def _image_sigma(series: Sequence[ReducedSeries], growth: NoiseGrowth | None) -> float:
-    """The noise of an image coordinate at T₀, px."""
+    """Return the noise of an image coordinate at T₀, px."""
     total, count = 0.0, 0
     for k, s in enumerate(series):
         ok = s.n > 0
@@ -218,16 +222,16 @@ def _image_sigma(series: Sequence[ReducedSeries], growth: NoiseGrowth | None) ->
     return float(np.sqrt(total / count))
 
 
-def _assessed(
+def _assess(
     s: ReducedSeries, model: ThermalModel, sigma: float, reading_sd: float, noise: Array | None
 ) -> SeriesFit:
-    """Assess how well a series is explained.
+    """Assess how well the model fits a series.
 
-    sigma px: noise of a coordinate at T₀; reading_sd K: of a row's temperature; noise (E,): of the
-    image over that at T₀, None where it does not grow.
+    sigma px: noise of a coordinate at T₀; reading_sd K: of a row's temperature; noise (E,): the
+    image noise relative to that at T₀, None if it does not grow.
     """
     averaged = float(np.sqrt(np.median(s.source.per_row)))
-    # a constant of each target is taken off: of the thermometer's noise nothing else is
+    # only a constant per target is removed from the residuals: the thermometer's noise remains
     drift = s.columns[..., :10] @ (model.rate_vector * s.scale[:10])
     left = np.hypot(sigma / averaged, reading_sd * np.sqrt(np.mean(drift**2)))
     if noise is not None:
@@ -242,7 +246,7 @@ def _assessed(
     )
 
 
-def fitted_camera(
+def build_camera(
     fitter: HypothesisFitter,
     fit: Fit,
     series: Sequence[ReducedSeries],
@@ -251,12 +255,12 @@ def fitted_camera(
     moved: Sequence[Moved],
     distortion_sigmas: float | None = None,
 ) -> ThermalCamera:
-    """Make the camera of a fit; its events and phases are those of the first series.
+    """Build the thermal camera of a fit; its events and phases are those of the first series.
 
-    series: as they came, unblocked; growth, moved: of effects beyond the fit; distortion_sigmas:
-    how sure it is what the distortion follows, None where that was given.
+    series: not averaged in blocks; growth, moved: effects on noise and targets, from outside the
+    fit; distortion_sigmas: significance of what the distortion follows, None if that was given.
     """
-    numbers = unknowns_of(fit, series[0].scale)
+    numbers = _list_unknowns(fit, series[0].scale)
     starts = [
         ThermalModel(
             s.source.camera,
@@ -283,7 +287,7 @@ def fitted_camera(
     sigma = _image_sigma(series, growth)
     stated = np.concatenate([s.source.grid.weights[s.source.grid.observed][:, 0] for s in series])
     fits = tuple(
-        _assessed(
+        _assess(
             s, models[k], sigma, fitter.series[k].thermometers[s.history.reference].noise,
             None if growth is None else growth.noise[k],
         )
@@ -335,7 +339,7 @@ def fitted_camera(
 
 
 def _tied_constants(model: ThermalModel) -> list[dict[str, Any]]:
-    """List what is known of formulas whose constants the data tie to each other or a size."""
+    """List the formulas whose constants are correlated with each other, and what is determined."""
     low, high = next(iter(model.validity.values()))
     found = []
     for e in model.effects:
@@ -353,9 +357,9 @@ def _tied_constants(model: ThermalModel) -> list[dict[str, Any]]:
 
 
 def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
-    """Normal matrix of interior (10) at T₀, the fit's unknowns (K + L), exteriors (6 each), px.
+    """Return the normal matrix of interior (10), unknowns (K + L) and exteriors (6 each), px.
 
-    The thermometers' errors are eliminated from all of them alike.
+    The interior orientation is that at T₀; the thermometers' errors are eliminated.
     """
     n, K, size = len(_INTERIOR), len(fit.coefficients), len(fit.covariance)
     M = np.zeros((n + size + 6 * len(fitter.series),) * 2)
@@ -374,7 +378,7 @@ def _joint_normal(fitter: HypothesisFitter, fit: Fit) -> Array:
     affinity = [IOP_NAMES.index("C1"), IOP_NAMES.index("C2")]
     M[affinity, affinity] += (AFFINITY_SD * fitter.series[0].scale[affinity]) ** -2
     empty = np.diag(M) <= 0
-    M[empty, empty] = 1e12  # a coefficient of a series that takes no part
+    M[empty, empty] = 1e12  # a coefficient of a series that does not take part
     return M
 
 
@@ -386,13 +390,13 @@ def _span(series: Sequence[ReducedSeries], channel: str) -> tuple[float, float]:
 
 
 def _rms(series: ReducedSeries, model: ThermalModel) -> float:
-    """Measured minus predicted from the readings, constant offsets of targets taken off, px."""
+    """Return the RMS px of measured minus predicted image points, less a constant per target."""
     prediction = model.predict(series.readings_history, series.source.field)
-    mean, _, moved = series_means(series, prediction)
+    mean, _, moved = average_residuals(series, prediction)
     points, weights = series.source.grid.points, series.weights[..., :2]
     total, count = 0.0, 0
     for part in chunks(*points.shape[:2]):
-        left = points[part] - projected(series, prediction, part) - mean
+        left = points[part] - project_targets(series, prediction, part) - mean
         use = (weights[part] > 0) & ~moved[:, None]
         total += float(np.sum(np.where(use, left, 0.0) ** 2))
         count += int(use.sum())
@@ -411,3 +415,23 @@ def _with_sds(effect: ModelEffect, sd: dict[str, float], series: ReducedSeries) 
             # a time between two frames: uniform over the interval
             found[key] = float(np.median(np.diff(series.times)) / np.sqrt(12.0))
     return ModelEffect(effect.name, effect.values, found)
+
+
+def _list_unknowns(fit: Fit, scale: Array) -> Unknowns:
+    """Return all parameters that have a standard deviation in the fit, the rates first.
+
+    scale (19,): px per unit of the columns.
+    """
+    rates = coefficients_of(fit, fit.blocks[:1], scale)
+    found = {f"rates.{name}": number for name, number in rates.items()}
+    for number, term in enumerate(fit.terms):
+        for place, (i, key) in enumerate(fit.searched, len(fit.coefficients)):
+            if i == number:
+                row = np.eye(1, len(fit.covariance), place)[0]
+                found[f"{term.effect}.{key}"] = float(dict(term.nonlinear)[key]), row
+        names = {term.kind.column(n): n for n in term.kind.linear}
+        blocks = [b for b in fit.blocks if b.term == number]
+        for key, one in coefficients_of(fit, blocks, scale).items():
+            column, at, k = key.partition("@")
+            found[f"{term.effect}.{names.get(column, column)}{at}{k}"] = one
+    return found

@@ -1,17 +1,18 @@
-"""The scene itself as a check of a thermal model: what does not move, seen by a camera that stands.
+"""The scene itself as a check of a thermal model: static features seen by a fixed camera.
 
-Features of a reference frame are found again in every frame. Most of what a river shows moves by
-itself (water, leaves, shadows); what has a common movement is the camera's. Of it the thermal
-model's prediction is taken off; the rest is a turn of the mount about three axes and a change of
-the principal distance, which the model did not predict. A turn from one frame to the next is a
-camera that was moved; a principal distance with a course of its own, an effect that is missing.
+Features of a reference frame are tracked into every frame. Much of a river scene moves by itself
+(water, leaves, shadows); the movement that features share is the camera's. The thermal model's
+prediction is subtracted from it. What remains, unpredicted, is a turn of the mount about three axes
+and a change of the principal distance. A turn from one frame to the next means that the camera was
+moved; a systematic change of the principal distance, that an effect is missing.
 
-From one place a shift of the principal point cannot be told from a turn, nor a shift of the camera
-from either where depths are unknown: what is stated as a turn may be any of them. The principal
-distance can be told, by the scale. Standard deviations are those of the features that take part.
+From one station a shift of the principal point cannot be separated from a turn, nor a shift of the
+camera from either if depths are unknown: what is reported as a turn may be any of them. The
+principal distance is determined by the scale. Standard deviations come from the scatter of the
+features that take part.
 
 Source: Fischler, M. and Bolles, R. (1981): Random sample consensus, CACM 24(6); Lucas, B. and
-Kanade, T. (1981), in OpenCV's pyramidal form, forwards and backwards.
+Kanade, T. (1981), in OpenCV's pyramidal form, tracked forwards and backwards.
 """
 
 from __future__ import annotations
@@ -47,30 +48,30 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 _MOST_FEATURES = 600
-_FEWEST = 12  # that have a common movement
+_FEWEST = 12  # features with a common movement
 _APART_PX = 12
 _WINDOW_PX = 21
-_BACK_PX = 0.3  # forwards and backwards again
+_BACK_PX = 0.3  # largest difference after tracking forwards and back
 _DRAWS = 300
-_NEAR_PX = 0.6  # of a common movement: a draw's followers
+_NEAR_PX = 0.6  # within this distance a feature follows a drawn movement
 _TUKEY = 4.685
 _ROUNDS = 10
-_WORD_SIGMAS = 4.0
-_MISSED_ALPHA = 1e-3  # of a model that holds
-_KNOWN = 1e6  # degrees of freedom of a variance that is known
-_FEWEST_BEYOND = 3  # frames more than a smooth course has numbers
+_WORD_SIGMAS = 4.0  # of a slope with temperature that the model is said to miss
+_MISSED_ALPHA = 1e-3  # probability of rejecting an adequate model
+_KNOWN = 1e6  # degrees of freedom that stand for a known variance
+_FEWEST_BEYOND = 3  # frames in excess of the parameters of a smooth course
 _MOVED_CHI2 = 30.7  # three degrees of freedom, one in a million
-_LEAST_PX = 0.03  # at the edge: real corners have a common wobble of up to 0.02 px RMS
-_LOCKED_PX = 0.004  # of matching, as a function of the pixel's part moved: common to all features
+_LEAST_PX = 0.03  # at the image's edge: real corners share a wobble of up to 0.02 px RMS
+_LOCKED_PX = 0.004  # matching error that depends on the subpixel shift: common to all features
 
 
 @dataclass(frozen=True, eq=False)
 class SceneMovement:
-    """The movement that a frame shows beside the model's prediction.
+    """The movement that a frame shows beyond the model's prediction.
 
-    values (4,): turns about the camera's x, y and z axis in rad, change of the principal distance
-    mm; covariance (4, 4); locked (4,): the part of the sds that further frames do not lessen;
-    follow (n,): which of the features have it in common.
+    values (4,): turns about the camera's x, y and z axes in rad, change of the principal distance
+    in mm; covariance (4, 4); locked (4,): the part of the sds that more frames do not reduce;
+    follow (n,): which features share the movement.
     """
 
     values: Array
@@ -79,8 +80,8 @@ class SceneMovement:
     follow: NDArray[np.bool_]
 
 
-def features(reference: NDArray[Any]) -> NDArray[np.float32]:
-    """Features (F, 2) px of a reference frame (H, W); DataError where it has too few."""
+def detect_features(reference: NDArray[Any]) -> NDArray[np.float32]:
+    """Detect features (F, 2) px in a reference frame (H, W). Raises DataError for too few."""
     corners = cv2.goodFeaturesToTrack(
         _eight_bit(reference), _MOST_FEATURES, 0.005, _APART_PX, blockSize=7
     )
@@ -95,10 +96,10 @@ def features(reference: NDArray[Any]) -> NDArray[np.float32]:
     return points
 
 
-def followed(
+def track_features(
     reference: NDArray[Any], points: NDArray[np.float32], image: NDArray[Any]
 ) -> tuple[NDArray[np.int64], Array]:
-    """Rows of the features (F, 2) px that are found again, and how far they moved (n, 2) px."""
+    """Track features (F, 2) px; return the rows of those found again and their shifts (n, 2) px."""
     first, now, start = _eight_bit(reference), _eight_bit(image), None
     options: dict[str, Any] = {
         "winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3,
@@ -112,10 +113,10 @@ def followed(
     return rows, (there - points)[rows].astype(float)
 
 
-def common_movement(
+def estimate_movement(
     then: Camera, now: Camera, points: Array, moved: Array, seed: int = 0
 ) -> SceneMovement | None:
-    """Estimate what features have in common beside the prediction; None where too few have it.
+    """Estimate the movement that features share beyond the prediction; None if too few share it.
 
     then, now: the predicted cameras; points (n, 2) px in the reference frame; moved (n, 2) px.
     """
@@ -145,7 +146,7 @@ def common_movement(
         x = np.linalg.solve(N, np.einsum("nci,n,nc->i", A, weight, left))
     r = left - A @ x
     inverse = np.linalg.inv(N)
-    # windows overlap: features near each other have their errors in common
+    # windows overlap: the errors of neighbouring features are correlated
     cells = np.unique(points // (2 * _WINDOW_PX), axis=0, return_inverse=True)[1].ravel()
     score = np.zeros((cells.max() + 1, 4))
     np.add.at(score, cells, np.einsum("nci,n,nc->ni", A, weight, r))
@@ -157,12 +158,12 @@ def common_movement(
 
 
 def _consensus(A: Array, left: Array, rng: np.random.Generator) -> Array | None:
-    """The movement that most features follow, of two features drawn at a time."""
+    """Return the movement of two drawn features that most features follow; None if too few do."""
     best, most = np.zeros(4), 0
     for _ in range(_DRAWS if len(left) >= _FEWEST else 0):
         pair = rng.choice(len(left), 2, replace=False)
         M = A[pair].reshape(4, 4)
-        # two features hardly tell the scale: a little weight on none
+        # two features hardly determine the scale: regularised towards no change
         x = np.linalg.solve(M.T @ M + 1e-6 * np.eye(4), M.T @ left[pair].ravel())
         count = int((np.abs(left - A @ x).max(axis=1) < _NEAR_PX).sum())
         if count > most:
@@ -172,11 +173,12 @@ def _consensus(A: Array, left: Array, rng: np.random.Generator) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class SceneCourse(Result):
-    """The course of a scene in a series of frames, beside a thermal model's prediction.
+    """The movements of a scene over a series of frames, beyond a thermal model's prediction.
 
-    names (E); times (E,) s UTC; temperatures (E,) °C; values (E, 4) and covariance (E, 4, 4) as of
-    `SceneMovement`, NaN where a frame shows nothing; unsure (E, 4): sds of the prediction itself,
-    since the reference frame; features (E,); locked (4,); pitch_rad: of a pixel.
+    names (E); times (E,) s UTC; temperatures (E,) °C; values (E, 4) and covariance (E, 4, 4) as in
+    `SceneMovement`, NaN for a frame without a common movement; unsure (E, 4): sds of the predicted
+    change since the reference frame; features (E,): that share the movement; reasons (E): why a
+    frame has none; locked (4,) as in `SceneMovement`; pitch_rad: the angle of a pixel.
     """
 
     camera: str
@@ -193,20 +195,19 @@ class SceneCourse(Result):
 
     @cached_property
     def sd(self) -> Array:
-        """(E, 4) of what is seen."""
+        """Standard deviations (E, 4) of `values`."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """(E,): frames with a common movement."""
+        """Which frames (E,) have a common movement."""
         return np.isfinite(self.values[:, 0])
 
     @cached_property
     def per_kelvin(self) -> tuple[Array, Array]:
         """Slopes (4,) of `values` against the temperature, and their standard deviations.
 
-        Those are of the larger of stated and found scatter; NaN where the temperature did not
-        change.
+        From the larger of stated and observed scatter; NaN below four frames or 1 K of change.
         """
         T = self.temperatures[self.seen]
         slopes, sds = np.full(4, np.nan), np.full(4, np.nan)
@@ -224,10 +225,7 @@ class SceneCourse(Result):
 
     @cached_property
     def model_misses(self) -> bool:
-        """Return whether the principal distance changes by more than the prediction is sure to.
-
-        With the temperature, or with anything else that has a course.
-        """
+        """True if c changes with temperature, or in another systematic way, beyond its sds."""
         slope, sd = (v[3] for v in self.per_kelvin)
         change = float(np.ptp(self.temperatures[self.seen])) if self.seen.any() else 0.0
         own = float(np.nanmax(self.unsure[:, 3], initial=0.0)) / max(change, 1e-9)
@@ -240,10 +238,10 @@ class SceneCourse(Result):
         return self._has_smooth_course(rows) or self._has_course(rows)
 
     def _has_smooth_course(self, rows: NDArray[np.int64]) -> bool:
-        """Test whether c goes with temperature, its square, time, or differs from the reference's.
+        """Test whether c changes with temperature, its square, time, or since the reference frame.
 
-        Noise is what these leave. All frames stand together in four numbers, and the effect is not
-        taken for noise: an effect of second order is found that is hidden in each frame.
+        The noise is estimated from the residuals. Four parameters describe all frames together, so
+        that the effect does not count as noise: one that no single frame shows is found.
         """
         T, hours = self.temperatures[rows] - self.temperatures[0], self.times[rows] - self.times[0]
         A = np.column_stack([np.ones(len(T)), T, T**2, hours])
@@ -263,7 +261,7 @@ class SceneCourse(Result):
         return explained / rank > _f_bound(rank, factor, free)
 
     def _has_course(self, rows: NDArray[np.int64]) -> bool:
-        """Test whether c has a course: noise is what differs from the mean of the frames beside."""
+        """Test whether c changes systematically; noise: differences from both neighbours' mean."""
         y, noise, known = self._beside(rows)
         v = self.covariance[rows, 3, 3]
         bends = np.diff(y, 2) ** 2 / (v[2:] + 4.0 * v[1:-1] + v[:-2])
@@ -272,7 +270,7 @@ class SceneCourse(Result):
         return whole / len(rows) > _f_bound(len(rows), factor, len(rows) / 2.0)
 
     def _beside(self, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-        """Return c beside the prediction (n,), its covariance by noise, and by the prediction."""
+        """Return c less the prediction (n,), its covariance from noise and from the prediction."""
         variance = self.covariance[rows, 3, 3]
         known = self.unsure[rows, 3] * np.sign(self.temperatures[rows] - self.temperatures[0])
         # the reference frame's noise is common to all
@@ -281,10 +279,9 @@ class SceneCourse(Result):
 
     @cached_property
     def movements(self) -> list[tuple[int, Array, Array]]:
-        """Frames in which the camera was moved since the one before: turn (3,) rad, covariance.
+        """Frames in which the camera has moved since the frame before: turn (3,) rad, covariance.
 
-        The next frame must show it too, where there is one. A mount that follows the temperature
-        slowly is none.
+        The next frame, if any, must confirm it. A mount's slow thermal movement does not count.
         """
         rows = np.flatnonzero(self.seen)
         values = np.vstack([np.zeros(3), self.values[rows, :3]])
@@ -333,23 +330,25 @@ class SceneCourse(Result):
         out = [f"{int(self.seen.sum())} of {len(self.names)} frames follow the reference frame"]
         slopes, sds = self.per_kelvin
         if np.isfinite(slopes).all():
+            verdict = "the model misses an effect"
+            if not self.model_misses:
+                verdict = "consistent with the model"
             out.append(
-                "principal distance beside the model: "
-                f"{with_sd(1e3 * slopes[3], 1e3 * sds[3], 'µm')} per kelvin"
-                + (": the model misses an effect" if self.model_misses else ", as it should be")
+                "change of the principal distance beyond the model: "
+                f"{with_sd(1e3 * slopes[3], 1e3 * sds[3], 'µm')} per kelvin, {verdict}"
             )
             px = [with_sd(slopes[k] / self.pitch_rad, sds[k] / self.pitch_rad) for k in (0, 1)]
             out.append(
-                f"turn of the mount, or principal point, which one place cannot tell: {px[0]} px "
-                f"per kelvin about x, {px[1]} about y"
+                "turn of the mount or shift of the principal point (one station cannot separate "
+                f"them): {px[0]} px per kelvin about x, {px[1]} about y"
             )
         else:
-            out.append("the temperature hardly changed: the model cannot be checked")
+            out.append("the temperature hardly changed: the model cannot be tested")
         for row, turn, C in self.movements:
             angle, sd = (float(np.degrees(np.linalg.norm(v))) for v in (turn, C.diagonal() ** 0.5))
             out.append(
                 f"{self.names[row]}: the camera was moved since the frame before: it turned by "
-                f"{angle:.4f} ± {sd:.4f}°; a shift looks alike"
+                f"{angle:.4f} ± {sd:.4f}°, or it was shifted, which looks the same"
             )
         reasons = [why for why in self.reasons if why]
         out += [f"{reasons.count(why)} × {why}" for why in sorted(set(reasons))]
@@ -364,7 +363,7 @@ class SceneCourse(Result):
         axes[0, 0].set_ylabel("turn in °")
         axes[0, 0].legend()
         axes[1, 0].errorbar(hours, 1e3 * self.values[:, 3], 1e3 * self.sd[:, 3], fmt=".")
-        axes[1, 0].set(ylabel="c beside the model in µm", xlabel="hours")
+        axes[1, 0].set(ylabel="c minus predicted c in µm", xlabel="hours")
         return figure
 
 
@@ -376,10 +375,10 @@ def follow_scene(
     advance: Callable[[int], None] = lambda _: None,
     recording: Path | None = None,
 ) -> SceneCourse:
-    """Follow the scene of frames (file, s UTC), the first of which is the reference.
+    """Follow a scene through frames (file, s UTC); the earliest frame is the reference.
 
-    recording: a folder to write what does not move to, for `discover`. Raises DataError where there
-    is no temperature, or nothing to follow.
+    recording: a folder to which the static features are written as a recording, for `discover`.
+    Raises DataError for fewer than two frames, times outside the log, or too few features.
     """
     if len(frames) < 2:
         raise DataError("a scene needs a reference frame and at least one more")
@@ -393,7 +392,7 @@ def follow_scene(
         log.times, log.channels, times, extrapolate, float(along.temperatures[0]),
         thermal.reading_sd,
     ).sd  # fmt: skip
-    corners = features(reference)
+    corners = detect_features(reference)
     E = len(frames)
     values, covariance = np.full((E, 4), np.nan), np.full((E, 4, 4), np.nan)
     locked = np.zeros(4)
@@ -410,8 +409,8 @@ def follow_scene(
             status = inspect_frame(image, (reference.shape[1], reference.shape[0]))
             reasons[k] = status.reason
             if status.ok:
-                rows, moved = followed(reference, corners, image)
-                found = common_movement(along[0], along[k], points[rows], moved, k)
+                rows, moved = track_features(reference, corners, image)
+                found = estimate_movement(along[0], along[k], points[rows], moved, k)
                 reasons[k] = "" if found else "too few features have a common movement"
         except ImageError as error:
             reasons[k] = str(error)
@@ -422,7 +421,7 @@ def follow_scene(
             count[k], locked = int(follow.sum()), found.locked
         advance(1)
     if recording is not None:
-        write_scene(recording, thermal.model.camera, along[0], log, times, points, tracks)
+        write_scene(recording, along[0], log, times, points, tracks)
     interior = InteriorOrientation.from_array(along.values[0])
     unsure = since[:, [2, 1, 0, 0]] / [interior.c, interior.c, np.inf, 1.0]
     return SceneCourse(
@@ -433,9 +432,10 @@ def follow_scene(
 
 
 def _f_bound(rank: int, factor: float, free: float) -> float:
-    """Bound of one of the two tests of a course, noise being `factor` times the stated variance.
+    """Return the bound of one of the two tests of c; factor: observed over stated variance.
 
-    Stated variances stand, unless that of so many degrees of freedom is of their upper quarter.
+    The stated variance counts as known unless `factor`, with `free` degrees of freedom, lies in the
+    upper quarter of its distribution.
     """
     if factor < fdtri(free, _KNOWN, 0.75):
         free = _KNOWN

@@ -1,9 +1,9 @@
-"""What does not move in photographs of a scene, as a recording that `discover` reads.
+"""The static features of photographs of a scene, as a recording that `discover` reads.
 
-A feature has a direction, not a depth. Its target lies on its ray, far beyond all that a mount
-moves by: an image tells of the camera's turns and of its interior orientation there, and of nothing
-else. Depths differ from target to target, so that the projection centre is determined and takes
-nothing off the principal distance, as it would before a plane.
+A feature has a direction, but no depth. Its target is placed on its ray, so far away that no
+movement of a mount matters: such an image determines the camera's turns and its interior
+orientation, and nothing else. Depths differ from target to target, so that the projection centre is
+determined and is not correlated with the principal distance, as it would be with a plane.
 """
 
 from __future__ import annotations
@@ -31,30 +31,29 @@ if TYPE_CHECKING:
     from thermocald.store.logger.temperatures import TemperatureLog
 
 _DISTANCE_MM = 1e6
-"""Of the targets: 1 mm of the mount moves no image point by more than 0.01 px."""
+"""Distance of the targets: 1 mm of mount movement moves no image point by more than 0.01 px."""
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 _MOST_TARGETS = 200
-_STILL = 0.8  # of the frames, in which a feature has to follow the others
+_STILL = 0.8  # fraction of the frames in which a feature has to follow the common movement
 _FEWEST_TARGETS = 12
 
 Track = tuple["NDArray[np.int64]", "Array"]
-"""Of one frame: the rows (n,) of features that follow the others, and where they are (n, 2) px."""
+"""One frame's features that follow the common movement: rows (n,), image points (n, 2) px."""
 
 
 def write_scene(
     path: Path,
-    name: str,
     camera: Camera,
     log: TemperatureLog,
     times: Array,
     points: Array,
     tracks: Sequence[Track | None],
 ) -> int:
-    """Write the features that stay where they are as a recording; return how many there are.
+    """Write the static features as a recording; return how many there are.
 
-    times (E,) s UTC: of the frames; camera: at the first of them; points (F, 2) px: the features in
-    that frame; tracks: of each frame, None where it shows nothing. Raises DataError where fewer
-    than twelve features stay, RecordingError where `path` cannot be written.
+    times (E,) s UTC: of the frames; camera: at the first frame; points (F, 2) px: the features in
+    that frame; tracks: one per frame, None for a frame without a common movement. Raises DataError
+    for fewer than twelve static features, RecordingError if `path` cannot be written.
     """
     shown = [track for track in tracks if track is not None]
     seen = np.bincount(np.concatenate([rows for rows, _ in shown]), minlength=len(points))
@@ -62,8 +61,8 @@ def write_scene(
     still = np.sort(still[np.argsort(-seen[still], kind="stable")[:_MOST_TARGETS]])
     if len(still) < _FEWEST_TARGETS:
         raise DataError(
-            f"{len(still)} features do not move in most of the frames; a recording needs "
-            f"{_FEWEST_TARGETS} at least"
+            f"{len(still)} features are static in most of the frames; a recording needs at least "
+            f"{_FEWEST_TARGETS}"
         )
     target = np.full(len(points), -1)
     target[still] = np.arange(len(still))
@@ -74,6 +73,7 @@ def write_scene(
     field = TestField.build(
         [f"feature{row}" for row in still], rays / -rays[:, 2:] * depths[:, None], across
     )
+    name = camera.name
     head = Head(
         name, name, float(np.median(np.diff(times))) if len(times) > 1 else 1.0,
         CameraSpec(name, camera.sensor, camera.interior.c, camera.interior),
@@ -94,9 +94,9 @@ def write_scene(
 
 
 def _noise(points: Array, shown: Sequence[Track], target: NDArray[np.int64]) -> float:
-    """Estimate the noise of an image point, px, from how neighbouring frames differ.
+    """Estimate the noise of an image point, px, from the differences of consecutive frames.
 
-    What they differ by in common, a shift, a turn and a scale, is taken off.
+    The common difference (shift, turn and scale) is removed first.
     """
     left = []
     for (rows, at), (later, there) in pairwise(shown):

@@ -1,6 +1,6 @@
 """A camera that has long been at one temperature, and the temperatures that a model was fitted on.
 
-Lags and self-heating have settled, a play lies in its middle, nothing creeps, slips or cycles.
+Lags and self-heating have settled, a play is in its middle, nothing creeps, slips or cycles.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 
-_REFUSED_FRACTION = 0.5  # of the fitted range of temperature
-_MARGIN_K = 0.25  # what thermometers differ by is not an extrapolation
+_REFUSED_FRACTION = 0.5  # of the fitted range of temperature, beyond its ends
+_MARGIN_K = 0.25  # differences between thermometers are not an extrapolation
 
 
 class ExtrapolationWarning(UserWarning):
-    """A model was asked for a temperature that it was not fitted on."""
+    """A warning that a model predicts outside the temperatures that it was fitted on."""
 
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """From the lowest to the highest temperature °C of the fit."""
+    """The lowest and the highest temperature of the fit, °C."""
 
     low: float
     high: float
 
     def beyond(self, T: float) -> float:
-        """Return by how many kelvin a temperature lies outside."""
+        """Return by how many kelvin a temperature is outside."""
         beyond = max(self.low - T, T - self.high)
         return beyond if beyond > _MARGIN_K else 0.0
 
@@ -47,16 +47,16 @@ class Validity:
         return self.beyond(T) > _REFUSED_FRACTION * max(self.high - self.low, 1.0)
 
     def check(self, temperatures: Array, extrapolate: bool) -> Array:
-        """Return by how many kelvin each temperature (E,) lies outside; warns.
+        """Return by how many kelvin each temperature (E,) is outside, and warn.
 
-        Raises UsageError for one that is far outside, unless `extrapolate`.
+        Raises UsageError if one is far outside, unless `extrapolate`.
         """
         low, high = self.low, self.high
         outside: Array = np.maximum(np.maximum(low - temperatures, temperatures - high), 0.0)
         outside[outside <= _MARGIN_K] = 0.0
         if not outside.any():
             return outside
-        # half of a log in fahrenheit may lie inside the range by chance: its middle tells
+        # half of a log in Fahrenheit may be inside the range by chance: its median shows it
         T = float(np.median(temperatures))
         if not self.is_far(T):
             T = float(temperatures[int(np.argmax(outside))])
@@ -70,7 +70,7 @@ class Validity:
                     f"{T:g} looks like fahrenheit: the model was fitted between {low:g} and "
                     f"{high:g} °C; convert it"
                 )
-            raise UsageError(f"{place}; ask for extrapolation by name if you mean it")
+            raise UsageError(f"{place}; set `extrapolate` to predict there nevertheless")
         warnings.warn(
             f"{place}; standard deviations are widened", ExtrapolationWarning, stacklevel=3
         )
@@ -81,7 +81,7 @@ class Validity:
 class SteadyCamera:
     """p(T) and ∂p/∂(parameters) as polynomials in T - T₀, and from each knee on in T - T_k.
 
-    knees: T_k, slope, ∂slope, ∂/∂T_k of each. They are linear: `model` carries the distortion.
+    knees: T_k, slope, ∂slope, ∂/∂T_k of each. `model` then makes the distortion follow c.
     """
 
     model: ThermalModel
@@ -91,7 +91,7 @@ class SteadyCamera:
     knees: tuple[tuple[float, Array, Array, Array], ...]
 
     def at(self, T: float) -> tuple[Array, Array, Array]:
-        """Values (10,), their slope (10,) per K, and the derivatives (10, p) at T °C."""
+        """Return values (10,), their slope (10,) per K, and the derivatives (10, p) at T °C."""
         dT = T - self.model.T0
         p0, p1, p2 = self.p
         J0, J1, J2 = self.J
@@ -113,7 +113,7 @@ def steady_camera(
     names: tuple[str, ...],
     channels: Mapping[str, float] | None,
 ) -> SteadyCamera:
-    """The steady camera of a model.
+    """Return the steady camera of a model.
 
     names: of the parameters whose derivatives are wanted; channels: °C of other thermometers.
     """

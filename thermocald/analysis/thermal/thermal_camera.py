@@ -1,22 +1,23 @@
-"""A thermal camera: the interior orientation, with covariance, at any temperature and history.
+"""A thermal camera: its interior orientation, with covariance, for any temperature and history.
 
     camera = ThermalCamera.load("camera.thermal.yaml")
     now = camera.at(35.0)                     # steady at 35 °C
     series = camera.along(times, temperatures)
     now.interior.c, now.sd["x0"], now.undistort(points), now.object_error(10_000.0)
 
-At one temperature the model is asked for a camera that has long been there and never hotter: lags
-and self-heating have settled, a play lies in its middle, nothing creeps, slips or cycles. With a
-history, effects act as they do in a fit.
+For a single temperature the model describes a camera that has long been at it and was never hotter:
+lags and self-heating have settled, a play is in its middle, nothing creeps, slips or cycles. Along
+a history, effects act as they do in a fit.
 
-Outside the temperatures that the model was fitted on the answer comes with a warning, and its
-standard deviation is widened by the whole drift beyond the range; more than half the range away it
-is refused, unless extrapolation is asked for by name.
+Outside the temperatures that the model was fitted on, a prediction comes with a warning, and its
+standard deviation is widened by the whole drift beyond the range. More than half the range away, it
+raises UsageError unless extrapolation is requested explicitly.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,19 +29,17 @@ from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera
+from thermocald.arrays import seconds
 from thermocald.errors import ConfigurationError, UsageError
 from thermocald.figures import BAND
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
 from thermocald.physics import catalogue
-from thermocald.physics.effect import Prediction
 from thermocald.physics.history import History
 from thermocald.physics.model_file import model_document, read_model, write_model
 from thermocald.result import Result, jsonable, new_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
@@ -48,25 +47,17 @@ if TYPE_CHECKING:
     from thermocald.physics.model import ThermalModel
 
 
-USUAL_THERMOMETER_SD = 0.05  # K, where no fit has found it
-_CHUNK = 20_000  # times in one go
-_STEP = 1e-3  # of a parameter, for its derivative
-_REMEMBERED = 6  # readings that effects of now follow from, and two of each channel
+USUAL_THERMOMETER_SD = 0.05  # K, if no fit has estimated it
+_CHUNK = 20_000  # times predicted at once
+_STEP = 1e-3  # relative step of a parameter for its derivative
+_REMEMBERED = 6  # readings that the present effects follow from, besides two of each channel
 _NUMBERS = ("interior", "distortion", "rates", "effects", "validity")
-_TOLD = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
-
-
-def seconds(times: ArrayLike) -> Array:
-    """Return times in s, of which datetime64 and pandas' are since 1970-01-01 UTC."""
-    given = np.asarray(times)
-    if np.issubdtype(given.dtype, np.datetime64):
-        given = given.astype("datetime64[us]").astype(np.int64) * 1e-6
-    return np.asarray(given, dtype=float)
+_VERDICT = ("effect_missing", "misfit_px", "significance_sigmas", "distortion_sigmas", "trembles")
 
 
 @dataclass(frozen=True, eq=False)
 class Along:
-    """The camera along a history; `[i]` is a Camera.
+    """The camera along a history; indexing gives a Camera.
 
     times (E,) s, temperatures (E,) °C; values (E, 10); covariance (E, 10, 10); extrapolated (E,) K.
     """
@@ -77,6 +68,7 @@ class Along:
     values: Array
     covariance: Array
     extrapolated: Array
+    camera: str = "camera"
 
     def __len__(self) -> int:
         return len(self.times)
@@ -88,19 +80,20 @@ class Along:
             self.values[i],
             self.covariance[i],
             float(self.extrapolated[i]),
+            self.camera,
         )
 
     @property
     def sd(self) -> Array:
-        """Standard deviations (E, 10), 0 where a parameter was held."""
+        """Standard deviations (E, 10); 0 for a parameter that was held."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, repr=False)
 class ThermalCamera(Result):
-    """A camera whose interior orientation is known at any temperature and history.
+    """A camera whose interior orientation is given for any temperature and history.
 
-    model: the thermal model; fitted: what `fit` said of it besides, None for one from a file.
+    model: the thermal model; fitted: what `fit` reports besides, None for a camera from a file.
 
     >>> camera = tc.load_camera("camera.yaml")
     >>> bool(camera.at(45.0).interior.c != camera.at(25.0).interior.c)
@@ -112,11 +105,11 @@ class ThermalCamera(Result):
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read a model file; ConfigurationError names file and key."""
+        """Read a model file. Raises ConfigurationError naming the file and key."""
         return cls(read_model(Path(path)))
 
     def save(self, path: Path | str) -> Path:
-        """Write the model file (YAML), whole or not at all; returns its path.
+        """Write the model file (YAML), whole or not at all, and return its path.
 
         >>> tc.load_camera("camera.yaml").save("copy.yaml").name
         'copy.yaml'
@@ -125,16 +118,16 @@ class ThermalCamera(Result):
         return Path(path)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `thermocald fit --json` writes; of a camera from a file its model alone."""
+        """Return what `thermocald fit --json` writes; for a camera from a file, its model alone."""
         written = model_document(self.model)
-        said: dict[str, Any] = self.model.evidence.get("fit") or {}
+        verdict: dict[str, Any] = self.model.evidence.get("fit") or {}
         document: dict[str, Any] = jsonable(
             {
                 "format": "thermocald-fit/1",
                 "camera": self.model.camera,
                 "reference_temperature": self.model.T0,
                 **{key: written.get(key) or {} for key in _NUMBERS},
-                **(said if self.fitted else {k: said[k] for k in _TOLD if k in said}),
+                **(verdict if self.fitted else {k: verdict[k] for k in _VERDICT if k in verdict}),
                 **(self.fitted or {}),
             }
         )
@@ -145,9 +138,9 @@ class ThermalCamera(Result):
         return model_lines(self.as_dict())
 
     def plot(self) -> Figure:
-        """Draw c, x0 and y0 of the steady camera against the temperature, µm from those at T0.
+        """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
-        The range is that which the model was fitted on, with a band of 95 %.
+        Covers the range that the model was fitted on, with 95 % bands.
         """
         limits = next(iter(self.model.validity.values()), (self.model.T0 - 15, self.model.T0 + 15))
         T = np.linspace(*limits, 60)
@@ -166,10 +159,10 @@ class ThermalCamera(Result):
         return figure
 
     def live(self, size: tuple[int, int] | None = None) -> LiveCamera:
-        """Return the camera as it follows a thermometer, reading by reading.
+        """Return a camera that follows a thermometer, reading by reading.
 
-        size: width and height px of the frames; by default the model's. Raises ConfigurationError
-        for a size that is no binning of the model's.
+        size: width and height px of the frames, by default the model's. Raises ConfigurationError
+        if the size is not a binning of the model's.
 
         >>> live = tc.load_camera("camera.yaml").live()
         >>> now = live.update(0.0, 25.0)
@@ -179,9 +172,9 @@ class ThermalCamera(Result):
         return LiveCamera(self if size is None else self.for_images(*size))
 
     def for_images(self, width: int, height: int, camera: str | None = None) -> ThermalCamera:
-        """The camera for images of a size px: as it is, or scaled where pixels were binned.
+        """Return the camera for images of a size px, scaled if pixels were binned.
 
-        ConfigurationError for another camera, or a crop, which no factor can tell.
+        Raises ConfigurationError for another camera, or for a crop, which no factor describes.
         """
         mine = self.model.sensor
         if camera is not None and camera != self.model.camera:
@@ -189,6 +182,8 @@ class ThermalCamera(Result):
                 f"the model is of camera {self.model.camera}, the images are of {camera}; a "
                 "thermal model belongs to one camera"
             )
+        if width <= 0 or height <= 0:
+            raise ConfigurationError(f"image size {width}×{height} px is impossible")
         factor = mine.width / width
         if abs(mine.height / height - factor) > 1e-9 * factor:
             raise ConfigurationError(
@@ -198,54 +193,52 @@ class ThermalCamera(Result):
         if factor == 1.0:
             return self
         sensor = Sensor(width, height, mine.pixel_pitch * factor)
-        # a target is measured to the same share of the image
+        # a target is measured to the same fraction of the image
         sigma = self.model.image_sigma / factor
         return replace(self, model=replace(self.model, sensor=sensor, image_sigma=sigma))
 
     @property
     def warning(self) -> str:
-        """What its user must know where the model's own fit found that an effect is missing, or
-        did not examine it.
-        """
-        found = self.model.evidence.get("fit") or {}
-        if why := found.get("not_examined"):
+        """The warning that an effect is missing, or that the fit did not test for one; else ""."""
+        verdict = self.model.evidence.get("fit") or {}
+        if why := verdict.get("not_examined"):
             return (
                 f"not examined whether the model misses an effect ({why}): it left "
-                f"{found['left_over_in_noise']:.1f} times the noise in its own series"
+                f"{verdict['left_over_in_noise']:.1f} times the noise in its own series"
                 + ("; no 95 % band is stated" if self.model.misses_an_effect else "")
             )
         if not self.model.misses_an_effect:
             return ""
         return (
-            f"the model misses an effect: it left {found['misfit_px']:.3f} px in its own series. "
-            "Standard deviations hold what it left there, not what it leaves elsewhere; thermocald "
-            "discover looks for the effect"
+            f"the model misses an effect: it left {verdict['misfit_px']:.3f} px in its own series. "
+            "Standard deviations include this misfit, but not a larger one in other conditions; "
+            "run thermocald discover to find the effect"
         )
 
     @property
     def thermometer_sd(self) -> float | None:
-        """The noise of a reading K that the fit found; None for a model that no fit has made."""
-        known = [
+        """The noise of a reading, K, that the fit estimated; None for a model without a fit."""
+        sds = [
             float(f["thermometer_sd_K"]) for f in self.model.fitted_on if "thermometer_sd_K" in f
         ]
-        return float(np.median(known)) if known else None
+        return float(np.median(sds)) if sds else None
 
     @property
     def reading_sd(self) -> float:
-        """The noise of a reading K, a usual one where no fit has found it."""
-        known = self.thermometer_sd
-        return USUAL_THERMOMETER_SD if known is None else known
+        """The noise of a reading, K; a typical value if no fit has estimated it."""
+        sd = self.thermometer_sd
+        return USUAL_THERMOMETER_SD if sd is None else sd
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
-        """The parameters with a covariance, as the model file names them."""
+        """The parameters with a standard deviation, as the model file names them."""
         if self.model.covariance is not None:
             return self.model.covariance_names
         return (*self.model.sds, *(f"{e.name}.{k}" for e in self.model.effects for k in e.sds))
 
     @cached_property
     def covariance(self) -> Array:
-        """The covariance of the parameters: the file's matrix, or its sds without correlation."""
+        """The covariance of the parameters: the file's matrix, or its sds uncorrelated."""
         return self.model.covariance_of(self.parameters)
 
     def at(
@@ -255,13 +248,18 @@ class ThermalCamera(Result):
         channels: Mapping[str, float] | None = None,
         extrapolate: bool = False,
     ) -> Camera:
-        """Return the camera that has long been at one temperature °C.
+        """Return the camera that has long been at one temperature, °C.
 
-        temperature_sd K: is carried into the covariance; channels: °C of other thermometers, for a
-        model that uses them. Warns outside the model's validity; raises UsageError far outside it
-        (unless `extrapolate`), and for what looks like fahrenheit.
+        temperature_sd K: is propagated into the covariance; channels: °C of other thermometers, for
+        a model that uses them. Warns outside the model's validity; raises UsageError far outside it
+        (unless `extrapolate`), also for a temperature that looks like Fahrenheit.
         """
-        T = float(temperature)
+        try:
+            T = float(temperature)
+        except (TypeError, ValueError):
+            T = math.nan
+        if math.isnan(T):
+            raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
             beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
@@ -285,23 +283,31 @@ class ThermalCamera(Result):
         relative_to: float | None = None,
         temperature_sd: float = 0.0,
     ) -> Along:
-        """Return the camera along a temperature log, effects with a memory in force.
+        """Return the camera along a temperature log, including effects with a memory.
 
-        times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)}, the
-        first is the reference; at (E,): the times asked for, by default `times`. The past begins
-        with the first time. relative_to °C: the covariance is that of the difference to the steady
-        camera at this temperature; temperature_sd K: of a reading, is carried into the covariance
-        (as if nothing had a memory, which would average it). Raises UsageError far outside the
-        model's validity (unless `extrapolate`).
+        times (R,) s or datetime64; temperatures (R,) °C of the reference, or {channel: (R,)} with
+        the reference first; at (E,): the times to predict for, by default `times`. The history
+        begins with the first time. relative_to °C: the covariance is that of the difference from
+        the steady camera at this temperature; temperature_sd K: of a reading, is propagated into
+        the covariance (as if no effect had a memory, which would average it). Raises UsageError far
+        outside the model's validity (unless `extrapolate`), and for lengths that differ.
 
         >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
         >>> along.values.shape, along.sd.shape
         ((3, 10), (3, 10))
         """
         t = seconds(times)
-        columns = temperatures if isinstance(temperatures, dict) else {"temperature": temperatures}
+        columns = (
+            temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
+        )
         readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
         instants = t if at is None else seconds(at)
+        sizes = ", ".join(f"{len(c)} of {name}" for name, c in readings.items())
+        if not len(t) or not len(instants) or any(len(c) != len(t) for c in readings.values()):
+            raise UsageError(
+                f"{len(t)} times, {sizes}, at {len(instants)} times: a log needs a temperature for "
+                "each of its times, and at least one time"
+            )
         begin = float(min(t[0], instants[0]))
         reference = next(iter(readings))
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
@@ -314,14 +320,14 @@ class ThermalCamera(Result):
             part = history.at(history.times[first : first + _CHUNK])
             drive, beyond = self.model.drive(part), outside[first : first + _CHUNK]
             linear = self._linear(part, drive)
-            found = self.model.carried(linear)
-            matrix = self._propagated(part, drive, linear, beyond, steady)
+            carried = self.model.carried(linear)
+            matrix = self._propagate(part, drive, linear, beyond, steady)
             if temperature_sd:
-                rates = np.broadcast_to(self.model.rate_vector[:, None], (len(found), 10, 1))
+                rates = np.broadcast_to(self.model.rate_vector[:, None], (len(carried), 10, 1))
                 slope = self.model.carried_derivatives(linear, rates)
                 share = _noise_share(t - begin, part.times) * temperature_sd**2
                 matrix += share[:, None, None] * slope * np.swapaxes(slope, 1, 2)
-            values.append(found)
+            values.append(carried)
             covariance.append(matrix)
         return Along(
             self.model.sensor,
@@ -330,18 +336,19 @@ class ThermalCamera(Result):
             np.concatenate(values),
             np.concatenate(covariance),
             outside,
+            self.model.camera,
         )
 
     def _linear(self, history: History, drive: Array) -> Array:
-        """Return what rates and effects add up to (E, 10); drive (E,) °C: behind the rates."""
+        """Return level plus rates plus effects, (E, 10); drive (E,) °C: what the rates follow."""
         model = self.model
         linear: Array = model.interior.as_array() + (drive - model.T0)[:, None] * model.rate_vector
         for effect in model.effects:
             if not catalogue.get(effect.name).is_drive:
-                linear = linear + _influence(model, effect.name, history)
+                linear = linear + model.influence(effect.name, history)
         return linear
 
-    def _propagated(
+    def _propagate(
         self,
         history: History,
         drive: Array,
@@ -350,19 +357,19 @@ class ThermalCamera(Result):
         steady: Array | None = None,
         driven: Mapping[tuple[str, float], Array] | None = None,
     ) -> Array:
-        """Return the covariance (E, 10, 10) of the orientations that the linear ones carry.
+        """Return the covariance (E, 10, 10) of the orientations that follow from `linear` (E, 10).
 
-        driven: {(parameter of a drive, ±1): drive (E,) with it moved}, where that is known.
+        driven: {(parameter of a drive, ±1): drive (E,) with it moved by a step}, if computed.
         """
         J = np.zeros((*linear.shape, len(self.parameters)))
         for i, name in enumerate(self.parameters):
-            group, key = name.split(".", 1)
+            group, key = name.rsplit(".", 1)  # a formula may contain dots
             if group == "interior":
                 J[:, IOP_NAMES.index(key), i] = 1.0
             elif group == "rates":
                 J[:, IOP_NAMES.index(key), i] = drive - self.model.T0
             elif not catalogue.get(group).is_drive:
-                up, down = (_influence(self._moved(name, s), group, history) for s in (1.0, -1.0))
+                up, down = (self._moved(name, s).influence(group, history) for s in (1.0, -1.0))
                 J[:, :, i] = (up - down) / (2.0 * self._step(name))
             else:
                 if driven is None:
@@ -380,7 +387,7 @@ class ThermalCamera(Result):
         return covariance
 
     def _step(self, name: str) -> float:
-        """Return the step of a parameter for its derivative."""
+        """Return the step of a parameter for its difference quotient."""
         return _STEP * max(abs(self.model.value(name)), 1e-9)
 
     def _moved(self, name: str, sign: float) -> ThermalModel:
@@ -389,7 +396,7 @@ class ThermalCamera(Result):
 
     @cached_property
     def validity(self) -> Validity | None:
-        """The temperatures that the model was fitted on, None where it does not say."""
+        """The temperatures that the model was fitted on; None if it does not state them."""
         limits = next(iter(self.model.validity.values()), None)
         return None if limits is None else Validity(*limits)
 
@@ -398,23 +405,21 @@ class ThermalCamera(Result):
         return steady_camera(self.model, self.parameters, None)
 
     def steady_polynomials(self) -> tuple[Array, Array, Array]:
-        """The linear parameters of the steady camera as polynomials in T - T0: three times (10,).
+        """Return the steady camera's linear parameters as polynomials in T - T0: arrays (10,).
 
-        UsageError for a model that needs more than one thermometer.
+        Raises UsageError for a model that needs more than one thermometer.
         """
         if any("channel" in catalogue.get(e.name).nonlinear for e in self.model.effects):
             raise UsageError("the model needs more than one thermometer: it is not a function of T")
         return self._steady.p
 
     def steady_knees(self) -> tuple[tuple[float, ...], ...]:
-        """For each knee its temperature °C, and by how much a kelvin beyond it changes each of the
-        ten parameters.
-        """
+        """Return each knee's temperature °C and the ten parameters' change per kelvin beyond it."""
         return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
 
 
 def _noise_share(times: Array, at: Array) -> Array:
-    """Variance (E,) of what is interpolated between readings at times (R,), in that of one."""
+    """Return the variance (E,) of an interpolated reading over that of a reading; times (R,)."""
     if len(times) < 2:
         return np.ones(len(at))
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
@@ -426,7 +431,7 @@ def _noise_share(times: Array, at: Array) -> Array:
 def load_camera(path: Path | str) -> ThermalCamera:
     """Load a thermal camera from the model file that `fit` wrote.
 
-    Raises ConfigurationError naming file and key.
+    Raises ConfigurationError naming the file and key.
 
     >>> tc.load_camera("camera.yaml").at(35.0).temperature
     35.0
@@ -434,24 +439,8 @@ def load_camera(path: Path | str) -> ThermalCamera:
     return ThermalCamera.load(Path(path).expanduser())
 
 
-def _influence(model: ThermalModel, name: str, history: History) -> Array:
-    """Return what an effect of a model adds to the interior orientation (E, 10)."""
-    effect = next(e for e in model.effects if e.name == name)
-    found = Prediction.none(len(history.times))
-    catalogue.get(name).influence(history, effect.values, found)
-    return found.iop
-
-
-def _followers(model: ThermalModel) -> list[Any]:
-    """What follows the readings through each drive of a model, in order; None of one that asks all.
-
-    Called one after the other, they give the temperature behind the linear terms.
-    """
-    return [catalogue.get(name).follower(values) for name, values in model.drives]
-
-
-def _pushed(followers: list[Any], time: float, value: float) -> Array:
-    """Take a reading °C, and return what drives now, (1,) °C."""
+def _push(followers: list[Any], time: float, value: float) -> Array:
+    """Pass a reading °C through the followers; return the temperature that drives now, (1,) °C."""
     for one in followers:
         value = one(time, value)
     return np.array([value])
@@ -460,11 +449,11 @@ def _pushed(followers: list[Any], time: float, value: float) -> Array:
 class LiveCamera:
     """A camera that follows its thermometer; made by `ThermalCamera.live`.
 
-    `update` takes a reading and gives the camera, `correct` a frame as the steady camera would have
-    seen it. Its state is that of one run: begin a new one for another. `along` asks the whole
-    history for every time; here effects with a memory keep their state, and a further reading costs
-    the same after an hour as after a minute. Formulas, and effects of others, may depend on all of
-    it: with them it is kept and asked (`keeps_all`).
+    `update` takes a reading and returns the camera; `correct` returns a frame as the steady camera
+    would have seen it. The state belongs to one run: make a new object for another. `along` uses
+    the whole history for every time; here effects with a memory store their state, and a further
+    reading costs the same after an hour as after a minute. Formulas and plug-in effects may depend
+    on the whole history: for them it is stored and used (`keeps_all`).
 
     >>> live = tc.load_camera("camera.yaml").live(size=(1640, 1232))
     >>> for k in range(3):
@@ -476,8 +465,8 @@ class LiveCamera:
     def __init__(self, thermal: ThermalCamera) -> None:
         self.thermal = thermal
         model = thermal.model
-        self._drive = _followers(model)
-        self.keeps_all = None in self._drive or not _is_of_now(model)
+        self._drive = model.followers()
+        self.keeps_all = None in self._drive or not model.is_of_now
         self._times: list[float] = []
         self._rows: list[tuple[float, ...]] = []
         self._channels: tuple[str, ...] = ()
@@ -485,18 +474,18 @@ class LiveCamera:
         self._maps: Maps | None = None
         drives = {name for name, _ in model.drives}
         self._moved = {
-            (name, sign): _followers(thermal._moved(name, sign))
+            (name, sign): thermal._moved(name, sign).followers()
             for name in thermal.parameters
             for sign in (1.0, -1.0)
             if name.split(".")[0] in drives
         }
 
     def update(self, time: Any, temperature: float | Mapping[str, float]) -> Camera:
-        """Take a reading and return the camera now, the same as `along` says of the history so far.
+        """Take a reading and return the camera now, equal to `along` over the history so far.
 
-        time: s, or datetime64, later than that before; temperature: °C, or {channel: °C}, the
-        first is the reference; NaN where a reading failed: the last one stands. Raises UsageError
-        for a time that is not later, and far outside the temperatures of the fit.
+        time: s or datetime64, later than the last; temperature: °C, or {channel: °C} with the
+        reference first; for NaN (a failed reading) the channel's last reading is used. Raises
+        UsageError if the time is not later, and far outside the temperatures of the fit.
 
         >>> live = tc.load_camera("camera.yaml").live()
         >>> live.update(0.0, 25.0).sd["c"] > 0
@@ -504,7 +493,7 @@ class LiveCamera:
         """
         thermal, (t, row) = self.thermal, self._checked(time, temperature)
         outside = np.zeros(1)
-        if thermal.validity is not None:  # before anything is kept: a refusal leaves no trace
+        if thermal.validity is not None:  # first, so that an error leaves the state unchanged
             outside = thermal.validity.check(np.array(row[:1]), extrapolate=False)
         self._remember(t, row)
         times = np.array(self._times)
@@ -512,12 +501,12 @@ class LiveCamera:
         if self.keeps_all:
             self._now = thermal.along(times, readings, [t], extrapolate=True)[0]
             return self._now
-        drive = _pushed(self._drive, t, row[0])
-        driven = {key: _pushed(moved, t, row[0]) for key, moved in self._moved.items()}
+        drive = _push(self._drive, t, row[0])
+        driven = {key: _push(moved, t, row[0]) for key, moved in self._moved.items()}
         begin, model = times[0], thermal.model
         history = History(times[-1:] - begin, times - begin, readings, self._channels[0], model.T0)
         linear = thermal._linear(history, drive)
-        covariance = thermal._propagated(history, drive, linear, outside, driven=driven)
+        covariance = thermal._propagate(history, drive, linear, outside, driven=driven)
         values = model.carried(linear)[0]
         self._now = Camera(
             model.sensor, row[0], values, covariance[0], float(outside[0]), model.camera
@@ -525,11 +514,11 @@ class LiveCamera:
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:
-        """Return a frame (H, W) or (H, W, 3) as the steady camera had seen it.
+        """Return a frame (H, W) or (H, W, 3) as the steady camera would have seen it.
 
-        to: °C of that camera, by default the model's T0. The maps of `cv2.remap` are kept, and
-        renewed when an image point has moved by more than 0.05 px. Raises UsageError before the
-        first reading, and for a frame of another size than `live(size=…)` said.
+        to: °C of that camera, by default the model's T0. The maps for `cv2.remap` are reused until
+        an image point has moved by more than 0.05 px. Raises UsageError before the first reading,
+        and for a frame whose size is not that given to `live(size=…)`.
 
         >>> import numpy as np
         >>> live = tc.load_camera("camera.yaml").live(size=(1640, 1232))
@@ -543,18 +532,18 @@ class LiveCamera:
         if frame.shape[:2] != (sensor.height, sensor.width):
             raise UsageError(
                 f"the frame has {frame.shape[1]}×{frame.shape[0]} px, the camera "
-                f"{sensor.width}×{sensor.height}: say live(size=({frame.shape[1]}, "
+                f"{sensor.width}×{sensor.height}; use live(size=({frame.shape[1]}, "
                 f"{frame.shape[0]}))"
             )
         return cv2.remap(frame, *self.maps(to), cv2.INTER_LINEAR)
 
     def maps(self, to: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the maps x, y (H, W) px of `cv2.remap` that `correct` uses now.
+        """Return the maps x, y (H, W) px for `cv2.remap` that `correct` uses now.
 
         They are the same objects until an image point has moved by more than 0.05 px.
         """
         if self._now is None:
-            raise UsageError("there is no reading yet: update(time, temperature) comes first")
+            raise UsageError("there is no reading yet: call update(time, temperature) first")
         target = self.thermal.model.T0 if to is None else to
         if self._maps is None or self._maps.to != target:
             steady = self.thermal.at(target, extrapolate=True)
@@ -564,12 +553,12 @@ class LiveCamera:
     def _checked(
         self, time: Any, temperature: float | Mapping[str, float]
     ) -> tuple[float, tuple[float, ...]]:
-        """Return the time s and the readings °C, failed ones as they were before."""
+        """Return the time s and the readings °C; a failed one is the last of its channel."""
         t = float(time) if isinstance(time, float | int) else float(seconds(time))
-        given = temperature
-        if isinstance(given, float | int):
-            given = {"temperature": given}
+        given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
         names, row = tuple(given), tuple(float(v) for v in given.values())
+        if not row:
+            raise UsageError("there is no reading: give a temperature, or {channel: °C}")
         if self._times:
             if t <= self._times[-1]:
                 raise UsageError(f"time {t} is not later than the last reading, {self._times[-1]}")
@@ -583,7 +572,7 @@ class LiveCamera:
         return t, row
 
     def _remember(self, time: float, row: tuple[float, ...]) -> None:
-        """Keep a reading; where not all are needed the first, the extremes and the last three."""
+        """Store a reading; unless all are needed, drop all but first, extremes and last three."""
         self._times.append(time)
         self._rows.append(row)
         last = len(self._times) - 1
@@ -593,17 +582,3 @@ class LiveCamera:
             needed = sorted({0, *extremes, last - 2, last - 1, last})
             self._times = [self._times[i] for i in needed]
             self._rows = [self._rows[i] for i in needed]
-
-
-def _is_of_now(model: ThermalModel) -> bool:
-    """Return whether the first, the extreme and the last readings tell what the effects do.
-
-    A drive that asks ahead, before another one, changes what it said of the past.
-    """
-    for name, values in model.drives[:-1]:
-        delay = catalogue.get(name).delay
-        if delay and float(values[delay]) < 0:
-            return False
-    kinds = [catalogue.get(e.name) for e in model.effects]
-    signals = [kind for kind in kinds if not kind.is_drive]
-    return all(kind.of_now or not set(kind.linear) & set(IOP_NAMES) for kind in signals)

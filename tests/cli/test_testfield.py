@@ -206,7 +206,7 @@ def test_camera_convert(tmp_path):
     assert document["statement"].startswith("exact")
     assert document["c"] == pytest.approx(2.0)
     assert "converted from a.cameramodel" in (tmp_path / "cameras.txt").read_text()
-    with pytest.raises(UsageError, match="there are opencv"):
+    with pytest.raises(UsageError, match="give one of opencv"):
         run("camera", "convert", tmp_path / "a.cameramodel", "--to", "x", "--out", tmp_path / "y")
     with pytest.raises(ConfigurationError, match=r"none\.xml"):
         run("camera", "convert", tmp_path / "none.xml", "--to", "ros", "--out", tmp_path / "y")

@@ -138,7 +138,7 @@ def test_a_board_is_as_large_as_the_paper_allows():
         (("--charuco", "11x8", "--dictionary", "DICT_4X4_50", "--paper", "A0", "--marker", 99),
          "smaller than squares"),
         (("--charuco", "12x12", "--dictionary", "DICT_4X4_50", "--paper", "A0"), "50 markers"),
-        (("--aprilgrid", "900x900"), "at most 5000"),
+        (("--aprilgrid", "900x900"), "5000 at most"),
         (("--chessboard", "999x998"), "3 to 100"),
     ],
 )  # fmt: skip

@@ -37,7 +37,6 @@ lint: $(STAMP) ## ruff, mypy --strict, layers
 	$(BIN)/lint-imports
 	@echo "== mypy --strict"
 	$(BIN)/mypy
-	$(BIN)/mypy tests/api/user_script.py
 
 # Two cores and one process more: tests of the daemon wait for it more than they work. Files in the order of
 # tests/conftest.py.

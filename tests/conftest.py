@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import threading
@@ -43,6 +44,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     place = {f"{name}.py": number for number, name in enumerate(LONGEST)}
     folder = Path(__file__).parent
     items.sort(key=lambda i: place.get(str(i.path.relative_to(folder)), len(place)))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Modules and tests stay to the end: the collector need not look at them again and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+        gc.set_threshold(5000, 10, 50)
 
 
 @pytest.fixture(scope="session")

@@ -128,6 +128,12 @@ def page_of(browser):
         page.close()
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Reports without their drawings, which take most of the time: where the words matter."""
+    monkeypatch.setattr("thermocald.figures.Figure.svgs", lambda *_: [])
+
+
 @pytest.fixture(autouse=True)
 def no_leaked_secrets(monkeypatch):
     """What a test makes a secret stays in the texts of the next ones."""

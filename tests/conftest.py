@@ -102,24 +102,27 @@ def browser():
         opened.close()
 
 
+def watch(page, url: str) -> None:
+    """Keep as `problems` what the page's console complains of and what leaves it from now on."""
+    begun = hasattr(page, "problems")
+    page.problems, page.own = [], (url, "data:", "blob:")
+    if begun:
+        return
+    page.on("console", lambda m: m.type in ("error", "warning") and page.problems.append(m.text))
+    page.on("pageerror", lambda e: page.problems.append(str(e)))
+    page.on("request", lambda r: r.url.startswith(page.own) or page.problems.append(r.url))
+
+
 @pytest.fixture
 def page_of(browser):
-    """(url, options) → its page; what the console complains of and what leaves it is `problems`."""
+    """(url, options) → its page, watched."""
     pages = []
 
     def open_(url: str, width: int = 1280, height: int = 900, **options):
         page = browser.new_page(viewport={"width": width, "height": height}, **options)
         page.set_default_timeout(120_000)  # ms: busy machines
         pages.append(page)
-        page.problems = []
-        page.on(
-            "console", lambda m: m.type in ("error", "warning") and page.problems.append(m.text)
-        )
-        page.on("pageerror", lambda e: page.problems.append(str(e)))
-        page.on(
-            "request",
-            lambda r: not r.url.startswith((url, "data:", "blob:")) and page.problems.append(r.url),
-        )
+        watch(page, url)
         page.goto(url)
         return page
 

@@ -37,7 +37,6 @@ lint: $(STAMP) ## run ruff, mypy --strict, and check the layers
 	$(BIN)/lint-imports
 	@echo "== mypy --strict"
 	$(BIN)/mypy
-	$(BIN)/mypy tests/api/user_script.py
 
 # One process more than two cores, because tests of the daemon mostly wait; tests/conftest.py orders the files
 WORKERS := -n 3 --dist loadfile --no-loadscope-reorder

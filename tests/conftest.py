@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import threading
@@ -43,6 +44,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     place = {f"{name}.py": number for number, name in enumerate(LONGEST)}
     folder = Path(__file__).parent
     items.sort(key=lambda i: place.get(str(i.path.relative_to(folder)), len(place)))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Modules and tests stay to the end: the collector need not look at them again and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+        gc.set_threshold(5000, 10, 50)
 
 
 @pytest.fixture(scope="session")
@@ -89,30 +102,39 @@ def browser():
         opened.close()
 
 
+def watch(page, url: str) -> None:
+    """Keep as `problems` what the page's console complains of and what leaves it from now on."""
+    begun = hasattr(page, "problems")
+    page.problems, page.own = [], (url, "data:", "blob:")
+    if begun:
+        return
+    page.on("console", lambda m: m.type in ("error", "warning") and page.problems.append(m.text))
+    page.on("pageerror", lambda e: page.problems.append(str(e)))
+    page.on("request", lambda r: r.url.startswith(page.own) or page.problems.append(r.url))
+
+
 @pytest.fixture
 def page_of(browser):
-    """(url, options) → its page; what the console complains of and what leaves it is `problems`."""
+    """(url, options) → its page, watched."""
     pages = []
 
     def open_(url: str, width: int = 1280, height: int = 900, **options):
         page = browser.new_page(viewport={"width": width, "height": height}, **options)
         page.set_default_timeout(120_000)  # ms: busy machines
         pages.append(page)
-        page.problems = []
-        page.on(
-            "console", lambda m: m.type in ("error", "warning") and page.problems.append(m.text)
-        )
-        page.on("pageerror", lambda e: page.problems.append(str(e)))
-        page.on(
-            "request",
-            lambda r: not r.url.startswith((url, "data:", "blob:")) and page.problems.append(r.url),
-        )
+        watch(page, url)
         page.goto(url)
         return page
 
     yield open_
     for page in pages:
         page.close()
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Reports without their drawings, which take most of the time: where the words matter."""
+    monkeypatch.setattr("thermocald.figures.Figure.svgs", lambda *_: [])
 
 
 @pytest.fixture(autouse=True)

@@ -47,12 +47,14 @@ SLOW = {
         for t in examples()
     ],
 )
-def test_an_example_of_a_docstring(inside, example):
+def test_an_example_of_a_docstring(inside, example, epochs, monkeypatch):
     if "board" in example.docstring and not (inside / "board").is_dir():
         pytest.skip("the reference data are absent")
     for library in ("pandas", "xarray"):
         if f"to_{library}" in example.docstring:
             pytest.importorskip(library)
+    if example.name not in SLOW and 'tc.open("M1").calibrate()' in example.docstring:
+        monkeypatch.setattr(tc.Series, "calibrate", lambda _: epochs)  # adjusted once for all
     said: list[str] = []
     failed, _ = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=said.append)
 
@@ -166,7 +168,11 @@ RESULTS = {
 
 
 @pytest.mark.parametrize("name", mostly_slow(RESULTS, *(set(RESULTS) - {"discovery"})))
-def test_one_result_prints_documents_draws_and_reports(name, epochs, camera, M1, M2, tmp_path):
+def test_one_result_prints_documents_draws_and_reports(
+    name, epochs, camera, M1, M2, tmp_path, request
+):
+    if name == "study":  # tests/output looks at its many drawings
+        request.getfixturevalue("undrawn")
     result = RESULTS[name](epochs, camera, M1, M2)
     assert str(result).count("\n") >= 3
     assert json.loads(json.dumps(result.as_dict(), allow_nan=False))

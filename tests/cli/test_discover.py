@@ -29,7 +29,7 @@ sources:
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     folder = tmp_path_factory.mktemp("blind")
-    series, _ = generate(Case(("thermal_lag",), 0.2, 31, epochs=100))
+    series, _ = generate(Case(("thermal_lag",), 0.2, 31, epochs=60))
     for s in series:
         write(s, folder / s.name)
     return folder

@@ -49,7 +49,7 @@ def test_a_standard_deviation_is_never_shown_as_nothing():
         assert "e-" not in text
 
 
-def test_a_study_of_a_minute_and_a_path_in_one_piece(minute):
+def test_a_study_of_a_minute_and_a_path_in_one_piece(minute, undrawn):
     report = minute.parent / "new folder" / "study.html"
     told = run("study", minute, "--report", report, COLUMNS="60")
     assert "in 1 minute the principal point" in " ".join(told.stdout.split())

@@ -14,17 +14,17 @@ from thermocald.thermal.series import in_blocks
 
 @pytest.fixture
 def short_blocks(monkeypatch):
-    """Make every series count as long: 180 epochs in 60 rows."""
-    monkeypatch.setattr(examination, "in_blocks", lambda series: in_blocks(series, rows=60))
+    """Make every series count as long: 120 epochs in 40 rows."""
+    monkeypatch.setattr(examination, "in_blocks", lambda series: in_blocks(series, rows=40))
 
 
 def test_an_effect_in_a_long_series(short_blocks, evidence_of):
-    evidence, _ = evidence_of("nonlinear_expansion", px=0.2, seed=12, with_m2=False)
+    evidence, _ = evidence_of("nonlinear_expansion", px=0.2, seed=12, epochs=120, with_m2=False)
     found = discover_series(evidence)
     assert [e.effect for e in found.effects] == ["nonlinear_expansion"]
     first, last = found.effects[0].where["epochs"]
     assert 0 <= first < last <= evidence[0].source.numbers[-1]
-    assert last > 60  # epochs, not rows
+    assert last > 40  # epochs, not rows
     page = report_html(found, "long")
     assert "<svg" in page
     assert re.search(r"Made on \d{4}-\d\d-\d\d at \d\d:\d\d UTC with thermocald", page)
@@ -37,7 +37,7 @@ def test_an_effect_in_a_long_series(short_blocks, evidence_of):
 
 def test_what_is_unexplained_in_a_long_series(short_blocks, evidence_of):
     """The temperature's rate is of all epochs and the misfit of blocks: np.gradient of both."""
-    evidence, _ = evidence_of("outside", px=0.3, seed=24, with_m2=False)
+    evidence, _ = evidence_of("outside", px=0.3, seed=24, epochs=120, with_m2=False)
     found = discover_series(evidence)
     rows = found.as_dict()["effects"][0]["evidence"]["base_misfit"]["against"]
     assert "rate of temperature" in [row["what"] for row in rows]

@@ -33,7 +33,7 @@ NAMED = ("thermal_lag", "softening", "housing_tilt", "target_displacement", "def
 
 @pytest.mark.parametrize("effect", mostly_slow(NAMED, "target_displacement", "defocus"))
 def test_a_hidden_effect_is_named(evidence_of, effect):
-    evidence, _ = evidence_of(effect, px=0.1, seed=21)
+    evidence, _ = evidence_of(effect, px=0.1, seed=21, epochs=90)
 
     found = discover_series(evidence)
 
@@ -51,7 +51,7 @@ def test_the_gap_shrinks_to_the_floor(evidence_of):
 
 
 def test_no_effect_no_name(evidence_of):
-    evidence, _ = evidence_of(seed=23)
+    evidence, _ = evidence_of(seed=23, epochs=90)
     found = discover_series(evidence)
     assert (found.verdict, found.effects) == ("adequate", ())
 
@@ -104,8 +104,19 @@ def test_a_play_shorter_than_an_interval_is_named(evidence_of):
     assert abs(said["value"] - truth["effects"][0][0]["half_width"]) < 3 * said["sd"]
 
 
+def test_a_lag_as_long_as_the_series_has_no_delay_beside_it(evidence_of):
+    """A time offset of so many seconds leaves one temperature, whose rates are not determined."""
+    evidence, _ = evidence_of("thermal_lag", seed=31, epochs=90)
+    search = Search(HypothesisFitter(evidence))
+    lag = next(c for c in search.candidates if c.effect == "thermal_lag")
+    found = search.refine((*search.base().terms, lag.term(904.0, 2)), (0.0, 0.0))
+    assert dict(found.terms[-1].nonlinear)["tau"] > 800.0
+
+    assert search.with_other_delay(found) is None
+
+
 def test_document(evidence_of):
-    evidence, truth = evidence_of("thermal_lag", seed=25)
+    evidence, truth = evidence_of("thermal_lag", seed=31, epochs=60)
     said: list[str] = []
     found = discover_series(evidence, said.append)
     document = found.as_dict()

@@ -17,11 +17,11 @@ from thermocald.thermal.movement import detect_tremble, measure_jumps, weight_ju
 from thermocald.thermal.reduce import reduce_together
 
 
-def trembling(effects, px, seed):
+def trembling(effects, px, seed, epochs=180):
     """Both series of a blind case, with each epoch's image shifted independently by px."""
     rng = np.random.default_rng([seed, 5])
     out = []
-    for series in generate(Case(effects, 0.3, seed))[0]:
+    for series in generate(Case(effects, 0.3, seed, epochs=epochs))[0]:
         found = series_input(series)
         grid = found.grid
         shift = px * rng.normal(size=(len(grid.points), 1, 2))
@@ -54,18 +54,19 @@ def test_a_tremble_is_no_drift(effects, px, expected):
 
 
 @pytest.mark.parametrize(
-    ("effects", "px", "seed"),
+    ("effects", "px", "seed", "epochs"),
     [
-        ((), 0.05, 2),
-        pytest.param(("softening",), 0.02, 3, marks=pytest.mark.slow),
-        pytest.param(("softening",), 0.05, 2, marks=pytest.mark.slow),
-        pytest.param(("thermal_lag",), 0.02, 3, marks=pytest.mark.slow),
-        pytest.param(("thermal_lag",), 0.05, 2, marks=pytest.mark.slow),
-        pytest.param(("cyclic_interference",), 0.02, 3, marks=pytest.mark.slow),
+        ((), 0.05, 2, 90),
+        pytest.param((), 0.05, 2, 180, marks=pytest.mark.slow),
+        pytest.param(("softening",), 0.02, 3, 180, marks=pytest.mark.slow),
+        pytest.param(("softening",), 0.05, 2, 180, marks=pytest.mark.slow),
+        pytest.param(("thermal_lag",), 0.02, 3, 180, marks=pytest.mark.slow),
+        pytest.param(("thermal_lag",), 0.05, 2, 180, marks=pytest.mark.slow),
+        pytest.param(("cyclic_interference",), 0.02, 3, 180, marks=pytest.mark.slow),
     ],
 )
-def test_what_trembles_is_noise_and_the_cause_is_named(effects, px, seed):
-    found = discover_series(trembling(effects, px, seed))
+def test_what_trembles_is_noise_and_the_cause_is_named(effects, px, seed, epochs):
+    found = discover_series(trembling(effects, px, seed, epochs))
 
     assert tuple(e.effect for e in found.effects) == effects
     assert all(a.significance < 6.0 for a in found.examination.adequacy)

@@ -351,7 +351,7 @@ def test_a_spike_beside_a_change_of_the_unit_hides_neither():
     assert find_spikes(values)[0][:2] == (27, 28)
 
 
-def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_path):
+def test_a_study_a_fit_and_a_discovery_of_the_doubtful_say_so(recording, tmp_path, undrawn):
     """Doubts are in the text, in `doubts` of the JSON, and in the notes of the report."""
     messages = []
     for name in ("a principal distance of another lens", "85.00 of a DS18B20", "an epoch twice",

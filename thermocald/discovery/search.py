@@ -15,6 +15,7 @@ European Physical Journal C 70, 525-530 (look-elsewhere effect).
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -265,8 +266,10 @@ class Search:
             for candidate in others:
                 swapped = candidate.term(seconds, len(self.fitter.series))
                 terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
-                solutions.append(self.refine(terms, solution.penalties))
-            return min(solutions, key=lambda s: s.fit.chi2)
+                # an offset as long as the series leaves its temperature constant, and its rates free
+                with contextlib.suppress(np.linalg.LinAlgError):
+                    solutions.append(self.refine(terms, solution.penalties))
+            return min(solutions, key=lambda s: s.fit.chi2, default=None)
         return None
 
     def with_events_moved(self, solution: Solution) -> Solution:

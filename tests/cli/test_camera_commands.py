@@ -221,7 +221,7 @@ def test_the_logger_tells_the_temperature_of_photographs(tmp_path):
         (("20=a.json", "50=free.json"), "calibrate both with the same --free"),
         (("20=a.json", "M1"), "fit series and calibrations apart"),
         (("20=a.json", "50=none.json"), "no covariance"),
-        (("20=a.json", "50=list.json"), "no camera file of any of"),
+        (("20=a.json", "50=list.json"), "not a camera file of any format"),
     ],
 )
 def test_calibrations_that_give_no_model_are_refused(tmp_path, inputs, said):

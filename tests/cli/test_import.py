@@ -203,7 +203,7 @@ def test_the_readme_leads_to_a_plot_in_ten_commands():
     from pathlib import Path
 
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    block = text.split("## Your first own plot")[1].split("```text\n")[1].split("```")[0]
+    block = text.split("## Your first plot")[1].split("```text\n")[1].split("```")[0]
     commands = block.strip().splitlines()
     assert len(commands) <= 10
     for command in commands[1:]:

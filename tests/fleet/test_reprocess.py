@@ -68,7 +68,7 @@ def test_bad_usage_is_said(archive, tmp_path):
         find_blocks([tmp_path], tmp_path, ())
     with pytest.raises(UsageError, match="give `local` or"):
         run_tasks(calibrate_block, [], "fast")
-    with pytest.raises(UsageError, match="there are calibrate, discover, study"):
+    with pytest.raises(UsageError, match="must be one of calibrate, discover, study"):
         find_series_tasks([archive], tmp_path, "dream")
     with pytest.raises(DataError, match="no recording or series is there"):
         find_series_tasks([tmp_path], tmp_path, "study")

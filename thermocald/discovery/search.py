@@ -266,7 +266,7 @@ class Search:
             for candidate in others:
                 swapped = candidate.term(seconds, len(self.fitter.series))
                 terms = (*solution.terms[:i], swapped, *solution.terms[i + 1 :])
-                # an offset as long as the series leaves its temperature constant, and its rates free
+                # an offset as long as the series leaves its temperature constant and its rates free
                 with contextlib.suppress(np.linalg.LinAlgError):
                     solutions.append(self.refine(terms, solution.penalties))
             return min(solutions, key=lambda s: s.fit.chi2, default=None)

@@ -232,7 +232,7 @@ def test_only_a_model_that_lacks_an_effect_is_contradicted(tmp_path):
     slope, sd = (v[3] for v in found.per_kelvin)
     assert slope == pytest.approx(0.3e-3, abs=3 * sd)
     assert "the model misses an effect" in str(found)
-    assert "cannot tell" in str(held)
+    assert "cannot separate" in str(held)
     assert held.as_dict()["frames"][0]["reason"] == "the reference frame"
 
 

@@ -134,7 +134,7 @@ def test_the_timers_command_archives_what_has_ended_and_deletes_old_frames(
     os.utime(old, (yesterday, yesterday))
     status, said = timer_command()
     assert status == 0, said
-    assert "1 frames" in said
+    assert "frames deleted: 1 " in said
     assert not old.exists()
     assert (daemon.folder / "recordings/one-M1").is_dir()
     assert not (daemon.folder / "recordings/one-M2").exists()

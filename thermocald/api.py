@@ -346,9 +346,10 @@ def plan(
 
     require_within(strength_px=(strength_px, 0.001), seeds=(seeds, 1))
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
+    source = None
     if series is not None:
         _require_series((series,))
-    source = None if series is None else series.observed()
+        source = series.observed()
     inputs = set_ups(source, thermal, preset, testfield, course, seeds)
     return plan_power(inputs, strength_px, progress or (lambda _: None))
 

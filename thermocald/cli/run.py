@@ -393,7 +393,7 @@ def _device(device: dict[str, Any]) -> str:
     last = ", ".join(shown)
     text: str = device["device"] + (f", {last}" if last else "")
     if device["faults"]:
-        text += f", {device['faults']} fault{'' if device['faults'] == 1 else 's'}"
+        text += f", {counted(device['faults'], 'fault')}"
     return text + (f": {device['why']}" if device["why"] else "")
 
 

@@ -23,7 +23,7 @@ from thermocald.analysis.series.course import Course, carried_by_c, table_of
 from thermocald.errors import DataError, DriverMissing, UsageError
 from thermocald.figures import BAND
 from thermocald.files import write_parts
-from thermocald.numbers import parameter_label, with_sd
+from thermocald.numbers import counted, parameter_label, with_sd
 from thermocald.photogrammetry.camera.camera_model import PARAMETER_NAMES
 from thermocald.photogrammetry.series.covariances import AFFINITY
 from thermocald.photogrammetry.series.mount import FASTEST_DRIFT_S
@@ -261,7 +261,7 @@ class Epochs(Result):
         exterior = _EXTERIOR_WORDS[self.exterior]
         calibrated = f"{document['ok']} of {document['epochs']} epochs calibrated"
         count = document["rejected"]
-        rejected = f"{count} rejected observation{'' if count == 1 else 's'}"
+        rejected = counted(count, "rejected observation")
         out = [f"{calibrated}, exterior orientation {exterior}, {rejected}"]
         if (sigma0 := document["sigma0"]) is not None:
             cause = ""

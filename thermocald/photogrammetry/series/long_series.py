@@ -305,7 +305,7 @@ class KnownSeries:
         for rows, one, G in _kinds_of(self.design, system):
             away = G - self.mean
             mine[rows] += away @ self.cofactors @ away.T
-            if self.pairs is not None:
+            if self.pairs:
                 mine[rows] += correlated_error_cofactors(one, self.pairs, pooled)[0][
                     np.ix_(own, own)
                 ]

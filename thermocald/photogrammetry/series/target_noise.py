@@ -206,8 +206,6 @@ def neighbours_variance(unit: Array, known: Mask) -> Array:
     the 15 epochs around each, 1 where fewer than 10 of them count: the noise of a camera that
     warms up and defocuses changes slowly, a gross error is of one epoch.
     """
-    if len(unit) < FEW_EPOCHS:
-        return np.ones(len(unit))
     size = min(_SMOOTH, len(unit))
     windows = np.lib.stride_tricks.sliding_window_view(np.where(known, unit, np.nan), size)
     enough = np.isfinite(windows).sum(axis=1) >= FEW_EPOCHS

@@ -31,6 +31,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     InteriorOrientation,
     project,
 )
+from thermocald.photogrammetry.epoch.snooping import TRUSTED_REDUNDANCY
 from thermocald.photogrammetry.field.testfield import find_misplaced
 from thermocald.photogrammetry.series.adjustment import adjusted, result
 from thermocald.photogrammetry.series.field_motion import taken_off
@@ -62,8 +63,10 @@ _USUAL_TREMBLE_PX = 0.08  # the largest of the real cameras' mounts that were ex
 _LEFT = 0.01  # a second test of a point has this fraction of the series' error probability
 _AGAINST = ("too_many_rejected", "global_test")  # statuses of an epoch that contradicts its series
 _CARRIED = ("weak_geometry", "global_test")  # statuses of an epoch that its series may carry
+# the same for few targets, which do not show whether some are wrong or all noisier than stated
+_CARRIED_FEW = ("too_many_rejected", "too_few_targets", "no_convergence")
 _MOST_SAID = 6  # targets that are named
-_DOUBTED = 5  # epochs in a row with a result of their own and none in the series
+_DOUBTED = 5  # epochs in a row with a result of their own and none in the series, or with neither
 
 _ESTIMATED = PARAMETER_NAMES[PRINCIPAL]
 
@@ -175,7 +178,7 @@ class RunningSeries:
         self._series: _Together | None = None
         self._level = np.zeros(16)
         self._shown = self._wrong = np.zeros(len(self._field), dtype=bool)
-        self._doubts = self._away = 0
+        self._doubts = self._away = self._refused = 0
 
     @property
     def tremble(self) -> Array:
@@ -207,7 +210,9 @@ class RunningSeries:
         self, calibrated: CalibratedEpoch, seen: Observations, reported: Array | None = None
     ) -> None:
         """Store an epoch; reported (16,): its values, if they were reported before a restart."""
-        epoch = calibrated.epoch
+        epoch, alone = calibrated.epoch, calibrated.adjustment
+        if alone.interior is None and not self._kept:
+            return
         self.epochs += 1
         self._kept.append(
             _Kept(
@@ -215,7 +220,7 @@ class RunningSeries:
                 epoch.number,
                 epoch.frame_time,
                 next(iter(epoch.temperatures.values()), np.nan),
-                calibrated.adjustment.values,
+                self._kept[-1].alone if alone.interior is None else alone.values,
                 reported,
             )
         )
@@ -230,12 +235,15 @@ class RunningSeries:
         hurried: whether further epochs are waiting.
         """
         alone = calibrated.adjustment
-        carried = alone.status in _CARRIED and alone.interior is not None
+        given = alone.interior is not None
+        carried = alone.status in _CARRIED if given else self._may_carry(alone)
         if not self.any or not (alone.ok or carried):
             return alone, {}
         self._hurried = hurried
         columns: dict[str, float] = {}
-        if self._elsewhere(alone):
+        if self._elsewhere(seen):
+            if not given:
+                return alone, columns
             self._away += 1
             if self._away < _STAYS:
                 return alone, columns
@@ -246,6 +254,12 @@ class RunningSeries:
         if alone.status == "global_test" and len(self._kept) < FEW_EPOCHS:
             return alone, columns  # too few to show whether the noise is larger than stated
         own, whole = self._adjust_newest()
+        if not given and whole.status != "ok":
+            self._kept.pop()
+            self.epochs -= 1
+            self._refused += 1
+            return alone, columns
+        self._refused = 0
         columns |= self._columns(whole)
         if not carried:  # what is carried contradicts nothing
             against = any(e is not None and e.status in _AGAINST for e in (own, whole))
@@ -319,16 +333,19 @@ class RunningSeries:
                 columns[f"level_sd_{name}"] = float(level[k])
         return columns
 
-    def _elsewhere(self, alone: Adjustment) -> bool:
+    def _may_carry(self, alone: Adjustment) -> bool:
+        """Return whether the series may carry an epoch that has no values of its own."""
+        redundancy = 2 * alone.n_observations - len(self._asked.unknowns)
+        few = alone.status in _CARRIED_FEW and redundancy < TRUSTED_REDUNDANCY
+        return few and len(self._kept) >= FEW_EPOCHS and self._refused < _DOUBTED
+
+    def _elsewhere(self, seen: Observations) -> bool:
         """Return whether the targets have moved further in the image than a mount can move them."""
         if not self._kept:
             return False
-        points = self._field.points[alone.targets]
-        here, there = (
-            project(self._sensor, values[IOP], values[EOP], points)
-            for values in (alone.values, self._kept[-1].alone)
-        )
-        return bool(np.median(np.abs(here - there)) > _TURNED_PX)
+        last = self._kept[-1].alone
+        there = project(self._sensor, last[IOP], last[EOP], self._field.points[seen.targets])
+        return bool(np.median(np.abs(seen.points - there)) > _TURNED_PX)
 
     def _adjust_newest(self) -> tuple[_Epoch | None, _Epoch]:
         """Return the newest epoch's own result, None if unchanged, and that in its series."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+import thermocald as tc
 from thermocald.analysis.series.adjusted import table_of_series
 from thermocald.analysis.series.drift import courses, with_drifts
 from thermocald.analysis.series.epochs import Epochs
@@ -16,6 +17,8 @@ from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.photogrammetry.field.testfield import Observations, TestField
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.photogrammetry.series.result import SeriesSettings
+from thermocald.physics.heat import SimulatedThermometer
+from thermocald.physics.presets import preset_simulation
 from thermocald.physics.testfields import corner_field, demonstration_model
 
 SIGMA = 0.05
@@ -144,3 +147,21 @@ def test_replay_reports_no_drift_in_noise_with_a_memory(coloured, phi, epochs):
         table = table_of(values, np.ones((epochs, 16)), "series")
         claims += [c.drifts for c in courses(table)]
     assert np.mean(claims) <= 0.025
+
+
+def test_a_noisy_thermometer_flattens_no_slope_and_hides_no_accuracy(tmp_path):
+    """The slope of `replay` is off by a few of its sds, and these are small, as in a study."""
+    off, relative = [], []
+    for seed in (1, 2):
+        s = preset_simulation("rpi-v2.1-heating", seed=seed)
+        noisy = {"temperature": SimulatedThermometer("housing", noise=1.0, resolution=0.0)}
+        s = replace(
+            s, model=replace(s.model, effects=()), device=replace(s.device, thermometers=noisy)
+        )
+        s.write(tmp_path / str(seed))
+        for line in tc.open(tmp_path / str(seed)).calibrate().drifts[1:]:
+            true = s.model.rates[line.name]
+            off.append((line.per_kelvin - true) / line.sd_per_kelvin)
+            relative.append(line.sd_per_kelvin / abs(true))
+    assert 0.2 < np.sqrt(np.mean(np.square(off))) < 2.0
+    assert max(relative) < 0.05

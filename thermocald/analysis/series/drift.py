@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.series.course import LEVEL, Course
-from thermocald.analysis.statistics.dependence import holm, slope_noise, slope_p_value
+from thermocald.analysis.statistics.dependence import dependence, holm, slope_noise
 from thermocald.analysis.statistics.noise_models import drift_test
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, PRINCIPAL
 from thermocald.photogrammetry.series.target_noise import slow_errors
+from thermocald.thermal.thermometer import estimate_reading_noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -91,12 +92,13 @@ def courses(table: Epochs) -> list[Course]:
     temperature, time = table.temperature[have], table.frame_time[have]
     if len(have) >= _FEWEST and np.ptp(temperature) >= _LEAST_WARMING_K:
         for name, line in lines.items():
-            values = table.values[have, IOP_NAMES.index(name)]
-            t, y, times = _thin(temperature, values, time)
-            t = t - t.mean()
-            slope = float(y @ t / (t @ t))
-            sd, p = slope_noise(y, t, slope).sd, slope_p_value(y, t, times)
-            lines[name] = replace(line, per_kelvin=slope, sd_per_kelvin=sd, p_temperature=p)
+            column = IOP_NAMES.index(name)
+            values, sds = table.values[have, column], table.sd[have, column]
+            t, y, sd, times = _thin(temperature, values, sds, time)
+            on = dependence(y, sd, t, estimate_reading_noise(times, t, None), times)
+            lines[name] = replace(
+                line, per_kelvin=on.slope, sd_per_kelvin=on.sd_slope, p_temperature=on.p_value
+            )
 
     @cache
     def without(group: str) -> dict[str, Course]:

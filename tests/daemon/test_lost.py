@@ -18,8 +18,8 @@ from tests.daemon.test_store_file import guard, path  # noqa: F401
 from tests.store.small import stored_numbers
 from thermocald.acquisition.pipeline import Pipeline
 from thermocald.acquisition.thermometers import Thermometers
-from thermocald.cli.run import status, status_warnings
-from thermocald.daemon.live_state import LiveState
+from thermocald.cli.run import status
+from thermocald.daemon.live_state import LiveState, status_warnings
 from thermocald.errors import DataError, StoreError
 from thermocald.hal import Frame, SystemClock, open_device
 from thermocald.output.dashboard.view import View

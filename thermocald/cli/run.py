@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -34,6 +34,9 @@ from thermocald.cli.common import (
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import counted, duration, with_sd
+
+if TYPE_CHECKING:
+    from thermocald.config import Config
 
 
 def run(
@@ -66,24 +69,28 @@ def run(
         config = require_config(config, "one of --config FILE, --mock, --recording FOLDER")
     if fast and recording is None:
         raise UsageError("--fast is for --recording: devices have their own pace")
+
+    def with_options(read: Config) -> Config:
+        page = {"enabled": True} if dashboard else {}
+        place = {} if store is None else {"path": store.absolute()}
+        return read.model_copy(
+            update={
+                "store": read.store.model_copy(update=place),
+                "dashboard": read.dashboard.model_copy(update=page),
+            }
+        )
+
     if config is not None:
         read = load_config(config, option_names)
     elif recording is not None:
         read = recording_config(recording)
     else:
         read = mock_config()
-    if store is not None:
-        read = read.model_copy(
-            update={"store": read.store.model_copy(update={"path": store.absolute()})}
-        )
-    if dashboard:
-        read = read.model_copy(
-            update={"dashboard": read.dashboard.model_copy(update={"enabled": True})}
-        )
     set_up_logging(read.logging.level)
     service = Service(
-        read,
+        with_options(read),
         config,
+        with_options=with_options,
         fast=fast,
         epochs=epochs,
         until_finished=bool(epochs) or recording is not None,
@@ -308,6 +315,8 @@ _OLD_S = 10.0
 
 def status_lines(document: dict[str, Any]) -> list[str]:
     """Return a `thermocald-status/1` document as lines; the first is the headline."""
+    from thermocald.daemon.live_state import status_warnings
+
     lines = [_headline(document), ""]
     for name, camera in document["cameras"].items():
         lines += _camera(name, camera)
@@ -394,37 +403,4 @@ def _device(device: dict[str, Any]) -> str:
     text: str = device["device"] + (f", {last}" if last else "")
     if device["faults"]:
         text += f", {counted(device['faults'], 'fault')}"
-    return text + (f": {device['why']}" if device["why"] else "")
-
-
-def status_warnings(document: dict[str, Any]) -> list[str]:
-    """Return the warnings of a status document, one sentence each."""
-    found = list(document["stalled"])
-    store = document["store"]
-    if store["state"] != "ok":
-        found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
-    if store["lost"]:
-        lost = counted(store["lost"], "epoch")
-        found.append(f"{lost} lost, taken but not stored: {store['lost_why']}")
-    if store.get("notice"):
-        found.append(f"store: {store['notice']}")
-    if document.get("dashboard", {}).get("why"):
-        found.append(document["dashboard"]["why"])
-    if document["frames"]["paused"]:
-        found.append(document["frames"]["paused"])
-    if not document["clock"]["trusted"]:
-        found.append("the clock is not synchronised: times may be wrong")
-    if not document["frames"].get("ages_known", True):
-        found.append("frames are not deleted for their age until the clock is synchronised")
-    for kind in ("camera", "thermometer", "output"):
-        for name, device in document[f"{kind}s"].items():
-            found += [f"{kind} {name}: {text}" for text in device.get("warnings", ())]
-    for name, camera in document["cameras"].items():
-        if camera["why"]:
-            found.append(f"camera {name}: {camera['why']}")
-        if camera["deferred"] > camera["caught_up"]:
-            found.append(
-                f"camera {name}: {camera['deferred'] - camera['caught_up']} epochs are still to be "
-                "calibrated"
-            )
-    return found
+    return text

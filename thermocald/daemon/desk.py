@@ -210,6 +210,7 @@ def session_of(
     """Return the requested session; raises UsageError or ConfigurationError."""
     from pydantic import ValidationError
 
+    from thermocald.config import in_words
     from thermocald.daemon.session import Session
     from thermocald.files import read_yaml
 
@@ -223,9 +224,7 @@ def session_of(
     try:
         return Session.model_validate(request)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"--{key}: {first['msg']}") from error
+        raise UsageError(f"--{in_words('', error)}") from error
 
 
 def listening_daemon(config: Config) -> Path | None:

@@ -152,7 +152,9 @@ class Sessions:
                     raise DataError(
                         f"series {other.session.series!r} uses the heating; wait until it ends"
                     )
-            self.station.heaters(session.steps(0.0))  # raises for wrong steps
+            for i in self.station.heaters(session.steps(0.0)):  # raises for wrong steps
+                if (link := self.station.outputs[i].link).state == "failed":
+                    raise DataError(f"output {link.name}: {link.why}")
         active = _Progress(session, "checking")
         if session.check:
             self._check(active)

@@ -364,7 +364,7 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
             if change := (last.get("online") or {}).get("orientation"):
                 lines += _wrapped(f"  {change}")
         else:
-            lines += _wrapped(f"  {last.get('status', '')}: {last.get('reason', '')}")
+            lines += _wrapped(f"  {last.get('status', '')}: {last.get('reason', '')}".rstrip(": "))
     late = 1000 * camera["late_p99_s"]
     count = f"  {camera['lost']} lost, {camera['skipped']} skipped"
     return [*lines, f"{count}; 99 % at most {late:.0f} ms late", ""]

@@ -159,7 +159,7 @@ class Service:
         }
         self._until_finished = until_finished
         self._on_turn = on_turn
-        self._started = self.clock.utc()
+        self._started = self.clock.monotonic()
         self._wake = threading.Event()
         self._end = False
         self._reload = False
@@ -257,7 +257,7 @@ class Service:
         document = {
             "version": __version__,
             "pid": os.getpid(),
-            "started": self._started,
+            "started": self.clock.utc() - self.clock.monotonic() + self._started,
             "utc": self.clock.utc(),
             "configuration": None if self._path is None else str(self._path.absolute()),
             "clock": {"trusted": self.clock.trusted(), "error_s": self.clock.error_s},

@@ -86,7 +86,8 @@ function verdict(camera, last) {
   if (["out", "failed", "hung"].includes(camera.device)) return [`${camera.device}: ${camera.why || "it does not answer"}`, "failed"];
   if (last.epoch === undefined) return [camera.series === "" ? "idle" : "no epoch yet", ""];
   if (["ok", "predicted", "resected", "last_pose"].includes(last.status)) return [last.online?.sentence || last.state, last.state];
-  return [last.status.replaceAll("_", " ") + (last.reason ? `: ${last.reason}` : ""), "failed"];
+  return [last.status.replaceAll("_", " ") + (last.reason ? `: ${last.reason}` : ""),
+    last.status === "not_calibrated" ? "drifting" : "failed"];
 }
 
 function showCamera(camera) {
@@ -100,7 +101,8 @@ function showCamera(camera) {
   for (const [name, label] of [["c", "c"], ["x0", "x₀"], ["y0", "y₀"]]) {
     const sd = online["sd_" + name] ?? last["sd_" + name];
     figures.push([label, measured(online[name] ?? last[name], 5, "mm"),
-      sd ? `± ${fixed(sd, 5)}; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : ""]);
+      (sd ? `± ${fixed(sd, 5)}` : "") + (sd && last["sd_" + name] ?
+        `; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : "")]);
   }
   figures.push(["σ₀", fixed(last.sigma0, 3), `${counted(last.n_observations, "target")}, ${last.n_rejected} rejected`]);
   if (online.orientation) figures.push(["Camera", online.orientation, ""]);

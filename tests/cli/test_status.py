@@ -71,6 +71,12 @@ def test_status_fits_into_80_columns_and_breaks_no_path():
     assert Equilibrium("ready", 0.0123, 0.0041).sentence == "ready: 0.0123 ± 0.0041 px/min"
 
 
+def test_a_disk_nearly_full_is_told_in_words():
+    """It was `store: results_only:  (0 epochs wait)`."""
+    little = document() | {"store": {"state": "results_only", "why": "", "waiting": 0, "lost": 0}}
+    assert "! store: its disk is nearly full: results are stored" in "\n".join(status_lines(little))
+
+
 @pytest.fixture
 def terminal(monkeypatch):
     """A keyboard: what is written to it is typed."""

@@ -180,7 +180,9 @@ def status_warnings(document: Mapping[str, Any]) -> list[str]:
     """Return the warnings of a status document, one sentence each."""
     found = list(document["stalled"])
     store = document["store"]
-    if store["state"] != "ok":
+    if store["state"] == "results_only":
+        found.append("store: its disk is nearly full: results are stored, observations are not")
+    elif store["state"] != "ok":
         found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
     if store["lost"]:
         lost = counted(store["lost"], "epoch")

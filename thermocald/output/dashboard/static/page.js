@@ -200,6 +200,7 @@ async function refreshCourse() {
     if (course !== courses) return;
     fillCameras();
     options($("series"), series.filter((s) => s.camera === chosen()).map((s) => s.series).reverse());
+    for (const id of ["bar", "course"]) $(id).hidden = !$("series").value;
     if (!$("series").value) {
       $("course-note").textContent = "no epoch of this camera is stored yet";
       Plotly.purge("course");

@@ -272,6 +272,22 @@ def test_reload_leaves_a_session_alone(live, daemon):
     assert series_of(daemon.store)["M7"][1] == list(range(1, 13))
 
 
+def test_a_session_whose_camera_is_gone_has_the_epochs_that_it_took(live, daemon):
+    """It was "0 of 40 epochs, stopped"."""
+    live()
+    daemon.ask("session start", session={**SESSION, "epochs": 40, "check": False})
+    daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
+    document = yaml.safe_load(daemon.config.read_text())
+    document["cameras"][0]["name"] = "phone-2"
+    daemon.config.write_text(yaml.safe_dump(document))
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: daemon.session().get("state") == "stopped")
+    session = daemon.session()
+    assert "there are: phone-2" in session["why"]
+    assert daemon.stop() == 0
+    assert series_of(daemon.store)["M7"][1] == list(range(1, session["taken"] + 1))
+
+
 def test_a_programme_is_taken_up_where_it_was():
     steps = [{"seconds": 600.0, "hold_c": None}, {"seconds": 1500.0, "hold_c": 45.0}]
     session = Session.model_validate({**SESSION, "programme": steps})

@@ -395,7 +395,7 @@ def _movement(last: dict[str, Any]) -> str:
 
 def _device(device: dict[str, Any]) -> str:
     shown = [
-        f"{value:.2f} °C" if name == "temperature" else f"{name.replace('_', ' ')} {value:.2f}"
+        f"{value:.2f} °C" if name == "temperature" else f"{name} {value:.2f} °C"
         for name, value in device.get("last", {}).items()
         if value is not None
     ]

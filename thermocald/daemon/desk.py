@@ -195,7 +195,9 @@ def only_camera(config: Config, camera: str | None = None) -> str:
     Raises UsageError if there is no such camera, or none is given and there are several.
     """
     names = [c.name for c in config.cameras]
-    there = ", ".join(names) or "none"
+    if not names:
+        raise UsageError("the configuration has no camera; add one under `cameras`")
+    there = ", ".join(names)
     if camera is None and len(names) != 1:
         raise UsageError(f"which camera? give --camera, one of: {there}")
     if camera is not None and camera not in names:

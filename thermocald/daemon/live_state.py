@@ -195,7 +195,8 @@ def status_warnings(document: Mapping[str, Any]) -> list[str]:
         found.append(document["frames"]["paused"])
     if not document["clock"]["trusted"]:
         found.append("the clock is not synchronised: times may be wrong")
-    if not document["frames"].get("ages_known", True):
+    frames = document["frames"]
+    if frames.get("keep") != "none" and not frames.get("ages_known", True):
         found.append("frames are not deleted for their age until the clock is synchronised")
     for kind in ("camera", "thermometer", "output"):
         for name, device in document[f"{kind}s"].items():

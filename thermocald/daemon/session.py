@@ -241,6 +241,9 @@ class Sessions:
                 line.take(line.plan.config.series)
             if session.programme:
                 self.station.heat(_NO_HEAT)
+            stored = self._guard.find(session.camera, session.series)
+            if not active.taken and stored is not None:
+                active.taken = self._guard.last_epoch(stored)
         except ThermocaldError as error:
             log.error("camera %s: %s", session.camera, error)
         kind = "session_refused" if state == "refused" else "session_ended"

@@ -31,7 +31,8 @@ from thermocald.addresses import hide_secrets, is_loopback, is_secret, without_s
 from thermocald.errors import ConfigurationError
 from thermocald.files import is_ordinary, read_yaml
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+Name = Annotated[str, Field(pattern=_NAME)]
 Period = Annotated[float, Field(ge=0.05, le=86400.0)]
 Positive = Annotated[float, Field(gt=0.0, le=1e9)]
 
@@ -111,6 +112,8 @@ def in_words(path: Path | str, error: ValidationError) -> str:
         message = str(context["error"])
     elif first["type"] not in ("thermocald", "of_key"):
         given = "a secret" if is_secret(where.rpartition(".")[2]) else _short(first["input"])
+        if context.get("pattern") == _NAME:
+            message = "must be a letter or digit, then up to 63 letters, digits, `_`, `.`, `-`"
         message = f"is {given}; {message[0].lower()}{message[1:]}"
     return f"{place}{where + ': ' if where else ''}{message}{more}"
 

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 WITH_VALUES = ("ok", "predicted", "resected", "last_pose")
 """Statuses of epochs without a fault: calibrated, or predicted and posed with a thermal model."""
 
+PAGE_OF = "THERMOCALD_PAGE_OF"
+"""Environment variable: the process id of the daemon that started a page, which ends with it."""
+
 _PARAMETERS = (
     "c", "x0", "y0", "A1", "A2", "A3", "B1", "B2", "C1", "C2", "omega", "phi", "kappa", "X0", "Y0",
     "Z0",

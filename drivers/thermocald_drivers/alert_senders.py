@@ -281,6 +281,8 @@ class MailAlert(AlertOutput):
             ) from None
         except (smtplib.SMTPRecipientsRefused, smtplib.SMTPSenderRefused):
             raise BadReading(f"{self.where}: rejects the sender or a recipient") from None
+        except smtplib.SMTPServerDisconnected:
+            raise DeviceGone(f"{self.where}: no answer, or it closed the connection") from None
         except (OSError, ValueError, smtplib.SMTPException) as error:
             raise DeviceGone(f"{self.where}: {support.reason(error)}") from None
 

@@ -150,9 +150,11 @@ class AdbPhone(Device):
             )
         if not states:
             others = ", ".join(f"{serial} ({state})" for serial, state in listed) or "none"
+            advice = "switch on USB debugging, and use a cable that carries data"
+            if any(state == "device" for _, state in listed):
+                advice += ", or set `serial` to another phone's"
             raise support.absent(
-                f"{self.where}: not attached; adb lists {others}; switch on USB debugging, "
-                "and use a cable that carries data",
+                f"{self.where}: not attached; adb lists {others}; {advice}",
                 seen=self.seen,
             )
         state = states[0]

@@ -7,6 +7,7 @@
 
 `loop: true` starts again after the last epoch, with times that continue. Otherwise the device
 raises DeviceFinished. An epoch without a frame, or without a temperature, raises BadReading.
+`after`, s UTC, leaves out the frames up to that time.
 
 Frames retain their recorded time: `utc` is the recorded time, `monotonic` the same instant on the
 clock's monotonic scale; `sequence` is the epoch's number. A JPEG is delivered as recorded, in
@@ -42,6 +43,7 @@ class ReplayOptions(DriverOptions):
 
     recording: support.Text | Path
     loop: bool = False
+    after: float | None = None
 
 
 @contextmanager
@@ -74,7 +76,8 @@ class _Replay(Device):
 
             with _permanent_errors():
                 self._recording = open_recording(self._path)
-            self._epochs = self._recording.iter_epochs()
+            after, every = self.options.after, self._recording.iter_epochs()
+            self._epochs = every if after is None else (e for e in every if e.frame_time > after)
         self.handle = self._recording
 
     def close(self) -> None:

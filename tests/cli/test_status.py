@@ -65,10 +65,16 @@ def test_status_fits_into_80_columns_and_breaks_no_path():
     assert "  c  3.04049 ± 0.00030 mm         moved 0.38 ± 0.33 px since the start" in lines
     assert "  the mount moves by 0.032 px about one orientation (101 epochs)" in lines
     assert "for 2 minutes" in lines[0]
-    assert "1 fault:" in text
+    assert "1 fault\n" in text
     # a drift has the digits of its sd: it was `1.11 ± 0.00 px/min`, `ready in about 13 ± 0 min`
     assert "drifting 1.1085 ± 0.0015 px/min, ready in about 12.5667 ± 0.0067 min" in text
     assert Equilibrium("ready", 0.0123, 0.0041).sentence == "ready: 0.0123 ± 0.0041 px/min"
+
+
+def test_a_disk_nearly_full_is_told_in_words():
+    """It was `store: results_only:  (0 epochs wait)`."""
+    little = document() | {"store": {"state": "results_only", "why": "", "waiting": 0, "lost": 0}}
+    assert "! store: its disk is nearly full: results are stored" in "\n".join(status_lines(little))
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ import pytest
 
 from thermocald.acquisition.device_loop import Link
 from thermocald.acquisition.pipeline import AcquiredEpoch
-from thermocald.cli.run import status_warnings
 from thermocald.config import parse_config
 from thermocald.daemon.epoch_keeper import EpochKeeper
+from thermocald.daemon.live_state import status_warnings
 from thermocald.daemon.plan import plan_cameras
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.epoch import Epoch

@@ -6,6 +6,7 @@ C library return. Not real: the kernel's clock; file times and its synchronisati
 
 from __future__ import annotations
 
+import re
 import time
 
 import numpy as np
@@ -78,7 +79,10 @@ def test_a_pi_that_starts_without_a_clock_loses_nothing_when_ntp_comes(daemon, c
     clocked(60 - time.time())  # a minute after the start of 1970
     clocked.set(0)
     daemon.until(lambda: "time stamps follow" in daemon.log())
+    assert re.search(r"was set forwards by \d{5} days; time stamps follow", daemon.log())
     daemon.more(2)
+    daemon.until(lambda: daemon.status()["utc"] > 1.6e9)
+    assert daemon.status()["utc"] - daemon.status()["started"] < 600.0  # it was 20,000 days
     assert daemon.stop() == 0
     columns, steps, archived = content(daemon, tmp_path)
     assert [step["adopted"] for step in steps] == [True]

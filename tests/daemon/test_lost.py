@@ -18,8 +18,8 @@ from tests.daemon.test_store_file import guard, path  # noqa: F401
 from tests.store.small import stored_numbers
 from thermocald.acquisition.pipeline import Pipeline
 from thermocald.acquisition.thermometers import Thermometers
-from thermocald.cli.run import status, status_warnings
-from thermocald.daemon.live_state import LiveState
+from thermocald.cli.run import status
+from thermocald.daemon.live_state import LiveState, status_warnings
 from thermocald.errors import DataError, StoreError
 from thermocald.hal import Frame, SystemClock, open_device
 from thermocald.output.dashboard.view import View
@@ -92,6 +92,22 @@ def test_the_exit_status_of_run_says_so(tmp_path):
     assert done.returncode == 1
     assert "1 epoch lost: epoch 7 of rpi" in done.stderr
     assert stored_numbers(tmp_path / "t.db") == [n for n in range(1, 21) if n != 7]
+
+
+def test_a_recording_is_not_played_twice_into_a_store(tmp_path):
+    """It was: 20 epochs became 40, and the standard deviations of a study 1.4 times too small."""
+    recording = make_recording(tmp_path / "small", 20)
+    run = ["run", "--recording", recording, "--fast", "--store", tmp_path / "t.db"]
+    assert call(*run, "--epochs", "8", folder=tmp_path).returncode == 0  # interrupted
+    assert call(*run, folder=tmp_path).returncode == 0
+    assert stored_numbers(tmp_path / "t.db") == list(range(1, 21))
+    with Store.open(tmp_path / "t.db") as store:
+        times = store.series_columns(store.find_series(), ["frame_time"])["frame_time"]
+    assert (np.diff(times) > 0).all()
+    again = call(*run, folder=tmp_path)
+    assert again.returncode == 1
+    assert "choose another --store to play it again" in again.stderr
+    assert stored_numbers(tmp_path / "t.db") == list(range(1, 21))
 
 
 def test_what_waits_at_the_end_for_a_store_that_is_away_is_lost(guard, path):  # noqa: F811

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import subprocess
 import sys
@@ -142,6 +143,40 @@ def test_a_port_in_use_is_one_error_and_the_daemon_goes_on(daemon, measured):
             lambda: "cannot be used" in daemon.status().get("dashboard", {}).get("why", "")
         )
         assert daemon.stop() == 0
+
+
+def test_the_page_follows_the_configuration_and_ends_with_a_killed_daemon(daemon, measured):
+    """A port changed by SIGHUP was ignored; a killed daemon's page kept the port for itself."""
+    ports = free_port(), free_port()
+
+    def serves(port: int) -> bool:
+        with socket.socket() as channel:
+            return channel.connect_ex(("127.0.0.1", port)) == 0
+
+    daemon.configure(**measured, dashboard={"enabled": True, "port": ports[0]})
+    daemon.start(INVOCATION_ID="")
+    daemon.until(lambda: serves(ports[0]))
+    daemon.configure(**measured, dashboard={"enabled": True, "port": ports[1]})
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: serves(ports[1]))
+    assert not serves(ports[0])
+    daemon.kill()
+    daemon.start(INVOCATION_ID="")
+    daemon.until(lambda: daemon.log().count(f"127.0.0.1:{ports[1]}/") == 2)
+    daemon.configure(**measured)
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: not serves(ports[1]))
+    assert daemon.status()["dashboard"]["why"] == ""
+    assert daemon.stop() == 0
+    # what the command line demands stays demanded
+    daemon.configure(**measured, dashboard={"port": ports[0]}, store={"path": "other.db"})
+    daemon.start("--dashboard", "--store", str(daemon.store), INVOCATION_ID="")
+    daemon.until(lambda: serves(ports[0]))
+    daemon.configure(**measured, dashboard={"port": ports[1]}, store={"path": "other.db"})
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: serves(ports[1]))
+    assert daemon.stop() == 0
+    assert "takes effect after a restart" not in daemon.log()
 
 
 def test_under_systemd_the_page_is_not_the_daemons_child(daemon, measured):

@@ -200,6 +200,28 @@ def test_a_programme_heats_during_the_session_and_not_after_it(daemon, devices, 
     assert daemon.stop() == 0
 
 
+def test_a_heater_that_reached_its_limit_is_not_started_again_by_a_session(daemon, devices):
+    """Each session began with a new output, which had forgotten the limit."""
+    pytest.importorskip("gpiozero")
+    sections = devices(period_s=0.3, name="phone-1", series=None)
+    steps = [{"seconds": 600, "hold_c": 20}]
+    sections["outputs"] = [{"name": "lamp", "driver": "relay", "pin": 17, "limit_c": 24,
+                            "programme": steps}]  # fmt: skip
+    daemon.configure(**sections)
+    daemon.start(GPIOZERO_PIN_FACTORY="mock")
+    folder = daemon.store.with_name(daemon.store.name + ".live")
+    daemon.until(lambda: ask(folder, "session status") is not None)
+    started = ask(folder, "session start", session={**SESSION, "programme": steps, "epochs": 200})
+    assert started["session"]["state"] == "checking"
+    daemon.until(lambda: daemon.status()["outputs"]["lamp"]["device"] == "failed")
+    ask(folder, "session stop", camera="phone-1")
+    with pytest.raises(DataError, match=r"lamp: .* reached the limit"):
+        ask(folder, "session start", session={**SESSION, "series": "M8", "programme": steps})
+    daemon.until(lambda: "reached the limit" in str(daemon.status()["warnings"]))
+    assert daemon.stop() == 0
+    assert daemon.events().count("device_failed") == 1
+
+
 @pytest.mark.slow
 def test_a_daemon_stops_heating_when_the_effects_are_separated(daemon, devices, live):
     """The command plans and watches, the daemon takes the epochs; see also `test_closed_loop`."""
@@ -248,6 +270,22 @@ def test_reload_leaves_a_session_alone(live, daemon):
     assert "the configuration was read again" in daemon.log()
     assert daemon.stop() == 0
     assert series_of(daemon.store)["M7"][1] == list(range(1, 13))
+
+
+def test_a_session_whose_camera_is_gone_has_the_epochs_that_it_took(live, daemon):
+    """It was "0 of 40 epochs, stopped"."""
+    live()
+    daemon.ask("session start", session={**SESSION, "epochs": 40, "check": False})
+    daemon.until(lambda: daemon.session().get("taken", 0) >= 2)
+    document = yaml.safe_load(daemon.config.read_text())
+    document["cameras"][0]["name"] = "phone-2"
+    daemon.config.write_text(yaml.safe_dump(document))
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: daemon.session().get("state") == "stopped")
+    session = daemon.session()
+    assert "there are: phone-2" in session["why"]
+    assert daemon.stop() == 0
+    assert series_of(daemon.store)["M7"][1] == list(range(1, session["taken"] + 1))
 
 
 def test_a_programme_is_taken_up_where_it_was():

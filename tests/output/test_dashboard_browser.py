@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.output.test_pages import _WIDER, keep
+from thermocald.daemon.live_state import status_warnings
 from thermocald.epoch import Epoch
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
@@ -84,7 +85,11 @@ def page_with(tmp_path):
         server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         servers.append(server)
         assert "the page is at" in server.stderr.readline()
-        start = lambda: (live / "status.json").write_text(json.dumps(status))  # noqa: E731
+
+        def start() -> None:
+            document = {**status, "warnings": status_warnings(status)}
+            (live / "status.json").write_text(json.dumps(document))
+
         return f"http://127.0.0.1:{port}/", start
 
     yield serve
@@ -135,7 +140,23 @@ def test_the_chosen_camera_rules_the_whole_page(cameras, page_with, page_of):
     assert page.evaluate(_SHOWN) == _all_of(int(wanted[-2:]))
     assert "out since 2020-09-13 12:26:40 UTC: no broker" in page.text_content("#devices")
     warned = "2 epochs lost, taken but not stored: the disk was full"
-    assert page.text_content("#warnings") == warned
+    assert page.text_content("#warnings") == f"{warned}\noutput mqtt: no broker"
+    assert "ready; every 10 s" in page.text_content("#devices")  # of every camera, not one alone
+
+
+def test_the_page_of_a_silent_daemon_says_so_and_its_times_are_utc(page_with, page_of):
+    """A killed daemon's page said "live" for ever; the curves were drawn in local time."""
+    url, start = page_with(2)
+    start()
+    page = page_of(url, timezone_id="Asia/Tokyo")
+    page.wait_for_function(_SETTLED, arg=_name(1))  # always the first camera
+    assert page.text_content("#connection") == "live"
+    first = page.evaluate("document.querySelector('#course').data[0].x[0]")
+    assert first == "2020-09-13T12:26:50.000"
+    page.wait_for_function(
+        "() => document.querySelector('#state').textContent.startsWith("
+        "'the daemon has not answered since 2020-09-13 12:26:40 UTC')"
+    )
 
 
 @pytest.mark.slow

@@ -105,6 +105,7 @@ def test_a_later_calibration_replaces_what_is_read_but_not_what_is_kept(filled, 
     store.amend(series, 21, make_result(21))
     store.amend(series, 4, make_result(400))
     store.amend(series, 4, make_result(401))
+    assert store.examine().epochs == store.last_epoch(series)  # a later calibration is no epoch
     columns = store.series_columns(series, ["c", "status", "temperature", "blur"])
     assert columns["c"][[3, 20]].tolist() == [make_result(i).values[0] for i in (401, 21)]
     assert (columns["status"][-1], columns["temperature"][-1]) == ("ok", 30.0)

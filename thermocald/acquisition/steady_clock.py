@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from thermocald.hal import Clock, SystemClock, read_together
 from thermocald.machine import NOT_BEFORE, machine_clock_trusted
+from thermocald.numbers import duration
 
 if TYPE_CHECKING:
     import threading
@@ -98,7 +99,8 @@ class SteadyClock:
         else:
             return None
         where = "forwards" if step > 0 else "back"
-        text = f"the clock was set {where} by {abs(step):.1f} s; {then}"
+        size = duration(abs(step)) if abs(step) >= _LEAP_S else f"{abs(step):.1f} s"
+        text = f"the clock was set {where} by {size}; {then}"
         log.warning(text, extra={"event": "clock_step"})
         return ClockStep(self.utc(), step, adopted, text)
 

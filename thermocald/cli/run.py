@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -34,6 +34,9 @@ from thermocald.cli.common import (
 from thermocald.errors import DataError, DeviceError, StoreError, UsageError
 from thermocald.names import WITH_VALUES
 from thermocald.numbers import counted, duration, with_sd
+
+if TYPE_CHECKING:
+    from thermocald.config import Config
 
 
 def run(
@@ -55,7 +58,7 @@ def run(
     Example: thermocald run --config config.yaml
     """
     from thermocald.config import load_config
-    from thermocald.daemon.plan import mock_config, recording_config
+    from thermocald.daemon.plan import mock_config, played_until, recording_config
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
     from thermocald.hal import option_names
@@ -66,24 +69,30 @@ def run(
         config = require_config(config, "one of --config FILE, --mock, --recording FOLDER")
     if fast and recording is None:
         raise UsageError("--fast is for --recording: devices have their own pace")
+
+    def with_options(read: Config) -> Config:
+        page = {"enabled": True} if dashboard else {}
+        place = {} if store is None else {"path": store.absolute()}
+        return read.model_copy(
+            update={
+                "store": read.store.model_copy(update=place),
+                "dashboard": read.dashboard.model_copy(update=page),
+            }
+        )
+
     if config is not None:
         read = load_config(config, option_names)
     elif recording is not None:
-        read = recording_config(recording)
+        # what the store has already is not played into it twice
+        after = played_until(with_options(recording_config(recording)))
+        read = recording_config(recording, after)
     else:
         read = mock_config()
-    if store is not None:
-        read = read.model_copy(
-            update={"store": read.store.model_copy(update={"path": store.absolute()})}
-        )
-    if dashboard:
-        read = read.model_copy(
-            update={"dashboard": read.dashboard.model_copy(update={"enabled": True})}
-        )
     set_up_logging(read.logging.level)
     service = Service(
-        read,
+        with_options(read),
         config,
+        with_options=with_options,
         fast=fast,
         epochs=epochs,
         until_finished=bool(epochs) or recording is not None,
@@ -308,6 +317,8 @@ _OLD_S = 10.0
 
 def status_lines(document: dict[str, Any]) -> list[str]:
     """Return a `thermocald-status/1` document as lines; the first is the headline."""
+    from thermocald.daemon.live_state import status_warnings
+
     lines = [_headline(document), ""]
     for name, camera in document["cameras"].items():
         lines += _camera(name, camera)
@@ -355,7 +366,7 @@ def _camera(name: str, camera: dict[str, Any]) -> list[str]:
             if change := (last.get("online") or {}).get("orientation"):
                 lines += _wrapped(f"  {change}")
         else:
-            lines += _wrapped(f"  {last.get('status', '')}: {last.get('reason', '')}")
+            lines += _wrapped(f"  {last.get('status', '')}: {last.get('reason', '')}".rstrip(": "))
     late = 1000 * camera["late_p99_s"]
     count = f"  {camera['lost']} lost, {camera['skipped']} skipped"
     return [*lines, f"{count}; 99 % at most {late:.0f} ms late", ""]
@@ -386,7 +397,7 @@ def _movement(last: dict[str, Any]) -> str:
 
 def _device(device: dict[str, Any]) -> str:
     shown = [
-        f"{value:.2f} °C" if name == "temperature" else f"{name.replace('_', ' ')} {value:.2f}"
+        f"{value:.2f} °C" if name == "temperature" else f"{name} {value:.2f} °C"
         for name, value in device.get("last", {}).items()
         if value is not None
     ]
@@ -394,37 +405,4 @@ def _device(device: dict[str, Any]) -> str:
     text: str = device["device"] + (f", {last}" if last else "")
     if device["faults"]:
         text += f", {counted(device['faults'], 'fault')}"
-    return text + (f": {device['why']}" if device["why"] else "")
-
-
-def status_warnings(document: dict[str, Any]) -> list[str]:
-    """Return the warnings of a status document, one sentence each."""
-    found = list(document["stalled"])
-    store = document["store"]
-    if store["state"] != "ok":
-        found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
-    if store["lost"]:
-        lost = counted(store["lost"], "epoch")
-        found.append(f"{lost} lost, taken but not stored: {store['lost_why']}")
-    if store.get("notice"):
-        found.append(f"store: {store['notice']}")
-    if document.get("dashboard", {}).get("why"):
-        found.append(document["dashboard"]["why"])
-    if document["frames"]["paused"]:
-        found.append(document["frames"]["paused"])
-    if not document["clock"]["trusted"]:
-        found.append("the clock is not synchronised: times may be wrong")
-    if not document["frames"].get("ages_known", True):
-        found.append("frames are not deleted for their age until the clock is synchronised")
-    for kind in ("camera", "thermometer", "output"):
-        for name, device in document[f"{kind}s"].items():
-            found += [f"{kind} {name}: {text}" for text in device.get("warnings", ())]
-    for name, camera in document["cameras"].items():
-        if camera["why"]:
-            found.append(f"camera {name}: {camera['why']}")
-        if camera["deferred"] > camera["caught_up"]:
-            found.append(
-                f"camera {name}: {camera['deferred'] - camera['caught_up']} epochs are still to be "
-                "calibrated"
-            )
-    return found
+    return text

@@ -116,7 +116,7 @@ def stop(camera: CameraOption = None, config: ConfigOption = None) -> None:
     """
     from thermocald.daemon.desk import only_camera
 
-    name = camera or only_camera(_configuration(config, False))
+    name = only_camera(_configuration(config, False), camera)
     one = _ask(config, "session stop", camera=name)["session"]
     say(f"{name}/{one['series']}: {one['taken']} of {one['epochs']} epochs, stopped")
 

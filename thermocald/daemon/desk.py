@@ -195,7 +195,9 @@ def only_camera(config: Config, camera: str | None = None) -> str:
     Raises UsageError if there is no such camera, or none is given and there are several.
     """
     names = [c.name for c in config.cameras]
-    there = ", ".join(names) or "none"
+    if not names:
+        raise UsageError("the configuration has no camera; add one under `cameras`")
+    there = ", ".join(names)
     if camera is None and len(names) != 1:
         raise UsageError(f"which camera? give --camera, one of: {there}")
     if camera is not None and camera not in names:
@@ -210,6 +212,7 @@ def session_of(
     """Return the requested session; raises UsageError or ConfigurationError."""
     from pydantic import ValidationError
 
+    from thermocald.config import in_words
     from thermocald.daemon.session import Session
     from thermocald.files import read_yaml
 
@@ -223,9 +226,7 @@ def session_of(
     try:
         return Session.model_validate(request)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"--{key}: {first['msg']}") from error
+        raise UsageError(f"--{in_words('', error)}") from error
 
 
 def listening_daemon(config: Config) -> Path | None:

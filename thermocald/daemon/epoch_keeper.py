@@ -150,6 +150,8 @@ class EpochKeeper:
             result = EpochResult("frame_not_kept", "calibration deferred, but no frame stored")
         epoch = replace(epoch, frame=path)
         values = result_row(self.plan, epoch, result, extra)
+        if deferred and result is None:
+            values["reason"] = "calibrated later, when there is time"
         stored = self._guard.append(Row(series, epoch, result, extra, acquired.clock_trusted))
         self.stored += stored
         self._on_kept(acquired, {**values, "stored": stored, "lost": self._guard.lost})

@@ -20,6 +20,7 @@ import numpy as np
 from thermocald.addresses import without_secrets
 from thermocald.errors import DataError
 from thermocald.files import overwrite_json, read_json
+from thermocald.numbers import counted
 from thermocald.result import jsonable
 
 if TYPE_CHECKING:
@@ -173,3 +174,39 @@ def running_status(path: Path) -> dict[str, Any]:
             f"the daemon that wrote {path} was killed {age_s:.0f} s ago; start it again"
         )
     return document
+
+
+def status_warnings(document: Mapping[str, Any]) -> list[str]:
+    """Return the warnings of a status document, one sentence each."""
+    found = list(document["stalled"])
+    store = document["store"]
+    if store["state"] == "results_only":
+        found.append("store: its disk is nearly full: results are stored, observations are not")
+    elif store["state"] != "ok":
+        found.append(f"store: {store['state']}: {store['why']} ({store['waiting']} epochs wait)")
+    if store["lost"]:
+        lost = counted(store["lost"], "epoch")
+        found.append(f"{lost} lost, taken but not stored: {store['lost_why']}")
+    if store.get("notice"):
+        found.append(f"store: {store['notice']}")
+    if document.get("dashboard", {}).get("why"):
+        found.append(document["dashboard"]["why"])
+    if document["frames"]["paused"]:
+        found.append(document["frames"]["paused"])
+    if not document["clock"]["trusted"]:
+        found.append("the clock is not synchronised: times may be wrong")
+    frames = document["frames"]
+    if frames.get("keep") != "none" and not frames.get("ages_known", True):
+        found.append("frames are not deleted for their age until the clock is synchronised")
+    for kind in ("camera", "thermometer", "output"):
+        for name, device in document[f"{kind}s"].items():
+            found += [f"{kind} {name}: {text}" for text in device.get("warnings", ())]
+            if device["why"]:
+                found.append(f"{kind} {name}: {device['why']}")
+    for name, camera in document["cameras"].items():
+        if camera["deferred"] > camera["caught_up"]:
+            found.append(
+                f"camera {name}: {camera['deferred'] - camera['caught_up']} epochs are still to be "
+                "calibrated"
+            )
+    return found

@@ -21,6 +21,7 @@ from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, S
 from thermocald.photogrammetry.epoch.adjustment import AdjustmentSettings
 from thermocald.photogrammetry.epoch.geometry import GeometryBounds
 from thermocald.photogrammetry.field.testfield import TestField
+from thermocald.store.database.store import Store
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import open_recording, read_testfield
 
@@ -247,18 +248,24 @@ def demo_config(folder: Path, seed: int) -> Config:
     return parse_config(config, Path("config.yaml"))
 
 
-def recording_config(path: Path) -> Config:
+def recording_config(path: Path, after: float | None = None) -> Config:
     """Return the configuration that plays a recording as camera and thermometer.
 
-    Raises RecordingError if it cannot be played.
+    after: s UTC, only later frames are played; None: all. Raises RecordingError if none can be.
     """
-    head = open_recording(path).head
+    recording = open_recording(path)
+    head = recording.head
+    if after is not None and not (recording.columns.frame_time > after).any():
+        raise RecordingError(
+            f"{path}: the store has epochs of this series up to its last frame or later; choose "
+            "another --store to play it again"
+        )
     try:
         require_columns({"recorded": head.channels}, ConfigurationError)
     except ConfigurationError as error:
         raise RecordingError(f"{path}: cannot be played: {error}") from error
     sensor = head.camera.sensor
-    replay = {"driver": "replay", "recording": str(path.absolute())}
+    replay = {"driver": "replay", "recording": str(path.absolute()), "after": after}
     period = max(0.05, head.interval)
     return parse_config(
         {
@@ -284,6 +291,17 @@ def recording_config(path: Path) -> Config:
         },
         Path("config.yaml"),
     )
+
+
+def played_until(config: Config) -> float | None:
+    """Return the time of the last epoch of a played recording in its store, s; None for none."""
+    path, wanted = config.store.path, (config.cameras[0].name, config.cameras[0].series)
+    if not path.exists() or not path.stat().st_size:
+        return None
+    with Store.open(path) as store:
+        found = [s for s in store.all_series() if (s.camera, s.name) == wanted]
+        times = [store.series_columns(s, ["frame_time"])["frame_time"] for s in found]
+    return max((float(t.max()) for t in times if len(t)), default=None)
 
 
 def _name(text: str) -> str:

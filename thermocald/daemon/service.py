@@ -27,14 +27,14 @@ from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.config import load_config
 from thermocald.daemon.camera_line import Runtime
 from thermocald.daemon.control import ControlSocket
-from thermocald.daemon.live_state import LiveState
+from thermocald.daemon.live_state import LiveState, status_warnings
 from thermocald.daemon.session import Sessions
 from thermocald.daemon.station import Station
 from thermocald.daemon.store_guard import StoreGuard
 from thermocald.daemon.systemd import notify, watchdog_interval_s
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.hal import option_names
-from thermocald.names import WITH_VALUES
+from thermocald.names import PAGE_OF, WITH_VALUES
 from thermocald.numbers import counted
 from thermocald.store.series import Event
 
@@ -60,13 +60,17 @@ class DashboardProcess:
     def __init__(self, store: Path, live: Path) -> None:
         self._store = store.absolute()
         self._live = live.absolute()
+        self._config: DashboardConfig | None = None
         self._child: subprocess.Popen[bytes] | None = None
         self._next_at = 0.0
         self.why = ""  # why the wanted page does not run, else empty
 
     def ensure_running(self, config: DashboardConfig) -> None:
-        """Start the process if it does not run, at most every 10 s."""
-        if self.why == _REFUSED or os.environ.get("INVOCATION_ID"):
+        """Start the process if it is wanted and does not run, at most every 10 s."""
+        if config != self._config:
+            self.stop()
+            self._config, self._child, self._next_at, self.why = config, None, 0.0, ""
+        if not config.enabled or self.why == _REFUSED or os.environ.get("INVOCATION_ID"):
             return
         child = self._child
         if child is not None and child.poll() == _WRONG_CONFIGURATION:
@@ -87,6 +91,7 @@ class DashboardProcess:
         if config.token_file is not None:
             command += ["--token-file", str(config.token_file)]
         environment = {k: v for k, v in os.environ.items() if k not in _PRIVATE}
+        environment[PAGE_OF] = str(os.getpid())
         try:
             # a process group of its own: Ctrl-C stops the daemon, which then stops the page
             self._child = subprocess.Popen(command, env=environment, process_group=0)
@@ -118,7 +123,8 @@ _SWITCH_INTERVAL_S = 0.0005  # of threads: a tick must not wait 5 ms for a calcu
 class Service:
     """A daemon in this process.
 
-    path: the configuration file, which SIGHUP reloads; until_finished: stop when all recordings
+    path: the configuration file, which SIGHUP reloads; with_options: changes what is read there as
+    the command line demands; until_finished: stop when all recordings
     have been played or all epochs taken, instead of serving requests at the control socket;
     on_turn: called in every turn, stops the service by returning True; clock: a virtual clock, on
     which rendered devices take no time. For the other arguments see `Runtime`.
@@ -129,6 +135,7 @@ class Service:
         config: Config,
         path: Path | None = None,
         *,
+        with_options: Callable[[Config], Config] = lambda config: config,
         fast: bool = False,
         epochs: int = 0,
         until_finished: bool = False,
@@ -142,6 +149,7 @@ class Service:
         self.clock = SteadyClock(clock, synchronised=trusted)
         self.live = LiveState.beside(config.store.path)
         self._path = path
+        self._with_options = with_options
         self._options: dict[str, Any] = {
             "fast": fast or clock is not None,
             "virtual": clock is not None,
@@ -151,7 +159,7 @@ class Service:
         }
         self._until_finished = until_finished
         self._on_turn = on_turn
-        self._started = self.clock.utc()
+        self._started = self.clock.monotonic()
         self._wake = threading.Event()
         self._end = False
         self._reload = False
@@ -228,8 +236,7 @@ class Service:
                 self._guard.event(Event(step.utc, "clock_step", step.text, data=data))
                 if step.adopted:
                     self._station.frames.restamp(step.seconds)
-            if self.config.dashboard.enabled:
-                self._dashboard.ensure_running(self.config.dashboard)
+            self._dashboard.ensure_running(self.config.dashboard)
             stalled = self._station.stalled()
             self._report_stalled(stalled)
             if interval is not None and not stalled and now - fed >= min(interval, 1.0):
@@ -247,10 +254,10 @@ class Service:
 
     def status(self) -> dict[str, Any]:
         """Return the document that `thermocald status` prints."""
-        return {
+        document = {
             "version": __version__,
             "pid": os.getpid(),
-            "started": self._started,
+            "started": self.clock.utc() - self.clock.monotonic() + self._started,
             "utc": self.clock.utc(),
             "configuration": None if self._path is None else str(self._path.absolute()),
             "clock": {"trusted": self.clock.trusted(), "error_s": self.clock.error_s},
@@ -260,6 +267,7 @@ class Service:
             "dashboard": {"enabled": self.config.dashboard.enabled, "why": self._dashboard.why},
             **self._station.status(),
         }
+        return {**document, "warnings": status_warnings(document)}
 
     def _ask(self, request: Request) -> dict[str, Any]:
         """Pass a request from the control socket's thread to the service's; return the answer."""
@@ -334,7 +342,9 @@ class Service:
 
     def _apply_configuration(self) -> str:
         """Read the configuration again and apply it; return the result in words."""
-        config = self.config if self._path is None else load_config(self._path, option_names)
+        config = self.config
+        if self._path is not None:
+            config = self._with_options(load_config(self._path, option_names))
         if config.store != self.config.store:
             log.warning("store: a change takes effect after a restart; the old store is still used")
             config = config.model_copy(update={"store": self.config.store})

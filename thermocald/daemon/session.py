@@ -152,7 +152,9 @@ class Sessions:
                     raise DataError(
                         f"series {other.session.series!r} uses the heating; wait until it ends"
                     )
-            self.station.heaters(session.steps(0.0))  # raises for wrong steps
+            for i in self.station.heaters(session.steps(0.0)):  # raises for wrong steps
+                if (link := self.station.outputs[i].link).state == "failed":
+                    raise DataError(f"output {link.name}: {link.why}")
         active = _Progress(session, "checking")
         if session.check:
             self._check(active)
@@ -239,6 +241,9 @@ class Sessions:
                 line.take(line.plan.config.series)
             if session.programme:
                 self.station.heat(_NO_HEAT)
+            stored = self._guard.find(session.camera, session.series)
+            if not active.taken and stored is not None:
+                active.taken = self._guard.last_epoch(stored)
         except ThermocaldError as error:
             log.error("camera %s: %s", session.camera, error)
         kind = "session_refused" if state == "refused" else "session_ended"

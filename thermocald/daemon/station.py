@@ -139,8 +139,13 @@ class Station:
         return found
 
     def heat(self, programme: Sequence[Mapping[str, Any]]) -> None:
-        """Start another programme on the heating outputs; raises as `heaters` does."""
+        """Start another programme on the heating outputs; raises as `heaters` does.
+
+        An output that failed stays as it is: one that reached its limit stays off.
+        """
         for i, output in self.heaters(programme).items():
+            if self.outputs[i].link.state == "failed":
+                continue
             old, self.outputs[i] = self.outputs[i], output
             if self._started:
                 old.stop(2.0)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermocald.figures import BAND, PALETTE, Figure, drawing_style, label_axes, new_drawing
 from thermocald.fleet.overview import add_findings, camera_types, read_overview
-from thermocald.numbers import parameter_label, percent, short_duration, shortened
+from thermocald.numbers import counted, parameter_label, percent, short_duration, shortened
 from thermocald.report import Answer, Chapter, Section, Table
 from thermocald.result import document_of
 from thermocald.store.server.connection import ServerAddress
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # kind of a finding → words for one camera, for several, and what to do
 _FINDINGS = {
-    "late": ("late", "late", "Late stations: check their power and network."),
+    "late": ("late", "late", "Late: check the power and network of the station, or its daemon."),
     "sensor": ("dead sensor", "with a dead sensor",
                "Dead sensors: replace the thermometer; frames are still taken."),
     "calibrate": ("needs calibration", "in need of calibration",
@@ -81,8 +81,7 @@ def fleet_lines(document: dict[str, Any]) -> list[str]:
     if not cameras:
         return ["no epochs there yet; stations send theirs with `thermocald forward`"]
     summary = document["summary"]
-    head = f"{summary['cameras']} cameras at {summary['stations']} stations: "
-    head = ", ".join([f"{head}{summary['sound']} without findings", *_counts(summary)])
+    head = ", ".join([f"{_title(summary)}: {summary['sound']} without findings", *_counts(summary)])
     lines = textwrap.wrap(head, _WIDTH)
     shown = [c for c in cameras if c["findings"]]
     shown += [c for c in cameras if not c["findings"]][:_MOST_WITHOUT]
@@ -109,6 +108,10 @@ def fleet_lines(document: dict[str, Any]) -> list[str]:
             subsequent_indent="  ",
         )
     return lines
+
+
+def _title(summary: Mapping[str, int]) -> str:
+    return f"{counted(summary['cameras'], 'camera')} at {counted(summary['stations'], 'station')}"
 
 
 def _counts(summary: Mapping[str, int]) -> list[str]:
@@ -149,7 +152,7 @@ def render_fleet(document: Mapping[str, Any]) -> str:
         for number, kind in enumerate(document["types"])
     ]
     proof = drawn[0][1].pop(0) if drawn and drawn[0][1] else None
-    title = f"{summary['cameras']} cameras at {summary['stations']} stations"
+    title = _title(summary)
     answer = Answer(
         f"{summary['sound']} of {summary['cameras']} cameras have no finding"
         + (f"; {', '.join(counts)}." if counts else "."),

@@ -45,7 +45,7 @@ class Equilibrium:
     def sentence(self) -> str:
         """The state as a sentence."""
         if self.state == "unknown":
-            return "not known yet"
+            return "not known yet whether it drifts"
         if self.state == "ready":
             return f"ready: {_two_digits(self.drift, self.sd_drift)} px/min"
         text = f"drifting {_two_digits(self.drift, self.sd_drift)} px/min"

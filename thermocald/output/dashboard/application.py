@@ -131,7 +131,7 @@ _HEADERS = {
 _PLOTLY = "package_data/plotly.min.js"
 _COOKIE = "thermocald_token"
 _STREAM_EVERY_S = 0.5
-_ALIVE_EVERY = 30
+_ALIVE_EVERY = 22
 _NAME_LENGTH = 64
 
 
@@ -290,13 +290,11 @@ async def _stream(request: Request) -> Response:
             ends = request.app.state.ends()
             changed = view.changed()
             silent += 1
-            if changed != seen:
+            # the same status again, too: its age tells that the daemon was killed
+            if changed != seen or silent >= _ALIVE_EVERY:
                 seen, silent = changed, 0
                 document = await asyncio.to_thread(view.shown)
                 yield f"data: {json.dumps(document)}\n\n"
-            elif silent >= _ALIVE_EVERY:
-                silent = 0
-                yield ": still here\n\n"
             if not ends:
                 await asyncio.sleep(_STREAM_EVERY_S)
 

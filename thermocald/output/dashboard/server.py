@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import os
 import socket
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from starlette.responses import JSONResponse
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from thermocald.errors import ConfigurationError, ThermocaldError
+from thermocald.names import PAGE_OF
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -75,8 +77,13 @@ def run_server(application: Starlette, listening: socket.socket) -> None:
 class _Server(uvicorn.Server):
     """A server that, when it stops, closes the connections of clients still reading an answer.
 
-    Cancelling their requests instead would put a traceback into the journal.
+    Cancelling their requests instead would put a traceback into the journal. It also stops when
+    the daemon that started it was killed: the port is free for the next daemon's page.
     """
+
+    async def on_tick(self, counter: int) -> bool:
+        self.should_exit |= os.environ.get(PAGE_OF, str(os.getppid())) != str(os.getppid())
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         hang_up = asyncio.get_running_loop().call_later(_END_S, self._hang_up)

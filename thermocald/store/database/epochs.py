@@ -456,17 +456,19 @@ def examine(connection: sqlite3.Connection) -> Examination:
         for (verdict,) in connection.execute("PRAGMA integrity_check(20)")
         if verdict != "ok"
     ]
-    epochs = 0
     cameras = dict(connection.execute("SELECT id, camera || '/' || name FROM series"))
     for table in KEPT:
         for row in whole_rows(connection, table, "NOT INDEXED ORDER BY id"):
-            epochs += table == "epoch"
             if row["damage"] and table == "epoch":
                 series = row["series_id"]
                 damaged.append(f"{cameras.get(series, f'series {series}')}, epoch {row['number']}")
             elif row["damage"]:
                 damaged.append(row["damage"].partition(":")[0])
     damaged += checked_chunks(connection)
+    # a later calibration of an epoch is another row of it
+    (epochs,) = connection.execute(
+        "SELECT count(*) FROM (SELECT DISTINCT series_id, number FROM epoch)"
+    ).fetchone()
     (orphans,) = connection.execute(
         "SELECT count(DISTINCT id / 1024) FROM detail "
         "WHERE id / 1024 NOT IN (SELECT id FROM epoch NOT INDEXED)"

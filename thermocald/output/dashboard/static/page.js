@@ -48,11 +48,9 @@ function show(document_) {
   if (document_.pid) lastUtc = document_.utc;
   status = document_;
   fillCameras();
-  const old = status.age_s > 10;
-  $("connection").textContent = !status.pid ? ended() :
-    old ? `the daemon has not answered for ${fixed(status.age_s, 0)} s` : "live";
-  if (!status.pid) $("state").textContent = `${ended()}; stored data are shown below`;
   showCamera((status.cameras || {})[chosen()]);
+  connected(!status.pid ? ended() : status.age_s > 10 ?
+    `the daemon has not answered since ${time(status.utc)} UTC` : "live");
   showDevices();
   showWarnings();
   if (status.pid) {
@@ -61,6 +59,13 @@ function show(document_) {
   }
   if (Date.now() - courseAt > COURSE_EVERY_MS) refreshCourse();
   if (Date.now() - eventsAt > COURSE_EVERY_MS) refreshEvents();
+}
+
+function connected(text) {
+  $("connection").textContent = text;
+  if (text === "live") return;
+  $("state").textContent = `${text}; stored data are shown below`;
+  $("state").className = status.pid ? "failed" : "";
 }
 
 function ended() {
@@ -76,26 +81,33 @@ function fillCameras() {
   if (names.length) options($("camera"), [...new Set(names)]);
 }
 
+// What a camera does now, in words, and its class of CSS.
+function verdict(camera, last) {
+  if (["out", "failed", "hung"].includes(camera.device)) return [`${camera.device}: ${camera.why || "it does not answer"}`, "failed"];
+  if (last.epoch === undefined) return [camera.series === "" ? "idle" : "no epoch yet", ""];
+  if (["ok", "predicted", "resected", "last_pose"].includes(last.status)) return [last.online?.sentence || last.state, last.state];
+  return [last.status.replaceAll("_", " ") + (last.reason ? `: ${last.reason}` : ""),
+    last.status === "not_calibrated" ? "drifting" : "failed"];
+}
+
 function showCamera(camera) {
-  const last = camera && camera.last;
-  if (!last || last.epoch === undefined) {
-    rows("figures", []);
-    if (status.pid) { $("state").textContent = "no epoch yet"; $("state").className = ""; }
-    return;
-  }
-  const online = last.online || {}, good = ["ok", "predicted", "resected", "last_pose"].includes(last.status);
-  const state = $("state");
-  state.className = good ? last.state : "failed";
-  state.textContent = good ? (online.sentence || last.state) : `${last.status}: ${last.reason}`;
+  const last = (camera && camera.last) || {}, online = last.online || {};
+  const [text, className] = verdict(camera || {}, last);
+  if ($("state").textContent !== text) $("state").textContent = text;
+  $("state").className = className;
+  if (last.epoch === undefined) { rows("figures", []); return; }
   const figures = [["Epoch", String(last.epoch), time(last.frame_time) + " UTC"],
     ["Temperature", measured(last.temperature, 2, "°C"), ""]];
   for (const [name, label] of [["c", "c"], ["x0", "x₀"], ["y0", "y₀"]]) {
     const sd = online["sd_" + name] ?? last["sd_" + name];
     figures.push([label, measured(online[name] ?? last[name], 5, "mm"),
-      sd ? `± ${fixed(sd, 5)}; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : ""]);
+      (sd ? `± ${fixed(sd, 5)}` : "") + (sd && last["sd_" + name] ?
+        `; this epoch alone ${fixed(last[name], 5)} ± ${fixed(last["sd_" + name], 5)}` : "")]);
   }
   figures.push(["σ₀", fixed(last.sigma0, 3), `${counted(last.n_observations, "target")}, ${last.n_rejected} rejected`]);
   if (online.orientation) figures.push(["Camera", online.orientation, ""]);
+  const session = (status.sessions || {})[chosen()];
+  if (session) figures.push(["Session", `${session.series}: ${session.taken} of ${session.epochs} epochs, ${session.state}`, session.why]);
   rows("figures", figures.flatMap(([name, value, more]) => {
     const dd = element("dd", value + " ");
     dd.append(element("small", more));
@@ -116,19 +128,18 @@ async function showFrame(name) {
   (targets.x || []).forEach((x, i) => {
     const y = targets.y[i], dot = document.createElementNS(SVG, "circle");
     const colour = targets.rejected[i] ? "#ff5d52" : "#43d17c";
-    Object.entries({ cx: x, cy: y, r: width / 300, fill: "none", stroke: colour,
-      "stroke-width": width / 900 }).forEach(([k, v]) => dot.setAttribute(k, v));
+    Object.entries({ cx: x, cy: y, r: width / 200, stroke: colour }).forEach(([k, v]) => dot.setAttribute(k, v));
     parts.push(dot);
     if (targets.vx[i] === null) return;
     const line = document.createElementNS(SVG, "line");
     Object.entries({ x1: x, y1: y, x2: x + targets.vx[i] * RESIDUAL_SCALE,
-      y2: y + targets.vy[i] * RESIDUAL_SCALE, stroke: "#ffc53d", "stroke-width": width / 700 })
+      y2: y + targets.vy[i] * RESIDUAL_SCALE, stroke: "#ffc53d" })
       .forEach(([k, v]) => line.setAttribute(k, v));
     parts.push(line);
   });
   overlay.replaceChildren(...parts);
   const count = (targets.x || []).length, bad = (targets.rejected || []).filter(Boolean).length;
-  const text = `epoch ${epoch.row.epoch}: ${counted(count, "target")}, ${bad} rejected (red); residuals ×${RESIDUAL_SCALE}`;
+  const text = `epoch ${epoch.row.epoch}: ${counted(count, "target")}, ${bad} rejected (red); residuals ×${RESIDUAL_SCALE} (yellow)`;
   $("frame-caption").textContent = text;
   overlay.setAttribute("aria-label", text);
   const picture = await fetch(`api/cameras/${encodeURIComponent(name)}/frame`).catch(() => null);
@@ -146,15 +157,18 @@ function showDevices() {
   for (const kind of ["cameras", "thermometers", "outputs"]) {
     for (const [name, device] of Object.entries(status[kind] || {})) {
       const row = element("tr"), state = element("td");
-      const good = ["open", "finished"].includes(device.device);
-      state.append(element("span", device.device, good ? "ready" : "failed"),
+      const idle = device.device === "closed" && device.series === "";
+      const good = idle || ["open", "finished"].includes(device.device);
+      state.append(element("span", idle ? "idle" : device.device, good ? "ready" : "failed"),
         (device.since ? ` since ${time(device.since)} UTC` : "") + (device.why ? `: ${device.why}` : ""));
-      const rhythm = kind === "cameras" ?
-        `every ${device.period_s} s, 99 % at most ${fixed(1000 * device.late_p99_s, 0)} ms late, ` +
-        `${device.skipped} skipped, ${device.lost} lost, ${device.deferred - device.caught_up} to calibrate later` : "";
+      const now = kind !== "cameras" ? Object.entries(device.last || {})
+        .map(([channel, celsius]) => `${channel} ${measured(celsius, 2, "°C")}`).join(", ") :
+        (good && !idle ? `${verdict(device, device.last)[0]}; ` : "") + `every ${device.period_s} s, ` +
+        `99 % at most ${fixed(1000 * device.late_p99_s, 0)} ms late, ${device.skipped} skipped, ${device.lost} lost, ` +
+        `${device.deferred - device.caught_up} to calibrate later`;
       const first = element("th", name);
       first.scope = "row";
-      row.append(first, state, element("td", rhythm));
+      row.append(first, state, element("td", now));
       content.push(row);
     }
   }
@@ -162,14 +176,7 @@ function showDevices() {
 }
 
 function showWarnings() {
-  const found = [...(status.stalled || [])];
-  const store = status.store || { state: "ok" };
-  if (store.state !== "ok") found.push(`store: ${store.state}: ${store.why}`);
-  if (store.lost) found.push(`${counted(store.lost, "epoch")} lost, taken but not stored: ${store.lost_why}`);
-  if (store.notice) found.push(`store: ${store.notice}`);
-  if (status.frames && status.frames.paused) found.push(status.frames.paused);
-  if (status.clock && !status.clock.trusted) found.push("the clock is not synchronised: times may be wrong");
-  const text = found.join("\n");
+  const text = (status.warnings || []).join("\n");
   if ($("warnings").textContent !== text) $("warnings").textContent = text;
 }
 
@@ -193,6 +200,7 @@ async function refreshCourse() {
     if (course !== courses) return;
     fillCameras();
     options($("series"), series.filter((s) => s.camera === chosen()).map((s) => s.series).reverse());
+    for (const id of ["bar", "course"]) $(id).hidden = !$("series").value;
     if (!$("series").value) {
       $("course-note").textContent = "no epoch of this camera is stored yet";
       Plotly.purge("course");
@@ -204,18 +212,22 @@ async function refreshCourse() {
     if (span) query.set("last", span);
     const columns = await get(`api/columns?${query}`);
     if (course === courses) draw(columns, `${query.get("camera")}/${query.get("series")}`);
-  } catch (error) { if (course === courses) $("course-note").textContent = "not available yet"; }
+  } catch (error) { if (course === courses) $("course-note").textContent = "not available now"; }
 }
 
 function draw(columns, name) {
   const style = getComputedStyle(document.documentElement);
   const colour = (name) => style.getPropertyValue(name).trim();
-  const x = columns.frame_time.map((t) => new Date(t * 1000));
+  // an interruption is a gap; a Date would be drawn in local time
+  const t = columns.frame_time, steps = t.slice(1).map((v, k) => v - t[k]).sort((a, b) => a - b);
+  const longest = 4 * steps[steps.length >> 1];
+  const cut = (values) => values.flatMap((v, k) => k && t[k] - t[k - 1] > longest ? [null, v] : [v]);
+  const x = cut(t.map((v) => new Date(v * 1000).toISOString().slice(0, 23)));
   const traces = [], layout = {
-    margin: { l: 70, r: 15, t: 36, b: 40 }, colorway: PALETTE, showlegend: columns.channels.length > 1,
+    margin: { l: 70, r: 15, t: 36, b: 55 }, colorway: PALETTE, showlegend: columns.channels.length > 1,
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", uirevision: "same",
     font: { color: colour("--ink") }, legend: { orientation: "h", y: 1.04, x: 0 },
-    xaxis: { gridcolor: colour("--line"), anchor: "y5", nticks: innerWidth < 600 ? 4 : 10, tickangle: 0 }, hovermode: "x",
+    xaxis: { title: { text: "UTC" }, gridcolor: colour("--line"), anchor: "y5", nticks: innerWidth < 600 ? 4 : 10, tickangle: 0 }, hovermode: "x",
   };
   const panels = [[columns.channels, "°C"], [["c"], "c in mm"], [["x0"], "x₀ in mm"], [["y0"], "y₀ in mm"],
     [["sigma0"], "σ₀ (no unit)"]];
@@ -224,20 +236,27 @@ function draw(columns, name) {
     layout[i ? `yaxis${i + 1}` : "yaxis"] = { title: { text: title, standoff: 10 }, automargin: true, domain: [top - 0.18, top],
       gridcolor: colour("--line"), zeroline: false, tickformat: title.endsWith("mm") ? ".4f" : "" };
     for (const name of names) {
-      const y = columns[name], sd = columns["sd_" + name];
-      if (sd && sd.some((v) => v !== null)) {
-        traces.push({ x: [...x, ...[...x].reverse()], yaxis: axis, type: "scatter", mode: "none",
-          y: [...y.map((v, k) => v === null ? null : v + BAND * sd[k]),
-            ...y.map((v, k) => v === null ? null : v - BAND * sd[k]).reverse()],
-          fill: "toself", fillcolor: "rgba(0,114,178,.2)", hoverinfo: "skip", showlegend: false });
+      const y = cut(columns[name]), sd = columns["sd_" + name] && cut(columns["sd_" + name]);
+      if (sd) {
+        const above = [], band = { x: [], y: [] };  // one polygon for each run of results
+        [...y, null].forEach((v, k) => {
+          if (v !== null) { above.push(k); return; }
+          const below = [...above].reverse();
+          band.x.push(...[...above, ...below].map((n) => x[n]), null);
+          band.y.push(...above.map((n) => y[n] + BAND * sd[n]), ...below.map((n) => y[n] - BAND * sd[n]), null);
+          above.length = 0;
+        });
+        traces.push({ ...band, yaxis: axis, type: "scatter", mode: "lines", line: { width: 1, color: "rgba(0,114,178,.2)" }, fill: "toself",
+          fillcolor: "rgba(0,114,178,.2)", hoverinfo: "skip", showlegend: false });
       }
       const line = names.length > 1 ? { width: 1.5 } : { width: 1.5, color: PALETTE[0] };
-      traces.push({ x, y, yaxis: axis, name, type: "scatter", mode: "lines",
+      traces.push({ x, y, yaxis: axis, name, type: "scatter", marker: { size: 4 },
+        mode: x.length > 200 ? "lines" : "lines+markers", // a single epoch is a point
         showlegend: names.length > 1, line });
     }
   });
   Plotly.react("course", traces, layout, { responsive: true, displaylogo: false });
-  $("course-note").textContent = `${name}: ${columns.epochs} epochs` +
+  $("course-note").textContent = `${name}: ${counted(columns.epochs, "epoch")}` +
     (columns.per_point > 1 ? `, up to ${columns.per_point} averaged per point` : "") +
     "; bands: 95 % uncertainty of a single epoch";
 }
@@ -246,8 +265,9 @@ function listen() {
   const stream = new EventSource("api/stream");
   stream.onmessage = (message) => show(JSON.parse(message.data));
   stream.onerror = () => {
-    $("connection").textContent = status.pid ? "the page's server does not answer; trying again" :
-      `${ended()}; the page's server has stopped too`;
+    if (!courseAt) { refreshCourse(); refreshEvents(); }
+    connected(status.pid ? "the page's server does not answer; trying again" :
+      `${ended()}; the page's server has stopped too`);
   };
 }
 
@@ -267,6 +287,4 @@ addEventListener("afterprint", () => { if ($("course").data) refreshCourse(); })
 for (const look of ["(prefers-color-scheme: dark)", "(max-width: 600px)"]) {
   matchMedia(look).addEventListener("change", refreshCourse);
 }
-refreshCourse();
-refreshEvents();
-listen();
+listen(); // its first message, which names the cameras, fetches the rest

@@ -276,7 +276,8 @@ def wave(n: int = 60) -> np.ndarray:
 
 @pytest.mark.parametrize("value", [85.0, 127.94, 0.0, -40.0, -45.0, 125.0, 130.0, -46.85])
 def test_what_a_thermometer_gives_unmeasured_is_found(value):
-    for rows in ([0], [20], [20, 21], [59], [5, 30, 31, 32]):
+    runs, thirds = list(range(7, 30)), list(range(0, 60, 3))
+    for rows in ([0], [20], [20, 21], [59], [5, 30, 31, 32], runs, runs[:1] + runs[20:], thirds):
         values = wave()
         values[rows] = value
         assert [i for s in find_spikes(values) for i in range(s.first, s.stop)] == rows

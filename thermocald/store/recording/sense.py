@@ -136,22 +136,29 @@ def find_spikes(values: Array) -> list[Spike]:
     v = values[known]
     if len(v) < _AROUND + 1:
         return []
+    sham = np.isin(np.round(v, 2), np.round(_NOT_MEASURED, 2))
     steps = np.diff(v)
-    leap = max(_LEAP_K, 10.0 * float(np.median(np.abs(steps))))
+    usual = np.abs(np.diff(v[~sham])) if (~sham).sum() > 1 else np.zeros(1)
+    good = np.append(np.flatnonzero(~sham), len(v))
+    leap = max(_LEAP_K, 10.0 * float(np.median(usual)))
     found: list[Spike] = []
     # a spike begins where a leap ends, or with the first reading
     for first in [0, *(np.flatnonzero(np.abs(steps) > leap) + 1).tolist()]:
         if found and known[first] < found[-1].stop:
             continue
-        ends = np.flatnonzero(np.abs(steps[first : first + _LONGEST_SPIKE]) > leap)
-        if len(ends) == 0 and first + _LONGEST_SPIKE < len(v):
+        # a value given without a measurement may be repeated for any time
+        longest = max(int(good[np.searchsorted(good, first)]) - first, _LONGEST_SPIKE)
+        ends = np.flatnonzero(np.abs(steps[first : first + longest]) > leap)
+        if len(ends) == 0 and first + longest < len(v):
             continue
         stop = first + (int(ends[0]) + 1 if len(ends) else len(v) - first)
-        measured = not all(np.isclose(x, _NOT_MEASURED, atol=0.006).any() for x in v[first:stop])
+        measured = not sham[first:stop].all()
         inner = first > 0 and stop < len(v)
-        if stop - first > _LONGEST_SPIKE or (measured and not inner):
+        if stop - first > min(longest, len(v) - 1) or (measured and not inner):
             continue
         if inner:
+            if measured and sham[[first - 1, stop]].all():
+                continue
             away = min(abs(v[first] - v[first - 1]), abs(v[stop - 1] - v[stop]))
             if abs(v[stop] - v[first - 1]) > 0.5 * away:
                 continue

@@ -103,6 +103,15 @@ class Table:
             for name, found in parts.items()
         }
 
+    def numeric(self, names: Sequence[str]) -> list[str]:
+        """Return the columns that begin with numbers or are empty; they are read until it shows."""
+        kinds: dict[str, bool | None] = dict.fromkeys(names)
+        for chunk in self.chunks(columns=names) if names else ():
+            kinds |= {n: chunk.is_number(n) for n, kind in kinds.items() if kind is None}
+            if None not in kinds.values():
+                break
+        return [n for n, kind in kinds.items() if kind is not False]
+
     def check(
         self,
         name: str,
@@ -242,14 +251,14 @@ class Chunk:
         except KeyError:
             return np.array([index.get(word.strip(), -1) for word in words], dtype=np.int64)
 
-    def is_number(self, name: str) -> bool:
-        """Return whether the first 100 fields of a column are numbers or empty."""
+    def is_number(self, name: str) -> bool | None:
+        """Return whether the first 100 fields that are not empty are numbers; None without any."""
+        fields = list(islice(filter(str.strip, self.text(name)), 100))
         try:
-            for text in self.text(name)[:100]:
-                float(text or "nan")
+            list(map(float, fields))
         except ValueError:
             return False
-        return True
+        return True if fields else None
 
     def check(
         self, name: str, wrong: NDArray[np.bool_], message: Callable[[int], str] | str

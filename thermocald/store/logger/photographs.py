@@ -83,13 +83,19 @@ def find_photographs(paths: list[Path]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
-            found += sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
+            # macOS leaves ._IMG_1.jpg, which is no picture, beside IMG_1.jpg
+            found += sorted(
+                p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.name[0] != "."
+            )
         elif path.is_file():
             found.append(path)
         else:
             raise DataError(f"{path}: there is no such file or folder")
     if not found:
-        raise DataError(f"{paths[0]}: holds no photographs ({', '.join(sorted(SUFFIXES))})")
+        raise DataError(
+            f"{paths[0]}: holds no photographs ({', '.join(sorted(SUFFIXES))}); convert others, "
+            "such as HEIC, to JPEG"
+        )
     return list(dict.fromkeys(found))
 
 

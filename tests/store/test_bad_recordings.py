@@ -110,6 +110,12 @@ FILES = {
     "semicolons": (
         "epochs.csv", lambda path: path.write_text(path.read_text().replace(",", ";")),
         "separate the columns with commas"),
+    "tabs": (
+        "testfield.csv", lambda path: path.write_text(path.read_text().replace(",", "\t")),
+        "separate the columns with commas"),
+    "UTF-16": (
+        "testfield.csv", lambda path: path.write_text(path.read_text(), "utf-16"),
+        "testfield.csv: is not text in UTF-8; save it as CSV in UTF-8"),
     "another case": (
         "testfield.csv", lambda path: edit(path, "X,Y,Z", "x,y,z"), "is 'x' meant"),
     "half a last line": (

@@ -76,9 +76,7 @@ class Table:
                     yield Chunk(self, first, block)
                     first += len(block)
             except (csv.Error, UnicodeDecodeError, OSError) as cause:
-                raise self._error(
-                    f"{self.path}, line {reader.line_num}: is not readable as CSV: {cause}"
-                ) from cause
+                raise self._unreadable(reader.line_num, cause) from cause
 
     def read(
         self,
@@ -152,9 +150,7 @@ class Table:
                 file.seek(0)
                 header = next(filter(None, csv.reader(file, strict=True)), None)
             except (csv.Error, UnicodeDecodeError, OSError) as cause:
-                raise self._error(
-                    f"{self.path}, line 1: is not readable as CSV: {cause}"
-                ) from cause
+                raise self._unreadable(1, cause) from cause
         if header is None:
             raise self._error(f"{self.path}: is empty; the first line must name the columns")
         names = [name.strip() for name in header]
@@ -167,10 +163,15 @@ class Table:
                 raise self._error(f"{self.path}, line 1: column {name!r} is duplicated")
         return names
 
+    def _unreadable(self, line: int, cause: Exception) -> ThermocaldError:
+        if isinstance(cause, UnicodeDecodeError):
+            return self._error(f"{self.path}: is not text in UTF-8; save it as CSV in UTF-8")
+        return self._error(f"{self.path}, line {line}: is not readable as CSV: {cause}")
+
     def _missing(self, name: str) -> str:
         found = ", ".join(n if n.isprintable() else repr(n) for n in self.columns)
         hint = ""
-        if len(self.columns) == 1 and any(mark in found for mark in ";\t"):
+        if len(self.columns) == 1 and name in self.columns[0]:
             hint = "; separate the columns with commas and write decimals with a point"
         elif near := [c for c in self.columns if c.lower() == name.lower()]:
             hint = f"; is {near[0]!r} meant? Names are case-sensitive"

@@ -209,13 +209,13 @@ DOUBTS = {
         lambda p: head(p, "{name: rpi", "{name: a/rpi"), "no store accepts it"),
     "an hour as the interval": (
         lambda p: head(p, "interval: 10.0", "interval: 3600"), "every 10 s"),
-    "an epoch twice": (repeat_epoch, "1 epochs hold the image points of another one: epoch 18"),
+    "an epoch twice": (repeat_epoch, "1 epoch with the image points of another one: epoch 18"),
     "85.00 of a DS18B20": (
         lambda p: change(p, "epochs.csv", temperature=put("85.0", 12, 30, 31)),
-        "3 readings are what it gives without a measurement, the first 85 °C at reading 13"),
+        "3 readings given without a measurement, the first 85 °C at reading 13"),
     "zeros of a lost sensor": (
         lambda p: change(p, "epochs.csv", board_temperature=put("0.0", 12)),
-        "board_temperature: 1 readings are"),
+        "board_temperature: 1 reading given"),
     "a thermometer in another time zone": (
         lambda p: change(p, "epochs.csv", temperature_time=scaled(1, 3600)),
         "read 3600 s after their frames"),
@@ -229,7 +229,7 @@ DOUBTS = {
         "board_temperature: all 40 readings are 85 °C"),
     "°C, then °F": (lambda p: change(p, "epochs.csv", temperature=fahrenheit), "from °C to °F"),
     "a reading that leaps": (
-        lambda p: change(p, "epochs.csv", temperature=put("71.3", 12)), "leap away and back"),
+        lambda p: change(p, "epochs.csv", temperature=put("71.3", 12)), "leaping away and back"),
 }  # fmt: skip
 
 

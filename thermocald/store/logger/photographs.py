@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, DriverMissing, ImageError, UsageError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files import read_camera
 from thermocald.photogrammetry.field.testfield import TestField
@@ -195,8 +196,8 @@ def strange_photographs(paths: Sequence[Path]) -> list[str]:
     if copies := find_copies(there):
         copy, original = next(iter(copies.items()))
         found.append(
-            f"{len(copies)} frames are copies of another one, the first {there[copy].name} of "
-            f"{there[original].name}"
+            f"{counted(len(copies), 'frame')} copied from another one, the first "
+            f"{there[copy].name} from {there[original].name}"
         )
     known = []
     for path in there:
@@ -331,8 +332,8 @@ def read_series(
     if (same := np.flatnonzero(np.diff(times) == 0)).size:
         first, second = (p.path.name for p in placed[same[0] : same[0] + 2])
         notes.append(
-            f"doubtful: {len(same)} photographs have the time of another one, the first {first} "
-            f"and {second}: the order of their names is used"
+            f"doubtful: {counted(len(same), 'photograph')} with the time of another one, the first "
+            f"{first} and {second}: the order of their names is used"
         )
     logged = read_log(log, options, (float(times[0]), float(times[-1])))
     _require_overlap(times, logged.times)

@@ -187,7 +187,7 @@ def read_log(
     ]  # fmt: skip
     times, channels, repeated = _sort_by_time(times, channels)
     if repeated:
-        notes.append(f"log: {repeated} rows with the time of the row before: left out")
+        notes.append(f"log: {counted(repeated, 'row')} with the time of the row before: left out")
     return TemperatureLog(times, channels, tuple(notes))
 
 
@@ -261,13 +261,13 @@ class _Table:
         if self._untimed:
             line, text = self._untimed[0]
             notes.append(
-                f"log: {len(self._untimed)} rows hold no time: left out (line {line}: "
+                f"log: {counted(len(self._untimed), 'row')} without a time: left out (line {line}: "
                 f"{text[:30]!r})"
             )
         for name, words in self._words.items():
             if words:
                 shown = ", ".join(repr(word) for word, _ in words.most_common(3))
-                what = f"{words.total()} values of {name!r} are not readings ({shown})"
+                what = f"{counted(words.total(), 'value')} of {name!r} without a reading ({shown})"
                 notes.append(f"log: {what}: left empty")
         return notes
 
@@ -563,10 +563,10 @@ def _drop_unmeasured(
         if not found:
             continue
         first = found[0].first
-        why = "leap away and back" if sort else "are what a thermometer gives without a measurement"
+        why = "leaping away and back" if sort else "given without a measurement"
         notes.append(
-            f"doubtful: {sum(s.stop - s.first for s in found)} readings of {name!r} {why} (the "
-            f"first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
+            f"doubtful: {counted(sum(s.stop - s.first for s in found), 'reading')} of {name!r} "
+            f"{why} (the first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
         )
     for spike in spikes:
         if not spike.measured:

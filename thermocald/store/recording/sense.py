@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from thermocald.numbers import counted
 from thermocald.photogrammetry.field.testfield import ELSEWHERE, find_misplaced
 
 if TYPE_CHECKING:
@@ -218,10 +219,10 @@ def reading_doubts(values: Array, label: str) -> Iterator[str]:
         )
     if spikes := find_spikes(values):
         first = spikes[0]
-        why = "leap away and back" if first.measured else "are what it gives without a measurement"
+        why = "leaping away and back" if first.measured else "given without a measurement"
         yield (
-            f"{label}: {sum(s.stop - s.first for s in spikes)} readings {why}, the first "
-            f"{values[first.first]:g} °C at reading {first.first + 1}; leave them empty"
+            f"{label}: {counted(sum(s.stop - s.first for s in spikes), 'reading')} {why}, the "
+            f"first {values[first.first]:g} °C at reading {first.first + 1}; leave them empty"
         )
 
 

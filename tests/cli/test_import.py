@@ -250,6 +250,26 @@ def test_a_copy_of_a_photograph_is_left_out(place):
     assert "photographs: IMG_9.jpeg is a copy of 4.jpg: left out" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("taken", "words"),
+    [
+        (
+            ["2000:01:01 00:00:05"],
+            "1.jpg: was taken at 2026-06-14T10:00:10.250Z, years",
+        ),
+        (["2026:06:14 12:00:00"] * 6, "0.jpg: all photographs have its time"),
+    ],
+)
+def test_a_camera_whose_clock_was_not_set_writes_nothing(place, taken, words):
+    for i, moment in enumerate(taken):
+        path = place / "photos" / f"{i}.jpg"
+        photograph(path, moment)
+        path.write_bytes(path.read_bytes() + bytes([i]))  # not a copy
+    with pytest.raises(ThermocaldError, match=words):
+        run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert not (place / "M1").exists()
+
+
 def test_two_photographs_of_one_time_are_told(place):
     photograph(place / "photos" / "3a.jpg", "2026:06:14 12:00:30", "250", focal=(305, 100))
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))

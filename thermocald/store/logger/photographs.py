@@ -33,7 +33,7 @@ from thermocald.store.logger.clock import iso, parse_moment
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import EpochColumns, Recording
-from thermocald.store.recording.sense import doubt_lines, pitch_doubts
+from thermocald.store.recording.sense import doubt_lines, pitch_doubts, time_fault
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -329,6 +329,15 @@ def read_series(
     order = np.argsort(times, kind="stable")
     times = times[order]
     placed = tuple(named[i] for i in order.tolist())
+    if fault := time_fault(times):
+        raise DataError(
+            f"{placed[fault[0]].path}: was taken at {iso(times[fault[0]])}, years from the "
+            "photograph before: a clock that was not set? Correct the times, or leave some out"
+        )
+    if len(times) > 1 and np.ptp(times) == 0:
+        raise DataError(
+            f"{placed[0].path}: all photographs have its time; take them from other data (--times)"
+        )
     if (same := np.flatnonzero(np.diff(times) == 0)).size:
         first, second = (p.path.name for p in placed[same[0] : same[0] + 2])
         notes.append(

@@ -162,9 +162,12 @@ def test_photographs_that_do_not_belong_together_are_refused(place):
         run(*arguments(place, "--timezone", "Europe/Berlin"))
 
 
-def test_times_from_names(place):
+@pytest.mark.parametrize(
+    "name", ["IMG_20260614_12000{}", "2026-06-14 12.00.0{}", "PXL_20260614_10000{}000.MP"]
+)
+def test_times_from_names(place, name):
     for i in range(6):
-        (place / "photos" / f"{i}.jpg").rename(place / "photos" / f"IMG_20260614_12000{i}.jpg")
+        (place / "photos" / f"{i}.jpg").rename(place / "photos" / f"{name.format(i)}.jpg")
     run(*arguments(place, "--timezone", "Europe/Berlin", "--times", "name"))
     recording = read_recording(place / "M1")
     assert recording.columns.frame_time.tolist() == [START + i for i in range(6)]

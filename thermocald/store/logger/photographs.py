@@ -48,7 +48,10 @@ if TYPE_CHECKING:
 
 SOURCES = ("exif", "name", "file")
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
-_IN_NAME = re.compile(r"(\d{8})[_T-]?(\d{6})(?:[_.-]?(\d{3}))?")
+_IN_NAME = re.compile(
+    r"(\d{4})[-_.]?(\d\d)[-_.]?(\d\d)(?:[_T -]| at )?"
+    r"(\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?:[_.-]?(\d{3}))?"
+)
 _EXIF_IFD = 0x8769
 _TIME_TAGS = ((0x9003, 0x9291, 0x9011), (0x9004, 0x9292, 0x9012), (0x0132, 0x9290, 0x9010))
 """Tags of time, fraction of a second and zone: when taken, digitised, last changed."""
@@ -250,11 +253,13 @@ def _name_moment(path: Path) -> datetime:
     if found is None:
         raise DataError(f"{path}: no time in the name, as in IMG_20260614_120301.jpg")
     try:
-        moment = parse_moment(f"{found[1]}T{found[2]}" + (f".{found[3]}" if found[3] else ""))
+        *parts, fraction = found.groups(default="")
+        moment = parse_moment("{}-{}-{}T{}:{}:{}".format(*parts) + (fraction and f".{fraction}"))
     except ValueError as cause:
         raise DataError(f"{path}: the name: {cause}") from cause
     assert isinstance(moment, datetime)
-    return moment
+    # names by Google's phones are in UTC
+    return moment.replace(tzinfo=UTC) if path.name.startswith("PXL_") else moment
 
 
 def _camera(details: dict[int, Any]) -> str:

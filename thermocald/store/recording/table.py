@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 _MAX_EXACT_INTEGER = 2**53
 _MOST_COLUMNS = 1000
 _LONGEST_HEADER = 200_000
+_LEFT_EMPTY = "; leave the field empty if there is none"
 
 
 class Table:
@@ -232,7 +234,9 @@ class Chunk:
             wrong = ~np.isfinite(values)
         if wrong.any():
             row = int(np.argmax(wrong))
-            self.fail(row, name, f"{column[row]!r} is not a finite number")
+            self.fail(
+                row, name, f"{column[row]!r} is not a finite number" + _LEFT_EMPTY * empty_is_nan
+            )
         return values
 
     def integers(self, name: str) -> NDArray[np.int64]:
@@ -279,4 +283,9 @@ class Chunk:
         try:
             return float(text)
         except ValueError:
-            self.fail(row, name, f"{text[:40]!r} is not a number")
+            hint = _LEFT_EMPTY * empty_is_nan
+            if re.match(r"\d{4}-\d\d-\d\d", text):
+                hint = "; write seconds since 1970"
+            elif re.fullmatch(r"[+-]?\d+,\d+", text.strip()):
+                hint = "; write decimals with a point"
+            self.fail(row, name, f"{text[:40]!r} is not a number{hint}")

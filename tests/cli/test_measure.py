@@ -211,6 +211,15 @@ def test_what_is_doubtful_in_the_log_is_told_and_its_gaps_are_refused(tmp_path):
     assert "or in a gap of over ten of its intervals" in done.stderr
 
 
+def test_a_level_in_another_height_system_is_doubtful(tmp_path):
+    """Seen at the Geul: 92.36 m at its gauge is 138.27 m in the control points' heights."""
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    assert "heights" not in measured(tmp_path).stderr
+    (tmp_path / "water.yaml").write_text("level: 92.4\nsd: 0.005\n")
+    assert "water.yaml: is 47 m away from control points" in measured(tmp_path).stderr
+
+
 def changed(folder, change) -> str:
     """Standard error of `measure` after a change {column: text} of each row of gcp.csv."""
     write_model(folder / "model.yaml")

@@ -292,6 +292,8 @@ def test_what_a_thermometer_gives_unmeasured_is_found(value):
         np.r_[np.full(20, 20.0), 20.0 + 65.0 * (1 - np.exp(-np.arange(60) / 3.0))],  # a kettle
         np.linspace(20.0, 120.0, 60),  # through 85 °C
         np.full(40, 85.0),  # at 85 °C
+        np.r_[np.full(20, 78.0), np.full(20, 85.0), np.full(20, 77.0)],  # a processor's limit
+        np.r_[np.full(20, 6.0), np.full(30, 0.0)],  # melting snow
         np.r_[np.full(9, np.nan), wave(20)],
         np.full(9, np.nan),
         np.empty(0),

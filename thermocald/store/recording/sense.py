@@ -30,6 +30,7 @@ _NOT_MEASURED = (85.0, 127.9375, 127.94, 0.0, -40.0, -45.0, -46.85, 125.0, 130.0
 """°C that thermometers give without measuring: at power-on, unplugged, all zeros or ones."""
 _LEAP_K = 5.0  # more than a camera warms in one interval
 _LONGEST_SPIKE = 3  # readings
+_LEAP_OF_RUN_K = 15.0  # a processor stays at 85 °C, melting snow at 0 °C
 _AROUND = 3  # readings before and after a change of the unit
 _FEWEST = 20  # image points for a judgement on all
 _MOST_OUTSIDE = 0.02  # of the image points: gross errors are rarer
@@ -141,6 +142,7 @@ def find_spikes(values: Array) -> list[Spike]:
     steps = np.diff(v)
     usual = np.abs(np.diff(v[~sham])) if (~sham).sum() > 1 else np.zeros(1)
     good = np.append(np.flatnonzero(~sham), len(v))
+    jumps = np.concatenate([[np.inf], np.abs(steps), [np.inf]])  # before each reading
     leap = max(_LEAP_K, 10.0 * float(np.median(usual)))
     found: list[Spike] = []
     # a spike begins where a leap ends, or with the first reading
@@ -157,10 +159,12 @@ def find_spikes(values: Array) -> list[Spike]:
         inner = first > 0 and stop < len(v)
         if stop - first > min(longest, len(v) - 1) or (measured and not inner):
             continue
+        away = min(jumps[first], jumps[stop])
+        if stop - first > _LONGEST_SPIKE and away < _LEAP_OF_RUN_K:
+            continue
         if inner:
             if measured and sham[[first - 1, stop]].all():
                 continue
-            away = min(abs(v[first] - v[first - 1]), abs(v[stop - 1] - v[stop]))
             if abs(v[stop] - v[first - 1]) > 0.5 * away:
                 continue
         found.append(Spike(int(known[first]), int(known[stop - 1]) + 1, measured))

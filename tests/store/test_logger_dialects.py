@@ -119,3 +119,12 @@ def test_rows_before_the_clock_was_set_are_refused(tmp_path):
 def test_a_time_of_unknown_form_is_shown(tmp_path):
     with pytest.raises(DataError, match=r"as in 2026-06-14 12:00:00; .*'time': 13:55; 'T °C': 21"):
         read(tmp_path / "log.csv", ["time,T °C"], lambda m, t, i: f"{m:%H:%M},{t}")
+
+
+def test_the_minus_of_scandinavian_spreadsheets_is_one(tmp_path):
+    found = read(
+        tmp_path / "log.csv",
+        ["time;T °C"],
+        lambda m, t, i: f"{m:%Y-%m-%d %H:%M};−{t:.1f}".replace(".", ","),
+    )
+    assert found.channels["T"] == pytest.approx(-np.array(CELSIUS))

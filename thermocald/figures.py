@@ -312,7 +312,7 @@ def _fill(axis: Any, panel: Panel, *, legend: bool) -> int:
     label_axes(axis, panel.x_label, panel.y_label)
     names = {c.name for c in panel.curves if c.name}
     rows = legend_above(axis) if legend and len(names) > 1 else 0
-    most = 40 if panel.arrows is None else 18  # letters, beside the scale arrow
+    most = 28 if panel.arrows is None else 18  # letters, beside the scale arrow
     axis.set_title(shortened(panel.title, most), loc="left", pad=6 + 10 * rows)
     return rows
 

@@ -108,7 +108,7 @@ def test_the_photographs_settle_day_and_month_and_footers_are_passed_over(place)
         photograph(place / "photos" / f"{i}.jpg", f"2026:07:06 12:00:{10 * i:02d}")
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
     assert "'06/07/2026 12:00:00' is day/month: this puts the log near" in result.stderr
-    assert "1 rows hold no time: left out (line 4: 'Average')" in result.stderr
+    assert "1 row without a time: left out (line 4: 'Average')" in result.stderr
 
 
 def test_a_dry_run_shows_all_and_writes_nothing(place):
@@ -162,9 +162,12 @@ def test_photographs_that_do_not_belong_together_are_refused(place):
         run(*arguments(place, "--timezone", "Europe/Berlin"))
 
 
-def test_times_from_names(place):
+@pytest.mark.parametrize(
+    "name", ["IMG_20260614_12000{}", "2026-06-14 12.00.0{}", "PXL_20260614_10000{}000.MP"]
+)
+def test_times_from_names(place, name):
     for i in range(6):
-        (place / "photos" / f"{i}.jpg").rename(place / "photos" / f"IMG_20260614_12000{i}.jpg")
+        (place / "photos" / f"{i}.jpg").rename(place / "photos" / f"{name.format(i)}.jpg")
     run(*arguments(place, "--timezone", "Europe/Berlin", "--times", "name"))
     recording = read_recording(place / "M1")
     assert recording.columns.frame_time.tolist() == [START + i for i in range(6)]
@@ -250,10 +253,30 @@ def test_a_copy_of_a_photograph_is_left_out(place):
     assert "photographs: IMG_9.jpeg is a copy of 4.jpg: left out" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("taken", "words"),
+    [
+        (
+            ["2000:01:01 00:00:05"],
+            "1.jpg: was taken at 2026-06-14T10:00:10.250Z, years",
+        ),
+        (["2026:06:14 12:00:00"] * 6, "0.jpg: all photographs have its time"),
+    ],
+)
+def test_a_camera_whose_clock_was_not_set_writes_nothing(place, taken, words):
+    for i, moment in enumerate(taken):
+        path = place / "photos" / f"{i}.jpg"
+        photograph(path, moment)
+        path.write_bytes(path.read_bytes() + bytes([i]))  # not a copy
+    with pytest.raises(ThermocaldError, match=words):
+        run(*arguments(place, "--timezone", "Europe/Berlin"))
+    assert not (place / "M1").exists()
+
+
 def test_two_photographs_of_one_time_are_told(place):
     photograph(place / "photos" / "3a.jpg", "2026:06:14 12:00:30", "250", focal=(305, 100))
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert "doubtful: 1 photographs have the time of another one, the first 3.jpg and 3a.jpg" in (
+    assert "doubtful: 1 photograph with the time of another one, the first 3.jpg and 3a.jpg" in (
         result.stderr
     )
 
@@ -261,18 +284,18 @@ def test_two_photographs_of_one_time_are_told(place):
 @pytest.mark.parametrize(
     ("values", "left"),
     [
-        ([21.0, 21.1, 85.0, 21.2, 21.3, 21.4, 21.5, 21.6], "1 readings"),
-        ([85.0, 21.1, 21.1, 21.2, 21.3, 21.4, 21.5, 21.6], "1 readings"),
+        ([21.0, 21.1, 85.0, 21.2, 21.3, 21.4, 21.5, 21.6], "1 reading"),
+        ([85.0, 21.1, 21.1, 21.2, 21.3, 21.4, 21.5, 21.6], "1 reading"),
         ([21.0, 21.1, 21.1, 21.2, 85.0, 85.0, 21.5, 21.6], "2 readings"),
-        ([21.0, 21.1, 0.0, 21.2, 21.3, 21.4, 21.5, 21.6], "1 readings"),
-        ([21.0, 21.1, 21.1, 21.2, 21.3, -40.0, 21.5, 21.6], "1 readings"),
-        ([21.0, 21.1, 127.94, 21.2, 21.3, 21.4, 21.5, 21.6], "1 readings"),
+        ([21.0, 21.1, 0.0, 21.2, 21.3, 21.4, 21.5, 21.6], "1 reading"),
+        ([21.0, 21.1, 21.1, 21.2, 21.3, -40.0, 21.5, 21.6], "1 reading"),
+        ([21.0, 21.1, 127.94, 21.2, 21.3, 21.4, 21.5, 21.6], "1 reading"),
     ],
 )
 def test_what_the_logger_did_not_measure_is_left_empty(place, values, left):
     log_of(place, values, "Time;Temp °C")
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert f"doubtful: {left} of 'Temp °C' are what a thermometer gives without" in result.stderr
+    assert f"doubtful: {left} of 'Temp °C' given without a measurement" in result.stderr
     columns = read_recording(place / "M1").columns
     at_frame = columns.at_frame("Temp")
     assert np.nanmax(at_frame) < 22
@@ -284,7 +307,7 @@ def test_what_the_logger_did_not_measure_is_left_empty(place, values, left):
 def test_a_reading_that_leaps_is_told_and_kept(place):
     log_of(place, [21.0, 21.1, 21.1, 43.7, 21.3, 21.4, 21.5, 21.6])
     result = run(*arguments(place, "--timezone", "Europe/Berlin"))
-    assert "1 readings of 'Temperature' leap away and back (the first 43.7 °C" in result.stderr
+    assert "1 reading of 'Temperature' leaping away and back (the first 43.7 °C" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -193,6 +194,30 @@ def test_what_cannot_be_measured_is_one_line(tmp_path, file, content, words):
     done = called(tmp_path)
     assert done.returncode in (1, 2)
     assert words in " ".join(done.stderr.split())
+
+
+def test_what_is_doubtful_in_the_log_is_told_and_its_gaps_are_refused(tmp_path):
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    log = tmp_path / "log.csv"
+    head, *rows = log.read_text().splitlines()
+    spiked = [f"{r.split(',')[0]},85.0" if i == 40 else r for i, r in enumerate(rows)]
+    log.write_text("\n".join([head, *spiked]) + "\n")
+    words = "warning: .*log.csv: 1 reading of 'temperature' given without a measurement"
+    assert re.search(words, measured(tmp_path).stderr)
+    log.write_text("\n".join([head, *rows[:100], *rows[-20:]]) + "\n")
+    done = called(tmp_path)
+    assert done.returncode == 1
+    assert "or in a gap of over ten of its intervals" in done.stderr
+
+
+def test_a_level_in_another_height_system_is_doubtful(tmp_path):
+    """Seen at the Geul: 92.36 m at its gauge is 138.27 m in the control points' heights."""
+    write_model(tmp_path / "model.yaml")
+    world(tmp_path, 1)
+    assert "heights" not in measured(tmp_path).stderr
+    (tmp_path / "water.yaml").write_text("level: 92.4\nsd: 0.005\n")
+    assert "water.yaml: is 47 m away from control points" in measured(tmp_path).stderr
 
 
 def changed(folder, change) -> str:

@@ -363,6 +363,26 @@ def test_down_in_a_figure_is_down_in_the_image(name, page_text, open_page):
         assert places == sorted(places)
 
 
+def test_photographs_without_targets_are_one_line(open_page):
+    field = corner_field("plain", per_side=6, pitch_mm=100.0)
+    model = demonstration_model(field)
+    nothing = Observations(np.arange(0), np.zeros((0, 2)), np.zeros((0, 2)))
+    measured = [
+        *(replace(o, sigmas=o.sigmas / 4) for o in from_five_places(field, model)),
+        *[nothing] * 90,
+    ]
+    result = calibrate_observations(
+        [f"{k}.jpg" for k in range(95)], measured, {}, field,
+        CameraSpec("", model.sensor, model.interior.c), AdjustmentSettings(),
+    )  # fmt: skip
+    page = open_page(render_calibration(result, model.sensor, "camera"), 1280)
+    steps = page.locator(".answer li").all_text_contents()
+    assert [s.split(":")[0] for s in steps if ".jpg" in s] == ["5.jpg, 6.jpg, 7.jpg and 87 more"]
+    assert re.search(
+        r"σ₀ \d\.\d+, redundancy \d+; it can be the noise", page.text_content(".answer")
+    )
+
+
 def test_a_name_from_right_to_left_exchanges_no_numbers(page_text, open_page):
     """Seen once: a camera of 3280 × 2464 px looked like one of 2464 × 3280."""
     page = open_page(page_text("calibration"), 1280)

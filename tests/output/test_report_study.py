@@ -69,6 +69,15 @@ def test_a_study_of_nearly_nothing_says_why(empty_study):
     words = words_of(render_study(empty_study))
     assert "The series has a single epoch: nothing can be said about change." in words
     assert "No Monte-Carlo" in words
+    assert "Record more epochs, over a wider range of temperatures." in words
+
+
+def test_three_epochs_are_correlated_by_chance_which_is_not_told(warm_up):
+    words = words_of(render_study(study([warm_up(epochs=3)("M1")], StudySettings(sets=500))))
+    assert "in M1 by up to" in words
+    assert "Correlation matrix, M1" not in words
+    assert "change together" not in words
+    assert "Record more epochs, over a wider range of temperatures." in words
 
 
 def test_image_clips_stand_side_by_side_and_are_black_beyond_the_edge(html, told, tmp_path):

@@ -13,7 +13,12 @@ from thermocald.errors import ImageError
 from thermocald.photogrammetry.camera.camera_model import CameraSpec
 from thermocald.photogrammetry.frame.tracking import Tracker
 from thermocald.photogrammetry.targets import image_file
-from thermocald.photogrammetry.targets.image_file import EncodedImage, decode_grey, decode_parts
+from thermocald.photogrammetry.targets.image_file import (
+    EncodedImage,
+    decode_grey,
+    decode_parts,
+    with_comment,
+)
 
 WIDTH, HEIGHT = 331, 247  # not whole numbers of units
 BOXES = np.array([[40, 30, 60, 50], [200, 100, 231, 117], [320, 200, 400, 230], [-9, -9, 3, 3]])
@@ -99,8 +104,17 @@ def test_other_files_are_decoded_whole(progressive):
 
 
 def test_a_truncated_jpeg_is_refused():
-    with pytest.raises(ImageError, match="its end is missing"):
-        EncodedImage(_cv2_jpeg(_colours())[:-200])
+    whole = _cv2_jpeg(_colours())
+    preview = with_comment(whole, "\xff").replace("\xff".encode(), b"\xff\xd9")
+    for data in (whole[:-200], preview[:-200]):
+        with pytest.raises(ImageError, match="its end is missing"):
+            EncodedImage(data)
+
+
+def test_a_video_after_the_end_of_a_jpeg_changes_nothing():
+    """Phones append the seconds around a photograph."""
+    data = _cv2_jpeg(_colours())
+    assert np.array_equal(decode_grey(data + bytes(range(200)) * 500), decode_grey(data))
 
 
 @pytest.fixture(scope="module")

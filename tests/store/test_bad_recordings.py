@@ -40,9 +40,11 @@ CELLS = [
     ("observations.csv", 6, "epoch", "1.5", "not an integer"),
     ("epochs.csv", 3, "frame_time", "1599999999.0", "runs backwards"),
     ("epochs.csv", 3, "temperature_time", "1599999999.0", "runs backwards"),
-    ("epochs.csv", 4, "frame_time", "2020-09-13 12:26", "is not a number"),
+    ("epochs.csv", 4, "frame_time", "2020-09-13 12:26", "write seconds since 1970"),
+    ("epochs.csv", 4, "frame_time", '"1600000020,5"', "write decimals with a point"),
+    ("epochs.csv", 4, "temperature", "NaN", "leave the field empty"),
     ("epochs.csv", 4, "frame_time", "nan", "not a finite number"),
-    ("epochs.csv", 4, "temperature", "warm", "'warm' is not a number"),
+    ("epochs.csv", 4, "temperature", "warm", "'warm' is not a number; leave the field empty"),
     ("epochs.csv", 4, "temperature", "-300", "below absolute zero"),
     ("epochs.csv", 4, "temperature", "1e300", "above 1000 °C"),
     ("epochs.csv", 4, "temperature", "2_5.0", "'2_5.0' is not a number"),
@@ -110,6 +112,12 @@ FILES = {
     "semicolons": (
         "epochs.csv", lambda path: path.write_text(path.read_text().replace(",", ";")),
         "separate the columns with commas"),
+    "tabs": (
+        "testfield.csv", lambda path: path.write_text(path.read_text().replace(",", "\t")),
+        "separate the columns with commas"),
+    "UTF-16": (
+        "testfield.csv", lambda path: path.write_text(path.read_text(), "utf-16"),
+        "testfield.csv: is not text in UTF-8; save it as CSV in UTF-8"),
     "another case": (
         "testfield.csv", lambda path: edit(path, "X,Y,Z", "x,y,z"), "is 'x' meant"),
     "half a last line": (

@@ -136,10 +136,10 @@ def test_a_log_is_the_same_in_every_dialect_without_an_option(tmp_path, name):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("Testo", "3 rows hold no time: left out (line 5: 'Minimum')"),
+        ("Testo", "3 rows without a time: left out (line 5: 'Minimum')"),
         (
             "Home Assistant",
-            "2 values of 'state' are not readings ('unavailable', 'unknown'): left empty",
+            "2 values of 'state' without a reading ('unavailable', 'unknown'): left empty",
         ),
         ("HOBO in °F", "is converted from degF, the unit in its head"),
         ("kelvin", "is converted from K"),

@@ -82,3 +82,49 @@ def test_thousandths_and_tenths_are_refused(tmp_path, factor):
             ["time,temp"],
             lambda m, t, i: f"{int(m.timestamp())},{round(factor * t)}",
         )
+
+
+@pytest.mark.parametrize("head", ["Pt100 mV", "Sensor Ohm", "T W/m²", "Delta T K", "T diff", "dT"])
+def test_a_column_of_another_quantity_is_no_temperature(tmp_path, head):
+    def row(m, t, i):
+        return f"{int(m.timestamp())};{t:.2f}"
+
+    with pytest.raises(DataError, match="which column is the temperature"):
+        read(tmp_path / "log.csv", [f"time;{head}"], row)
+    found = read(
+        tmp_path / "log.csv", [f"time;{head};T °C"], lambda m, t, i: f"{row(m, 2, i)};{t:.2f}"
+    )
+    assert list(found.channels) == ["T"]
+
+
+def test_hours_without_am_and_pm_are_doubtful(tmp_path):
+    found = read(
+        tmp_path / "log.csv",
+        ["time,T °C"],
+        lambda m, t, i: f"{m - timedelta(minutes=60):%d.%m.%Y %I:%M},{t}",
+    )
+    (note,) = [note for note in found.notes if "doubtful" in note]
+    assert "run back 1 time, the first by 43140 s" in note
+
+
+def test_rows_before_the_clock_was_set_are_refused(tmp_path):
+    with pytest.raises(DataError, match=r"line 4, column 'time': is 26 years after the row before"):
+        read(
+            tmp_path / "log.csv",
+            ["time,T °C"],
+            lambda m, t, i: f"{m.replace(year=2026 if i > 1 else 2000):%Y-%m-%d %H:%M},{t}",
+        )
+
+
+def test_a_time_of_unknown_form_is_shown(tmp_path):
+    with pytest.raises(DataError, match=r"as in 2026-06-14 12:00:00; .*'time': 13:55; 'T °C': 21"):
+        read(tmp_path / "log.csv", ["time,T °C"], lambda m, t, i: f"{m:%H:%M},{t}")
+
+
+def test_the_minus_of_scandinavian_spreadsheets_is_one(tmp_path):
+    found = read(
+        tmp_path / "log.csv",
+        ["time;T °C"],
+        lambda m, t, i: f"{m:%Y-%m-%d %H:%M};−{t:.1f}".replace(".", ","),
+    )
+    assert found.channels["T"] == pytest.approx(-np.array(CELSIUS))

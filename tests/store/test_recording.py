@@ -110,11 +110,15 @@ def test_epochs_of_different_columns_are_written_together(tmp_path, field, head,
     assert np.isnan(third.quality["blur"]).all()
 
 
-def test_a_column_of_text_that_begins_empty_is_ignored(recording_path):
-    file = recording_path / "observations.csv"
-    header, first, *rows = file.read_text().splitlines()
-    file.write_text("\n".join([f"{header},comment", f"{first},", *(f"{r},a" for r in rows)]) + "\n")
-    assert "comment" not in read_recording(recording_path).epochs[0].observations.quality
+@pytest.mark.parametrize("empty", [1, 120])
+def test_a_column_of_text_that_begins_empty_is_ignored(tmp_path, field, head, make_epoch, empty):
+    write_recording(tmp_path / "r", head, field, [make_epoch(i) for i in range(1, 13)])
+    file = tmp_path / "r" / "observations.csv"
+    header, *rows = file.read_text().splitlines()
+    text = [f"{row},{'a' if i >= empty else ''}" for i, row in enumerate(rows)]
+    file.write_text("\n".join([f"{header},comment", *text]) + "\n")
+    assert text[-1].endswith("a")
+    assert "comment" not in read_recording(tmp_path / "r").epochs[0].observations.quality
 
 
 def test_covariances_and_quality_travel(tmp_path, field, head):

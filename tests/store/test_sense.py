@@ -209,13 +209,13 @@ DOUBTS = {
         lambda p: head(p, "{name: rpi", "{name: a/rpi"), "no store accepts it"),
     "an hour as the interval": (
         lambda p: head(p, "interval: 10.0", "interval: 3600"), "every 10 s"),
-    "an epoch twice": (repeat_epoch, "1 epochs hold the image points of another one: epoch 18"),
+    "an epoch twice": (repeat_epoch, "1 epoch with the image points of another one: epoch 18"),
     "85.00 of a DS18B20": (
         lambda p: change(p, "epochs.csv", temperature=put("85.0", 12, 30, 31)),
-        "3 readings are what it gives without a measurement, the first 85 °C at reading 13"),
+        "3 readings given without a measurement, the first 85 °C at reading 13"),
     "zeros of a lost sensor": (
         lambda p: change(p, "epochs.csv", board_temperature=put("0.0", 12)),
-        "board_temperature: 1 readings are"),
+        "board_temperature: 1 reading given"),
     "a thermometer in another time zone": (
         lambda p: change(p, "epochs.csv", temperature_time=scaled(1, 3600)),
         "read 3600 s after their frames"),
@@ -229,7 +229,7 @@ DOUBTS = {
         "board_temperature: all 40 readings are 85 °C"),
     "°C, then °F": (lambda p: change(p, "epochs.csv", temperature=fahrenheit), "from °C to °F"),
     "a reading that leaps": (
-        lambda p: change(p, "epochs.csv", temperature=put("71.3", 12)), "leap away and back"),
+        lambda p: change(p, "epochs.csv", temperature=put("71.3", 12)), "leaping away and back"),
 }  # fmt: skip
 
 
@@ -276,7 +276,8 @@ def wave(n: int = 60) -> np.ndarray:
 
 @pytest.mark.parametrize("value", [85.0, 127.94, 0.0, -40.0, -45.0, 125.0, 130.0, -46.85])
 def test_what_a_thermometer_gives_unmeasured_is_found(value):
-    for rows in ([0], [20], [20, 21], [59], [5, 30, 31, 32]):
+    runs, thirds = list(range(7, 30)), list(range(0, 60, 3))
+    for rows in ([0], [20], [20, 21], [59], [5, 30, 31, 32], runs, runs[:1] + runs[20:], thirds):
         values = wave()
         values[rows] = value
         assert [i for s in find_spikes(values) for i in range(s.first, s.stop)] == rows
@@ -291,6 +292,8 @@ def test_what_a_thermometer_gives_unmeasured_is_found(value):
         np.r_[np.full(20, 20.0), 20.0 + 65.0 * (1 - np.exp(-np.arange(60) / 3.0))],  # a kettle
         np.linspace(20.0, 120.0, 60),  # through 85 °C
         np.full(40, 85.0),  # at 85 °C
+        np.r_[np.full(20, 78.0), np.full(20, 85.0), np.full(20, 77.0)],  # a processor's limit
+        np.r_[np.full(20, 6.0), np.full(30, 0.0)],  # melting snow
         np.r_[np.full(9, np.nan), wave(20)],
         np.full(9, np.nan),
         np.empty(0),

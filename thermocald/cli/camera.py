@@ -250,12 +250,12 @@ def correct(
     Example: thermocald correct --model camera.thermal.yaml --log weather.csv points.csv
     """
     thermal = warned(tc.load_camera(model))
-    done = tc.correct(
-        points, thermal, log=log, log_options=log_options, to=to, temperature_sd=temperature_sd,
-        size=None if image_size is None else _size(image_size), timezone=timezone,
-        ambiguous=ambiguous, extrapolate=extrapolate, say=say,
-    )  # fmt: skip
     with warnings_said():
+        done = tc.correct(
+            points, thermal, log=log, log_options=log_options, to=to, temperature_sd=temperature_sd,
+            size=None if image_size is None else _size(image_size), timezone=timezone,
+            ambiguous=ambiguous, extrapolate=extrapolate, say=say,
+        )  # fmt: skip
         if done.of_images and out is None:
             raise UsageError("--out is missing: the folder for the corrected images")
         if out is not None:

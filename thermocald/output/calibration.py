@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.analysis.field import CELLS, FieldCheck
+from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, image_panel
 from thermocald.numbers import UNITS, coefficient, parameter_label, percent, plain, with_sd
@@ -32,7 +33,7 @@ _MOST_ARROWS = 3000
 _RINGS = 10
 _LITTLE_COVERED = 0.6
 _FIELD_DOMINATES = 2.0  # times the standard deviation from the image points alone
-_FEW_NAMES = 3  # for which a legend has room
+_FEW_NAMES = 3  # for which a legend or a line has room
 
 
 def render_calibration(result: Photographs, sensor: Sensor, name: str) -> str:
@@ -61,11 +62,11 @@ def coverage(points: Array, sensor: Sensor) -> float:
 
 def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sensor) -> Answer:
     proof = residual_figure(result, sensor) if posed else None
-    steps = [
-        f"{Path(p.path).name}: {_outcome(p, ', ')}."
-        for p in result.photographs
-        if not len(p.points)
-    ]
+    without: dict[str, list[str]] = {}
+    for p in result.photographs:
+        if not len(p.points):
+            without.setdefault(_outcome(p, ", "), []).append(Path(p.path).name)
+    steps = [f"{_listed(names)}: {outcome}." for outcome, names in without.items()]
     if not posed or result.interior is None:
         return Answer(f"Not calibrated: {result.reason}.", proof, next_steps=tuple(steps))
     points, residuals = _used(posed)
@@ -75,6 +76,7 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     if result.estimated:
         sentence = f"{_estimates(result, sensor)}."
         fit = f"; σ₀ {result.sigma0:.2f}, redundancy {result.redundancy}"
+        fit += f"; {CAUSES_OF_SIGMA0}" if result.sigma0 > 1.0 + MATERIAL else ""
     else:
         sentence = f"The interior orientation was held fixed, not estimated: {result.reason}."
         fit = ""
@@ -98,6 +100,11 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
             "Errors of the camera model, which the standard deviations do not include.",
         ),
     )  # fmt: skip
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:_FEW_NAMES])
+    return f"{shown} and {len(names) - _FEW_NAMES} more" if len(names) > _FEW_NAMES else shown
 
 
 def _estimates(result: Photographs, sensor: Sensor) -> str:

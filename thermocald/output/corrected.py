@@ -157,12 +157,12 @@ class Correction:
             )
 
     def _possible(self, block: RowBlock) -> RowBlock:
-        """Return the rows within the image and the time span of the log; refuse the others."""
+        """Return the rows within the image whose temperature is known; refuse the others."""
         log = self.log.times
-        step = float(np.median(np.diff(log))) if len(log) > 1 else 0.0
-        within = (block.times >= log[0] - step) & (block.times <= log[-1] + step)
         possible = block.kept(
-            within, f"was measured outside the temperature log ({iso(log[0])} to {iso(log[-1])})"
+            self.log.known_at(block.times),
+            f"was measured outside the temperature log ({iso(log[0])} to {iso(log[-1])}), or in a "
+            "gap of over ten of its intervals",
         )
         if possible.values.shape[1]:
             sensor = self.thermal.model.sensor

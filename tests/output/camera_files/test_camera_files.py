@@ -453,6 +453,17 @@ def test_aicon_states_standard_deviations(tmp_path, plain):
         ("p.txt", "1 PINHOLE 100 100 -90 90 50 50\n", "principal distance of -90"),
         ("q.txt", "1 RADIAL 4000 3000 3500 2000 1500 -3 0\n", "folds back"),
         ("r.txt", "1 PINHOLE 100 0 90 90 50 50\n", "100 × 0"),
+        ("fy.txt", "1 PINHOLE 1280 720 944 94.4 640 360\n", "fx is 10 times fy"),
+        ("sign.txt", "1 PINHOLE 1280 720 944 -944 640 360\n", "fx is -1 times fy"),
+        ("decimal.yaml", """cam0: {camera_model: pinhole, intrinsics: [944,2, 635.5, 359.5],
+         resolution: [1280, 720]}""", "fx is 472 times fy"),
+        ("point.txt", "1 PINHOLE 1280 720 944 944 6400 360\n", r"\(6400, 360\) px lies outside"),
+        ("cx.xml", """<calibration><width>1280</width><height>720</height><f>944</f><cx>635</cx>
+         </calibration>""", r"\(1274, 360\) px lies outside"),
+        ("comma.yaml", """%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720
+camera_matrix: [944., 0., 635.5, 0., 944., 359.5, 0., 0., 1.]
+distortion_coefficients: {rows: 1, cols: 4, data: [-0,05, 0.1, 0.001, 0.0005]}
+""", "has 5 numbers, not 1 × 4: is a comma wrong"),
     ],
 )  # fmt: skip
 def test_wrong_files_are_one_error_that_names_the_file(tmp_path, name, text, reason):

@@ -11,6 +11,7 @@ touches them: together they give its level.
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -57,11 +58,16 @@ def read_surface(path: Path, control: ControlPoints) -> Plane | Line | Profile:
     middle, extent = points.mean(axis=0), np.linalg.norm(np.ptp(points, axis=0))
     places = surface.points if isinstance(surface, Profile) else surface.point
     away = float(np.linalg.norm(places - middle, axis=-1).min())
+    unit = UNITS[control.unit]
+    where = (
+        f"is {away / unit:.0f} {control.unit} away from control points that extend over "
+        f"{extent / unit:.0f} {control.unit}"
+    )
     if away > _FARTHEST * extent > 0:
-        unit = UNITS[control.unit]
-        raise ConfigurationError(
-            f"{path}: is {away / unit:.0f} {control.unit} away from control points that extend "
-            f"over {extent / unit:.0f} {control.unit}: both need the same coordinates and unit"
+        raise ConfigurationError(f"{path}: {where}: both need the same coordinates and unit")
+    if away > extent > 0:
+        warnings.warn(
+            f"{path}: {where}: are both in the same coordinates and heights?", stacklevel=3
         )
     return surface
 

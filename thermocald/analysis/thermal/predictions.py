@@ -7,6 +7,7 @@ wanted error of its position at the end of the history.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -49,7 +50,7 @@ def read_model_log(
 
     The reference is the column that the options name, else the model's reference, else the first.
     path: a logger's file, a recording's folder or `epochs.csv`, or a store; near: as in `read_log`.
-    Raises ConfigurationError for the recording of another camera.
+    Warns of doubtful readings. Raises ConfigurationError for the recording of another camera.
     """
     options = options or LogOptions()
     reference = next(iter(thermal.model.validity), None)
@@ -68,6 +69,9 @@ def read_model_log(
         else:
             options = replace(options, wanted=tuple(thermal.model.validity))
         log = read_log(require_source(path), options, near)
+        for note in log.notes:
+            if (doubt := note.removeprefix("doubtful: ")) != note:
+                warnings.warn(f"{path}: {doubt}", stacklevel=3)
     if camera is not None:
         thermal.for_images(camera.sensor.width, camera.sensor.height, camera.name)
     return log.with_reference(wanted or reference)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from thermocald.arrays import Array
 
 _DRAWN = 400  # points of a cloud
+FEWEST_FOR_R = 10  # epochs: fewer are correlated by chance
 _ALIKE = 0.005  # correlations that differ by less are printed alike
 _CLUSTERS = ("#1b7837", "#7fbf7b", "#e6a800", "#d6278a", "#7b3294", "#000000")
 
@@ -347,7 +348,7 @@ def _ellipse(covariance: Array, centre: Array) -> tuple[Array, Array]:
 def _matrices(camera: CameraStudy) -> Iterator[Figure]:
     """Draw the correlations over the epochs of each series, and those within the adjustments."""
     for study in camera.series:
-        if len(study.series) > 2:
+        if len(study.series) >= FEWEST_FOR_R:
             names = [parameter_label(n) for n in study.columns]
             title = f"Correlation matrix, {study.series.name}"
             yield Figure(

@@ -80,6 +80,11 @@ def _answer(camera: CameraStudy) -> Answer:
             "Fit a thermal model, with which to correct measurements: thermocald fit.",
             "Find what a straight line does not explain, and why: thermocald discover.",
         ]
+    elif any(
+        len(study.series) < 2 or any(np.isfinite(t.values).any() for t in study.series.thermometers)
+        for study in camera.series
+    ):
+        steps = ["Record more epochs, over a wider range of temperatures."]
     else:
         steps = ["Record a temperature with the frames; without one nothing can be corrected."]
     if len(camera.series) < 2:

@@ -18,6 +18,7 @@ from thermocald.numbers import (
     signed,
     with_sd,
 )
+from thermocald.output.study.figures import FEWEST_FOR_R
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES
 from thermocald.result import document_of, jsonable
 from thermocald.store.recording.sense import doubt_lines
@@ -155,7 +156,8 @@ def _trajectory(camera: CameraStudy, limit_mm: float) -> list[str]:
         f"{', '.join(parts[:-1])} and {parts[-1]}."
     )
     strong = []
-    for i, j in ((1, 2), (0, 1), (0, 2)):
+    known = sum(len(study.series) for study in camera.series) >= FEWEST_FOR_R
+    for i, j in ((1, 2), (0, 1), (0, 2)) if known else ():
         over_time = float(camera.over_time[i, j])
         if not abs(over_time) >= _TOGETHER:
             continue

@@ -23,6 +23,7 @@ from thermocald.photogrammetry.camera.camera_model import (
     CameraModel,
     CameraSpec,
     InteriorOrientation,
+    image_to_px,
 )
 from thermocald.photogrammetry.camera_files.camera_record import OWN, CameraRecord, Format
 from thermocald.photogrammetry.camera_files.formats import (
@@ -39,11 +40,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from thermocald.arrays import Array
+    from thermocald.photogrammetry.camera.camera_model import Sensor
 
 FORMATS: dict[str, Format] = {
     format_.name: format_ for format_ in (OPENCV, ROS, COLMAP, MRCAL, KALIBR, METASHAPE, AICON, OWN)
 }
 _LARGEST_FILE = 10_000_000
+_LARGEST_ASPECT = 2.0  # of fx and fy; that of anamorphic lenses
+_EDGE = 0.01  # of the image's shorter side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,10 +139,25 @@ def read(
         values, covariance, exact, largest, rms = conversions.convert(
             sensor, record.family, record.values, conversions.BROWN, record.covariance
         )
+        _require_plausible(sensor, values)
     except (ConfigurationError, DataError) as cause:
         raise ConfigurationError(f"{path} ({chosen.about}): {cause}") from cause
     model = CameraModel(sensor, InteriorOrientation.from_array(values))
     return ImportedCamera(model, chosen.name, record.name, exact, largest, rms, covariance)
+
+
+def _require_plausible(sensor: Sensor, interior: Array) -> None:
+    """Raise ConfigurationError for an interior orientation (10,) that no camera has."""
+    aspect = 1.0 + float(interior[8])
+    if not 1.0 / _LARGEST_ASPECT < aspect < _LARGEST_ASPECT:
+        raise ConfigurationError(f"fx is {aspect:.3g} times fy: is a number or a comma wrong?")
+    u, v = image_to_px(sensor, interior[1:3])
+    W, H = sensor.width, sensor.height
+    if not sensor.contains([u, v], _EDGE * min(W, H)):
+        raise ConfigurationError(
+            f"the principal point ({u:.0f}, {v:.0f}) px lies outside the {W} × {H} px of the image "
+            "or at its edge: is a number wrong, or the size that of another image?"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

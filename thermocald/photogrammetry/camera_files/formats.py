@@ -90,7 +90,16 @@ def _of_matrices(document: dict[Any, Any], counts: tuple[int, ...]) -> CameraRec
 
     def matrix(key: str, counts: tuple[int, ...]) -> Array:
         node = document.get(key, {"data": []})
-        return numbers(node.get("data") if isinstance(node, dict) else node, key, counts)
+        if not isinstance(node, dict):
+            return numbers(node, key, counts)
+        found = numbers(node.get("data"), key, counts)
+        if "rows" in node and "cols" in node:  # a decimal comma makes two numbers of one
+            rows, cols = (number(node[side], f"{key}.{side}") for side in ("rows", "cols"))
+            if rows * cols != len(found):
+                raise ConfigurationError(
+                    f"{key} has {len(found)} numbers, not {rows:g} × {cols:g}: is a comma wrong?"
+                )
+        return found
 
     K, d = matrix("camera_matrix", (9,)), matrix("distortion_coefficients", counts)
     if np.any(d[12:]):

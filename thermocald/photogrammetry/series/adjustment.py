@@ -92,7 +92,7 @@ def choose_exterior(
 ) -> SeriesEstimator:
     """Choose how the exterior orientation is estimated, from the good epochs and an estimate."""
     if estimate is None or (asked == "auto" and good < FEWEST_EPOCHS):
-        why = f"{good} epochs do not show how the mount moves, {FEWEST_EPOCHS} would"
+        why = f"too few epochs ({good} of {FEWEST_EPOCHS}) to show how the mount moves"
         s = replace(series.s, exterior="per_epoch")
         return replace(series, s=s, bound=None, choice=why)
     movement, A = estimate_mount_movement(series, estimate), estimate.system.design.at.A

@@ -281,7 +281,9 @@ class EncodedImage:
                 f"{_MOST_PIXELS // 10**6} million are decoded"
             )
         self._is_jpeg = data[:2] == _JPEG
-        if self._is_jpeg and b"\xff\xd9" not in data[-64:]:
+        # phones append a video after the end; a preview among the metadata has an end of its own
+        scan = max((end for *_, end in _segments(data)), default=2) if self._is_jpeg else 0
+        if self._is_jpeg and data.find(bytes((0xFF, _EOI)), scan) < 0:
             raise ImageError(f"{self.name}: the JPEG is cut off, its end is missing")
 
     def whole(self) -> NDArray[Any]:

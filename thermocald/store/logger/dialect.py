@@ -193,7 +193,7 @@ def _parse_rows(path: Path, lines: Iterable[str], mark: str) -> Iterator[tuple[i
     reader = csv.reader(lines, delimiter=mark)
     try:
         for row in reader:
-            fields = [field.strip() for field in row]
+            fields = [field.strip().replace("−", "-") for field in row]
             if any(fields):
                 yield reader.line_num, fields
     except csv.Error as cause:

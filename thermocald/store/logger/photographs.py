@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermocald.errors import DataError, DriverMissing, ImageError, UsageError
+from thermocald.numbers import counted
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.camera_files import read_camera
 from thermocald.photogrammetry.field.testfield import TestField
@@ -32,7 +33,7 @@ from thermocald.store.logger.clock import iso, parse_moment
 from thermocald.store.logger.temperatures import read_log
 from thermocald.store.recording.head import CameraSpec, Channel, Head
 from thermocald.store.recording.reader import EpochColumns, Recording
-from thermocald.store.recording.sense import doubt_lines, pitch_doubts
+from thermocald.store.recording.sense import doubt_lines, pitch_doubts, time_fault
 from thermocald.store.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -47,7 +48,10 @@ if TYPE_CHECKING:
 
 SOURCES = ("exif", "name", "file")
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
-_IN_NAME = re.compile(r"(\d{8})[_T-]?(\d{6})(?:[_.-]?(\d{3}))?")
+_IN_NAME = re.compile(
+    r"(\d{4})[-_.]?(\d\d)[-_.]?(\d\d)(?:[_T -]| at )?"
+    r"(\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?:[_.-]?(\d{3}))?"
+)
 _EXIF_IFD = 0x8769
 _TIME_TAGS = ((0x9003, 0x9291, 0x9011), (0x9004, 0x9292, 0x9012), (0x0132, 0x9290, 0x9010))
 """Tags of time, fraction of a second and zone: when taken, digitised, last changed."""
@@ -83,13 +87,19 @@ def find_photographs(paths: list[Path]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
-            found += sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
+            # macOS leaves ._IMG_1.jpg, which is no picture, beside IMG_1.jpg
+            found += sorted(
+                p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.name[0] != "."
+            )
         elif path.is_file():
             found.append(path)
         else:
             raise DataError(f"{path}: there is no such file or folder")
     if not found:
-        raise DataError(f"{paths[0]}: holds no photographs ({', '.join(sorted(SUFFIXES))})")
+        raise DataError(
+            f"{paths[0]}: holds no photographs ({', '.join(sorted(SUFFIXES))}); convert others, "
+            "such as HEIC, to JPEG"
+        )
     return list(dict.fromkeys(found))
 
 
@@ -189,8 +199,8 @@ def strange_photographs(paths: Sequence[Path]) -> list[str]:
     if copies := find_copies(there):
         copy, original = next(iter(copies.items()))
         found.append(
-            f"{len(copies)} frames are copies of another one, the first {there[copy].name} of "
-            f"{there[original].name}"
+            f"{counted(len(copies), 'frame')} copied from another one, the first "
+            f"{there[copy].name} from {there[original].name}"
         )
     known = []
     for path in there:
@@ -243,11 +253,13 @@ def _name_moment(path: Path) -> datetime:
     if found is None:
         raise DataError(f"{path}: no time in the name, as in IMG_20260614_120301.jpg")
     try:
-        moment = parse_moment(f"{found[1]}T{found[2]}" + (f".{found[3]}" if found[3] else ""))
+        *parts, fraction = found.groups(default="")
+        moment = parse_moment("{}-{}-{}T{}:{}:{}".format(*parts) + (fraction and f".{fraction}"))
     except ValueError as cause:
         raise DataError(f"{path}: the name: {cause}") from cause
     assert isinstance(moment, datetime)
-    return moment
+    # names by Google's phones are in UTC
+    return moment.replace(tzinfo=UTC) if path.name.startswith("PXL_") else moment
 
 
 def _camera(details: dict[int, Any]) -> str:
@@ -322,11 +334,20 @@ def read_series(
     order = np.argsort(times, kind="stable")
     times = times[order]
     placed = tuple(named[i] for i in order.tolist())
+    if fault := time_fault(times):
+        raise DataError(
+            f"{placed[fault[0]].path}: was taken at {iso(times[fault[0]])}, years from the "
+            "photograph before: a clock that was not set? Correct the times, or leave some out"
+        )
+    if len(times) > 1 and np.ptp(times) == 0:
+        raise DataError(
+            f"{placed[0].path}: all photographs have its time; take them from other data (--times)"
+        )
     if (same := np.flatnonzero(np.diff(times) == 0)).size:
         first, second = (p.path.name for p in placed[same[0] : same[0] + 2])
         notes.append(
-            f"doubtful: {len(same)} photographs have the time of another one, the first {first} "
-            f"and {second}: the order of their names is used"
+            f"doubtful: {counted(len(same), 'photograph')} with the time of another one, the first "
+            f"{first} and {second}: the order of their names is used"
         )
     logged = read_log(log, options, (float(times[0]), float(times[-1])))
     _require_overlap(times, logged.times)

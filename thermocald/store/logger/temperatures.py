@@ -18,7 +18,7 @@ import numpy as np
 
 from thermocald.errors import DataError, UsageError
 from thermocald.names import channel_fault
-from thermocald.numbers import column_label
+from thermocald.numbers import column_label, counted
 from thermocald.store.logger.clock import (
     DeviceClock,
     day_and_month,
@@ -39,7 +39,7 @@ from thermocald.store.logger.dialect import (
     without_unit,
 )
 from thermocald.store.recording.readings import TemperatureLog as TemperatureLog
-from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts
+from thermocald.store.recording.sense import find_spikes, find_unit_change, stuck_doubts, time_fault
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -53,7 +53,8 @@ _TEMPERATURE_NAME = re.compile(
     re.IGNORECASE,
 )
 _OTHER_NAME = re.compile(
-    r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|\bnr\b|index|count|record|lux|light|dew|taupunkt"
+    r"hum|feucht|\brh\b|%|press|druck|hpa|mbar|volt|batt|w/m|radiation|strahlung|\bm[va]\b|ohms?\b|[ΩΩ]"
+    r"|delta|Δ|(?<![a-z])diff(?:eren[cz]e?)?(?![a-z])|\bd_?t\b|\bnr\b|index|count|record|lux|light|dew|taupunkt"
     r"|\bdpt\b|vpd|alarm|limit|threshold|serial|trusted|湿度|露点|序号"
     # setpoints and statistics, not readings
     r"|(?<![^\W_])(?:set|sp|soll|goal|min|max|avg|mean|std)(?![^\W_])|set.?(?:point|temp|value|wert)"
@@ -75,7 +76,7 @@ _NO_READING = {-127.0, -999.0, -9999.0, -99.0, 9999.0}
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
 _GOOD_SHARE = 0.8
-_FAHRENHEIT = (45.0, 120.0)  # °F of rooms and cameras, or °C of a hot camera
+_FAHRENHEIT = 45.0  # °F of rooms and cameras, or °C of a hot camera
 _LATEST_S = 1e11
 _WORDS = {"dmy": "day/month", "mdy": "month/day"}
 _LONGER = 10.0  # ratio of spans: with day and month exchanged, a log spans months
@@ -155,7 +156,17 @@ def read_log(
     table.read()
     times = table.times(clock)
     if len(times) < 2:
-        raise DataError(f"{path}: holds {len(times)} readings; at least two are needed")
+        raise DataError(f"{path}: holds {counted(len(times), 'reading')}; at least two are needed")
+    if fault := time_fault(times):
+        raise DataError(f"{table.where(fault[0])}, column {time_names[0]!r}: {fault[1]}")
+    steps = np.diff(times)
+    if not table.labels and steps.max() > 0 and (back := np.flatnonzero(steps < 0) + 1).size:
+        row = int(back[0])
+        notes.append(
+            f"doubtful: the times run back {counted(len(back), 'time')}, the first by "
+            f"{-steps[row - 1]:.0f} s ({table.where(row)}): was the clock set, or are hours of a "
+            "12-hour clock without AM and PM? The rows are put in the order of their times"
+        )
     _require_columns(table.file, tuple(options.names), "--name")
     channels = {}
     for name in names:
@@ -176,7 +187,7 @@ def read_log(
     ]  # fmt: skip
     times, channels, repeated = _sort_by_time(times, channels)
     if repeated:
-        notes.append(f"log: {repeated} rows with the time of the row before: left out")
+        notes.append(f"log: {counted(repeated, 'row')} with the time of the row before: left out")
     return TemperatureLog(times, channels, tuple(notes))
 
 
@@ -250,13 +261,13 @@ class _Table:
         if self._untimed:
             line, text = self._untimed[0]
             notes.append(
-                f"log: {len(self._untimed)} rows hold no time: left out (line {line}: "
+                f"log: {counted(len(self._untimed), 'row')} without a time: left out (line {line}: "
                 f"{text[:30]!r})"
             )
         for name, words in self._words.items():
             if words:
                 shown = ", ".join(repr(word) for word, _ in words.most_common(3))
-                what = f"{words.total()} values of {name!r} are not readings ({shown})"
+                what = f"{counted(words.total(), 'value')} of {name!r} without a reading ({shown})"
                 notes.append(f"log: {what}: left empty")
         return notes
 
@@ -399,9 +410,10 @@ def _find_time_columns(file: LoggerFile, options: LogOptions) -> tuple[str, ...]
     seconds = [n for n, kind in kinds.items() if kind == "seconds"]
     if len(seconds) == 1:
         return (seconds[0],)
+    shown = "; ".join(f"{n!r}: {file.column(n)[0]}" for n in file.names)
     raise DataError(
-        f"{file.path}: no column holds dates with times; give --time-column NAME (twice for a date "
-        f"and a time). Columns: {_quoted(file.names)}"
+        f"{file.path}: no column holds dates with times, as in 2026-06-14 12:00:00; change their "
+        f"form, or give --time-column NAME (twice for a date and a time). First row: {shown}"
     )
 
 
@@ -504,7 +516,7 @@ def _to_celsius_column(table: _Table, name: str, options: LogOptions) -> tuple[A
             raise DataError(
                 f"{path}, column {name!r}: {known[0]:g} looks like kelvin: give --unit K to convert"
             )
-        if len(known) and known.min() > _FAHRENHEIT[0] and known.max() < _FAHRENHEIT[1]:
+        if len(known) and known.min() > _FAHRENHEIT:
             notes.append(
                 f"doubtful: {name!r} names no unit: {known[0]:g} is taken as °C; if it is °F, it "
                 f"is {(known[0] - 32) / 1.8:.1f} °C: give --unit degF, or degC"
@@ -551,10 +563,10 @@ def _drop_unmeasured(
         if not found:
             continue
         first = found[0].first
-        why = "leap away and back" if sort else "are what a thermometer gives without a measurement"
+        why = "leaping away and back" if sort else "given without a measurement"
         notes.append(
-            f"doubtful: {sum(s.stop - s.first for s in found)} readings of {name!r} {why} (the "
-            f"first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
+            f"doubtful: {counted(sum(s.stop - s.first for s in found), 'reading')} of {name!r} "
+            f"{why} (the first {celsius[first]:.4g} °C, {table.where(first)}): {treated}"
         )
     for spike in spikes:
         if not spike.measured:

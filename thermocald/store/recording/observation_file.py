@@ -114,8 +114,7 @@ class ObservationFile:
         self._field, self._numbers, self._sensor = field, numbers, sensor
         self._has_covariances = "sxy" in self._table.columns
         extras = [n for n in self._table.columns if n not in {*_REQUIRED, "sxy", ""}]
-        first = next(self._table.chunks(100), None) if extras else None
-        self._quality = [n for n in extras if first is not None and first.is_number(n)]
+        self._quality = self._table.numeric(extras)
 
     def load(self) -> ObservationRows:
         """Return all observations sorted by epoch; the file may have them in any order."""

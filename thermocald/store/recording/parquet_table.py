@@ -209,14 +209,11 @@ def _parse(table: Table, target: Path) -> None:
     """Write a CSV table as Parquet with pyarrow's parser; its numbers are Python's to the bit."""
     from pyarrow import csv, float64, int64, string
 
-    first = next(table.chunks(100), None)
-    if first is None:
+    if next(table.chunks(1), None) is None:
         raise ValueError("no rows")
-    kinds = {
-        name: int64() if name == "epoch" else float64() if first.is_number(name) else string()
-        for name in table.columns
-        if name
-    } | {"target": string()}
+    names = [name for name in table.columns if name]
+    numeric = dict.fromkeys(table.numeric(names), float64())
+    kinds = dict.fromkeys(names, string()) | numeric | {"epoch": int64(), "target": string()}
     reader = csv.open_csv(
         table.path,
         csv.ReadOptions(block_size=_TEXT_BLOCK, column_names=table.columns, skip_rows=1),
@@ -272,14 +269,14 @@ def csv_to_parquet(source: Path, target: Path, advance: Any) -> None:
     """
     pyarrow = _pyarrow()
     table = Table(source, ("epoch", "target", "x", "y", "sx", "sy"))
-    numeric: dict[str, bool] = {}
+    numeric = table.numeric([name for name in table.columns if name not in ("", "target")])
 
     def columns_of(chunk: Chunk) -> dict[str, Any]:
         columns: dict[str, Any] = {}
         for name in filter(None, table.columns):
             if name == "epoch":
                 columns[name] = pyarrow.array(chunk.integers(name))
-            elif name != "target" and numeric.setdefault(name, chunk.is_number(name)):
+            elif name in numeric:
                 values = chunk.numbers(name, empty_is_nan=True)
                 columns[name] = pyarrow.array(values, mask=np.isnan(values))
             else:

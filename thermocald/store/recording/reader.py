@@ -13,6 +13,7 @@ import numpy as np
 from thermocald.epoch import Epoch
 from thermocald.errors import RecordingError
 from thermocald.names import FileFolder
+from thermocald.numbers import counted
 from thermocald.photogrammetry.series.normals import runs
 from thermocald.store.recording.head import CameraSpec, Channel, Head, read_head
 from thermocald.store.recording.observation_file import LONG_FROM_BYTES, ObservationFile
@@ -183,7 +184,8 @@ class Recording:
                 found += reading_doubts(values, f"{name} of {READINGS}")
         if repeated := [f for f, n in Counter(columns.frames).items() if f and n > 1]:
             found.append(
-                f"{len(repeated)} frames are listed in several epochs, the first {repeated[0]}"
+                f"{counted(len(repeated), 'frame')} listed in several epochs, the first "
+                f"{repeated[0]}"
             )
         if self.has_observations and not self.is_long:
             first: dict[bytes, int] = {}
@@ -194,7 +196,7 @@ class Recording:
                     twice += [(epoch.number, same)] if same != epoch.number else []
             if twice:
                 found.append(
-                    f"{len(twice)} epochs hold the image points of another one: epoch "
+                    f"{counted(len(twice), 'epoch')} with the image points of another one: epoch "
                     f"{twice[0][0]} those of {twice[0][1]}"
                 )
         return found

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 READINGS = "readings.csv"
 """The file with every reading of a log, in a recording of frames and a separate log."""
@@ -44,6 +44,12 @@ class TemperatureLog:
             return self
         first = {name: self.channels[name]}
         return replace(self, channels=first | self.channels)
+
+    def known_at(self, times: Array) -> Mask:
+        """Return whether the reference is known at times (n,) s: in the log, in no gap of it."""
+        reference = next(iter(self.channels.values()))
+        known: Mask = np.isfinite(interpolate_readings(times, self.times, reference))
+        return known
 
 
 def write_readings(path: Path, readings: TemperatureLog) -> None:

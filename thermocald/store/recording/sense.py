@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from thermocald.numbers import counted
 from thermocald.photogrammetry.field.testfield import ELSEWHERE, find_misplaced
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ _NOT_MEASURED = (85.0, 127.9375, 127.94, 0.0, -40.0, -45.0, -46.85, 125.0, 130.0
 """°C that thermometers give without measuring: at power-on, unplugged, all zeros or ones."""
 _LEAP_K = 5.0  # more than a camera warms in one interval
 _LONGEST_SPIKE = 3  # readings
+_LEAP_OF_RUN_K = 15.0  # a processor stays at 85 °C, melting snow at 0 °C
 _AROUND = 3  # readings before and after a change of the unit
 _FEWEST = 20  # image points for a judgement on all
 _MOST_OUTSIDE = 0.02  # of the image points: gross errors are rarer
@@ -136,23 +138,33 @@ def find_spikes(values: Array) -> list[Spike]:
     v = values[known]
     if len(v) < _AROUND + 1:
         return []
+    sham = np.isin(np.round(v, 2), np.round(_NOT_MEASURED, 2))
     steps = np.diff(v)
-    leap = max(_LEAP_K, 10.0 * float(np.median(np.abs(steps))))
+    usual = np.abs(np.diff(v[~sham])) if (~sham).sum() > 1 else np.zeros(1)
+    good = np.append(np.flatnonzero(~sham), len(v))
+    jumps = np.concatenate([[np.inf], np.abs(steps), [np.inf]])  # before each reading
+    leap = max(_LEAP_K, 10.0 * float(np.median(usual)))
     found: list[Spike] = []
     # a spike begins where a leap ends, or with the first reading
     for first in [0, *(np.flatnonzero(np.abs(steps) > leap) + 1).tolist()]:
         if found and known[first] < found[-1].stop:
             continue
-        ends = np.flatnonzero(np.abs(steps[first : first + _LONGEST_SPIKE]) > leap)
-        if len(ends) == 0 and first + _LONGEST_SPIKE < len(v):
+        # a value given without a measurement may be repeated for any time
+        longest = max(int(good[np.searchsorted(good, first)]) - first, _LONGEST_SPIKE)
+        ends = np.flatnonzero(np.abs(steps[first : first + longest]) > leap)
+        if len(ends) == 0 and first + longest < len(v):
             continue
         stop = first + (int(ends[0]) + 1 if len(ends) else len(v) - first)
-        measured = not all(np.isclose(x, _NOT_MEASURED, atol=0.006).any() for x in v[first:stop])
+        measured = not sham[first:stop].all()
         inner = first > 0 and stop < len(v)
-        if stop - first > _LONGEST_SPIKE or (measured and not inner):
+        if stop - first > min(longest, len(v) - 1) or (measured and not inner):
+            continue
+        away = min(jumps[first], jumps[stop])
+        if stop - first > _LONGEST_SPIKE and away < _LEAP_OF_RUN_K:
             continue
         if inner:
-            away = min(abs(v[first] - v[first - 1]), abs(v[stop - 1] - v[stop]))
+            if measured and sham[[first - 1, stop]].all():
+                continue
             if abs(v[stop] - v[first - 1]) > 0.5 * away:
                 continue
         found.append(Spike(int(known[first]), int(known[stop - 1]) + 1, measured))
@@ -211,10 +223,10 @@ def reading_doubts(values: Array, label: str) -> Iterator[str]:
         )
     if spikes := find_spikes(values):
         first = spikes[0]
-        why = "leap away and back" if first.measured else "are what it gives without a measurement"
+        why = "leaping away and back" if first.measured else "given without a measurement"
         yield (
-            f"{label}: {sum(s.stop - s.first for s in spikes)} readings {why}, the first "
-            f"{values[first.first]:g} °C at reading {first.first + 1}; leave them empty"
+            f"{label}: {counted(sum(s.stop - s.first for s in spikes), 'reading')} {why}, the "
+            f"first {values[first.first]:g} °C at reading {first.first + 1}; leave them empty"
         )
 
 

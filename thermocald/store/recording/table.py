@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 _MAX_EXACT_INTEGER = 2**53
 _MOST_COLUMNS = 1000
 _LONGEST_HEADER = 200_000
+_LEFT_EMPTY = "; leave the field empty if there is none"
 
 
 class Table:
@@ -76,9 +78,7 @@ class Table:
                     yield Chunk(self, first, block)
                     first += len(block)
             except (csv.Error, UnicodeDecodeError, OSError) as cause:
-                raise self._error(
-                    f"{self.path}, line {reader.line_num}: is not readable as CSV: {cause}"
-                ) from cause
+                raise self._unreadable(reader.line_num, cause) from cause
 
     def read(
         self,
@@ -102,6 +102,15 @@ class Table:
             name: tuple(chain.from_iterable(found)) if name in texts else np.concatenate(found)
             for name, found in parts.items()
         }
+
+    def numeric(self, names: Sequence[str]) -> list[str]:
+        """Return the columns that begin with numbers or are empty; they are read until it shows."""
+        kinds: dict[str, bool | None] = dict.fromkeys(names)
+        for chunk in self.chunks(columns=names) if names else ():
+            kinds |= {n: chunk.is_number(n) for n, kind in kinds.items() if kind is None}
+            if None not in kinds.values():
+                break
+        return [n for n, kind in kinds.items() if kind is not False]
 
     def check(
         self,
@@ -143,9 +152,7 @@ class Table:
                 file.seek(0)
                 header = next(filter(None, csv.reader(file, strict=True)), None)
             except (csv.Error, UnicodeDecodeError, OSError) as cause:
-                raise self._error(
-                    f"{self.path}, line 1: is not readable as CSV: {cause}"
-                ) from cause
+                raise self._unreadable(1, cause) from cause
         if header is None:
             raise self._error(f"{self.path}: is empty; the first line must name the columns")
         names = [name.strip() for name in header]
@@ -158,10 +165,15 @@ class Table:
                 raise self._error(f"{self.path}, line 1: column {name!r} is duplicated")
         return names
 
+    def _unreadable(self, line: int, cause: Exception) -> ThermocaldError:
+        if isinstance(cause, UnicodeDecodeError):
+            return self._error(f"{self.path}: is not text in UTF-8; save it as CSV in UTF-8")
+        return self._error(f"{self.path}, line {line}: is not readable as CSV: {cause}")
+
     def _missing(self, name: str) -> str:
         found = ", ".join(n if n.isprintable() else repr(n) for n in self.columns)
         hint = ""
-        if len(self.columns) == 1 and any(mark in found for mark in ";\t"):
+        if len(self.columns) == 1 and name in self.columns[0]:
             hint = "; separate the columns with commas and write decimals with a point"
         elif near := [c for c in self.columns if c.lower() == name.lower()]:
             hint = f"; is {near[0]!r} meant? Names are case-sensitive"
@@ -222,7 +234,9 @@ class Chunk:
             wrong = ~np.isfinite(values)
         if wrong.any():
             row = int(np.argmax(wrong))
-            self.fail(row, name, f"{column[row]!r} is not a finite number")
+            self.fail(
+                row, name, f"{column[row]!r} is not a finite number" + _LEFT_EMPTY * empty_is_nan
+            )
         return values
 
     def integers(self, name: str) -> NDArray[np.int64]:
@@ -242,14 +256,14 @@ class Chunk:
         except KeyError:
             return np.array([index.get(word.strip(), -1) for word in words], dtype=np.int64)
 
-    def is_number(self, name: str) -> bool:
-        """Return whether the first 100 fields of a column are numbers or empty."""
+    def is_number(self, name: str) -> bool | None:
+        """Return whether the first 100 fields that are not empty are numbers; None without any."""
+        fields = list(islice(filter(str.strip, self.text(name)), 100))
         try:
-            for text in self.text(name)[:100]:
-                float(text or "nan")
+            list(map(float, fields))
         except ValueError:
             return False
-        return True
+        return True if fields else None
 
     def check(
         self, name: str, wrong: NDArray[np.bool_], message: Callable[[int], str] | str
@@ -269,4 +283,9 @@ class Chunk:
         try:
             return float(text)
         except ValueError:
-            self.fail(row, name, f"{text[:40]!r} is not a number")
+            hint = _LEFT_EMPTY * empty_is_nan
+            if re.match(r"\d{4}-\d\d-\d\d", text):
+                hint = "; write seconds since 1970"
+            elif re.fullmatch(r"[+-]?\d+,\d+", text.strip()):
+                hint = "; write decimals with a point"
+            self.fail(row, name, f"{text[:40]!r} is not a number{hint}")

@@ -13,7 +13,7 @@ from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
 from thermocald.photogrammetry import camera_files
-from thermocald.series import COLDEST_C, Series, require_within, source_of
+from thermocald.series import COLDEST_C, Series, require_series, require_within, source_of
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.temperatures import LogOptions, log_options
 
@@ -107,10 +107,13 @@ def predict(
 
     if sum((temperature is not None, log is not None, bool(test), programme is not None)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
+    if channels is not None and temperature is None:
+        raise UsageError("channels belong to a temperature; a log has its own")
     require_within(
         temperature=(temperature, COLDEST_C), distance_m=(distance_m, 0.01),
         wanted_mm=(wanted_mm, 1e-3),
     )  # fmt: skip
+    require_series(test)
     thermal = _thermal(model)
     if temperature is not None:
         state = thermal.at(temperature, channels=channels, extrapolate=extrapolate)

@@ -160,6 +160,8 @@ def test_what_is_wrong_is_said(camera):
         live.update(0.0, 30.0)
     with pytest.raises(UsageError, match=r"live\(size=\(640, 480\)\)"):
         live.correct(np.zeros((480, 640), np.uint8))
+    with pytest.raises(UsageError, match="frame of bool cannot be resampled"):
+        live.correct(np.zeros((1232, 1640), bool))
     with pytest.raises(UsageError, match="outside"):
         live.update(1.0, 150.0)
     assert live.update(2.0, float("nan")).temperature == 30.0

@@ -30,7 +30,7 @@ from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera
 from thermocald.arrays import seconds
-from thermocald.errors import ConfigurationError, UsageError
+from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
@@ -260,12 +260,14 @@ class ThermalCamera(Result):
             T = math.nan
         if math.isnan(T):
             raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
+        _require_sd(temperature_sd)
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
             beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
         if channels is None:
             values, slope, J = self._steady.at(T)
         else:
+            self._require_channels(channels)
             values, slope, J = steady_camera(self.model, self.parameters, channels).at(T)
         covariance = J @ self.covariance @ J.T
         if temperature_sd:
@@ -273,6 +275,17 @@ class ThermalCamera(Result):
         if beyond:
             covariance += np.diag((slope * beyond) ** 2)
         return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
+
+    def _require_channels(self, given: Mapping[str, float]) -> None:
+        """Raise UsageError for thermometers that the model does not know, or without a reading."""
+        used = (e.values.get("channel") for e in self.model.effects)
+        known = list(dict.fromkeys([*self.model.validity, *(str(c) for c in used if c)]))
+        for name, value in given.items():
+            if name not in known:
+                there = ", ".join(known) or "none"
+                raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
+            if not math.isfinite(value):
+                raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
 
     def along(
         self,
@@ -290,25 +303,34 @@ class ThermalCamera(Result):
         begins with the first time. relative_to °C: the covariance is that of the difference from
         the steady camera at this temperature; temperature_sd K: of a reading, is propagated into
         the covariance (as if no effect had a memory, which would average it). Raises UsageError far
-        outside the model's validity (unless `extrapolate`), and for lengths that differ.
+        outside the model's validity (unless `extrapolate`), for lengths that differ and for times
+        that run backwards, DataError for times `at` that the log does not cover.
 
         >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
         >>> along.values.shape, along.sd.shape
         ((3, 10), (3, 10))
         """
+        _require_sd(temperature_sd)
         t = seconds(times)
         columns = (
             temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
         )
-        readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
-        instants = t if at is None else seconds(at)
-        sizes = ", ".join(f"{len(c)} of {name}" for name, c in readings.items())
-        if not len(t) or not len(instants) or any(len(c) != len(t) for c in readings.values()):
+        try:
+            readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
+        except (TypeError, ValueError):
+            raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
+        instants = t if at is None else np.atleast_1d(seconds(at))
+        sizes = ", ".join(f"{c.size} of {name}" for name, c in readings.items()) or "no temperature"
+        shapes = {t.shape, (t.size,), *(c.shape for c in readings.values())}
+        if not readings or not t.size or instants.ndim != 1 or not len(instants) or len(shapes) > 1:
             raise UsageError(
-                f"{len(t)} times, {sizes}, at {len(instants)} times: a log needs a temperature for "
+                f"{t.size} times, {sizes}, at {instants.size} times: a log needs a temperature for "
                 "each of its times, and at least one time"
             )
-        begin = float(min(t[0], instants[0]))
+        if (np.diff(t) < 0).any():
+            raise UsageError("the times run backwards: give a log in the order of time")
+        _require_inside(t, instants)
+        begin = float(min(t[0], instants.min()))
         reference = next(iter(readings))
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
         outside = np.zeros(len(instants))
@@ -416,6 +438,25 @@ class ThermalCamera(Result):
     def steady_knees(self) -> tuple[tuple[float, ...], ...]:
         """Return each knee's temperature °C and the ten parameters' change per kelvin beyond it."""
         return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
+
+
+def _require_inside(log: Array, times: Array) -> None:
+    """Raise DataError for times (n,) s that a log's times (R,) do not cover, but for a step."""
+    begin, end = float(log[0]), float(log[-1])
+    step = float(np.median(np.diff(log))) if len(log) > 1 else 0.0
+    outside = (times < begin - step) | (times > end + step)
+    if outside.any():
+        from thermocald.store.logger.clock import iso
+
+        raise DataError(
+            f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
+            f"({iso(begin)} to {iso(end)}), the first is {iso(times[outside][0])}"
+        )
+
+
+def _require_sd(temperature_sd: float) -> None:
+    if not 0.0 <= temperature_sd < math.inf:
+        raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be at least 0")
 
 
 def _noise_share(times: Array, at: Array) -> Array:
@@ -535,7 +576,11 @@ class LiveCamera:
                 f"{sensor.width}×{sensor.height}; use live(size=({frame.shape[1]}, "
                 f"{frame.shape[0]}))"
             )
-        return cv2.remap(frame, *self.maps(to), cv2.INTER_LINEAR)
+        maps = self.maps(to)
+        try:
+            return cv2.remap(frame, *maps, cv2.INTER_LINEAR)
+        except cv2.error:
+            raise UsageError(f"a frame of {frame.dtype} cannot be resampled; give uint8") from None
 
     def maps(self, to: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the maps x, y (H, W) px for `cv2.remap` that `correct` uses now.
@@ -554,9 +599,12 @@ class LiveCamera:
         self, time: Any, temperature: float | Mapping[str, float]
     ) -> tuple[float, tuple[float, ...]]:
         """Return the time s and the readings °C; a failed one is the last of its channel."""
-        t = float(time) if isinstance(time, float | int) else float(seconds(time))
+        t = float(seconds(time))
         given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
-        names, row = tuple(given), tuple(float(v) for v in given.values())
+        try:
+            names, row = tuple(given), tuple(float(v) for v in given.values())
+        except (TypeError, ValueError):
+            raise UsageError(f"{temperature!r}: give °C, NaN for a failed reading") from None
         if not row:
             raise UsageError("there is no reading: give a temperature, or {channel: °C}")
         if self._times:

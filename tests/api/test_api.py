@@ -131,8 +131,18 @@ def test_bands_of_drawings_hold_95_percent(epochs, camera):
     axis = camera.plot().axes[1]
     outline = axis.collections[0].get_paths()[0].vertices
     first = outline[np.isclose(outline[:, 0], axis.lines[0].get_xdata()[0]), 1]
-    expected = 2 * 1.96 * 1e3 * np.sqrt(camera.at(float(outline[:, 0].min())).covariance[1, 1])
-    np.testing.assert_allclose(np.ptp(first), expected, rtol=1e-9)
+    cold = [float(outline[:, 0].min())]
+    since_T0 = camera.along([0.0], cold, relative_to=camera.model.T0)  # the level's sd cancels
+    np.testing.assert_allclose(np.ptp(first), 2 * 1.96 * 1e3 * since_T0.sd[0, 1], rtol=1e-6)
+
+
+def test_a_drawn_distortion_is_zero_at_the_principal_point(camera):
+    now = camera.at(35.0)
+    arrows = now.plot().axes[0].collections[0]
+    shift, pitch = np.hypot(arrows.U, arrows.V), now.sensor.pixel_pitch
+    middle = now.sensor.centre + np.array([1, -1]) * now.values[1:3] / pitch
+    near = np.argmin(np.linalg.norm(arrows.XY - middle, axis=1))
+    assert shift[near] < 0.05 < 5.0 < shift.max()
 
 
 def test_epochs_as_a_data_frame(epochs):

@@ -140,16 +140,17 @@ class ThermalCamera(Result):
     def plot(self) -> Figure:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
-        Covers the range that the model was fitted on, with 95 % bands.
+        Covers the range that the model was fitted on, with 95 % bands of these changes.
         """
         limits = next(iter(self.model.validity.values()), (self.model.T0 - 15, self.model.T0 + 15))
         T = np.linspace(*limits, 60)
-        states = [self.at(t) for t in T.tolist()]
-        base = self.at(self.model.T0, extrapolate=True)
+        base, _, J0 = self._steady.at(self.model.T0)
+        values, _, J = zip(*(self._steady.at(t) for t in T.tolist()), strict=True)
+        changes, by = np.array(values) - base, np.array(J) - J0  # the level cancels in a change
+        sds = np.sqrt(np.einsum("epi,ij,epj->ep", by, self.covariance, by))
         figure, axes = new_figure(3)
         for k, axis in enumerate(axes[:, 0]):
-            y = 1e3 * np.array([s.values[k] - base.values[k] for s in states])
-            band = 1e3 * BAND * np.array([np.sqrt(s.covariance[k, k]) for s in states])
+            y, band = 1e3 * changes[:, k], 1e3 * BAND * sds[:, k]
             axis.plot(T, y)
             axis.fill_between(T, y - band, y + band, alpha=0.3)
             axis.set_ylabel(f"change of {parameter_label(IOP_NAMES[k])} in µm")

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from thermocald.analysis.camera.camera import Camera, CameraDifference
-    from thermocald.analysis.field import FieldCheck
     from thermocald.analysis.thermal.places import Places
     from thermocald.analysis.thermal.predictions import Prediction
     from thermocald.analysis.thermal.scene import SceneCourse
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera_files import Conversion
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.survey import Survey
+    from thermocald.results import FieldCheck
 
     Model = ThermalCamera | Path | str
     LogRead = LogOptions | Mapping[str, Any] | None
@@ -412,6 +412,7 @@ def check_testfield(
     from thermocald.analysis.field import assess_field
     from thermocald.api import read_testfield
     from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
+    from thermocald.results import FieldCheck
 
     require_within(sigma_px=(sigma_px, 1e-4))
     if camera is None:
@@ -420,7 +421,8 @@ def check_testfield(
         model = camera.model
     else:
         model = camera_files.read(source_of(camera), pixel_pitch=pixel_pitch).model
-    return assess_field(read_testfield(field), model, place, look_at, roll, sigma_px)
+    found = assess_field(read_testfield(field), model, place, look_at, roll, sigma_px)
+    return FieldCheck(**vars(found))
 
 
 def _thermal(model: Model) -> ThermalCamera:

@@ -176,6 +176,7 @@ RESULTS = {
     "camera": lambda epochs, camera, M1, M2: camera,
     "camera_at": lambda epochs, camera, M1, M2: camera.at(35.0),
     "discovery": lambda epochs, camera, M1, M2: tc.discover(M1, verify=[M2]),
+    "field": lambda epochs, camera, M1, M2: tc.check_testfield(M1.testfield),
 }
 
 

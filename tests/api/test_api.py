@@ -252,6 +252,7 @@ def test_a_prediction_is_the_camera_and_is_held_against_series(camera, M1, world
     along = tc.predict(camera, log=world / "M1").as_dict()
     assert len(along["rows"]) == len(M1)
     said = call("predict", "--model", "camera.yaml", "--test", "M1", folder=world).stdout
+    assert "fitted on this series: this is no test" in said
     assert str(tc.predict(camera, test=[M1])) == said.strip().replace("M1:", f"{world / 'M1'}:")
     with pytest.raises(UsageError, match="give one of"):
         tc.predict(camera, 35.0, log=world / "M1")

@@ -140,12 +140,18 @@ class ThermalCamera(Result):
     def plot(self) -> Figure:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
-        Covers the range that the model was fitted on, with 95 % bands of these changes.
+        Covers the range that the model was fitted on, with 95 % bands of these changes; other
+        thermometers are taken to be as warm.
         """
         limits = next(iter(self.model.validity.values()), (self.model.T0 - 15, self.model.T0 + 15))
         T = np.linspace(*limits, 60)
-        base, _, J0 = self._steady.at(self.model.T0)
-        values, _, J = zip(*(self._steady.at(t) for t in T.tolist()), strict=True)
+
+        def at(t: float) -> tuple[Array, Array, Array]:
+            alike = dict.fromkeys(self.channels, t)
+            return steady_camera(self.model, self.parameters, alike).at(t)
+
+        base, _, J0 = at(self.model.T0)
+        values, _, J = zip(*map(at, T.tolist()), strict=True)
         changes, by = np.array(values) - base, np.array(J) - J0  # the level cancels in a change
         sds = np.sqrt(np.einsum("epi,ij,epj->ep", by, self.covariance, by))
         figure, axes = new_figure(3)
@@ -275,12 +281,38 @@ class ThermalCamera(Result):
             covariance += temperature_sd**2 * np.outer(slope, slope)
         if beyond:
             covariance += np.diag((slope * beyond) ** 2)
+        if channels is not None:
+            others = {name: np.array([float(value)]) for name, value in channels.items()}
+            outside, drift = self._beyond(others, extrapolate)
+            covariance = _widened(covariance[None], drift)[0]
+            beyond = max(beyond, float(np.max(outside)))
         return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The other thermometers that the model's effects follow."""
+        named = (e.values.get("channel") for e in self.model.effects)
+        return tuple(dict.fromkeys(str(c) for c in named if c))
+
+    def _beyond(
+        self, readings: Mapping[str, Array], extrapolate: bool
+    ) -> tuple[Array | float, Array | float]:
+        """Return by how many kelvin (E,) other thermometers are outside, and the drift (E, 10)."""
+        outside: Array | float = 0.0
+        drift: Array | float = 0.0
+        for effect in self.model.effects:
+            name = str(effect.values.get("channel", ""))
+            if name in readings and name in self.model.validity:
+                of_fit = Validity(*self.model.validity[name], name)
+                beyond = of_fit.check(readings[name], extrapolate)
+                rates = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
+                outside = np.maximum(outside, beyond)
+                drift = drift + np.abs(beyond[:, None] * rates)
+        return outside, drift
 
     def _require_channels(self, given: Mapping[str, float]) -> None:
         """Raise UsageError for thermometers that the model does not know, or without a reading."""
-        used = (e.values.get("channel") for e in self.model.effects)
-        known = list(dict.fromkeys([*self.model.validity, *(str(c) for c in used if c)]))
+        known = list(dict.fromkeys([*self.model.validity, *self.channels]))
         for name, value in given.items():
             if name not in known:
                 there = ", ".join(known) or "none"
@@ -337,6 +369,8 @@ class ThermalCamera(Result):
         outside = np.zeros(len(instants))
         if self.validity is not None:
             outside = self.validity.check(history.temperature(), extrapolate)
+        others = {name: history.temperature(name) for name in self.channels if name in readings}
+        further, drift = self._beyond(others, extrapolate)
         values, covariance = [], []
         steady = None if relative_to is None else self._steady.at(relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
@@ -357,8 +391,8 @@ class ThermalCamera(Result):
             instants,
             history.temperature(),
             np.concatenate(values),
-            np.concatenate(covariance),
-            outside,
+            _widened(np.concatenate(covariance), drift),
+            np.maximum(outside, further),
             self.model.camera,
         )
 
@@ -439,6 +473,13 @@ class ThermalCamera(Result):
     def steady_knees(self) -> tuple[tuple[float, ...], ...]:
         """Return each knee's temperature °C and the ten parameters' change per kelvin beyond it."""
         return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
+
+
+def _widened(covariance: Array, drift: Array | float) -> Array:
+    """Return covariances (E, 10, 10) with a drift (E, 10) beyond a thermometer's range added."""
+    rows = np.arange(10)
+    covariance[:, rows, rows] += np.square(drift)
+    return covariance
 
 
 def _require_inside(log: Array, times: Array) -> None:
@@ -537,6 +578,8 @@ class LiveCamera:
         outside = np.zeros(1)
         if thermal.validity is not None:  # first, so that an error leaves the state unchanged
             outside = thermal.validity.check(np.array(row[:1]), extrapolate=False)
+        others = {name: np.array([T]) for name, T in zip(self._channels[1:], row[1:], strict=True)}
+        further, drift = thermal._beyond(others, extrapolate=False)
         self._remember(t, row)
         times = np.array(self._times)
         readings = dict(zip(self._channels, np.array(self._rows).T, strict=True))
@@ -550,9 +593,9 @@ class LiveCamera:
         linear = thermal._linear(history, drive)
         covariance = thermal._propagate(history, drive, linear, outside, driven=driven)
         values = model.carried(linear)[0]
-        self._now = Camera(
-            model.sensor, row[0], values, covariance[0], float(outside[0]), model.camera
-        )
+        beyond = float(np.max(np.maximum(outside, further)))
+        covariance = _widened(covariance, drift)
+        self._now = Camera(model.sensor, row[0], values, covariance[0], beyond, model.camera)
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:

@@ -20,6 +20,7 @@ from thermocald.series import (
     Series,
     check_exterior,
     free_names,
+    require_series,
     require_within,
     source_of,
 )
@@ -182,7 +183,7 @@ def study(
         raise UsageError(
             f"{len(labels)} labels for {len(series)} series; give one for each at most"
         )
-    _require_series(series)
+    require_series(series)
     check_exterior(exterior)
     settings = StudySettings(
         window=window, alpha=alpha, sets=sets, seed=seed, distance_mm=distance_mm, grid=grid,
@@ -248,10 +249,11 @@ def fit(
     from thermocald.physics.model_file import read_model
     from thermocald.thermal.hypothesis import check_names
     from thermocald.thermal.reduce import reduce_series
+    from thermocald.thermal.source import refuse_copies
 
     if not series:
         raise UsageError("give at least one series to fit a model to")
-    _require_series(series)
+    require_series(series)
     require_within(T0=(T0, COLDEST_C))
     if isinstance(kind, Path) or (isinstance(kind, str) and Path(kind).suffix in (".yaml", ".yml")):
         kind = read_model(source_of(kind))
@@ -267,7 +269,9 @@ def fit(
         listed.append(effect)
     if start is not None and T0 is None:
         T0 = start.T0
-    reduced = [reduce_series(one.observed(progress, jobs), strict=False) for one in series]
+    inputs = [one.observed(progress, jobs) for one in series]
+    refuse_copies(inputs)
+    reduced = [reduce_series(one, strict=False) for one in inputs]
     check_names(listed, reduced)
     if isinstance(kind, ThermalModel):
         camera = fit_with_type(reduced, kind)
@@ -305,8 +309,9 @@ def discover(
 
     require_within(jobs=(jobs, 1))
     tell = say or (lambda _: None)
+    require_series(verify)
     every = (series, *verify)
-    _require_series(every)
+    require_series(every)
     start = _model_of(model)
     inputs = []
     for one in every:
@@ -348,7 +353,7 @@ def plan(
     thermal, course = (None if p is None else source_of(p) for p in (model, programme))
     source = None
     if series is not None:
-        _require_series((series,))
+        require_series((series,))
         source = series.observed()
     inputs = set_ups(source, thermal, preset, testfield, course, seeds)
     return plan_power(inputs, strength_px, progress or (lambda _: None))
@@ -466,19 +471,6 @@ def _doubts(series: Sequence[Series], reduced: Sequence[ReducedSeries]) -> list[
 
 def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
     return [source_of(p) for p in ((given,) if isinstance(given, str | Path) else given)]
-
-
-def _require_series(series: Sequence[Series]) -> None:
-    """Raise UsageError for what is not a series, and for a series that is given twice."""
-    for i, one in enumerate(series):
-        if not isinstance(one, Series):
-            raise UsageError(f"{str(one)[:80]!r} is not a series: open it with thermocald.open")
-        for other in series[:i]:
-            if one is other or one.place == other.place:
-                raise UsageError(
-                    f"{one.source} is the same series as {other.source}; give each series once (a "
-                    "copy would count as a second measurement that agrees perfectly)"
-                )
 
 
 def _model_of(model: ThermalCamera | ThermalModel | Path | str | None) -> ThermalModel | None:

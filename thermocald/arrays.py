@@ -7,10 +7,13 @@ arithmetic on it. A `scratch` array must not leave the function that asked for i
 from __future__ import annotations
 
 import threading
+import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from thermocald.errors import UsageError
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -23,11 +26,26 @@ _buffers = threading.local()  # by name
 
 
 def seconds(times: ArrayLike) -> Array:
-    """Return times in s; datetime64 and pandas times count from 1970-01-01 UTC."""
+    """Return times in s; datetime64, datetimes and pandas times count from 1970-01-01 UTC.
+
+    Raises UsageError for anything else, and for a time that is unknown (NaN, NaT).
+    """
     given = np.asarray(times)
-    if np.issubdtype(given.dtype, np.datetime64):
-        given = given.astype("datetime64[us]").astype(np.int64) * 1e-6
-    return np.asarray(given, dtype=float)
+    try:
+        if given.dtype == object and given.size and not isinstance(given.flat[0], float | int):
+            with warnings.catch_warnings():  # numpy warns that it converts a zone to UTC
+                warnings.simplefilter("ignore", UserWarning)
+                given = given.astype("datetime64[us]")
+        if given.dtype.kind == "M":
+            given = given - np.datetime64(0, "s")
+        if given.dtype.kind == "m":
+            given = given / np.timedelta64(1, "s")
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        found = np.full(1, np.nan)
+    if not np.isfinite(found).all():
+        raise UsageError("a time is not known: give seconds since 1970-01-01 UTC, or datetime64")
+    return found
 
 
 def spread_rows(count: int, most: int) -> Index:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from thermocald.analysis import field as checks
 from thermocald.analysis.camera.camera import Camera
 from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.analysis.study import study as studies
@@ -282,6 +283,27 @@ class Calibration(Result):
         known = replace(self.file, interior=self.photographs.interior)
         write_camera(Path(path), known, self.photographs.covariance[:10, :10], comment)
         return Path(path)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FieldCheck(Result, checks.FieldCheck):
+    """How well a camera sees a test field, what it would calibrate, and what is missing."""
+
+    as_dict = checks.FieldCheck.as_dict
+    lines = checks.FieldCheck.lines
+
+    def page(self, title: str = "") -> str:
+        """Return the report as HTML text."""
+        from thermocald.output.calibration import render_field_check
+
+        return render_field_check(self, title)
+
+    def plot(self) -> Figure:
+        """Draw the visible targets in the image, px."""
+        from thermocald.figures import draw_figure
+        from thermocald.output.calibration import seen_figure
+
+        return draw_figure(seen_figure(self))
 
 
 def discovery_lines(found: Discovery) -> list[str]:

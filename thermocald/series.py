@@ -35,7 +35,7 @@ from thermocald.store.sources import StoredRecording, open_source, require_sourc
 from thermocald.thermal.source import series_input
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -326,6 +326,21 @@ def check_exterior(exterior: str) -> None:
     if exterior not in EXTERIOR_CHOICES:
         choices = ", ".join(EXTERIOR_CHOICES)
         raise UsageError(f"--exterior {exterior}: must be one of {choices}")
+
+
+def require_series(series: Sequence[Series]) -> None:
+    """Raise UsageError for what is not a series, and for a series that is given twice."""
+    if isinstance(series, Series):
+        raise UsageError(f"{series.source}: give a list of series, [series], not one series")
+    for i, one in enumerate(series):
+        if not isinstance(one, Series):
+            raise UsageError(f"{str(one)[:80]!r} is not a series: open it with thermocald.open")
+        for other in series[:i]:
+            if one is other or one.place == other.place:
+                raise UsageError(
+                    f"{one.source} is the same series as {other.source}; give each series once (a "
+                    "copy would count as a second measurement that agrees perfectly)"
+                )
 
 
 def require_within(

@@ -13,7 +13,7 @@ from thermocald.analysis.thermal.predictions import read_model_log
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera, load_camera
 from thermocald.errors import UsageError
 from thermocald.photogrammetry import camera_files
-from thermocald.series import COLDEST_C, Series, require_within, source_of
+from thermocald.series import COLDEST_C, Series, require_series, require_within, source_of
 from thermocald.store.logger.clock import device_clock
 from thermocald.store.logger.temperatures import LogOptions, log_options
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from thermocald.analysis.camera.camera import Camera, CameraDifference
-    from thermocald.analysis.field import FieldCheck
     from thermocald.analysis.thermal.places import Places
     from thermocald.analysis.thermal.predictions import Prediction
     from thermocald.analysis.thermal.scene import SceneCourse
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from thermocald.photogrammetry.camera_files import Conversion
     from thermocald.photogrammetry.field.testfield import TestField
     from thermocald.photogrammetry.survey import Survey
+    from thermocald.results import FieldCheck
 
     Model = ThermalCamera | Path | str
     LogRead = LogOptions | Mapping[str, Any] | None
@@ -107,10 +107,13 @@ def predict(
 
     if sum((temperature is not None, log is not None, bool(test), programme is not None)) != 1:
         raise UsageError("give one of --temperature, --log, --test, --programme")
+    if channels is not None and temperature is None:
+        raise UsageError("channels belong to a temperature; a log has its own")
     require_within(
         temperature=(temperature, COLDEST_C), distance_m=(distance_m, 0.01),
         wanted_mm=(wanted_mm, 1e-3),
     )  # fmt: skip
+    require_series(test)
     thermal = _thermal(model)
     if temperature is not None:
         state = thermal.at(temperature, channels=channels, extrapolate=extrapolate)
@@ -409,6 +412,7 @@ def check_testfield(
     from thermocald.analysis.field import assess_field
     from thermocald.api import read_testfield
     from thermocald.photogrammetry.camera.camera_model import RASPBERRY_PI_V2
+    from thermocald.results import FieldCheck
 
     require_within(sigma_px=(sigma_px, 1e-4))
     if camera is None:
@@ -417,7 +421,8 @@ def check_testfield(
         model = camera.model
     else:
         model = camera_files.read(source_of(camera), pixel_pitch=pixel_pitch).model
-    return assess_field(read_testfield(field), model, place, look_at, roll, sigma_px)
+    found = assess_field(read_testfield(field), model, place, look_at, roll, sigma_px)
+    return FieldCheck(**vars(found))
 
 
 def _thermal(model: Model) -> ThermalCamera:

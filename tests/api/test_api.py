@@ -5,7 +5,9 @@ from __future__ import annotations
 import doctest
 import importlib
 import json
+import pickle
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +19,7 @@ import thermocald as tc
 from tests.commands import call, finish
 from tests.golden.workshop import PROGRAMME
 from tests.marks import mostly_slow
-from thermocald.errors import ConfigurationError, DataError, StoreError, UsageError
+from thermocald.errors import ConfigurationError, DataError, RecordingError, StoreError, UsageError
 
 DOCUMENTED = (
     "api", "series", "results", "analysis.series.epochs", "analysis.camera.camera",
@@ -129,8 +131,18 @@ def test_bands_of_drawings_hold_95_percent(epochs, camera):
     axis = camera.plot().axes[1]
     outline = axis.collections[0].get_paths()[0].vertices
     first = outline[np.isclose(outline[:, 0], axis.lines[0].get_xdata()[0]), 1]
-    expected = 2 * 1.96 * 1e3 * np.sqrt(camera.at(float(outline[:, 0].min())).covariance[1, 1])
-    np.testing.assert_allclose(np.ptp(first), expected, rtol=1e-9)
+    cold = [float(outline[:, 0].min())]
+    since_T0 = camera.along([0.0], cold, relative_to=camera.model.T0)  # the level's sd cancels
+    np.testing.assert_allclose(np.ptp(first), 2 * 1.96 * 1e3 * since_T0.sd[0, 1], rtol=1e-6)
+
+
+def test_a_drawn_distortion_is_zero_at_the_principal_point(camera):
+    now = camera.at(35.0)
+    arrows = now.plot().axes[0].collections[0]
+    shift, pitch = np.hypot(arrows.U, arrows.V), now.sensor.pixel_pitch
+    middle = now.sensor.centre + np.array([1, -1]) * now.values[1:3] / pitch
+    near = np.argmin(np.linalg.norm(arrows.XY - middle, axis=1))
+    assert shift[near] < 0.05 < 5.0 < shift.max()
 
 
 def test_epochs_as_a_data_frame(epochs):
@@ -164,6 +176,7 @@ RESULTS = {
     "camera": lambda epochs, camera, M1, M2: camera,
     "camera_at": lambda epochs, camera, M1, M2: camera.at(35.0),
     "discovery": lambda epochs, camera, M1, M2: tc.discover(M1, verify=[M2]),
+    "field": lambda epochs, camera, M1, M2: tc.check_testfield(M1.testfield),
 }
 
 
@@ -239,6 +252,7 @@ def test_a_prediction_is_the_camera_and_is_held_against_series(camera, M1, world
     along = tc.predict(camera, log=world / "M1").as_dict()
     assert len(along["rows"]) == len(M1)
     said = call("predict", "--model", "camera.yaml", "--test", "M1", folder=world).stdout
+    assert "fitted on this series: this is no test" in said
     assert str(tc.predict(camera, test=[M1])) == said.strip().replace("M1:", f"{world / 'M1'}:")
     with pytest.raises(UsageError, match="give one of"):
         tc.predict(camera, 35.0, log=world / "M1")
@@ -300,7 +314,13 @@ OUT_OF_BOUNDS = {
     "sigma_px is 0": lambda M1, field: tc.check_testfield(field, sigma_px=0.0),
     "'M1' is not a series: open it": lambda M1, field: tc.fit("M1"),
     "'M2' is not a series": lambda M1, field: tc.discover(M1, verify=["M2"]),
+    "give a list of series": lambda M1, field: tc.discover(M1, verify=M1),
+    "M1: give a list": lambda M1, field: tc.predict("camera.yaml", test=M1),
+    "channels belong to a temperature": lambda M1, field: tc.predict(
+        "camera.yaml", log="M1", channels={"temperature": 30.0}
+    ),
 }
+HOT = [25.0, 30.0, 35.0]
 OF_A_CAMERA = {
     "the temperature is 'warm'": lambda camera: camera.at("warm"),
     "give one number": lambda camera: camera.at([30.0, 31.0]),
@@ -309,6 +329,18 @@ OF_A_CAMERA = {
         [1, 2, 3]
     ),
     "the pose: must be": lambda camera: camera.at(35.0).project([[0, 0, -1e3]], None),
+    "no thermometer 'foo'; it knows temperature": lambda camera: tc.predict(
+        camera, 35.0, channels={"foo": 1.0}
+    ),
+    "of board_temperature is nan": lambda camera: camera.at(
+        35.0, channels={"board_temperature": np.nan}
+    ),
+    "temperature_sd is -1": lambda camera: camera.at(35.0, temperature_sd=-1.0),
+    "times run backwards": lambda camera: camera.along([120.0, 60.0, 0.0], HOT),
+    "a time is not known": lambda camera: camera.along(["noon"] * 3, HOT),
+    "a time is not known: give": lambda camera: camera.live().update(np.nan, 30.0),
+    "a temperature is no number": lambda camera: camera.along([0.0, 60.0, 120.0], "hot"),
+    "give °C, NaN for a failed": lambda camera: camera.live().update(0.0, None),
 }
 
 
@@ -322,6 +354,57 @@ def test_an_argument_out_of_bounds_is_refused(M1, message):
 def test_what_no_camera_can_answer_is_refused(camera, message):
     with pytest.raises(UsageError, match=message):
         OF_A_CAMERA[message](camera)
+
+
+def test_times_of_pandas_with_and_without_a_zone(camera):
+    """Each is UTC, a difference of times too, and no time is invented for an unknown one."""
+    pandas = pytest.importorskip("pandas")
+    plain = pandas.date_range("2020-07-01 12:00", periods=3, freq="min")
+    berlin = plain.tz_localize("UTC").tz_convert("Europe/Berlin")
+    wanted = 1593604800.0 + np.array([0.0, 60.0, 120.0])
+    for times in (plain, berlin, pandas.Series(berlin), list(berlin), berlin.to_pydatetime()):
+        np.testing.assert_array_equal(camera.along(times, HOT).times, wanted)
+        assert camera.live().update(times[0], 30.0).temperature == 30.0
+    np.testing.assert_array_equal(camera.along(plain - plain[0], HOT).times, wanted - wanted[0])
+    with pytest.raises(UsageError, match="a time is not known"):
+        camera.along([plain[0], plain[1], pandas.NaT], HOT)
+
+
+def test_no_camera_is_predicted_beyond_the_log(camera):
+    assert len(camera.along([0.0, 60.0, 120.0], HOT, at=[0.0, 179.0])) == 2
+    for at in (1e6, -1000.0):
+        with pytest.raises(DataError, match="1 of 2 times are outside the temperature log"):
+            camera.along([0.0, 60.0, 120.0], HOT, at=[30.0, at])
+
+
+def test_one_image_point_is_an_array_of_one(camera):
+    now = camera.at(35.0)
+    for method in (now.undistort, now.rays, now.point_covariance):
+        np.testing.assert_array_equal(method([9.0, 90.0]), method([[9.0, 90.0]]))
+
+
+def test_a_copy_is_no_second_measurement(M1, inside, tmp_path):
+    """Neither a copied folder nor the store of the same recording, in a fit and in a study."""
+    shutil.copytree("M1", tmp_path / "again")
+    for copy in (tc.open(tmp_path / "again"), tc.open("thermocald.db")):
+        with pytest.raises(DataError, match="holds the same observations as"):
+            tc.fit(M1, copy)
+    with pytest.raises(DataError, match="has the same epochs as"):
+        tc.study(M1, tc.open("thermocald.db"))
+
+
+def test_a_recording_that_is_gone_is_named(inside, tmp_path):
+    moved = tc.open(shutil.copytree("M1", tmp_path / "moved"))
+    shutil.rmtree(tmp_path / "moved")
+    for use in (moved.calibrate, moved.doubts, lambda: tc.fit(moved)):
+        with pytest.raises(RecordingError, match=r"observations.csv: cannot be read"):
+            use()
+
+
+def test_epochs_are_pickled_whole(epochs):
+    again = pickle.loads(pickle.dumps(epochs))
+    assert str(again) == str(epochs)
+    np.testing.assert_array_equal(again.covariance, epochs.covariance)
 
 
 def test_the_import_costs_nothing():

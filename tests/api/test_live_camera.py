@@ -151,6 +151,35 @@ def test_maps_are_kept_while_no_point_moves():
     assert live.maps() is not before
 
 
+def test_another_thermometer_outside_its_range_widens_too(camera):
+    """By the whole drift that follows it; far outside it is refused, at, along and live."""
+    rate = 2e-4  # mm/K
+    heat = ModelEffect("second_heat_source", {"channel": "board_temperature", "x0": rate}, {})
+    model = replace(camera.model, effects=(heat,), covariance=None)
+    two = replace(camera, model=model)
+    high = model.validity["board_temperature"][1]
+    times = np.array([0.0, 10.0])
+
+    def cameras(board):
+        one = {"temperature": 35.0, "board_temperature": board}
+        live = two.live()
+        live.update(0.0, one | {"board_temperature": 35.0})
+        log = {"temperature": [35.0, 35.0], "board_temperature": [35.0, board]}
+        yield two.at(35.0, channels={"board_temperature": board})
+        yield two.along(times, log)[1]
+        yield live.update(10.0, one)
+
+    within = [now.covariance[1, 1] for now in cameras(high)]
+    with pytest.warns(UserWarning, match=r"of board_temperature is 4\.0 K outside"):
+        beyond = list(cameras(high + 4.0))
+    for now, before in zip(beyond, within, strict=True):
+        assert now.extrapolated == pytest.approx(4.0)
+        assert now.covariance[1, 1] == pytest.approx(before + (4.0 * rate) ** 2, rel=1e-6)
+    with pytest.raises(UsageError, match=r"of board_temperature is 100\.0 K outside"):
+        two.at(35.0, channels={"board_temperature": high + 100.0})
+    assert len(two.plot().axes) == 3  # which takes all thermometers to be as warm
+
+
 def test_what_is_wrong_is_said(camera):
     live = camera.live((1640, 1232))
     with pytest.raises(UsageError, match="no reading yet"):
@@ -160,6 +189,8 @@ def test_what_is_wrong_is_said(camera):
         live.update(0.0, 30.0)
     with pytest.raises(UsageError, match=r"live\(size=\(640, 480\)\)"):
         live.correct(np.zeros((480, 640), np.uint8))
+    with pytest.raises(UsageError, match="frame of bool cannot be resampled"):
+        live.correct(np.zeros((1232, 1640), bool))
     with pytest.raises(UsageError, match="outside"):
         live.update(1.0, 150.0)
     assert live.update(2.0, float("nan")).temperature == 30.0

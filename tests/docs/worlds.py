@@ -155,7 +155,7 @@ def how_to_export(shelf: Path, folder: Path) -> None:
 
 
 def how_to_thermal_model(shelf: Path, folder: Path) -> None:
-    put_recordings(shelf, folder, "M1", "M2")
+    put_recordings(shelf, folder, "M1", "M2", "M3")
     put_model(shelf, folder, "what-discover-wrote.yaml")
     put_measured(shelf, folder)
     put_heat(folder, "camera.yaml")

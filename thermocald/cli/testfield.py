@@ -271,10 +271,7 @@ def check(
         roll=roll, sigma_px=sigma,
     )  # fmt: skip
     if report is not None:
-        from thermocald.files import write_text
-        from thermocald.output.calibration import render_field_check
-
-        write_text(report, render_field_check(found))
+        found.report(report)
     show(found, json, *found.lines())
 
 

@@ -30,6 +30,7 @@ from thermocald.photogrammetry.series.field_motion import (
 from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.thermal.reduce import with_points, without_targets
 from thermocald.thermal.scan import cosines
+from thermocald.thermal.source import refuse_copies
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,13 +57,7 @@ def require_other_series(series: Sequence[SeriesInput]) -> None:
                 f"{b.name}: the reference temperature is {next(iter(b.readings), 'missing')!r}, in "
                 f"{a.name} it is {reference!r}; both series need the same thermometer"
             )
-    for k, other in enumerate(series):
-        for before in series[:k]:
-            if np.array_equal(before.grid.points, other.grid.points, equal_nan=True):
-                raise DataError(
-                    f"{other.name} holds the same observations as {before.name}; "
-                    "--verify needs a separate measurement (if simulated, with another --seed)"
-                )
+    refuse_copies(series)
 
 
 _PASSES = 2

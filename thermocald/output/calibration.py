@@ -17,7 +17,7 @@ from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, image_panel
 from thermocald.numbers import UNITS, coefficient, parameter_label, percent, plain, with_sd
-from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, CameraModel, Sensor, project
+from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from thermocald.analysis.camera.photographs import PhotographResult, Photographs
     from thermocald.arrays import Array
-    from thermocald.photogrammetry.field.testfield import TestField
 
 
 _CELLS = (12, 9)
@@ -266,7 +265,7 @@ def _photographs(result: Photographs) -> Table:
     )
 
 
-def render_field_check(result: FieldCheck) -> str:
+def render_field_check(result: FieldCheck, title: str = "") -> str:
     """Return the report as HTML text."""
     field, model = result.field, result.camera
     pitch = model.sensor.pixel_pitch
@@ -291,10 +290,10 @@ def render_field_check(result: FieldCheck) -> str:
     rows = tuple((parameter_label(n), *(_sd(value) for value in row)) for n, row in sds.items())
     reasons = list(result.hidden.values())
     return Chapter(
-        "Check of a test field",
+        title or "Check of a test field",
         Answer(
             sentence,
-            _seen(result, field, model),
+            seen_figure(result),
             (more,),
             tuple(map(as_sentence, result.advice))
             or ("No addition would improve it by a seventh: mount it.",),
@@ -329,8 +328,9 @@ def _sd(value: float) -> str:
     return f"{plain(value, 'px', 2)}" if value < 1e300 else "undetermined"
 
 
-def _seen(result: FieldCheck, field: TestField, model: CameraModel) -> Figure:
+def seen_figure(result: FieldCheck) -> Figure:
     """Draw the visible targets in the image, and the parts of it that should all hold some."""
+    model, field = result.camera, result.field
     w, h = float(model.sensor.width), float(model.sensor.height)
     upright = [((x, x), (0.0, h)) for x in np.linspace(0, w, CELLS[0] + 1)]
     level = [((0.0, w), (y, y)) for y in np.linspace(0, h, CELLS[1] + 1)]

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermocald.acquisition.calibrator import Calibrator, calibrated_epochs
+from thermocald.errors import DataError
 from thermocald.photogrammetry.linalg import mad_sd
 from thermocald.photogrammetry.series.normals import ObservationBlocks, ObservationGrid, recut
 from thermocald.store.recording.reader import Recording
@@ -303,6 +304,20 @@ def epochs_input(head: Head, field: TestField, epochs: Sequence[Epoch], name: st
     )  # fmt: skip
     grid = ObservationGrid.from_observations(field, [e.observations for e in epochs])
     return replace(whole, grid=grid)
+
+
+def refuse_copies(series: Sequence[SeriesInput]) -> None:
+    """Raise DataError if two series hold the same observations, but for a store's rounding."""
+    for k, other in enumerate(series):
+        points = other.grid.points
+        for before in series[:k]:
+            if before.grid.points.shape == points.shape and np.allclose(
+                before.grid.points, points, rtol=0.0, atol=1e-4, equal_nan=True
+            ):
+                raise DataError(
+                    f"{other.name} holds the same observations as {before.name}; give a separate "
+                    "measurement (if simulated, with another --seed)"
+                )
 
 
 def series_input(

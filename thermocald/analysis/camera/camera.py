@@ -245,7 +245,8 @@ class Camera(Result):
         width, height = self.sensor.width, self.sensor.height
         u, v = np.meshgrid(np.linspace(0, width - 1, 25), np.linspace(0, height - 1, 19))
         points = np.stack([u.ravel(), v.ravel()], axis=1)
-        dx, dy = (points - self.undistort(points)).T
+        centred = InteriorOrientation(*self.values[:3].tolist())
+        dx, dy = (points - self.undistort(points, centred)).T
         drawn = axis.quiver(*points.T, dx, dy, np.hypot(dx, dy), angles="xy", width=0.003)
         figure.colorbar(drawn, label="distortion, px")
         axis.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="x, px", ylabel="y, px")

@@ -45,7 +45,7 @@ def ideal_points(
     They are the tangents of the angles to the optical axis. Raises GeometryError for points beyond
     the radius at which the distortion folds back.
     """
-    i, points = np.asarray(iop, dtype=float), np.asarray(image_points, dtype=float)
+    i, points = np.asarray(iop, dtype=float), np.atleast_2d(np.asarray(image_points, dtype=float))
     out, inverse = np.empty_like(points), _inverse_radial(sensor, i)
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)

@@ -137,6 +137,10 @@ class Epochs(Result):
         values: Array = table[:, PARAMETER_NAMES.index(column)]
         return values
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: not `without`, a function that holds the observations."""
+        return {**vars(self), "without": None}
+
     def part(self, rows: slice) -> Epochs:
         """Return some rows, without the results for the whole series."""
         return replace(

@@ -45,7 +45,7 @@ from thermocald.photogrammetry.targets.image_file import (
     with_metadata,
 )
 from thermocald.result import jsonable, with_sds
-from thermocald.store.logger.clock import DeviceClock, iso, parse_moment
+from thermocald.store.logger.clock import DeviceClock, parse_moment
 
 if TYPE_CHECKING:
     import io
@@ -86,7 +86,6 @@ def correct_points(
     temperature_sd K: of a reading of the log. Raises DataError for times outside the log.
     """
     unique, place = np.unique(times, return_inverse=True)
-    require_inside(log, times)
     steady, along = _predict(camera, log, unique, to, temperature_sd, extrapolate)
     sensor = camera.model.sensor
     r = rays(sensor, along.values[place], points[:, None, :])
@@ -96,17 +95,6 @@ def correct_points(
     J = J[:, :, :10]
     sds = np.sqrt(np.einsum("ncp,npq,ncq->nc", J, along.covariance[place], J, optimize=True))
     return Corrected(corrected, sds, along.temperatures[place], along.extrapolated[place])
-
-
-def require_inside(log: TemperatureLog, times: Array) -> None:
-    """Raise DataError for times (n,) s that a temperature log does not cover."""
-    outside = ~log.known_at(times)
-    if outside.any():
-        raise DataError(
-            f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
-            f"({iso(log.times[0])} to {iso(log.times[-1])}) or in a gap of over ten of its "
-            f"intervals, the first is {iso(times[outside][0])}"
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +129,6 @@ def image_corrections(
     extrapolate: bool = False,
 ) -> list[ImageCorrection]:
     """Return one correction per time; arguments and errors as in `correct_points`."""
-    require_inside(log, times)
     steady, along = _predict(camera, log, times, to, temperature_sd, extrapolate)
     sensor = camera.model.sensor
     maps = Maps(sensor, steady, camera.model.T0 if to is None else to)

@@ -21,7 +21,6 @@ import numpy as np
 from scipy.special import chdtrc
 
 from thermocald.analysis.thermal.control_points import UNITS
-from thermocald.analysis.thermal.correction import require_inside
 from thermocald.errors import ConfigurationError, DataError
 from thermocald.figures import BAND
 from thermocald.files import read_yaml
@@ -269,7 +268,6 @@ def measure_places(
         raise DataError("there is no image point to measure")
     if not len(control.seen):
         raise DataError("the control points have no x, y, sx, sy: add their image points, px")
-    require_inside(log, np.append(times, when))
     noise = camera.reading_sd
     then = camera.along(log.times, log.channels, [when], extrapolate, temperature_sd=noise)
     seen_at = float(then.temperatures[0])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +30,6 @@ from thermocald.thermal.reduce import reduce_series
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from matplotlib.figure import Figure
 
@@ -205,19 +205,23 @@ def predict_along(thermal: ThermalCamera, log: TemperatureLog, extrapolate: bool
 def check_prediction(thermal: ThermalCamera, inputs: Sequence[SeriesInput]) -> Prediction:
     """Compare measured series with the model's prediction of them."""
     found, lines = [], []
+    fitted = [f for f in thermal.model.fitted_on if "recording" in f]
+    known = {(str(f["series"]), Path(str(f["recording"])).resolve()) for f in fitted}
     series = [reduce_series(s, strict=False) for s in inputs]
     for s in series:
         sensor = s.source.sensor
         sd = thermal.thermometer_sd or s.thermometers[s.history.reference].noise
         scaled = thermal.for_images(sensor.width, sensor.height, s.source.camera)
         error = predicted_error(scaled.model, s, sd)
-        found.append(asdict(error))
+        in_fit = (s.source.series, Path(s.source.name).resolve()) in known
+        found.append({**asdict(error), "in_fit": in_fit})
         bands = f"{error.coverage:.1%} inside their 95 % bands"
         if thermal.model.misses_an_effect:
             bands = "no 95 % band is stated, as the model misses an effect"
         lines.append(
             f"{s.source.name}: predicted to {error.rms_px:.4f} px (noise alone "
             f"{error.floor_px:.4f}), {bands}, {error.object_mm:.2f} mm at 10 m"
+            + ("; the model was fitted on this series: this is no test of it" if in_fit else "")
         )
     document = {
         "format": "thermocald-prediction-test/1",

@@ -59,8 +59,7 @@ class Predictor:
         self.thermal = thermal
         # `at` checks the range of temperature itself, for each epoch and without a warning
         self._free = replace(thermal, model=replace(thermal.model, validity={}))
-        named = (e.values.get("channel") for e in thermal.model.effects)
-        self._channels = tuple(dict.fromkeys(str(c) for c in named if c))
+        self._channels = thermal.channels
         self._pair: tuple[LiveCamera, LiveCamera] | None = None
         self._now: tuple[Camera, Camera] | None = None
         self._recent: deque[tuple[float, dict[str, float]]] = deque(maxlen=_REMEMBERED)

@@ -25,7 +25,6 @@ import cv2
 import numpy as np
 from scipy.special import fdtri
 
-from thermocald.analysis.thermal.correction import require_inside
 from thermocald.analysis.thermal.scene_recording import Track, write_scene
 from thermocald.errors import DataError, ImageError
 from thermocald.numbers import with_sd
@@ -384,7 +383,6 @@ def follow_scene(
         raise DataError("a scene needs a reference frame and at least one more")
     frames = sorted(frames, key=lambda frame: frame[1])
     times = np.array([time for _, time in frames])
-    require_inside(log, times)
     reference = decode_grey(frames[0][0])
     thermal = thermal.for_images(reference.shape[1], reference.shape[0])
     along = thermal.along(log.times, log.channels, times, extrapolate)

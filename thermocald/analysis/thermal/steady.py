@@ -32,10 +32,11 @@ class ExtrapolationWarning(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """The lowest and the highest temperature of the fit, °C."""
+    """The lowest and the highest temperature of the fit, °C; of: a thermometer's name."""
 
     low: float
     high: float
+    of: str = ""
 
     def beyond(self, T: float) -> float:
         """Return by how many kelvin a temperature is outside."""
@@ -60,9 +61,10 @@ class Validity:
         T = float(np.median(temperatures))
         if not self.is_far(T):
             T = float(temperatures[int(np.argmax(outside))])
+        whose = f" of {self.of}" if self.of else ""
         place = (
-            f"{T:g} °C is {self.beyond(T):.1f} K outside the {low:g} to {high:g} °C that the model "
-            "was fitted on"
+            f"{T:g} °C{whose} is {self.beyond(T):.1f} K outside the {low:g} to {high:g} °C that "
+            "the model was fitted on"
         )
         if self.is_far(T) and not extrapolate:
             if low <= (T - 32.0) / 1.8 <= high:

@@ -30,7 +30,7 @@ from thermocald.analysis.camera.undistortion import Maps
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.steady import SteadyCamera, Validity, steady_camera
 from thermocald.arrays import seconds
-from thermocald.errors import ConfigurationError, UsageError
+from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.figures import BAND
 from thermocald.numbers import parameter_label
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor
@@ -140,16 +140,23 @@ class ThermalCamera(Result):
     def plot(self) -> Figure:
         """Draw the changes of c, x0 and y0 since T0 (µm) of the steady camera against temperature.
 
-        Covers the range that the model was fitted on, with 95 % bands.
+        Covers the range that the model was fitted on, with 95 % bands of these changes; other
+        thermometers are taken to be as warm.
         """
         limits = next(iter(self.model.validity.values()), (self.model.T0 - 15, self.model.T0 + 15))
         T = np.linspace(*limits, 60)
-        states = [self.at(t) for t in T.tolist()]
-        base = self.at(self.model.T0, extrapolate=True)
+
+        def at(t: float) -> tuple[Array, Array, Array]:
+            alike = dict.fromkeys(self.channels, t)
+            return steady_camera(self.model, self.parameters, alike).at(t)
+
+        base, _, J0 = at(self.model.T0)
+        values, _, J = zip(*map(at, T.tolist()), strict=True)
+        changes, by = np.array(values) - base, np.array(J) - J0  # the level cancels in a change
+        sds = np.sqrt(np.einsum("epi,ij,epj->ep", by, self.covariance, by))
         figure, axes = new_figure(3)
         for k, axis in enumerate(axes[:, 0]):
-            y = 1e3 * np.array([s.values[k] - base.values[k] for s in states])
-            band = 1e3 * BAND * np.array([np.sqrt(s.covariance[k, k]) for s in states])
+            y, band = 1e3 * changes[:, k], 1e3 * BAND * sds[:, k]
             axis.plot(T, y)
             axis.fill_between(T, y - band, y + band, alpha=0.3)
             axis.set_ylabel(f"change of {parameter_label(IOP_NAMES[k])} in µm")
@@ -260,19 +267,58 @@ class ThermalCamera(Result):
             T = math.nan
         if math.isnan(T):
             raise UsageError(f"the temperature is {temperature!r}: give one number, °C")
+        _require_sd(temperature_sd)
         beyond = 0.0
         if self.validity is not None and self.validity.beyond(T):
             beyond = float(self.validity.check(np.array([T]), extrapolate)[0])
         if channels is None:
             values, slope, J = self._steady.at(T)
         else:
+            self._require_channels(channels)
             values, slope, J = steady_camera(self.model, self.parameters, channels).at(T)
         covariance = J @ self.covariance @ J.T
         if temperature_sd:
             covariance += temperature_sd**2 * np.outer(slope, slope)
         if beyond:
             covariance += np.diag((slope * beyond) ** 2)
+        if channels is not None:
+            others = {name: np.array([float(value)]) for name, value in channels.items()}
+            outside, drift = self._beyond(others, extrapolate)
+            covariance = _widened(covariance[None], drift)[0]
+            beyond = max(beyond, float(np.max(outside)))
         return Camera(self.model.sensor, T, values, covariance, beyond, self.model.camera)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The other thermometers that the model's effects follow."""
+        named = (e.values.get("channel") for e in self.model.effects)
+        return tuple(dict.fromkeys(str(c) for c in named if c))
+
+    def _beyond(
+        self, readings: Mapping[str, Array], extrapolate: bool
+    ) -> tuple[Array | float, Array | float]:
+        """Return by how many kelvin (E,) other thermometers are outside, and the drift (E, 10)."""
+        outside: Array | float = 0.0
+        drift: Array | float = 0.0
+        for effect in self.model.effects:
+            name = str(effect.values.get("channel", ""))
+            if name in readings and name in self.model.validity:
+                of_fit = Validity(*self.model.validity[name], name)
+                beyond = of_fit.check(readings[name], extrapolate)
+                rates = [float(effect.values.get(n, 0.0)) for n in IOP_NAMES]
+                outside = np.maximum(outside, beyond)
+                drift = drift + np.abs(beyond[:, None] * rates)
+        return outside, drift
+
+    def _require_channels(self, given: Mapping[str, float]) -> None:
+        """Raise UsageError for thermometers that the model does not know, or without a reading."""
+        known = list(dict.fromkeys([*self.model.validity, *self.channels]))
+        for name, value in given.items():
+            if name not in known:
+                there = ", ".join(known) or "none"
+                raise UsageError(f"the model knows no thermometer {name!r}; it knows {there}")
+            if not math.isfinite(value):
+                raise UsageError(f"the temperature of {name} is {value!r}: give one number, °C")
 
     def along(
         self,
@@ -290,30 +336,42 @@ class ThermalCamera(Result):
         begins with the first time. relative_to °C: the covariance is that of the difference from
         the steady camera at this temperature; temperature_sd K: of a reading, is propagated into
         the covariance (as if no effect had a memory, which would average it). Raises UsageError far
-        outside the model's validity (unless `extrapolate`), and for lengths that differ.
+        outside the model's validity (unless `extrapolate`), for lengths that differ and for times
+        that run backwards, DataError for times `at` that the log does not cover.
 
         >>> along = tc.load_camera("camera.yaml").along([0.0, 60.0, 120.0], [25.0, 30.0, 35.0])
         >>> along.values.shape, along.sd.shape
         ((3, 10), (3, 10))
         """
+        _require_sd(temperature_sd)
         t = seconds(times)
         columns = (
             temperatures if isinstance(temperatures, Mapping) else {"temperature": temperatures}
         )
-        readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
-        instants = t if at is None else seconds(at)
-        sizes = ", ".join(f"{len(c)} of {name}" for name, c in readings.items())
-        if not len(t) or not len(instants) or any(len(c) != len(t) for c in readings.values()):
+        try:
+            readings = {str(n): np.asarray(c, dtype=float) for n, c in columns.items()}
+        except (TypeError, ValueError):
+            raise UsageError("a temperature is no number: give °C, NaN if unknown") from None
+        instants = t if at is None else np.atleast_1d(seconds(at))
+        sizes = ", ".join(f"{c.size} of {name}" for name, c in readings.items()) or "no temperature"
+        shapes = {t.shape, (t.size,), *(c.shape for c in readings.values())}
+        if not readings or not t.size or instants.ndim != 1 or not len(instants) or len(shapes) > 1:
             raise UsageError(
-                f"{len(t)} times, {sizes}, at {len(instants)} times: a log needs a temperature for "
+                f"{t.size} times, {sizes}, at {instants.size} times: a log needs a temperature for "
                 "each of its times, and at least one time"
             )
-        begin = float(min(t[0], instants[0]))
+        if (np.diff(t) < 0).any():
+            raise UsageError("the times run backwards: give a log in the order of time")
         reference = next(iter(readings))
+        if at is not None:
+            _require_known(t, readings[reference], instants)
+        begin = float(min(t[0], instants.min()))
         history = History(instants - begin, t - begin, readings, reference, self.model.T0)
         outside = np.zeros(len(instants))
         if self.validity is not None:
             outside = self.validity.check(history.temperature(), extrapolate)
+        others = {name: history.temperature(name) for name in self.channels if name in readings}
+        further, drift = self._beyond(others, extrapolate)
         values, covariance = [], []
         steady = None if relative_to is None else self._steady.at(relative_to)[2]
         for first in range(0, len(instants), _CHUNK):
@@ -334,8 +392,8 @@ class ThermalCamera(Result):
             instants,
             history.temperature(),
             np.concatenate(values),
-            np.concatenate(covariance),
-            outside,
+            _widened(np.concatenate(covariance), drift),
+            np.maximum(outside, further),
             self.model.camera,
         )
 
@@ -418,6 +476,33 @@ class ThermalCamera(Result):
         return tuple((knee, *rate.tolist()) for knee, rate, _, _ in self._steady.knees)
 
 
+def _widened(covariance: Array, drift: Array | float) -> Array:
+    """Return covariances (E, 10, 10) with a drift (E, 10) beyond a thermometer's range added."""
+    rows = np.arange(10)
+    covariance[:, rows, rows] += np.square(drift)
+    return covariance
+
+
+def _require_known(log: Array, readings: Array, times: Array) -> None:
+    """Raise DataError for times (n,) s at which a log's readings (R,) at (R,) s are not known."""
+    from thermocald.store.recording.readings import interpolate_readings
+
+    outside = ~np.isfinite(interpolate_readings(times, log, readings))
+    if outside.any():
+        from thermocald.store.logger.clock import iso
+
+        raise DataError(
+            f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
+            f"({iso(log[0])} to {iso(log[-1])}) or in a gap of over ten of its intervals, the "
+            f"first is {iso(times[outside][0])}"
+        )
+
+
+def _require_sd(temperature_sd: float) -> None:
+    if not 0.0 <= temperature_sd < math.inf:
+        raise UsageError(f"temperature_sd is {temperature_sd!r}; it must be at least 0")
+
+
 def _noise_share(times: Array, at: Array) -> Array:
     """Return the variance (E,) of an interpolated reading over that of a reading; times (R,)."""
     if len(times) < 2:
@@ -495,6 +580,8 @@ class LiveCamera:
         outside = np.zeros(1)
         if thermal.validity is not None:  # first, so that an error leaves the state unchanged
             outside = thermal.validity.check(np.array(row[:1]), extrapolate=False)
+        others = {name: np.array([T]) for name, T in zip(self._channels[1:], row[1:], strict=True)}
+        further, drift = thermal._beyond(others, extrapolate=False)
         self._remember(t, row)
         times = np.array(self._times)
         readings = dict(zip(self._channels, np.array(self._rows).T, strict=True))
@@ -508,9 +595,9 @@ class LiveCamera:
         linear = thermal._linear(history, drive)
         covariance = thermal._propagate(history, drive, linear, outside, driven=driven)
         values = model.carried(linear)[0]
-        self._now = Camera(
-            model.sensor, row[0], values, covariance[0], float(outside[0]), model.camera
-        )
+        beyond = float(np.max(np.maximum(outside, further)))
+        covariance = _widened(covariance, drift)
+        self._now = Camera(model.sensor, row[0], values, covariance[0], beyond, model.camera)
         return self._now
 
     def correct(self, frame: NDArray[Any], to: float | None = None) -> NDArray[Any]:
@@ -535,7 +622,11 @@ class LiveCamera:
                 f"{sensor.width}×{sensor.height}; use live(size=({frame.shape[1]}, "
                 f"{frame.shape[0]}))"
             )
-        return cv2.remap(frame, *self.maps(to), cv2.INTER_LINEAR)
+        maps = self.maps(to)
+        try:
+            return cv2.remap(frame, *maps, cv2.INTER_LINEAR)
+        except cv2.error:
+            raise UsageError(f"a frame of {frame.dtype} cannot be resampled; give uint8") from None
 
     def maps(self, to: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the maps x, y (H, W) px for `cv2.remap` that `correct` uses now.
@@ -554,9 +645,12 @@ class LiveCamera:
         self, time: Any, temperature: float | Mapping[str, float]
     ) -> tuple[float, tuple[float, ...]]:
         """Return the time s and the readings °C; a failed one is the last of its channel."""
-        t = float(time) if isinstance(time, float | int) else float(seconds(time))
+        t = float(seconds(time))
         given = temperature if isinstance(temperature, Mapping) else {"temperature": temperature}
-        names, row = tuple(given), tuple(float(v) for v in given.values())
+        try:
+            names, row = tuple(given), tuple(float(v) for v in given.values())
+        except (TypeError, ValueError):
+            raise UsageError(f"{temperature!r}: give °C, NaN for a failed reading") from None
         if not row:
             raise UsageError("there is no reading: give a temperature, or {channel: °C}")
         if self._times:

@@ -209,8 +209,8 @@ class Recording:
     @property
     def is_long(self) -> bool:
         """Whether the observations are read in parts, as they are too many for memory."""
-        size = self._observation_path.stat().st_size if self.has_observations else 0
-        return size >= LONG_FROM_BYTES
+        path = self._observation_path  # a file that is gone is reported when it is read
+        return self.has_observations and path.exists() and path.stat().st_size >= LONG_FROM_BYTES
 
     @property
     def _observation_path(self) -> Path:

@@ -14,6 +14,7 @@ from thermocald.discovery.search import Search
 from thermocald.discovery.validation import compare_with_surrogates
 from thermocald.output.discovery import report_html
 from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.series import in_blocks
 
 KEYS = {
@@ -54,6 +55,19 @@ def test_no_effect_no_name(evidence_of):
     evidence, _ = evidence_of(seed=23, epochs=90)
     found = discover_series(evidence)
     assert (found.verdict, found.effects) == ("adequate", ())
+
+
+def test_epochs_with_few_targets_have_no_weight(evidence_of):
+    """Three epochs show eight targets; the image moves so far that the projection is curved."""
+    (series,), _ = evidence_of("permanent_set", px=8.0, seed=1, epochs=60, with_m2=False)
+    hidden = np.zeros(series.source.grid.observed.shape, dtype=bool)
+    hidden[30:33, 8:] = True
+    source = replace(series.source, grid=series.source.grid.reject(hidden))
+
+    found = discover_series([reduce_series(source)])
+
+    assert [e.effect for e in found.effects] == ["permanent_set"]
+    assert found.stages[-1].fit.chi2_reduced == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ from thermocald.photogrammetry.linalg import inverse_of_determined, scaled_inver
 from thermocald.physics import catalogue
 from thermocald.physics.model import ThermalModel
 from thermocald.result import jsonable
-from thermocald.thermal.hypothesis import BASE
+from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.scan import examine_all
 from thermocald.thermal.series import COLUMNS
 
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Fit, Term
+    from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -274,7 +274,7 @@ def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
     if alternatives:
         names = ", ".join(a["effect"] for a in alternatives)
         statement += f". Alternatives not excluded: {names}"
-    if (lags := lagging_thermometer(fit, k)) is not None:
+    if (lags := _find_lagging_thermometer(x, fit, k)) is not None:
         alternatives.append(lags)
         statement += f". Or {lags['statement']}"
     if len(x.adequacy) < 2:
@@ -289,6 +289,22 @@ def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
         },
         estimates, evidence, alternatives, term,
     )  # fmt: skip
+
+
+def _find_lagging_thermometer(x: Examination, fit: Fit, k: int) -> dict[str, Any] | None:
+    """Return a lag of the thermometer as an alternative to a gradient or a negative delay, or None.
+
+    A short lag of the thermometer looks like a camera that is ahead of it by a pure delay: the fit
+    alone decides, as between two drives.
+    """
+    term = fit.terms[k]
+    if float(dict(term.nonlinear).get(term.kind.delay, 0.0)) < 0.0:
+        rate = next(n for n in catalogue.names() if catalogue.get(n).follows_rate)
+        fit = x.fitter.fit([Term(rate) if t is term else t for t in fit.terms])
+        fit = x.fitter.refine(fit)
+        if fit.chi2 > x.best.fit.chi2 + criteria.DRIVES_BAND:
+            return None
+    return lagging_thermometer(fit, k)
 
 
 def _widen_estimates(

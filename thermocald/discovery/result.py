@@ -34,6 +34,7 @@ from thermocald.discovery.unnamed import (
     describe_misfit,
     describe_proposal,
     describe_unnamed,
+    say_contradiction,
 )
 from thermocald.discovery.validation import cross_validation
 from thermocald.photogrammetry.camera.camera_model import (
@@ -48,7 +49,7 @@ from thermocald.physics import catalogue
 from thermocald.physics.model import ThermalModel
 from thermocald.result import jsonable
 from thermocald.thermal.hypothesis import BASE, Term
-from thermocald.thermal.scan import examine_all
+from thermocald.thermal.scan import examine, examine_all
 from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
@@ -371,7 +372,8 @@ def _conclude_unexplained(
 
     Otherwise it is described and bridged by a smooth term, without a name.
     """
-    described = describe_unnamed(x)
+    alone = examine(x.fitter, base, 0)
+    described = describe_unnamed(x, alone)
     resembling: list[dict[str, Any]] = [
         {
             "effect": s.names[0],
@@ -391,9 +393,8 @@ def _conclude_unexplained(
         stages[-1:] = [measure_stage(x, a, f, known) for a, f in zip(added, fits, strict=True)]
         entry = describe_proposal(described, proposal, x, fits[1])
     else:
-        bridge = sum(a.excess for a in x.base_adequacy[:1])
         before = measure_stage(x, "unnamed", base, known)
-        gaps = (measure_gap(x, base, 0, known, bridge), *before.gaps[1:])
+        gaps = (measure_gap(x, base, 0, known, alone.excess), *before.gaps[1:])
         stages.append(replace(before, gaps=gaps))
         evidence = {
             **described.evidence,
@@ -405,7 +406,11 @@ def _conclude_unexplained(
             },
             "image_space": [e.effect for e in list_image_effects(x)],
         }
-        statement = f"{described.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}"
+        if alone.adequate:
+            del evidence["bridge"]
+        statement = say_contradiction(x) or (
+            f"{described.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}"
+        )
         entry = replace(described, statement=statement, evidence=evidence)
     entry = replace(entry, alternatives=[*entry.alternatives, *resembling])
     nan = float("nan")

@@ -7,6 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.blind.bridge import series_input
+from tests.blind.case import Case
+from tests.blind.generator import generate
 from tests.marks import mostly_slow
 from thermocald.discovery.evidence import find_displaced_targets
 from thermocald.discovery.result import discover_series
@@ -14,6 +17,7 @@ from thermocald.discovery.search import Search
 from thermocald.discovery.validation import compare_with_surrogates
 from thermocald.output.discovery import report_html
 from thermocald.thermal.fit import HypothesisFitter
+from thermocald.thermal.reduce import reduce_series, reduce_together
 from thermocald.thermal.series import in_blocks
 
 KEYS = {
@@ -54,6 +58,31 @@ def test_no_effect_no_name(evidence_of):
     evidence, _ = evidence_of(seed=23, epochs=90)
     found = discover_series(evidence)
     assert (found.verdict, found.effects) == ("adequate", ())
+
+
+def test_recordings_of_two_cameras_contradict_each_other():
+    """M2 is of another camera of the same type; M1 alone lacks no effect."""
+    cases = (Case((), seed=n, epochs=50, camera="rpi-v2.1", with_m2=False) for n in (3, 5))
+
+    found = discover_series(reduce_together([series_input(generate(c)[0][0]) for c in cases]))
+
+    assert found.headline == "unexplained: unnamed"
+    assert found.effects[0].statement.startswith("the recordings contradict each other: the model")
+    assert "bridge" not in found.effects[0].evidence
+    assert found.stages[-1].fit.chi2_reduced == pytest.approx(1.0, abs=0.06)
+
+
+def test_epochs_with_few_targets_have_no_weight(evidence_of):
+    """Three epochs show eight targets; the image moves so far that the projection is curved."""
+    (series,), _ = evidence_of("permanent_set", px=8.0, seed=1, epochs=60, with_m2=False)
+    hidden = np.zeros(series.source.grid.observed.shape, dtype=bool)
+    hidden[30:33, 8:] = True
+    source = replace(series.source, grid=series.source.grid.reject(hidden))
+
+    found = discover_series([reduce_series(source)])
+
+    assert [e.effect for e in found.effects] == ["permanent_set"]
+    assert found.stages[-1].fit.chi2_reduced == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.slow

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tests.analysis.test_thermal_model import for_fit, simulated
+from tests.blind.world import lagged
 from thermocald.discovery.entries import lagging_thermometer
+from thermocald.discovery.result import discover_series
 from thermocald.physics.model import ModelEffect
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import Term
+from thermocald.thermal.reduce import reduce_series
 from thermocald.thermal.source import epochs_input
 
 NAMES = ("c", "x0", "y0")
@@ -39,3 +44,20 @@ def test_a_mount_that_bends_is_no_lag_of_the_thermometer():
     rates = simulated(1, listed=()).model.rates
     early = {n: -TAU * rates[n] for n in NAMES}
     assert alternative(2, early) is None
+
+
+def test_a_slow_thermometer_is_offered_beside_a_negative_delay(evidence_of):
+    """A lag of 12 s of the thermometer itself looks like a pure delay of as much."""
+    (series,), _ = evidence_of(seed=2, epochs=100, with_m2=False)
+    source = series.source
+    fine = np.arange(source.reading_times[0], source.reading_times[-1])
+    name, warm = next(iter(source.readings.items()))
+    slow = np.interp(
+        source.reading_times, fine, lagged(np.interp(fine, source.reading_times, warm), 12.0)
+    )
+
+    (effect,) = discover_series([reduce_series(replace(source, readings={name: slow}))]).effects
+
+    assert (effect.effect, effect.alternative_names) == ("time_offset", ["lagging_thermometer"])
+    assert effect.statement.startswith("the thermometer follows the camera after a pure delay of 1")
+    assert abs(effect.alternatives[-1]["values"]["tau"] - 12.0) < 1.0

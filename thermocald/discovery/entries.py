@@ -117,7 +117,7 @@ def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
         f"{say_estimate(_make_estimate(tau, sd, 's'))}: "
         f"it explains {', '.join(own.parameters)} by one number",
         "experiment": "put a small, fast thermometer beside the present one and record again: a "
-        "lag of the thermometer disappears, a gradient remains",
+        "lag of the thermometer disappears, any other cause remains",
     }
 
 

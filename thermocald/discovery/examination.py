@@ -14,7 +14,12 @@ from thermocald.discovery.evidence import (
     find_displaced_targets,
     replace_moved_boards,
 )
-from thermocald.discovery.mounted import is_convincing, search_beside_mount, split_knocks
+from thermocald.discovery.mounted import (
+    contradict,
+    is_convincing,
+    search_beside_mount,
+    split_knocks,
+)
 from thermocald.discovery.search import Search, Solution
 from thermocald.discovery.validation import (
     SurrogateTest,
@@ -332,9 +337,9 @@ def _examine_beside_mount(
     given: Sequence[tuple[str, dict[str, Any]]],
     jobs: int,
 ) -> Examination | None:
-    """Search beside a moving mount; None if the movement is too smooth for a mount.
+    """Search beside a moving mount; None if that explains no movement as smooth as this one.
 
-    It is then an influence that was not recorded.
+    It is then an influence that was not recorded; None also if the series contradict each other.
     """
     fitter = HypothesisFitter([in_blocks(replace(e, correlation=1.0)) for e in calibrated])
     fitter = HypothesisFitter(
@@ -354,6 +359,8 @@ def _examine_beside_mount(
         best, blocks, tests = _keep_named(search, base, whole, jobs)
     if not is_convincing(base, best):
         best, blocks, tests = base, [], ()
+    if contradict(best):
+        return None
     tried = iter(beside.as_slips)
     as_slips = tuple(t.parameters != EOP_NAMES or next(tried) for t in knocks)
     rivals: list[Solution] = []

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from thermocald.discovery import criteria
 from thermocald.discovery.search import Search, Solution
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.movement import (
     Mount,
     estimate_mount_motion,
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Term
 
 _WIDTH = 4  # solutions of a level whose movement is estimated
 _LEVELS = 5
@@ -210,3 +210,20 @@ def is_convincing(base: Solution, best: Solution) -> bool:
         outside.append(without.chi2_of(left) - whole.chi2_of(left))
     least = criteria.MOUNT_WORSE * max(inside)
     return min(outside) > -least and sum(outside) > least
+
+
+def contradict(best: Solution) -> bool:
+    """Test whether a further series needs rates of its own, however much the mount moves.
+
+    A movement that is estimated from all series may be as large as their contradiction.
+    """
+    count = len(best.fitter.series)
+    shared = _profile(best, best).fit.objective
+    for s in range(1, count):
+        fresh = tuple(() if k == s else None for k in range(count))
+        own = Term("housing_tilt", BASE, fresh=fresh, through_drive=True)  # along T, as the rates
+        fit = best.fitter.fit((*best.terms, own))
+        trial = _profile(best, replace(best, fit=fit))
+        if shared - trial.fit.objective > criteria.MOUNT_FURTHER:
+            return True
+    return False

@@ -34,6 +34,7 @@ from thermocald.discovery.unnamed import (
     describe_misfit,
     describe_proposal,
     describe_unnamed,
+    say_contradiction,
 )
 from thermocald.discovery.validation import cross_validation
 from thermocald.photogrammetry.camera.camera_model import (
@@ -47,8 +48,8 @@ from thermocald.photogrammetry.linalg import inverse_of_determined, scaled_inver
 from thermocald.physics import catalogue
 from thermocald.physics.model import ThermalModel
 from thermocald.result import jsonable
-from thermocald.thermal.hypothesis import BASE
-from thermocald.thermal.scan import examine_all
+from thermocald.thermal.hypothesis import BASE, Term
+from thermocald.thermal.scan import examine, examine_all
 from thermocald.thermal.series import COLUMNS
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ if TYPE_CHECKING:
 
     from thermocald.arrays import Array
     from thermocald.thermal.fit import HypothesisFitter
-    from thermocald.thermal.hypothesis import Fit, Term
+    from thermocald.thermal.hypothesis import Fit
     from thermocald.thermal.series import ReducedSeries
 
 
@@ -274,7 +275,7 @@ def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
     if alternatives:
         names = ", ".join(a["effect"] for a in alternatives)
         statement += f". Alternatives not excluded: {names}"
-    if (lags := lagging_thermometer(fit, k)) is not None:
+    if (lags := _find_lagging_thermometer(x, fit, k)) is not None:
         alternatives.append(lags)
         statement += f". Or {lags['statement']}"
     if len(x.adequacy) < 2:
@@ -289,6 +290,22 @@ def _describe_effect(x: Examination, fit: Fit, k: int) -> EffectFound:
         },
         estimates, evidence, alternatives, term,
     )  # fmt: skip
+
+
+def _find_lagging_thermometer(x: Examination, fit: Fit, k: int) -> dict[str, Any] | None:
+    """Return a lag of the thermometer as an alternative to a gradient or a negative delay, or None.
+
+    A short lag of the thermometer looks like a camera that is ahead of it by a pure delay: the fit
+    alone decides, as between two drives.
+    """
+    term = fit.terms[k]
+    if float(dict(term.nonlinear).get(term.kind.delay, 0.0)) < 0.0:
+        rate = next(n for n in catalogue.names() if catalogue.get(n).follows_rate)
+        fit = x.fitter.fit([Term(rate) if t is term else t for t in fit.terms])
+        fit = x.fitter.refine(fit)
+        if fit.chi2 > x.best.fit.chi2 + criteria.DRIVES_BAND:
+            return None
+    return lagging_thermometer(fit, k)
 
 
 def _widen_estimates(
@@ -355,7 +372,8 @@ def _conclude_unexplained(
 
     Otherwise it is described and bridged by a smooth term, without a name.
     """
-    described = describe_unnamed(x)
+    alone = examine(x.fitter, base, 0)
+    described = describe_unnamed(x, alone)
     resembling: list[dict[str, Any]] = [
         {
             "effect": s.names[0],
@@ -375,9 +393,8 @@ def _conclude_unexplained(
         stages[-1:] = [measure_stage(x, a, f, known) for a, f in zip(added, fits, strict=True)]
         entry = describe_proposal(described, proposal, x, fits[1])
     else:
-        bridge = sum(a.excess for a in x.base_adequacy[:1])
         before = measure_stage(x, "unnamed", base, known)
-        gaps = (measure_gap(x, base, 0, known, bridge), *before.gaps[1:])
+        gaps = (measure_gap(x, base, 0, known, alone.excess), *before.gaps[1:])
         stages.append(replace(before, gaps=gaps))
         evidence = {
             **described.evidence,
@@ -389,7 +406,11 @@ def _conclude_unexplained(
             },
             "image_space": [e.effect for e in list_image_effects(x)],
         }
-        statement = f"{described.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}"
+        if alone.adequate:
+            del evidence["bridge"]
+        statement = say_contradiction(x) or (
+            f"{described.statement}; {NO_PROPOSAL[len(x.fitter.series) > 1]}"
+        )
         entry = replace(described, statement=statement, evidence=evidence)
     entry = replace(entry, alternatives=[*entry.alternatives, *resembling])
     nan = float("nan")

@@ -19,26 +19,30 @@ from thermocald.photogrammetry.linalg import explained, inverse_of_determined
 from thermocald.physics import catalogue
 from thermocald.physics.formula import say_together
 from thermocald.result import jsonable
+from thermocald.thermal.scan import examine
 from thermocald.thermal.series import COLUMNS, unit_directions
 
 if TYPE_CHECKING:
     from thermocald.arrays import Array
     from thermocald.discovery.examination import Examination
     from thermocald.discovery.proposal import Proposal
+    from thermocald.discovery.search import Solution
     from thermocald.thermal.hypothesis import Fit
+    from thermocald.thermal.scan import Adequacy
     from thermocald.thermal.series import ReducedSeries
 
 # a shift of the image is attributed to the principal point rather than to a tilt
 _IN_ORDER = (range(3), range(3, 10), range(10, 16), range(16, len(COLUMNS)))
 
 
-def describe_unnamed(x: Examination) -> EffectFound:
+def describe_unnamed(x: Examination, alone: Adequacy) -> EffectFound:
     """Describe what the base model leaves in M1 by time, space and correlations.
 
-    The size is the movement of the image points, px; the parameters are the fewest that explain
-    nearly all of this movement.
+    alone: of constants from M1; if they leave nothing, constants from all series do. The size is
+    the movement of the image points, px; the parameters are the fewest that explain nearly all of
+    this movement.
     """
-    a, e = x.base_adequacy[0], x.fitter.series[0]
+    a, e = x.base_adequacy[0] if alone.adequate else alone, x.fitter.series[0]
     rest = a.trajectories.T @ a.amplitudes  # (E, P), px-scaled
     rest = rest - rest.mean(axis=0)
     seen = e.columns[e.weights[..., 0].any(axis=0)].reshape(-1, rest.shape[1])
@@ -134,6 +138,30 @@ def _choose_movers(metric: Array, moved: Array) -> list[str]:
             explained = gains[best]
             chosen.append(left.pop(best))
     return [COLUMNS[i] for i in chosen]
+
+
+def say_contradiction(x: Examination) -> str | None:
+    """Say what reproduces a series alone, with constants of its own; None if nothing does."""
+    fitter, every = x.fitter, range(len(x.fitter.series))
+
+    def reproduces(s: Solution, series: int) -> bool:
+        fit = fitter.refine(fitter.fit(s.terms, only=[series]), only=[series])
+        return examine(fitter, fit, series).adequate
+
+    if len(every) < 2:
+        return None
+    if reproduces(x.base, 0):
+        found = "the model reproduces the first recording alone, and lacks no effect there"
+    elif names := [s.names[-1] for s in x.ranking[:4] if all(reproduces(s, k) for k in every)]:
+        found = (
+            f"with {' or '.join(dict.fromkeys(names))} the model reproduces each recording alone"
+        )
+    else:
+        return None
+    return (
+        f"the recordings contradict each other: {found}, but its constants do not hold in another; "
+        "was the camera, its focus, its mount or the thermometer changed between them?"
+    )
 
 
 NO_PROPOSAL = {

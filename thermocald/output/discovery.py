@@ -388,8 +388,8 @@ def _effect(effect: EffectFound) -> Section:
         text.append(
             f"Effects that merely resemble it: {', '.join(alike)}. They do not pass the absolute "
             "test."
-            + ("" if effect.term else " The smooth term fitted to M1 does not apply to another "
-               "series.")
+            + (" The smooth term fitted to M1 does not apply to another series."
+               if "bridge" in effect.evidence else "")
         )  # fmt: skip
     table = Table("Estimates", ("parameter", "value ± sd"), tuple(rows))
     return Section(f"Effect found: {effect.effect}", tuple(text), (), (table,), tuple(items))

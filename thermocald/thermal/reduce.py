@@ -364,7 +364,7 @@ def _reduce(
     variance = float(np.median(sigma0[enough]) ** 2)
     v = np.where((seen & ~bad)[..., None], v, np.nan)
     weak = ~enough
-    N[weak], b[weak], yy[weak], count[weak] = 0.0, 0.0, 0.0, 0
+    N[weak], b[weak], yy[weak], count[weak], w[weak], v[weak] = 0.0, 0.0, 0.0, 0, 0.0, np.nan
     return ReducedSeries(
         source=source,
         times=times,
@@ -385,10 +385,7 @@ def _reduce(
         variance=variance,
         correlation=_measure_correlation(v),
         gross=int(bad.sum()),
-        # epochs without weight do not count for the offsets of hidden targets either
-        hidden=group_hidden_targets(
-            np.where(enough[:, None, None], w, 0.0) / variance, misclosure - offsets, A
-        ),
+        hidden=group_hidden_targets(w / variance, misclosure - offsets, A),
         distortion=distortion,
     )
 

@@ -15,6 +15,7 @@ from thermocald.physics.effect import (
     Proportional,
     Steady,
     coefficient_units,
+    say_estimate,
 )
 from thermocald.physics.history import Follower, History, follow_delay, follow_lag
 from thermocald.physics.operators import interpolation_matrix
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from thermocald.arrays import Array
-    from thermocald.physics.effect import Values
+    from thermocald.physics.effect import Estimates, Values
 
 
 class ThermalLag(Operated):
@@ -71,6 +72,14 @@ class TimeOffset(Effect):
         "cycle": "returns to the same line each time",
         "idle": "does nothing",
     }
+
+    def sentence(self, estimates: Estimates) -> str:
+        """Write a sentence for a report; a negative delay is the thermometer's."""
+        d = estimates["d"]
+        if d["value"] >= 0.0:
+            return super().sentence(estimates)
+        late = say_estimate({**d, "value": -d["value"]})
+        return f"the thermometer follows the camera after a pure delay of {late}"
 
     def follower(self, values: Values) -> Follower | None:
         return follow_delay(float(values["d"]))

@@ -29,6 +29,7 @@ from thermocald.figures import (
     tick_text,
 )
 from thermocald.numbers import parameter_label, plain, shortened, with_sd
+from thermocald.photogrammetry.linalg import best_level
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
 
@@ -170,8 +171,7 @@ def _sections(d: Discovery) -> list[Section]:
 
 def _without_level(e: ReducedSeries, values: Array) -> Array:
     """Subtract from parameters (E, P) their mean, weighted as the image points determine them."""
-    right = np.einsum("epq,eq->p", e.N, values)
-    return np.asarray(values - np.linalg.lstsq(e.N.sum(axis=0), right, rcond=1e-12)[0])
+    return values - best_level(e.N, np.einsum("epq,eq->ep", e.N, values))
 
 
 def _model(fit: Fit, series: int) -> Array:

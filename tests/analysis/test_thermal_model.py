@@ -31,6 +31,17 @@ def simulated(seed, series="M1", epochs=120, listed=(LAG,), power=9.0):
     return audit_thermal.simulated(seed, tuple(listed), epochs, power, until, series)
 
 
+def misread(seed, epochs, noise, field_mm):
+    """Return a simulation with this noise of its thermometers, and it seen with a wrong field."""
+    s = simulated(seed, epochs=epochs)
+    thermometers = {k: replace(t, noise=noise) for k, t in s.device.thermometers.items()}
+    s = replace(s, device=replace(s.device, thermometers=thermometers))
+    rng = np.random.default_rng(1000 + seed)
+    wrong = s.field.points + rng.normal(0, field_mm, s.field.points.shape)
+    stated = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field_mm))
+    return s, epochs_input(s.head, stated, list(s.epochs()), "M1")
+
+
 def for_fit(source):
     return reduce_series(source, strict=False)
 

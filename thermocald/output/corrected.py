@@ -159,10 +159,9 @@ class Correction:
     def _possible(self, block: RowBlock) -> RowBlock:
         """Return the rows within the image and the time span of the log; refuse the others."""
         log = self.log.times
-        step = float(np.median(np.diff(log))) if len(log) > 1 else 0.0
-        within = (block.times >= log[0] - step) & (block.times <= log[-1] + step)
         possible = block.kept(
-            within, f"was measured outside the temperature log ({iso(log[0])} to {iso(log[-1])})"
+            self.log.covers(block.times),
+            f"was measured outside the temperature log ({iso(log[0])} to {iso(log[-1])})",
         )
         if possible.values.shape[1]:
             sensor = self.thermal.model.sensor

@@ -100,13 +100,11 @@ def correct_points(
 
 def require_inside(log: TemperatureLog, times: Array) -> None:
     """Raise DataError for times (n,) s that a temperature log does not cover."""
-    begin, end = float(log.times[0]), float(log.times[-1])
-    step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
-    outside = (times < begin - step) | (times > end + step)
+    outside = ~log.covers(times)
     if outside.any():
         raise DataError(
             f"{int(outside.sum())} of {len(times)} times are outside the temperature log "
-            f"({iso(begin)} to {iso(end)}), the first is {iso(times[outside][0])}"
+            f"({iso(log.times[0])} to {iso(log.times[-1])}), the first is {iso(times[outside][0])}"
         )
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from thermocald.arrays import Array
+    from thermocald.arrays import Array, Mask
 
 READINGS = "readings.csv"
 """The file with every reading of a log, in a recording of frames and a separate log."""
@@ -37,6 +37,17 @@ class TemperatureLog:
     times: Array
     channels: dict[str, Array]
     notes: tuple[str, ...] = ()
+
+    @property
+    def step(self) -> float:
+        """The usual time between readings, s; 0 if there is only one."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
+
+    def covers(self, times: Array) -> Mask:
+        """Return which times (n,) s are in the log, or at most a step outside."""
+        first, last = self.times[0] - self.step, self.times[-1] + self.step
+        within: Mask = (first <= times) & (times <= last)
+        return within
 
     def with_reference(self, name: str | None) -> TemperatureLog:
         """Return the log with the channel `name` first; unchanged if it has no such channel."""

@@ -23,6 +23,7 @@ import numpy as np
 from tests.blind.bridge import series_input
 from tests.blind.case import SINGLE, Case
 from tests.blind.generator import generate
+from tests.blind.outcome import excess_closed
 from thermocald.discovery.result import discover_series
 from thermocald.discovery.search import list_candidates
 from thermocald.thermal.fit import HypothesisFitter
@@ -188,7 +189,7 @@ def main() -> None:
         own = scores["thermocald discover"]
         own.seconds.append(time.process_time() - begin)
         _count(own, {e.effect for e in found.effects}, case)
-        closed = found.excess_closed()
+        closed = excess_closed(found)
         if closed is not None:
             own.closed.append(closed)
         fitter = HypothesisFitter([first, second])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from thermocald.acquisition.device_loop import Schedule
 from thermocald.acquisition.steady_clock import SteadyClock
 from thermocald.hal import VirtualClock
 
@@ -74,20 +73,6 @@ def test_a_pi_that_learns_the_time_after_boot_follows_at_once(make, start):
     assert clock.utc() == 1.75e9 + 30.0
     assert clock.trusted()
     assert clock.check() is None
-
-
-def test_the_rhythm_does_not_notice_any_of_it(make):
-    machine = VirtualClock(utc=1.7e9)
-    clock = make(machine)
-    schedule = Schedule(clock, 10.0)
-    ticks = []
-    for k in range(12):
-        schedule.wait()
-        ticks.append(clock.monotonic())
-        if k in (3, 7):
-            machine.step_utc(3600.0 if k == 3 else -3600.0)
-        clock.check()
-    assert ticks == [10.0 * k for k in range(12)]
 
 
 def test_a_thread_that_had_to_wait_between_two_clocks_moves_no_time_stamp():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.audit_thermal import rate_errors, seen
-from tests.analysis.test_thermal_model import LAG, for_fit, reduced, run, simulated
+from tests.analysis.test_thermal_model import LAG, for_fit, misread, reduced, run, simulated
 from thermocald.analysis.thermal.model_text import model_lines
 from thermocald.analysis.thermal.prediction_test import predicted_error
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -18,7 +18,6 @@ from thermocald.photogrammetry.camera.camera_model import project
 from thermocald.physics import catalogue
 from thermocald.physics.effect import Effect, coefficient_units
 from thermocald.physics.model import ModelEffect
-from thermocald.thermal.source import epochs_input
 
 SIZE = {"c": 3e-4, "x0": 6e-4, "y0": -4e-4}
 NOISE_PX = 0.04
@@ -175,13 +174,7 @@ def level_pulls(draws, epochs, noise=0.1, field=0.02):
     """Return errors of the level and the rates over their stated sds, (draws, 11)."""
     pulls = []
     for seed in range(draws):
-        s = simulated(seed, epochs=epochs)
-        thermometers = {k: replace(t, noise=noise) for k, t in s.device.thermometers.items()}
-        s = replace(s, device=replace(s.device, thermometers=thermometers))
-        rng = np.random.default_rng(1000 + seed)
-        wrong = s.field.points + rng.normal(0, field, s.field.points.shape)
-        stated = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field))
-        source = epochs_input(s.head, stated, list(s.epochs()), "M1")
+        s, source = misread(seed, epochs, noise, field)
         f = fit_thermal_model([for_fit(source)], [LAG], T0=30.0, search=False)
         true = s.model.interior.as_array() + 5.0 * s.model.rate_vector
         names = ("c", "x0", "y0", "A1", "A2", "A3", "B1", "B2")

@@ -18,7 +18,6 @@ from thermocald.analysis.thermal.thermal_camera import ThermalCamera
 from thermocald.errors import ConfigurationError, DataError, UsageError
 from thermocald.photogrammetry.camera.camera_model import InteriorOrientation, Sensor, rays
 from thermocald.physics.model import ModelEffect
-from thermocald.physics.model_file import write_model
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 
 
@@ -138,15 +137,6 @@ def test_outside_the_validity_it_warns_or_refuses():
         assert camera.at(-20.0, extrapolate=True).sd["c"] > 40 * 2e-4 * 0.99
 
 
-@pytest.mark.parametrize("T", [70.0, 86.0, 100.0])
-def test_fahrenheit_is_refused(T):
-    camera = ThermalCamera(thermal_model())
-    with pytest.raises(UsageError, match="looks like fahrenheit"):
-        camera.at(T)
-    with pytest.raises(UsageError, match="looks like fahrenheit"):
-        camera.along([0.0, 10.0, 20.0], [T - 1, T, T + 1])
-
-
 def test_missing_readings_are_refused():
     camera = ThermalCamera(thermal_model(*LISTED))
     with pytest.raises(UsageError, match="temperature is nan: give one number"):
@@ -206,13 +196,6 @@ def test_warm_up_time_of_an_exponential():
     assert steady_from == pytest.approx(300.0 * np.log(worst / 2.0), abs=6.0)
     still_moving, _ = warm_up(camera.along(t[:60], T[:60]), 10_000.0, 0.1)
     assert still_moving is None
-
-
-def test_a_written_model_is_loaded(tmp_path):
-    write_model(tmp_path / "m.yaml", thermal_model(*LISTED))
-    a, b = ThermalCamera.load(tmp_path / "m.yaml").at(30.0), ThermalCamera(thermal_model(*LISTED))
-    np.testing.assert_array_equal(a.values, b.at(30.0).values)
-    np.testing.assert_allclose(a.covariance, b.at(30.0).covariance, rtol=1e-12, atol=0)
 
 
 def test_a_formula_with_a_decimal_point_is_predicted_along_a_log(tmp_path):

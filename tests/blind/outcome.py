@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from thermocald.discovery import criteria
 from thermocald.discovery.result import Discovery
 
 
@@ -28,6 +29,14 @@ class Outcome:
     misfit_px: float = 0.0
 
 
+def excess_closed(discovery: Discovery) -> float | None:
+    """Return the share of reduced χ²'s excess over the floor in M2 that the effects explain."""
+    before, after = discovery.stages[0].verify, discovery.stages[-1].verify
+    if before is None or after is None or before.chi2_reduced - before.floor < criteria.EXCESS:
+        return None
+    return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
+
+
 def compare(
     case: Any, discovery: Discovery, seconds: float, accepted: tuple[tuple[str, ...], ...] = ()
 ) -> Outcome:
@@ -42,6 +51,6 @@ def compare(
         wrong = [h for h in hidden if h not in found]
         close = all(any(w in a.split("+") for a in listed) for w in wrong)
     return Outcome(
-        case, found, discovery.verdict, listed, right, close, {}, discovery.excess_closed(),
+        case, found, discovery.verdict, listed, right, close, {}, excess_closed(discovery),
         seconds, max(a.misfit_px for a in discovery.examination.adequacy),
     )  # fmt: skip

@@ -17,6 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from tests.blind.case import OUTSIDE, Case
 from tests.blind.generator import Unseen
+from tests.blind.outcome import excess_closed
 from tests.blind.outside import HUMID, RECORDED, UNRECORDED
 from tests.blind.score import discover_case
 
@@ -50,7 +51,7 @@ def describe(kind: str, seed: int, px: float = 0.3) -> Described:
     proposed = first is not None and first.effect == "unnamed" and first.term is not None
     return Described(
         kind, seed, first.statement if proposed else found.headline, proposed,
-        found.verdict == "effects_found", found.excess_closed() or 0.0, seconds,
+        found.verdict == "effects_found", excess_closed(found) or 0.0, seconds,
     )  # fmt: skip
 
 

@@ -28,10 +28,6 @@ def recording(tmp_path_factory):
     return folder
 
 
-def test_replay_writes_one_json_document_and_nothing_else(recording):
-    assert json.loads(finish("replay", recording, "--json", "-").stdout)["ok"] == 40
-
-
 def test_a_store_gives_what_is_stored(recording, tmp_path):
     """The epochs are exported as they were adjusted, as on the dashboard: not adjusted again."""
     store = tmp_path / "t.db"
@@ -198,14 +194,6 @@ def test_every_command_has_help_with_an_example():
     for name, entry in COMMANDS.items():
         if not entry.group:
             assert "Example" in run(name, "--help").stdout, name
-
-
-def test_without_a_configuration_run_says_where_it_looked(tmp_path):
-    done = run("run", folder=tmp_path)
-    assert done.returncode == 2
-    assert "./config.yaml" in done.stderr
-    (tmp_path / "config.yaml").write_text("cameras: 3\n")
-    assert "config.yaml: cameras" in run("run", folder=tmp_path).stderr  # it is read
 
 
 def test_a_page_of_no_store_is_an_error(tmp_path):

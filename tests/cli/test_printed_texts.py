@@ -64,14 +64,6 @@ def test_folders_that_do_not_exist_are_made(minute):
     assert out.read_text().startswith("epoch,frame_time")
 
 
-def test_a_prediction_has_no_sd_of_nothing(minute, tmp_path):
-    run("fit", minute, "-o", tmp_path / "m.yaml")
-    said = run("predict", "--model", tmp_path / "m.yaml", "--temperature", 25.0).stdout
-    assert not re.search(r"± 0(?![.\d])", said)
-    assert not re.search(r"± 0\.0+(?!\d)", said)
-    assert not re.search(r"e-0\d", said)
-
-
 def test_the_line_of_a_session_stays_one_line(monkeypatch):
     terminal = io.StringIO()
     terminal.isatty = lambda: True

@@ -13,7 +13,7 @@ from tests.commands import invoke as run
 from tests.commands import succeed
 from tests.photogrammetry import network_cases as cases
 from tests.pictures import ORIENTATION, save_photograph
-from thermocald.errors import ConfigurationError, GeometryError, ThermocaldError, UsageError
+from thermocald.errors import GeometryError, ThermocaldError, UsageError
 from thermocald.photogrammetry.camera.camera_model import CameraModel, InteriorOrientation, Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.physics.scene import Scene
@@ -43,24 +43,6 @@ def test_check_says_before_printing_whether_a_series_gets_a_result(arguments, ca
     assert document["calibrates"] is calibrates
     if not calibrates:
         assert any("correlate at" in reason for reason in document["weak"])
-
-
-def test_print_json_is_the_only_thing_on_standard_output(tmp_path):
-    result = succeed(
-        "testfield", "print", "--paper", "200x150", "--diameter", 5, "--markers",
-        "DICT_4X4_50", "--no-plain", "--out", tmp_path, "--json", "-",
-    )  # fmt: skip
-    document = json.loads(result.stdout)
-    assert document["format"] == "thermocald-testfield-print/1"
-    assert document["plain"] == 0
-    assert document["markers"] > 0
-    assert document["targets"] == document["coded"] + 4 * document["markers"]
-
-
-def test_print_that_cannot_be_is_refused(tmp_path):
-    with pytest.raises(UsageError, match="smaller discs"):
-        run("testfield", "print", "--diameter", 100, "--out", tmp_path / "x")
-    assert run("testfield", "print", "--paper", "A4").exit_code == 2
 
 
 @pytest.fixture(scope="module")
@@ -170,14 +152,6 @@ def test_a_wrong_file_of_distances_is_named_by_its_line(photographs, tmp_path):
             "--out", tmp_path / "o.csv")  # fmt: skip
 
 
-def test_check_says_what_is_seen_and_what_to_add(photographs):
-    result = succeed("testfield", "check", photographs[0] / "testfield.csv")
-    assert "standard deviations in px" in result.stdout
-    assert "better: " in result.stdout
-    assert "one plane" in result.stdout
-    assert "Raspberry Pi camera v2.1" in result.stderr
-
-
 def test_check_json_from_a_place(photographs):
     result = succeed(
         "testfield", "check", photographs[0] / "testfield.csv", "--from", 700, 150, 400, "--roll",
@@ -192,24 +166,6 @@ def test_check_json_from_a_place(photographs):
     with pytest.raises(GeometryError, match="visible from there"):
         run("testfield", "check", photographs[0] / "testfield.csv", "--from", 200, 150, -400,
             "--at", 200, 150, -900)  # fmt: skip
-
-
-def test_camera_convert(tmp_path):
-    model = CameraModel(Sensor(640, 480, 0.003), InteriorOrientation(2.0, 0.01, 0.02, -1e-2))
-    from thermocald.photogrammetry import camera_files
-
-    camera_files.write(model, tmp_path / "a.cameramodel", "mrcal")
-    result = succeed("camera", "convert", tmp_path / "a.cameramodel", "--to", "colmap", "--out",
-                 tmp_path / "cameras.txt", "--json", "-")  # fmt: skip
-    document = json.loads(result.stdout)
-    assert (document["source_format"], document["out_format"]) == ("mrcal", "colmap")
-    assert document["statement"].startswith("exact")
-    assert document["c"] == pytest.approx(2.0)
-    assert "converted from a.cameramodel" in (tmp_path / "cameras.txt").read_text()
-    with pytest.raises(UsageError, match="give one of opencv"):
-        run("camera", "convert", tmp_path / "a.cameramodel", "--to", "x", "--out", tmp_path / "y")
-    with pytest.raises(ConfigurationError, match=r"none\.xml"):
-        run("camera", "convert", tmp_path / "none.xml", "--to", "ros", "--out", tmp_path / "y")
 
 
 def test_a_turned_camera_does_not_turn_its_picture(tmp_path):

@@ -45,15 +45,6 @@ def test_a_hidden_effect_is_named(evidence_of, effect):
     assert [e.effect for e in found.effects] == [effect]
 
 
-@pytest.mark.slow
-def test_the_gap_shrinks_to_the_floor(evidence_of):
-    evidence, _ = evidence_of("permanent_set", px=0.1, seed=22)
-    found = discover_series(evidence)
-    assert found.stages[0].verify.chi2_reduced > 2
-    assert found.excess_closed() > 0.9
-    assert found.stages[-1].fit.rms_px < 0.06
-
-
 def test_no_effect_no_name(evidence_of):
     evidence, _ = evidence_of(seed=23, epochs=90)
     found = discover_series(evidence)

@@ -13,6 +13,7 @@ import pytest
 from tests.blind.bridge import series_input
 from tests.blind.case import OUTSIDE, Case
 from tests.blind.generator import generate
+from tests.blind.outcome import excess_closed
 from tests.blind.outside import HUMID
 from thermocald.discovery.formulas import Library, condense
 from thermocald.discovery.proposal import propose
@@ -127,4 +128,4 @@ def test_a_discovery_says_the_formula_and_the_gap_closes():
     assert (found.verdict, entry.effect) == ("unexplained", "unnamed")
     assert "tanh((T − " in entry.statement
     assert entry.evidence["proposal"]["transferable"] is True
-    assert found.excess_closed() > 0.8
+    assert excess_closed(found) > 0.8

@@ -1,30 +1,22 @@
 """The level of a discovered model: its sds include both noises and the test field's errors."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from tests.analysis.test_thermal_model import simulated
+from tests.analysis.test_thermal_model import misread
 from thermocald.discovery.result import estimate_level
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.hypothesis import make_known_term
 from thermocald.thermal.noise import calibrate_thermometers
 from thermocald.thermal.reduce import reduce_series
-from thermocald.thermal.source import epochs_input
 
 
 def pulls(draws: int, noise: float, field: float) -> np.ndarray:
     """Return the errors of c, x0, y0 at T0 over their sds (draws, 3)."""
     out = []
     for seed in range(draws):
-        s = simulated(seed, epochs=40)
-        thermometers = {k: replace(t, noise=noise) for k, t in s.device.thermometers.items()}
-        s = replace(s, device=replace(s.device, thermometers=thermometers))
-        rng = np.random.default_rng(1000 + seed)
-        wrong = s.field.points + rng.normal(0, field, s.field.points.shape)
-        said = replace(s.field, points=wrong, sigmas=np.full(wrong.shape, field))
-        reduced = reduce_series(epochs_input(s.head, said, list(s.epochs()), "M1"), 30.0)
+        s, source = misread(seed, 40, noise, field)
+        reduced = reduce_series(source, 30.0)
         fitter = HypothesisFitter(calibrate_thermometers([reduced]))
         fit = fitter.refine(fitter.fit((make_known_term("thermal_lag", {"tau": 70.0}, 1),)))
         level, sd = estimate_level(fitter, fit)

@@ -137,20 +137,6 @@ def test_photographs_and_a_logger(photographs, tmp_path):
     run("predict", "--model", model, "--temperature", 30)
 
 
-def test_calibrate_photographs(photographs, tmp_path):
-    """Photographs of the session give one camera, with c within the drift."""
-    folder, truth = photographs
-    some = sorted((folder / "photos").glob("*.jpg"))[::4]
-    document = json.loads(
-        run(
-            "calibrate", *some, "--testfield", folder / "frames" / "testfield.csv",
-            "--pixel-pitch", 0.00224, "--json", "-", "--report", tmp_path / "page.html",
-        ).stdout
-    )  # fmt: skip
-    assert [p["status"] for p in document["photographs"]] == ["ok"] * 3
-    assert truth["c"].min() - 0.002 < document["interior"]["c"] < truth["c"].max() + 0.002
-
-
 @pytest.fixture(scope="module")
 def odd(tmp_path_factory):
     """Return the fit of a warm-up, and a function that copies it with rows left out or changed."""

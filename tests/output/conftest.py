@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
 
+from tests.analysis.conftest import WarmUp
 from thermocald.analysis.study.study import StudySettings, study
-
-_SPEC = importlib.util.spec_from_file_location(
-    "warm_up_series", Path(__file__).parents[1] / "analysis" / "conftest.py"
-)
-assert _SPEC is not None
-assert _SPEC.loader is not None
-_WARM_UP = importlib.util.module_from_spec(_SPEC)
-sys.modules[_SPEC.name] = _WARM_UP  # dataclasses look their module up
-_SPEC.loader.exec_module(_WARM_UP)
 
 
 @pytest.fixture(scope="session")
 def warm_up():
     """A builder of series of a camera that warms up, set by its fields."""
-    return _WARM_UP.WarmUp
+    return WarmUp
 
 
 @pytest.fixture(scope="session")

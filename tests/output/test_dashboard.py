@@ -319,21 +319,27 @@ def test_dns_rebinding_and_foreign_pages_are_refused(client_of, base, headers, s
     assert client_of(base=base).get("/api/status", headers=headers).status_code == status
 
 
-def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
-    """SIGTERM with an open stream: the page learns when acquisition stopped; nothing is logged."""
-    store, live = folders
-    with Store.open(store, "append") as opened:
-        opened.add_event(Event(1.7e9, "stopped", "thermocald stopped"))
+def start_page(store, live) -> tuple[subprocess.Popen, int]:
+    """Return the process of `dashboard` on a store, and its port."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "thermocald", "dashboard", "--store", str(store)]
     command += ["--live", str(live), "--port", str(port)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
-        assert "the page is at" in server.stderr.readline()
-        address = f"http://127.0.0.1:{port}/api/"
+    server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert "the page is at" in server.stderr.readline()
+    return server, port
+
+
+def test_a_page_that_is_open_hears_the_end(folders, tmp_path):
+    """SIGTERM with an open stream: the page learns when acquisition stopped; nothing is logged."""
+    store, live = folders
+    with Store.open(store, "append") as opened:
+        opened.add_event(Event(1.7e9, "stopped", "thermocald stopped"))
+    server, port = start_page(store, live)
+    with server:
         with (
-            httpx.stream("GET", address + "stream", timeout=20) as page,
+            httpx.stream("GET", f"http://127.0.0.1:{port}/api/stream", timeout=20) as page,
             socket.create_connection(("127.0.0.1", port)) as stuck,
         ):
             stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

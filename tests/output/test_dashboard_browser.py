@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import socket
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from tests.output.test_dashboard import start_page
 from tests.output.test_pages import _WIDER, keep
 from thermocald.daemon.live_state import status_warnings
 from thermocald.epoch import Epoch
@@ -77,14 +75,8 @@ def page_with(tmp_path):
                 (live / f"{_name(k)}.json").write_text(
                     json.dumps({"row": {"epoch": 30}, "targets": targets})
                 )
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        command = [sys.executable, "-m", "thermocald", "dashboard", "--store", str(path)]
-        command += ["--live", str(live), "--port", str(port)]
-        server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        server, port = start_page(path, live)
         servers.append(server)
-        assert "the page is at" in server.stderr.readline()
 
         def start() -> None:
             document = {**status, "warnings": status_warnings(status)}

@@ -103,9 +103,3 @@ def test_a_camera_looks_along_its_own_minus_z():
     assert image[0, 1] < SENSOR.centre[1]
     np.testing.assert_allclose(image[1], SENSOR.centre)
     assert np.isnan(image[2]).all()
-
-
-def test_rotation_round_trip():
-    exterior = ExteriorOrientation(0.3, -1.1, 2.5, 1.0, 2.0, 3.0)
-    again = ExteriorOrientation.from_rotation(exterior.rotation, exterior.centre)
-    np.testing.assert_allclose(again.as_array(), exterior.as_array(), atol=1e-12)

@@ -63,15 +63,6 @@ def test_two_bodies_ramp():
             assert abs(T[name][i] - expected) < 1e-8
 
 
-def test_halving_the_step_changes_nothing():
-    air = {"ambient": Course.polygon([0.0, 400.0, 1600.0], [22.0, 35.0, 18.0])}
-    lamp = {"a": Course.steps([0.0, 123.4, 777.7, 1600.0], [0.0, 9.0, 1.0])}
-    coarse = two_bodies().solve(np.arange(0, 1500, 20.0), 22.0, lamp, air)
-    fine = two_bodies().solve(np.arange(0, 1500, 0.5), 22.0, lamp, air)
-    for name in "ab":
-        np.testing.assert_allclose(fine[name][::40], coarse[name], rtol=0, atol=1e-9)
-
-
 def test_energy_is_conserved():
     """Two isolated bodies keep their heat."""
     network = HeatNetwork({"a": 30.0, "b": 7.0}, (("a", "b", 0.2),))

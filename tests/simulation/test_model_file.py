@@ -63,14 +63,6 @@ def change(document, path, value):
         document[last] = value
 
 
-def test_missing_and_broken_files(tmp_path):
-    with pytest.raises(ConfigurationError, match="cannot be read"):
-        read_model(tmp_path / "none.yaml")
-    (tmp_path / "m.yaml").write_text("format: [")
-    with pytest.raises(ConfigurationError, match=r"m\.yaml, line"):
-        read_model(tmp_path / "m.yaml")
-
-
 CAMERA = {
     "format": "thermocald-camera/1",
     "name": "mine",

@@ -9,14 +9,12 @@ import pytest
 from scipy.stats import norm
 
 from thermocald.photogrammetry.camera.camera_model import (
-    CameraSpec,
     ExteriorOrientation,
     InteriorOrientation,
     Sensor,
     project,
 )
 from thermocald.photogrammetry.field.testfield import TestField
-from thermocald.photogrammetry.frame.measurement import measure
 from thermocald.photogrammetry.targets.corner import measure_corners
 from thermocald.photogrammetry.targets.markers import locate_markers
 from thermocald.physics import shapes as portable
@@ -172,17 +170,3 @@ def test_portable_arithmetic_is_right():
     eop = corner_view(field, 1200.0).with_values(kappa=0.4).as_array()
     image = portable.project(SENSOR, iop, eop, field.points)
     np.testing.assert_allclose(image, project(SENSOR, iop, eop, field.points), rtol=0, atol=1e-9)
-
-
-def test_a_coded_field_is_measured_without_a_prior():
-    """Ring codes are found, and centres measured with true sigmas."""
-    field = demonstration_field("circles")
-    model = demonstration_model(field)
-    iop, eop = model.interior.as_array(), model.exterior.as_array()
-    image = Scene(SENSOR, field).render(iop, eop, seed=3)
-    found = measure(image, field, CameraSpec("", SENSOR, 3.04))
-    assert found.status.ok, found.status
-    seen = found.observations
-    assert len(seen) >= 140
-    error = (seen.points - project(SENSOR, iop, eop, field.points)[seen.targets]) / seen.sigmas
-    assert np.sqrt(np.mean(error**2)) < 1.3

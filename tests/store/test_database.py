@@ -13,7 +13,6 @@ import pytest
 from thermocald.epoch import Epoch
 from thermocald.errors import StoreError, StoreVersionError
 from thermocald.store.database.store import Store
-from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.recording.testfield_file import parse_testfield
 from thermocald.store.series import NOT_CALIBRATED, EpochResult, Event
 
@@ -148,13 +147,6 @@ def test_events_stand_with_their_epoch(filled, make_epoch):
     assert store.events(since_utc=1.6e9 + 250) == [gone]
 
 
-def test_untrusted_clock_is_remembered(filled, make_epoch):
-    store, series = filled
-    store.append(series, make_epoch(21), clock_trusted=False)
-    found = store.series_columns(series, ["clock_trusted"])["clock_trusted"]
-    assert found.tolist() == [1] * 20 + [0]
-
-
 @pytest.mark.parametrize("name", ["c", "epoch", "status", "sd_x0"])
 def test_names_that_are_taken(filled, head, field, make_epoch, name):
     store, series = filled
@@ -201,15 +193,6 @@ def test_a_failed_epoch_leaves_nothing(filled, make_epoch, make_result):
         store.append(series, wrong, make_result(21))
     assert list(store._db.iterdump()) == before
     store.append(series, make_epoch(21), make_result(21))
-
-
-def test_store_to_recording_and_back(filled, tmp_path, field):
-    store, series = filled
-    epochs = (stored.epoch for stored in store.epochs(series))
-    write_recording(tmp_path / "r", series.head, series.testfield, epochs)
-    stored = [s.epoch.observations for s in store.epochs(series)]
-    for epoch, seen in zip(read_recording(tmp_path / "r").epochs, stored, strict=True):
-        assert np.array_equal(epoch.observations.points, seen.points)
 
 
 def test_readers_see_committed_epochs_while_it_is_written(filled, store_path, make_epoch):

@@ -121,18 +121,6 @@ def test_a_column_of_text_that_begins_empty_is_ignored(tmp_path, field, head, ma
     assert "comment" not in read_recording(tmp_path / "r").epochs[0].observations.quality
 
 
-def test_covariances_and_quality_travel(tmp_path, field, head):
-    rows = np.arange(4)
-    seen = Observations(
-        rows, np.ones((4, 2)), np.full((4, 2), 0.1), np.full(4, 0.003), {"blur": rows * 0.5}
-    )
-    with RecordingWriter(tmp_path / "r", head, field) as writer:
-        writer.append(Epoch(1, 1.6e9, np.nan, observations=seen))
-    (epoch,) = read_recording(tmp_path / "r").epochs
-    assert epoch.observations.covariances.tolist() == [0.003] * 4
-    assert epoch.observations.quality["blur"].tolist() == [0.0, 0.5, 1.0, 1.5]
-
-
 def test_frames_are_kept_and_found(tmp_path, field, head):
     image = np.arange(64, dtype=np.uint8).reshape(8, 8)
     with RecordingWriter(tmp_path / "r", head, field) as writer:
@@ -180,23 +168,6 @@ def test_extra_columns_are_kept_and_ignored(recording_path):
         file.write_text("\n".join([f"{header},{column}", *(f"{row},fine" for row in rows)]) + "\n")
     recording = read_recording(recording_path)
     assert recording.columns.extra == {"weather": ("fine",) * 5}
-
-
-def test_a_failing_source_leaves_nothing(tmp_path, field, head, make_epoch):
-    def epochs():
-        yield make_epoch(1)
-        raise RuntimeError("the simulation failed")
-
-    with pytest.raises(RuntimeError):
-        write_recording(tmp_path / "r", head, field, epochs())
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_recording_is_not_overwritten(recording_path, field, head):
-    before = (recording_path / "epochs.csv").read_bytes()
-    with pytest.raises(RecordingError, match="exists already"):
-        RecordingWriter(recording_path, head, field).__enter__()
-    assert (recording_path / "epochs.csv").read_bytes() == before
 
 
 def test_writing_does_not_grow_with_length(tmp_path, field, head, make_epoch):

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermocald.discovery import criteria
 from thermocald.discovery.entries import (
     EffectFound,
     acts_on,
@@ -142,13 +141,6 @@ class Discovery:
     final_fit: Fit
     cross_validation: tuple[float, float]
     doubts: tuple[str, ...] = ()
-
-    def excess_closed(self) -> float | None:
-        """Return the share of reduced χ²'s excess over the floor in M2 that the effects explain."""
-        before, after = self.stages[0].verify, self.stages[-1].verify
-        if before is None or after is None or before.chi2_reduced - before.floor < criteria.EXCESS:
-            return None
-        return 1.0 - (after.chi2_reduced - after.floor) / (before.chi2_reduced - before.floor)
 
     def effects_with_gaps(self) -> list[tuple[EffectFound, Gap, Gap]]:
         """Return each effect with the gap in M1 before and after it, from the last stages."""

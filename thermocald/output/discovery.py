@@ -29,6 +29,7 @@ from thermocald.figures import (
     tick_text,
 )
 from thermocald.numbers import parameter_label, plain, shortened, with_sd
+from thermocald.photogrammetry.linalg import best_level
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence, day
 from thermocald.store.recording.sense import doubt_lines
 
@@ -64,7 +65,7 @@ def report_html(discovery: Discovery, title: str) -> str:
 
 def _answer(d: Discovery) -> Answer:
     before, after = d.stages[0], d.stages[-1]
-    temperatures = _temperatures(d)
+    temperatures, noise = _temperatures(d), d.examination.fitter.series[0].sigma_px
     by_gap = sorted(d.effects_with_gaps(), key=lambda e: e[2].rms_px - e[1].rms_px)
     closing = [e for e, _, _ in by_gap]
     if closing:
@@ -73,7 +74,7 @@ def _answer(d: Discovery) -> Answer:
         sentence = as_sentence(say_adequate(d.examination))
     else:
         sentence = (
-            f"The model reproduces the recording within its noise of {_noise_px(d, 0):.3f} px"
+            f"The model reproduces the recording within its noise of {noise:.3f} px"
             f"{temperatures}: it lacks no effect that this recording could show."
         )
     more = []
@@ -85,7 +86,7 @@ def _answer(d: Discovery) -> Answer:
         more.append(
             f"With {it} the gap between model and measurement falls from "
             f"{' and from '.join(changes)}{temperatures}; the noise of an image coordinate is "
-            f"{_noise_px(d, 0):.3f} px."
+            f"{noise:.3f} px."
         )
     return Answer(sentence, _trajectory(d), tuple(more), _next_steps(d), _not_covered(d))
 
@@ -170,19 +171,12 @@ def _sections(d: Discovery) -> list[Section]:
 
 def _without_level(e: ReducedSeries, values: Array) -> Array:
     """Subtract from parameters (E, P) their mean, weighted as the image points determine them."""
-    right = np.einsum("epq,eq->p", e.N, values)
-    return np.asarray(values - np.linalg.lstsq(e.N.sum(axis=0), right, rcond=1e-12)[0])
+    return values - best_level(e.N, np.einsum("epq,eq->ep", e.N, values))
 
 
 def _model(fit: Fit, series: int) -> Array:
     C, V, index = fit.designs[series]
     return np.asarray((C * fit.coefficients[index]) @ V.T)
-
-
-def _noise_px(d: Discovery, series: int) -> float:
-    """Return the standard deviation of an image coordinate, px: the least misfit of any model."""
-    weights = d.examination.fitter.series[series].weights[..., :2]
-    return float(1.0 / np.sqrt(np.mean(weights[weights > 0])))
 
 
 def _trajectory(d: Discovery) -> Figure:
@@ -196,7 +190,7 @@ def _trajectory(d: Discovery) -> Figure:
     model = _without_level(e, final - base) if found else rests[0]
     _, _, v = np.linalg.svd(model @ root, full_matrices=False)
     # root-mean-square over the image coordinates
-    noise = _noise_px(d, 0) / np.sqrt(max(float(2 * e.n.mean()), 1.0))
+    noise = e.sigma_px / np.sqrt(max(float(2 * e.n.mean()), 1.0))
     along = root @ v[0] * noise
     measured, (before, after) = _without_level(e, e.values) @ along, (r @ along for r in rests)
     name = " + ".join(effect.effect for effect in d.effects) if found else ""
@@ -254,7 +248,7 @@ def _movement(d: Discovery) -> Figure:
     reading_sd = e.thermometers[e.history.reference].noise
     of_readings = reading_sd * float(np.sqrt(np.mean((e.columns[seen] @ rates) ** 2)))
     # a movement below the noise must not look large
-    longest = max(float(np.linalg.norm(drawn[0][1], axis=1).max()), _noise_px(d, 0))
+    longest = max(float(np.linalg.norm(drawn[0][1], axis=1).max()), e.sigma_px)
     frame = (e.source.sensor.width, e.source.sensor.height)
     targets = Curve("", places[:, 0], places[:, 1], "points", PALE)
     titles = ("Before", "After") if len(drawn) > 1 else ("Misfit",)
@@ -311,7 +305,7 @@ def gap_figure(d: Discovery) -> Figure:
     """Draw the gap of every stage on every recording as bars, with the noise."""
     groups = [
         (
-            _noise_px(d, k),
+            d.examination.fitter.series[k].sigma_px,
             [
                 (_gap_name(name, s), s.gaps[k].rms_px, _FOUND if s.added else _BASE)
                 for s in d.stages
@@ -461,7 +455,7 @@ def _candidates(d: Discovery) -> Section:
     singles: dict[str, Solution] = {}
     for s in sorted(x.ranking, key=lambda s: s.score):
         singles.setdefault(_candidate_name(s), s)
-    noise = _noise_px(d, 0)
+    noise = x.fitter.series[0].sigma_px
     best = x.best.names[len(x.base.terms) :] if x.adequate else ()
     rows = [(name, s, _left_px(d, s.fit)) for name, s in singles.items()]
     rows.sort(key=lambda row: (row[0].split(" ")[0] not in best, row[2]))
@@ -493,7 +487,7 @@ def _left_px(d: Discovery, fit: Fit) -> float:
     e = d.examination.fitter.series[0]
     within = float(np.sum(e.weights[..., :2] * np.nan_to_num(e.residuals) ** 2))
     chi2 = within + e.correlation * image_chi2(e, fit, 0)
-    return _noise_px(d, 0) * math.sqrt(chi2 / max(2.0 * float(e.n.sum()), 1.0))
+    return e.sigma_px * math.sqrt(chi2 / max(2.0 * float(e.n.sum()), 1.0))
 
 
 def _why(d: Discovery, name: str, s: Solution, left: float, noise: float) -> str:

@@ -26,6 +26,7 @@ from thermocald.photogrammetry.linalg import (
     orthonormal_combinations,
     scaled_inverse,
     subtract_level,
+    symmetric_power,
 )
 from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
@@ -133,10 +134,8 @@ def guess_mount_motion(fitter: HypothesisFitter, fit: Fit, W: Array) -> Array:
         k = np.arange(1, len(A) + 1)
         total += np.einsum("k,ki,kj->ij", k**2, A, A) - float(np.sum(k**2)) * np.eye(len(total))
         count += len(A)
-    size, U = np.linalg.eigh(total / count)
     # EM leaves a zero variance at zero, and rough half-waves can hide a slow drift in the moments
-    out: Array = (U * np.maximum(size, _FLOOR)) @ U.T
-    return out
+    return symmetric_power(total / count, 1.0, _FLOOR)
 
 
 def weight_leaps_down(fitter: HypothesisFitter, fit: Fit, W: Array) -> list[ReducedSeries]:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermocald.photogrammetry.linalg import orthonormal_combinations, scaled_solve
+from thermocald.photogrammetry.linalg import orthonormal_combinations, scaled_solve, symmetric_power
 from thermocald.thermal import criteria
 from thermocald.thermal.fit import HypothesisFitter
 from thermocald.thermal.movement import detect_tremble, weight_jumps_down
@@ -306,10 +306,10 @@ def measure_slow_noise(evidence: ReducedSeries) -> tuple[Array, Array]:
     total = np.zeros(M.shape)
     for rows in _group_targets(evidence):
         A = (evidence.columns[rows] @ W).reshape(-1, len(M))
-        left, V = np.linalg.eigh(np.eye(len(M)) - A.T @ (A * mean[rows].reshape(-1, 1)))
+        left = np.eye(len(M)) - A.T @ (A * mean[rows].reshape(-1, 1))
         pull = (trajectories @ v[:, rows].reshape(len(v), -1)) @ A
         # the residuals of a cluster do not show a combination that it alone determines
-        pull = pull @ (V / np.sqrt(np.maximum(left, 0.05))) @ V.T
+        pull = pull @ symmetric_power(left, -0.5, 0.05)
         total += pull.T @ pull / len(trajectories)
     total[~good] = 0.0
     total[:, ~good] = 0.0

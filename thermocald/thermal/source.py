@@ -353,8 +353,7 @@ def series_input(
     log = source.columns.readings
     if log is not None:  # from one hour before the series on, and some readings per frame
         begin, end = float(found.frame_times[0]), float(found.frame_times[-1])
-        step = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
-        rows = np.flatnonzero((log.times >= begin - _MEMORY_S) & (log.times <= end + step))
+        rows = np.flatnonzero((log.times >= begin - _MEMORY_S) & (log.times <= end + log.step))
         rows = rows[:: max(1, len(rows) // (_READINGS_A_FRAME * len(found.frame_times)))]
         channels = {name: values[rows] for name, values in log.channels.items()}
         found = replace(found, reading_times=log.times[rows], readings=channels)

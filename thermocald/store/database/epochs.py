@@ -270,8 +270,8 @@ def latest_epochs(
         epoch = Epoch(
             number=row["number"],
             frame_time=row["frame_time"],
-            temperature_time=_nan(row["temperature_time"]),
-            temperatures=_parse_numbers(row["temperatures"]),
+            temperature_time=number_or_nan(row["temperature_time"]),
+            temperatures=parse_numbers(row["temperatures"]),
             frame=relative_path(row["frame"], f"epoch {row['number']}: frame", StoreError)
             if row["frame"]
             else None,
@@ -283,13 +283,13 @@ def latest_epochs(
             reason=row["reason"],
             values=np.array([row[name] for name in _VALUES], dtype=float),
             covariance=unpack_covariance(covariance) if covariance else None,
-            sigma0=_nan(row["sigma0"]),
+            sigma0=number_or_nan(row["sigma0"]),
             redundancy=row["redundancy"],
             n_observations=row["n_observations"],
             rejected=tuple(json.loads(row["rejected"])),
         )
         yield StoredEpoch(
-            epoch, result, _parse_numbers(row["extra"]), bool(row["clock_trusted"]), row["revision"]
+            epoch, result, parse_numbers(row["extra"]), bool(row["clock_trusted"]), row["revision"]
         )
 
 
@@ -344,11 +344,13 @@ def _numbers_json(values: Mapping[str, float]) -> str:
     return json.dumps(finite)
 
 
-def _parse_numbers(text: str) -> dict[str, float]:
-    return {name: _nan(value) for name, value in json.loads(text).items()}
+def parse_numbers(text: str) -> dict[str, float]:
+    """Return named numbers from the JSON of a column; NaN where it says null."""
+    return {name: number_or_nan(value) for name, value in json.loads(text).items()}
 
 
-def _nan(value: float | None) -> float:
+def number_or_nan(value: float | None) -> float:
+    """Return a number of a column; NaN for NULL."""
     return math.nan if value is None else value
 
 

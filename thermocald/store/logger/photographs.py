@@ -369,12 +369,11 @@ def read_series(
     spec, about_camera = _camera_of(photographs[0], camera, pitch, distance, testfield is None)
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     span = f"{iso(times[0])} to {iso(times[-1])}, every {interval:.4g} s"
-    step = float(np.median(np.diff(logged.times)))
     temperatures = f"{np.nanmin(at_frame):.2f} to {np.nanmax(at_frame):.2f} °C"
     notes = [
         f"photographs: {len(times)}, {placed[0].width} × {placed[0].height} px, {span}",
         *notes, *logged.notes,
-        f"log: {iso(logged.times[0])} to {iso(logged.times[-1])}, every {step:.4g} s",
+        f"log: {iso(logged.times[0])} to {iso(logged.times[-1])}, every {logged.step:.4g} s",
         (f"temperature ({reference}): known for {known.sum()} of {len(known)} photographs, "
          f"{temperatures}"),
     ]  # fmt: skip

@@ -38,6 +38,11 @@ class TemperatureLog:
     channels: dict[str, Array]
     notes: tuple[str, ...] = ()
 
+    @property
+    def step(self) -> float:
+        """The usual time between readings, s; 0 if there is only one."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
+
     def with_reference(self, name: str | None) -> TemperatureLog:
         """Return the log with the channel `name` first; unchanged if it has no such channel."""
         if name not in self.channels:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from thermocald.store.database.epochs import number_or_nan, parse_numbers
 from thermocald.store.recording.head import parse_head
 from thermocald.store.server.connection import Connected
 
@@ -229,8 +230,8 @@ class FleetReader(Connected):
             if len(recent) < _COMPARED:
                 newest.append((key, number, revision, frame_time))
             if not recent or recent[-1].frame_time != frame_time:  # an older revision follows
-                values = {n: _nan(v) for n, v in json.loads(temperatures).items()}
-                recent.append(RecentEpoch(frame_time, _nan(received), status, values))
+                values = parse_numbers(temperatures)
+                recent.append(RecentEpoch(frame_time, number_or_nan(received), status, values))
         columns = [list(column) for column in zip(*newest, strict=True)] or [[]] * 4
         for (key,) in self._query(
             "SELECT DISTINCT s.key FROM unnest(%s::uuid[], %s::int8[], %s::int4[], %s::float8[]) "
@@ -295,7 +296,3 @@ class FleetReader(Connected):
 def _extreme(of: Callable[[list[float]], float], values: Iterable[float | None]) -> float:
     known = [v for v in values if v is not None and not math.isnan(v)]
     return of(known) if known else math.nan
-
-
-def _nan(value: float | None) -> float:
-    return math.nan if value is None else float(value)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermocald.discovery import criteria
 from thermocald.discovery.entries import (
     EffectFound,
     acts_on,

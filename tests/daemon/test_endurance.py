@@ -78,7 +78,7 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
     period_s = 900.0  # windows fill during the first 2,500 epochs
     day = round(86_400 / period_s)
     path = make_recording(
-        tmp_path / "days", 5 * day, per_side=2, interval=period_s,
+        tmp_path / "days", 5 * day, interval=period_s,
         temperature_of=lambda k: 25.0 + 8.0 * np.sin(2 * np.pi * k / day),
     )  # fmt: skip
     sections = replayed(path, period_s=period_s)

@@ -16,25 +16,33 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 LONGEST = (
-    # of the slow suite, by `make test-slow` with --durations; the goldens of the quick one too
-    "daemon/test_endurance", "golden/test_golden", "store/test_bounds", "docs/test_commands",
-    "main_paths/test_live", "blind/test_score", "analysis/test_running_series",
-    "cli/test_first_hour", "photogrammetry/test_mount", "daemon/test_rhythm",
-    "real_corners/test_real_corners", "test_properties", "store/test_kills", "analysis/test_scene",
+    # of the slow suite, by `make test-slow` with --durations; one that waits beside two that work
+    "golden/test_golden", "daemon/test_endurance", "daemon/test_changes", "blind/test_score",
+    "main_paths/test_live", "docs/test_commands", "test_properties", "cli/test_first_hour",
+    "discovery/test_tremble", "discovery/test_years", "cli/test_discover",
+    "daemon/test_page_attacks", "daemon/test_faults", "daemon/test_rhythm", "fleet/test_dask",
+    "output/test_report_study", "discovery/test_linearisation", "store/test_bounds",
+    "photogrammetry/test_ring_code", "docs/test_site", "daemon/test_chaos",
+    "analysis/test_type_model", "analysis/test_type_fit", "discovery/test_grammar",
+    "analysis/test_river", "analysis/test_running_series", "photogrammetry/test_measurement",
+    "analysis/test_scene",
     # of the quick one
-    "main_paths/test_commands", "api/test_api", "output/test_pages", "daemon/test_quota",
-    "daemon/test_faults", "cli/test_commands", "discovery/test_examination", "daemon/test_changes",
-    "store/test_sense", "output/camera_files/test_camera_files", "daemon/test_sessions",
-    "test_audit", "drivers/test_android", "daemon/test_keeping", "drivers/test_chip_outputs",
-    "cli/test_testfield", "cli/test_thermal_commands", "store/test_wal",
-    "daemon/test_virtual_clock", "cli/test_discover", "photogrammetry/test_series",
-    "daemon/test_clock", "photogrammetry/test_network", "drivers/test_sensor_properties",
-    "daemon/test_store_file", "api/test_live_camera", "drivers/test_serial_line",
-    "output/test_dashboard_browser", "output/test_board_print", "drivers/test_contract",
-    "simulation/test_outside_effect", "fleet/test_stations", "photogrammetry/test_tracking",
-    "analysis/test_thermal_model", "photogrammetry/test_measurement", "cli/test_measure",
-    "photogrammetry/test_scale", "output/test_testfield_print", "analysis/test_delay",
-    "daemon/test_session", "cli/test_outputs",
+    "main_paths/test_commands", "api/test_api", "photogrammetry/test_network",
+    "analysis/test_thermal_model", "fleet/test_stations", "simulation/test_outside_effect",
+    "daemon/test_quota", "discovery/test_examination", "cli/test_measure",
+    "photogrammetry/test_series", "output/test_testfield_print", "photogrammetry/test_boards",
+    "output/test_pages", "analysis/test_gauge", "analysis/test_missing_effect",
+    "cli/test_commands", "discovery/test_blocks", "store/test_sense",
+    "analysis/test_online_filter", "daemon/test_clock", "cli/test_printed_texts",
+    "analysis/test_drift", "cli/test_real_data", "output/camera_files/test_camera_files",
+    "store/test_hostile_input", "api/test_live_camera", "fleet/test_reprocess",
+    "photogrammetry/test_mount", "real_corners/test_real_corners", "store/test_kills",
+    "daemon/test_sessions", "test_audit", "drivers/test_android", "daemon/test_keeping",
+    "drivers/test_chip_outputs", "cli/test_testfield", "cli/test_thermal_commands",
+    "store/test_wal", "daemon/test_virtual_clock", "drivers/test_sensor_properties",
+    "daemon/test_store_file", "drivers/test_serial_line", "output/test_dashboard_browser",
+    "output/test_board_print", "drivers/test_contract", "photogrammetry/test_tracking",
+    "photogrammetry/test_scale", "analysis/test_delay", "daemon/test_session", "cli/test_outputs",
 )  # fmt: skip
 """Files that take longest, in that order: so that no process is left alone with one at the end."""
 

@@ -14,6 +14,7 @@ from tests.blocks import InBlocks
 from thermocald.analysis.series import adjusted, recorded
 from thermocald.analysis.study.study import StudySettings, study
 from thermocald.analysis.thermal.thermal_model import fit_thermal_model
+from thermocald.photogrammetry.series import long_series
 from thermocald.photogrammetry.series.normals import gathered
 from thermocald.series import Series
 from thermocald.store.recording.reader import Recording, open_recording
@@ -38,7 +39,7 @@ def day(tmp_path_factory):
 @pytest.fixture
 def samples(monkeypatch):
     """Limit the epochs that are adjusted together."""
-    for module in (adjusted, recorded):
+    for module in (adjusted, recorded, long_series):
         monkeypatch.setattr(module, "together_at_most", lambda _: TOGETHER)
 
 

@@ -127,21 +127,7 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
     sensor = Sensor(1640, 1232, 0.00224)
     model = write_markers(tmp_path, sensor)
     images = [tmp_path / f"{k}.png" for k in range(3)]
-    (tmp_path / "camera.yaml").write_text(
-        f"name: mock\nwidth: {sensor.width}\nheight: {sensor.height}\n"
-        f"pixel_pitch: {sensor.pixel_pitch}\n"
-    )
-    done = finish("calibrate", *images, "--testfield", tmp_path / "field.csv",
-               "--camera", tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
-    document = json.loads(done.stdout)
-    assert document["status"] == "ok"
-    assert [p["status"] for p in document["photographs"]] == ["ok"] * 3
-    for name in ("c", "x0", "y0"):
-        found, sd = document["interior"][name], document["interior"][f"sd_{name}"]
-        assert abs(found - getattr(model.interior, name)) < 4 * sd
-    assert len(document["correlations"]["matrix"]) == 8
-
-    # The folder, and its pixel pitch by option; files for the next command and for people.
+    # the folder, and its pixel pitch by option; files for the next command and for people
     out, page = tmp_path / "found.json", tmp_path / "page.html"
     done = finish("calibrate", tmp_path, "--testfield", tmp_path / "field.csv", "--pixel-pitch",
                sensor.pixel_pitch, "--camera-out", out, "--report", page)  # fmt: skip
@@ -156,13 +142,24 @@ def test_photographs_of_markers_give_the_camera(tmp_path):
     assert json.loads(done.stdout)["interior"]["c"] == c
 
     # a copy of a photograph adds no information
+    (tmp_path / "camera.yaml").write_text(
+        f"name: mock\nwidth: {sensor.width}\nheight: {sensor.height}\n"
+        f"pixel_pitch: {sensor.pixel_pitch}\n"
+    )
     copy = tmp_path / "copy.png"
     copy.write_bytes(images[0].read_bytes())
-    done = run("calibrate", *images, copy, "--testfield", tmp_path / "field.csv", "--camera",
-               tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
-    again = json.loads(done.stdout)
-    assert again["interior"] == document["interior"]
-    assert again["photographs"][3]["reason"] == f"is a copy of {images[0].name}"
+    done = finish("calibrate", *images, copy, "--testfield", tmp_path / "field.csv",
+               "--camera", tmp_path / "camera.yaml", "--json", "-")  # fmt: skip
+    document = json.loads(done.stdout)
+    assert document["status"] == "ok"
+    assert [p["status"] for p in document["photographs"][:3]] == ["ok"] * 3
+    for name in ("c", "x0", "y0"):
+        found, sd = document["interior"][name], document["interior"][f"sd_{name}"]
+        assert abs(found - getattr(model.interior, name)) < 4 * sd
+        assert found == written["interior"][name]
+        assert sd == written["interior"][f"sd_{name}"]
+    assert len(document["correlations"]["matrix"]) == 8
+    assert document["photographs"][3]["reason"] == f"is a copy of {images[0].name}"
 
 
 def test_the_demo_finds_what_was_put_in(tmp_path):

@@ -17,8 +17,8 @@ PROGRAMME = """
 format: thermocald-programme/1
 name: one lamp cycle
 series: M1
-epochs: 100
-interval: 10.0
+epochs: 50
+interval: 20.0
 ambient: 22.0
 sources:
   housing: [{from: 0, to: 60, value: 0}, {from: 60, to: 500, value: 6.0},

@@ -25,6 +25,7 @@ from thermocald.physics.testfields import corner_field, demonstration_model
 from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head, read_head
 from thermocald.store.recording.reader import CameraSpec, Channel, write_recording
+from thermocald.store.recording.testfield_file import write_testfield
 
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
@@ -150,15 +151,23 @@ def small_camera(tmp_path_factory) -> Path:
     return write_small_camera(tmp_path_factory.mktemp("model") / "small.thermal.yaml")
 
 
+@pytest.fixture(scope="session")
+def small_field(tmp_path_factory) -> Path:
+    """A quarter of the demonstration's targets in the same place: a frame costs half."""
+    path = tmp_path_factory.mktemp("field") / "small.csv"
+    write_testfield(path, corner_field("markers", per_side=2, pitch_mm=300.0))
+    return path
+
+
 @pytest.fixture
-def devices(small_camera):
+def devices(small_camera, small_field):
     """Sections of a configuration with a fast rendered camera and a thermometer, with faults."""
 
     def make(period_s: float = 0.2, name: str = "one", camera=(), thermometer=(), **options):
         cameras = {
             "name": name, "driver": "mock", "period_s": period_s, "thermometers": ["housing"],
             "latency_s": 0.02, "faults": list(camera), **options,
-            "options": {"testfield": "markers", "model": str(small_camera), "seed": 1},
+            "options": {"testfield": str(small_field), "model": str(small_camera), "seed": 1},
             "principal_distance_mm": 3.04,
         }  # fmt: skip
         housing = {"name": "housing", "driver": "mock", "period_s": period_s,

@@ -15,7 +15,7 @@ from thermocald.store.database.store import Store
 from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
 
-EPOCHS = 24
+EPOCHS = 12
 PLAIN = {"target_offsets": False, "exterior": "per_epoch"}
 KEYS = {
     "plain": {},

@@ -18,13 +18,13 @@ from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.sources import StoredRecording
 
-EPOCHS, WHEN = 34, 23
+EPOCHS, WHEN = 22, 13
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory, forker):
-    """The store of one daemon with five cameras that see the same until epoch 23."""
+    """The store of one daemon with five cameras that see the same until epoch 13."""
     folder = tmp_path_factory.mktemp("changes")
     taken = read_recording(make_recording(folder / "taken", EPOCHS, per_side=4, interval=10.0))
     field, sensor = taken.testfield, taken.camera.sensor

@@ -1,4 +1,4 @@
-"""Months in minutes, a day on a disk of 50 MB, and the rhythm of ticks under load."""
+"""Months in minutes, half a day on a disk of 25 MB, and the rhythm of ticks under load."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
     period_s = 900.0  # windows fill during the first 2,500 epochs
     day = round(86_400 / period_s)
     path = make_recording(
-        tmp_path / "days", 5 * day, per_side=2, interval=period_s,
+        tmp_path / "days", 5 * day, interval=period_s,
         temperature_of=lambda k: 25.0 + 8.0 * np.sin(2 * np.pi * k / day),
     )  # fmt: skip
     sections = replayed(path, period_s=period_s)
@@ -112,15 +112,16 @@ def test_the_last_month_of_three_costs_what_the_first_did(daemon, replayed, tmp_
         assert (np.diff(times) > 0).all()
 
 
-def test_a_day_of_epochs_on_a_disk_of_50_mb_loses_no_result(daemon, replayed, tmp_path, small_disk):
-    disk = small_disk(50)
+def test_half_a_day_on_a_disk_of_25_mb_loses_no_result(daemon, replayed, tmp_path, small_disk):
+    """Its observations and covariances alone would fill the disk."""
+    disk, epochs = small_disk(25), 4320
     path = make_recording(tmp_path / "day", 300, per_side=7, interval=10.0)
     daemon.store = disk / "thermocald.db"
     sections = replayed(path, period_s=10.0)
     sections["store"] = {"path": str(daemon.store), "durable": False}
     sections["outputs"] = []
     document = json.dumps({**sections, "frames": {"keep": "none"}})
-    run = fast_run(document, 8640)
+    run = fast_run(document, epochs)
     done = subprocess.run(
         [sys.executable, "-c", run],
         cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=True,
@@ -130,7 +131,7 @@ def test_a_day_of_epochs_on_a_disk_of_50_mb_loses_no_result(daemon, replayed, tm
         assert store.examine().damaged == ()
         series = store.find_series()
         columns = store.series_columns(series, ["epoch", "c", "sd_c", "status"])
-        assert columns["epoch"].astype(int).tolist() == list(range(1, 8641))
+        assert columns["epoch"].astype(int).tolist() == list(range(1, epochs + 1))
         assert np.isfinite(columns["c"]).all()
         assert np.isfinite(columns["sd_c"]).all()
 

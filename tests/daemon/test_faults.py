@@ -35,12 +35,12 @@ def test_killed_and_restarted_nothing_committed_is_lost(daemon, recording, repla
 
 def test_unplugged_and_back_told_once_each_and_no_other_device_waits(daemon, devices):
     gone = [{"kind": "unplugged", "at_s": 1.0, "for_s": 1.5}]
-    sections = devices(camera=gone)
+    sections = devices(camera=gone, period_s=0.4)
     second = {**sections["cameras"][0], "name": "two", "faults": []}
     sections["cameras"].append(second)
     daemon.run(**sections)
     daemon.until(lambda: "camera one is back" in daemon.log())
-    daemon.until(lambda: sum(r["device"] == "two" for r in daemon.results()) > 10)
+    daemon.until(lambda: sum(r["device"] == "two" for r in daemon.results()) > 8)
     assert daemon.stop() == 0
     assert daemon.log().count("camera one is out") == 1
     assert daemon.log().count("camera one is back") == 1

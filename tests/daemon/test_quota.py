@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import call
+from tests.daemon.conftest import make_recording
 from tests.marks import mostly_slow
 from thermocald.daemon.live_state import LiveState
 from thermocald.output.dashboard.view import View
@@ -162,14 +163,18 @@ COMMANDS = {
 }
 
 
+@pytest.fixture(scope="module")
+def few(tmp_path_factory):
+    """Ten epochs, of which each table has more than 200 bytes."""
+    return make_recording(tmp_path_factory.mktemp("few") / "small", 10)
+
+
 @pytest.mark.parametrize("case", COMMANDS)
 def test_a_command_under_a_quota_says_so_and_leaves_nothing_half(
-    case, quota, recording, tmp_path, preloaded
+    case, quota, few, tmp_path, preloaded
 ):
     quota.fill(200)
-    command = [
-        part.format(recording=recording, out=quota.folder / "out") for part in COMMANDS[case]
-    ]
+    command = [part.format(recording=few, out=quota.folder / "out") for part in COMMANDS[case]]
     done = preloaded.start(tmp_path, *command, **quota.environment)
     said = done.said()
     assert done.returncode == 3

@@ -62,7 +62,7 @@ def test_the_command_has_the_daemon_take_a_session_and_ends_with_its_recording(l
     told = process.said()
     assert process.returncode == 0, told
     assert "taken by the daemon" in told
-    assert "192 targets" in told
+    assert "48 targets" in told
     stored = series_of(daemon.store)
     assert stored["M7"] == ("cold", list(range(1, 5)))
     recording = read_recording(daemon.folder / "phone-1-M7")

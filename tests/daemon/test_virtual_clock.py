@@ -16,13 +16,14 @@ from thermocald.store.database.store import Store
 
 
 @pytest.fixture
-def run(tmp_path, small_camera):
+def run(tmp_path, small_camera, small_field):
     """A count, faults of camera and thermometer → the stored columns of that many epochs."""
 
     def ran(epochs, camera=(), thermometer=()):
         document = demo_config(tmp_path, 1).model_dump(mode="json", by_alias=True)
-        seen = {"testfield": "markers", "model": str(small_camera), "faults": list(camera)}
-        document["cameras"][0]["options"] |= seen
+        document["cameras"][0]["options"] |= {
+            "testfield": str(small_field), "model": str(small_camera), "faults": list(camera)
+        }  # fmt: skip
         document["thermometers"][0]["options"] |= {"faults": list(thermometer)}
         config = parse_config(document, Path("config.yaml"))
         clock = VirtualClock(1_600_000_000.0)

@@ -34,8 +34,11 @@ def calibrated(archive, tmp_path_factory):
     return out
 
 
-def test_processes_give_the_bits_of_one(archive, calibrated, tmp_path):
-    done = run_tasks(calibrate_block, blocks_of(archive, tmp_path), jobs=2)
+def test_processes_give_the_bits_of_one_and_what_fails_costs_itself(archive, calibrated, tmp_path):
+    blocks = blocks_of(archive, tmp_path)
+    gone = replace(blocks[1], recording=tmp_path / "gone", target=tmp_path / "gone.parquet")
+    done = run_tasks(calibrate_block, [*blocks[:2], gone, *blocks[2:]], jobs=2)
+    assert sorted(bool(o.error) for o in done) == [False, False, False, False, True]
     assert sum(o.calibrated for o in done) == 160
     assert files(calibrated) == files(tmp_path)
     table = parquet.read_table(calibrated)
@@ -47,14 +50,6 @@ def test_an_interrupted_run_goes_on(archive, tmp_path):
     blocks = blocks_of(archive, tmp_path)
     run_tasks(calibrate_block, blocks[:3])
     assert blocks_of(archive, tmp_path) == blocks[3:]
-
-
-def test_what_fails_costs_itself(archive, tmp_path):
-    blocks = blocks_of(archive, tmp_path)
-    blocks[1] = replace(blocks[1], recording=tmp_path / "gone")
-    done = run_tasks(calibrate_block, blocks, jobs=2)
-    assert sorted(bool(o.error) for o in done) == [False, False, False, True]
-    assert len(files(tmp_path)) == 3
 
 
 @pytest.mark.slow

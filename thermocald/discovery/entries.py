@@ -85,7 +85,7 @@ def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
     A thermometer that follows the camera with a lag τ reads T - τ dT/dt. Every parameter that
     drifts with T then has a gradient of τ times its rate, which a bent mount has only by chance.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     term = fit.terms[number]
     base = next(b for b in fit.blocks if b.term < 0)
@@ -107,7 +107,7 @@ def lagging_thermometer(fit: Fit, number: int) -> dict[str, Any] | None:
     left = gradients - tau * rates
     off = float(left @ weight @ left)
     sd = information**-0.5
-    if tau < _SURE * sd or off > chi2.isf(_UNLIKE, len(a) - 1):
+    if tau < _SURE * sd or off > chdtri(len(a) - 1, _UNLIKE):
         return None
     return {
         "effect": "lagging_thermometer",

@@ -51,7 +51,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
     but not at the beginning, their coordinate errors tilt the line. All epochs share that part of
     the change's sd, and a slow change that it explains is no drift.
     """
-    from scipy.stats import norm
+    from scipy.special import ndtr
 
     found, ok = [], table.ok
     time = table.frame_time[ok]
@@ -70,7 +70,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
         span, tilt_sd = float(np.ptp(time)), float(table.trend_sd[column])
         if tilt_sd > 0:
             slow = float(np.ptp(np.polynomial.Polynomial.fit(t, y, 3)(t)))
-            p = max(p, float(2 * norm.sf(slow / tilt_sd)))
+            p = max(p, float(2 * ndtr(-slow / tilt_sd)))
         line = Course(
             name, float(values.mean()), float(values.std(ddof=1)),
             float(np.sqrt(np.mean(sds**2))), slope * span,

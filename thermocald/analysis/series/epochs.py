@@ -232,11 +232,11 @@ class Epochs(Result):
         if hang := self._hang_on_c():
             document["changes_hang_on_c"] = hang
         if adjustment is not None and self.exterior == "series":
-            from scipy.stats import chi2
+            from scipy.special import chdtri
 
             # test of single epochs for another exterior orientation
             values = self.stillness[np.isfinite(self.stillness)]
-            bound = float(chi2.ppf(1 - 0.01 / max(len(values), 1), 6))
+            bound = float(chdtri(6, 0.01 / max(len(values), 1)))
             document["stood_still"] = {
                 "epochs_that_moved": int((values > bound).sum()),
                 "largest_chi2": float(values.max(initial=0.0)),

@@ -236,7 +236,7 @@ def slope_p_value(values: Array, temperature: Array, times: Array | None = None)
     It is the largest over the noise models of the t-test of a slope by generalised least squares.
     times (n,): evenly spaced by default.
     """
-    from scipy.stats import t
+    from scipy.special import stdtr
 
     at = Frequencies.of(len(values), times)
     v, u = at.coefficients(values), at.coefficients(temperature)
@@ -244,7 +244,7 @@ def slope_p_value(values: Array, temperature: Array, times: Array | None = None)
         at, at.spectra(MODELS), at.sums(u * u), at.sums(u * v), at.sums(v * v)
     )
     degrees = len(v) - 1
-    p = 2 * t.sf(np.abs(product) / np.sqrt(information * left / degrees), degrees)
+    p = 2 * stdtr(degrees, -np.abs(product) / np.sqrt(information * left / degrees))
     return largest_p_value(np.asarray(p), deviance)
 
 
@@ -257,7 +257,7 @@ def dependence(
     evenly spaced by default; noise decorrelates in a gap. Raises ValueError for fewer than 4
     epochs, or if values or temperature are constant.
     """
-    from scipy.stats import chi2, t
+    from scipy.special import chdtri, stdtr
 
     n = len(values)
     if n < 4 or not np.ptp(values) > 0 or not np.ptp(temperature) > 0:
@@ -268,7 +268,7 @@ def dependence(
 
     slope, sd_slope, square = fit_straight_line(temperature, values, temperature_sd, sds)
     misfit = float(np.sqrt(square / (n - 2)))
-    if square > chi2.isf(_CHANCE, n - 2):
+    if square > chdtri(n - 2, _CHANCE):
         # scatter about the line is the parameter's, not the thermometer's; only if significant, as
         # a smaller weight of the thermometer's noise flattens the line
         unexplained = (misfit**2 - 1) * float(
@@ -289,7 +289,7 @@ def dependence(
     return Dependence(
         n,
         r,
-        float(2 * t.sf(size, n - 2)),
+        float(2 * stdtr(n - 2, -size)),
         noise.n_effective,
         noise.lag_one,
         slope_p_value(values, temperature, times),
@@ -374,7 +374,7 @@ def moving_f_test(
     standard deviations; the critical ratios, above which the variance is significantly greater; the
     degrees of freedom of the mean squared standard deviations.
     """
-    from scipy.stats import f
+    from scipy.special import fdtri
 
     if window < 3 or window % 2 == 0:
         raise ValueError(f"the window must be an odd number of at least 3, not {window}")
@@ -384,7 +384,7 @@ def moving_f_test(
     # one quantile for every number of degrees that occurs
     different = np.flatnonzero(np.bincount(degrees_sd))
     quantiles = np.zeros(int(different.max(initial=0)) + 1)
-    quantiles[different] = f.isf(alpha, window - 1, np.maximum(different, 1.0))
+    quantiles[different] = fdtri(window - 1, np.maximum(different, 1.0), 1 - alpha)
     variance, mean = moving(values, window, np.var, ddof=1), moving(sds**2, window, np.mean)
     ratio = variance[starts] / mean[starts]
     return starts + window // 2, ratio, quantiles[degrees_sd], degrees_sd

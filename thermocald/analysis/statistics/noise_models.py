@@ -360,7 +360,7 @@ def _slow_against_fast(
 
     power (m,): of the series; high: that beyond the band, of the series without jumps.
     """
-    from scipy.stats import f
+    from scipy.special import fdtrc
 
     degrees = float(at.count[band:].sum()) - 2.0
     if degrees < _LEAST_FAST:
@@ -369,7 +369,7 @@ def _slow_against_fast(
     deviance = degrees * np.log(size) + np.log(models[:, band:]) @ at.count[band:]
     slow = float(at.count[:band].sum())
     ratio = (power[:band] / models[:, :band]).sum(axis=1) / slow / size
-    return largest_p_value(np.asarray(f.sf(ratio, slow, degrees)), deviance)
+    return largest_p_value(np.asarray(fdtrc(slow, degrees, ratio)), deviance)
 
 
 def _without_trend(power: Array, first: Array, trend: Array, band: int) -> Array:
@@ -388,7 +388,7 @@ def _excess(
     power: Array, fast: Array, at: Frequencies, models: Array, band: int, redundancy: float
 ) -> float:
     """Return the p-value of the variance of the standardised series, 1 if the sds are right."""
-    from scipy.stats import f
+    from scipy.special import fdtrc
 
     deviance = (fast[band:] / models[:, band:]).sum(axis=1)
     deviance = deviance + np.log(models[:, band:]) @ at.count[band:]
@@ -396,5 +396,5 @@ def _excess(
     expected = models @ at.count
     degrees = expected**2 / (models**2 @ at.count)
     return largest_p_value(
-        np.asarray(f.sf(power.sum() / expected, degrees, max(redundancy, 1.0))), deviance
+        np.asarray(fdtrc(degrees, max(redundancy, 1.0), power.sum() / expected)), deviance
     )

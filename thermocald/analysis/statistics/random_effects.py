@@ -159,7 +159,7 @@ def odd_specimens(values: Array, covariances: Array) -> Array:
     Each is compared with the type of the others; its most distant parameter counts, corrected for
     the number of parameters.
     """
-    from scipy.stats import t
+    from scipy.special import stdtr
 
     count, size = values.shape
     found = np.ones(count)
@@ -167,7 +167,7 @@ def odd_specimens(values: Array, covariances: Array) -> Array:
         rest = np.arange(count) != i
         others = population(values[rest], covariances[rest])
         sd = np.sqrt(np.diag(others.prior) + np.diag(covariances[i]))
-        p = 2 * t.sf(np.abs(values[i] - others.mean) / sd, count - 2)
+        p = 2 * stdtr(count - 2, -np.abs(values[i] - others.mean) / sd)
         found[i] = min(1.0, size * float(p.min()))
     return found
 

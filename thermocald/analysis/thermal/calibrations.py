@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from thermocald.analysis.camera.camera import CameraDifference
 from thermocald.analysis.thermal.thermal_camera import ThermalCamera
@@ -155,7 +155,7 @@ def fit_calibrations(
     distortion, sure = choose_basis({basis: s for basis, (_, _, s) in found_in.items()})
     x, covariance, square = found_in[distortion]
     redundancy = len(y) - len(x)
-    missing = bool(redundancy and square > chi2.ppf(1 - _LEVEL, redundancy))
+    missing = bool(redundancy and square > chdtri(redundancy, _LEVEL))
     sigma0 = float(np.sqrt(square / redundancy)) if redundancy else 1.0
     if missing:
         covariance *= sigma0**2

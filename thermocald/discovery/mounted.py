@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 from thermocald.discovery import criteria
 from thermocald.discovery.search import Search, Solution
 from thermocald.photogrammetry.camera.camera_model import EOP_NAMES
+from thermocald.physics import catalogue
+from thermocald.physics.effect import Proportional
 from thermocald.thermal.hypothesis import BASE, Term
 from thermocald.thermal.movement import (
     Mount,
@@ -219,9 +221,11 @@ def contradict(best: Solution) -> bool:
     """
     count = len(best.fitter.series)
     shared = _profile(best, best).fit.objective
+    kinds = {n: catalogue.get(n) for n in catalogue.names()}
+    along_T = next(n for n, k in kinds.items() if isinstance(k, Proportional) and k.power == 1)
     for s in range(1, count):
         fresh = tuple(() if k == s else None for k in range(count))
-        own = Term("housing_tilt", BASE, fresh=fresh, through_drive=True)  # along T, as the rates
+        own = Term(along_T, BASE, fresh=fresh, through_drive=True)
         fit = best.fitter.fit((*best.terms, own))
         trial = _profile(best, replace(best, fit=fit))
         if shared - trial.fit.objective > criteria.MOUNT_FURTHER:

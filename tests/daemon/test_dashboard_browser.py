@@ -49,8 +49,8 @@ def test_it_is_live_on_desk_and_phone_light_and_dark(daemon, shown, page_of):
         f"() => parseInt(document.querySelector('#figures dd').textContent) > {epoch + 2}"
     )
     assert page.text_content("#connection") == "live"
-    page.wait_for_function("() => document.querySelectorAll('#overlay circle').length > 100")
-    page.wait_for_function("() => document.querySelectorAll('#overlay line').length > 100")
+    page.wait_for_function("() => document.querySelectorAll('#overlay circle').length > 40")
+    page.wait_for_function("() => document.querySelectorAll('#overlay line').length > 40")
     page.wait_for_function("() => document.querySelector('#frame').naturalWidth > 300")
     page.wait_for_function(f"() => ({_DRAWN})() >= 5")
     for span in ("86400", ""):

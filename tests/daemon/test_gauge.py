@@ -15,6 +15,7 @@ from PIL import Image
 from tests.commands import call
 from thermocald.physics.testfields import demonstration_field, demonstration_model
 from thermocald.store.database.store import Store
+from thermocald.store.recording.testfield_file import read_testfield
 
 
 @pytest.fixture
@@ -31,15 +32,15 @@ def thermal_model(small_camera, tmp_path):
 
 
 @pytest.fixture
-def control_points(tmp_path):
-    """The corners of a few markers of the rendered field, in metres of a national grid."""
-    field = demonstration_field("markers")
+def control_points(tmp_path, small_field):
+    """The corners of half the markers of the rendered field, in metres of a national grid."""
+    field = read_testfield(small_field)
     path = tmp_path / "gcp.csv"
     with path.open("w", newline="") as out:
         rows = csv.writer(out)
         rows.writerow(["target", "X", "Y", "Z", "sX", "sY", "sZ", "kind", "code"])
         for i, name in enumerate(field.names):
-            if i % 40 < 4:  # whole markers
+            if i % 8 < 4:  # whole markers
                 at = field.points[i] / 1000 + (192_000, 313_000, 138)
                 row = [name, *(f"{v:.6f}" for v in at), 2e-4, 2e-4, 2e-4]
                 rows.writerow([*row, field.kinds[i], field.codes[i]])

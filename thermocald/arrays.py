@@ -34,7 +34,7 @@ def seconds(times: ArrayLike) -> Array:
     try:
         if given.dtype == object and given.size and not isinstance(given.flat[0], float | int):
             with warnings.catch_warnings():  # numpy warns that it converts a zone to UTC
-                warnings.simplefilter("ignore", UserWarning)
+                warnings.simplefilter("ignore")
                 given = given.astype("datetime64[us]")
         if given.dtype.kind == "M":
             given = given - np.datetime64(0, "s")

@@ -58,7 +58,7 @@ def run(
     Example: thermocald run --config config.yaml
     """
     from thermocald.config import load_config
-    from thermocald.daemon.plan import mock_config, played_until, recording_config
+    from thermocald.daemon.plan import mock_config, recording_config
     from thermocald.daemon.service import Service
     from thermocald.daemon.systemd import set_up_logging
     from thermocald.hal import option_names
@@ -83,9 +83,7 @@ def run(
     if config is not None:
         read = load_config(config, option_names)
     elif recording is not None:
-        # what the store has already is not played into it twice
-        after = played_until(with_options(recording_config(recording)))
-        read = recording_config(recording, after)
+        read = recording_config(recording, store)
     else:
         read = mock_config()
     set_up_logging(read.logging.level)

@@ -248,13 +248,17 @@ def demo_config(folder: Path, seed: int) -> Config:
     return parse_config(config, Path("config.yaml"))
 
 
-def recording_config(path: Path, after: float | None = None) -> Config:
+def recording_config(path: Path, store: Path | None = None) -> Config:
     """Return the configuration that plays a recording as camera and thermometer.
 
-    after: s UTC, only later frames are played; None: all. Raises RecordingError if none can be.
+    What the store has already is not played into it twice; store: by default named after the
+    recording. Raises RecordingError if nothing can be played.
     """
     recording = open_recording(path)
-    head = recording.head
+    head, name = recording.head, path.absolute().name
+    camera, series = _name(head.camera.name), _name(head.series)
+    place = store or Path(f"{name}.db")
+    after = _played_until(place, camera, series)
     if after is not None and not (recording.columns.frame_time > after).any():
         raise RecordingError(
             f"{path}: the store has epochs of this series up to its last frame or later; choose "
@@ -269,12 +273,12 @@ def recording_config(path: Path, after: float | None = None) -> Config:
     period = max(0.05, head.interval)
     return parse_config(
         {
-            "store": {"path": f"{path.absolute().name}.db", "durable": False},
-            "frames": {"keep": "none", "folder": f"{path.absolute().name}-frames"},
+            "store": {"path": str(place), "durable": False},
+            "frames": {"keep": "none", "folder": f"{name}-frames"},
             "cameras": [
                 {
-                    "name": _name(head.camera.name),
-                    "series": _name(head.series),
+                    "name": camera,
+                    "series": series,
                     "period_s": period,
                     "sensor": {
                         "width_px": sensor.width,
@@ -293,13 +297,12 @@ def recording_config(path: Path, after: float | None = None) -> Config:
     )
 
 
-def played_until(config: Config) -> float | None:
-    """Return the time of the last epoch of a played recording in its store, s; None for none."""
-    path, wanted = config.store.path, (config.cameras[0].name, config.cameras[0].series)
+def _played_until(path: Path, camera: str, series: str) -> float | None:
+    """Return the time of a series' last epoch in a store, s UTC; None if there is none."""
     if not path.exists() or not path.stat().st_size:
         return None
     with Store.open(path) as store:
-        found = [s for s in store.all_series() if (s.camera, s.name) == wanted]
+        found = [s for s in store.all_series() if (s.camera, s.name) == (camera, series)]
         times = [store.series_columns(s, ["frame_time"])["frame_time"] for s in found]
     return max((float(t.max()) for t in times if len(t)), default=None)
 

@@ -112,7 +112,7 @@ def photographs(tmp_path_factory):
     return folder, truth
 
 
-def test_photographs_and_a_logger(photographs, tmp_path):
+def test_photographs_and_a_logger(photographs, undrawn, tmp_path):
     """The drift is recovered; import, replay, study, fit and predict work."""
     folder, truth = photographs
     m1 = tmp_path / "M1"

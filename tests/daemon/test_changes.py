@@ -18,7 +18,7 @@ from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.sources import StoredRecording
 
-EPOCHS, WHEN = 22, 13
+EPOCHS, WHEN = 18, 13
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 
 

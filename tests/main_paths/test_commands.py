@@ -141,7 +141,7 @@ def test_photographs_and_a_logger(photographs, undrawn, tmp_path):
 def odd(tmp_path_factory):
     """Return the fit of a warm-up, and a function that copies it with rows left out or changed."""
     folder = tmp_path_factory.mktemp("odd")
-    tc.simulate("rpi-v2.1-heating", seed=5, epochs=90, out=folder / "plain")
+    tc.simulate("rpi-v2.1-heating", seed=5, epochs=60, out=folder / "plain")
 
     def write(name, table, change):
         out = folder / name

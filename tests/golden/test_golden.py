@@ -24,10 +24,7 @@ SLOW = ("discover", "blind-time-offset", "blind-pair", "real-lag")
 
 @pytest.mark.parametrize(
     "case",
-    [
-        pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in SLOW else ())
-        for c in CASES
-    ],
+    [pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in SLOW else ()) for c in CASES],
 )
 def test_golden(workshop, case: Case):
     if case.needs_data and not DATA.is_dir():

@@ -12,11 +12,6 @@ from tests.blind.score import judge, run
 from tests.blind.tables import summary
 
 
-@pytest.mark.slow
-def test_a_single_effect():
-    assert judge(Case(("second_heat_source",), 0.1, 41)).right
-
-
 def test_doubled_thermometer_noise_gives_no_name():
     assert judge(Case((), 0.3, 42, thermometer_k=0.08)).right
 

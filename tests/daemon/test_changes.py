@@ -18,7 +18,7 @@ from thermocald.store.recording.head import Head
 from thermocald.store.recording.reader import read_recording, write_recording
 from thermocald.store.sources import StoredRecording
 
-EPOCHS, WHEN = 22, 13
+EPOCHS, WHEN = 18, 13
 HAPPENS = ("nothing", "knock", "slip", "wrong_lens", "target_moved")
 
 
@@ -111,7 +111,7 @@ def test_every_epoch_has_its_own_result_before_and_after_a_knock(store):
 
 @pytest.mark.slow  # on a virtual clock in test_virtual_clock
 def test_the_mock_at_half_a_second_tells_nothing(daemon, devices):
-    daemon.run("--epochs", "600", **devices(period_s=0.5))
-    assert daemon.wait(560.0) == 0
+    daemon.run("--epochs", "300", **devices(period_s=0.5))
+    assert daemon.wait(400.0) == 0
     assert daemon.events() == ["started", "series_begun", "stopped"]
-    assert len(daemon.stored()[0]) == 600
+    assert len(daemon.stored()[0]) == 300

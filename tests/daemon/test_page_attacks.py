@@ -153,21 +153,6 @@ def test_the_page_follows_the_configuration_and_ends_with_a_killed_daemon(daemon
         with socket.socket() as channel:
             return channel.connect_ex(("127.0.0.1", port)) == 0
 
-    daemon.configure(**measured, dashboard={"enabled": True, "port": ports[0]})
-    daemon.start(INVOCATION_ID="")
-    daemon.until(lambda: serves(ports[0]))
-    daemon.configure(**measured, dashboard={"enabled": True, "port": ports[1]})
-    daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: serves(ports[1]))
-    assert not serves(ports[0])
-    daemon.kill()
-    daemon.start(INVOCATION_ID="")
-    daemon.until(lambda: daemon.log().count(f"127.0.0.1:{ports[1]}/") == 2)
-    daemon.configure(**measured)
-    daemon.signal(signal.SIGHUP)
-    daemon.until(lambda: not serves(ports[1]))
-    assert daemon.status()["dashboard"]["why"] == ""
-    assert daemon.stop() == 0
     # what the command line demands stays demanded
     daemon.configure(**measured, dashboard={"port": ports[0]}, store={"path": "other.db"})
     daemon.start("--dashboard", "--store", str(daemon.store), INVOCATION_ID="")
@@ -175,6 +160,15 @@ def test_the_page_follows_the_configuration_and_ends_with_a_killed_daemon(daemon
     daemon.configure(**measured, dashboard={"port": ports[1]}, store={"path": "other.db"})
     daemon.signal(signal.SIGHUP)
     daemon.until(lambda: serves(ports[1]))
+    assert not serves(ports[0])
+    daemon.kill()
+    daemon.configure(**measured, dashboard={"enabled": True, "port": ports[1]})
+    daemon.start(INVOCATION_ID="")
+    daemon.until(lambda: daemon.log().count(f"127.0.0.1:{ports[1]}/") == 2)
+    daemon.configure(**measured)
+    daemon.signal(signal.SIGHUP)
+    daemon.until(lambda: not serves(ports[1]))
+    assert daemon.status()["dashboard"]["why"] == ""
     assert daemon.stop() == 0
     assert "takes effect after a restart" not in daemon.log()
 

@@ -18,18 +18,11 @@ from thermocald.photogrammetry.series.normals import ObservationGrid
 from thermocald.results import discovery_lines
 from thermocald.thermal.reduce import reduce_together
 
-slow = pytest.mark.slow
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "effects"),
-    [
-        pytest.param("knock", (), marks=slow),
-        ("knock", ("softening",)),
-        pytest.param("creep", (), marks=slow),
-        pytest.param("creep", ("permanent_set",), marks=slow),
-    ],
+    [("knock", ()), ("knock", ("softening",)), ("creep", ()), ("creep", ("permanent_set",))],
 )
 def test_a_board_that_moves_is_reported_and_the_cameras_effect_is_named(evidence_of, kind, effects):
     evidence, _ = evidence_of(*effects, px=0.1, seed=2, field_motion=kind)
@@ -46,7 +39,7 @@ def test_a_board_that_moves_is_reported_and_the_cameras_effect_is_named(evidence
     assert (document[0]["time_s"] is not None) is (kind == "knock")
 
 
-@pytest.mark.parametrize("effects", [(), pytest.param(("softening",), marks=slow)])
+@pytest.mark.parametrize("effects", [(), pytest.param(("softening",), marks=pytest.mark.slow)])
 def test_a_target_that_wanders_is_reported_and_no_displacement(evidence_of, effects):
     evidence, _ = evidence_of(*effects, px=0.1, seed=2, field_motion="wander")
 

@@ -70,7 +70,7 @@ def test_a_recorded_humidity_is_a_quantity_too():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["smooth", pytest.param("random_walk", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["smooth", "random_walk"])
 def test_what_was_not_recorded_gets_no_formula(kind):
     assert propose(examined(kind, 33), BASE) is None
 

@@ -57,7 +57,6 @@ def test_a_tremble_is_no_drift(effects, px, expected):
     ("effects", "px", "seed", "epochs"),
     [
         ((), 0.05, 2, 90),
-        pytest.param((), 0.05, 2, 180, marks=pytest.mark.slow),
         pytest.param(("softening",), 0.02, 3, 180, marks=pytest.mark.slow),
         pytest.param(("softening",), 0.05, 2, 180, marks=pytest.mark.slow),
         pytest.param(("thermal_lag",), 0.02, 3, 180, marks=pytest.mark.slow),

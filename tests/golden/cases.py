@@ -80,6 +80,9 @@ CASES = (
     Case("discover", "discover M1 --verify M2 --json discover.json --model-out found.yaml"
          " --effect-out effect.yaml", ("discover.json", "found.yaml", "effect.yaml"), RPI,
          ESTIMATE),
+    Case("discover-lag", "discover lag/M1 --verify lag/M2 --json lag.json --effect-out"
+         " lag-effect.yaml --model-out lag-model.yaml",
+         ("lag.json", "lag-model.yaml", "lag-effect.yaml"), (), ESTIMATE),
     Case("blind-time-offset", "discover time_offset/M1 --verify time_offset/M2 --json b1.json",
          ("b1.json",), (), ESTIMATE),
     Case("blind-pair", "discover pair/M1 --verify pair/M2 --json b2.json", ("b2.json",), (),

@@ -18,16 +18,13 @@ def workshop(tmp_path_factory):
     return Workshop(tmp_path_factory.mktemp("golden"))
 
 
-CORPUS_TOO = ("blind-time-offset", "blind-pair", "real-lag")
-"""Cases like those of the slow suite's corpora."""
+SLOW = ("discover", "blind-time-offset", "blind-pair", "real-lag")
+"""Discoveries of 5 to 20 s, like those of the corpora; `discover-lag` writes the same files."""
 
 
 @pytest.mark.parametrize(
     "case",
-    [
-        pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in CORPUS_TOO else ())
-        for c in CASES
-    ],
+    [pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in SLOW else ()) for c in CASES],
 )
 def test_golden(workshop, case: Case):
     if case.needs_data and not DATA.is_dir():

@@ -138,12 +138,14 @@ def photographs(folder: Path) -> None:
     (folder / "log.csv").write_text(text.replace("21.", "21,").replace("22.", "22,"), "latin-1")
 
 
-def blind(folder: Path, name: str, effects: tuple[str, ...], strength: float, seed: int) -> None:
+def blind(
+    folder: Path, name: str, effects: tuple[str, ...], strength: float, seed: int, epochs: int = 180
+) -> None:
     """Write a blind recording with code that shares nothing with the program."""
     from tests.blind.case import Case as Blind
     from tests.blind.generator import generate, write
 
-    for series in generate(Blind(effects, strength, seed))[0]:
+    for series in generate(Blind(effects, strength, seed, epochs=epochs))[0]:
         write(series, folder / name / series.name)
 
 
@@ -176,6 +178,9 @@ INPUTS: dict[str, Callable[[Path], None]] = {
     "correct": points,
     "import": photographs,
     "data-calibrate": walls,
+    "discover-lag": functools.partial(
+        blind, name="lag", effects=("thermal_lag",), strength=0.2, seed=31, epochs=60
+    ),
     "blind-time-offset": functools.partial(
         blind, name="time_offset", effects=("time_offset",), strength=0.1, seed=41
     ),

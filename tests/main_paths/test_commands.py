@@ -90,7 +90,7 @@ def test_a_recording_without_thermal_effects(shared, tmp_path, camera):
 def photographs(tmp_path_factory):
     """Return a folder of JPEGs with EXIF times, a logger's file and a field; and the truth."""
     folder = tmp_path_factory.mktemp("photographs")
-    truth = crooked.write_frames(folder / "frames", 12, seed=4)
+    truth = crooked.write_frames(folder / "frames", 8, seed=4)
     photos = folder / "photos"
     photos.mkdir()
     heads = read_rows(folder / "frames" / "epochs.csv")
@@ -112,7 +112,7 @@ def photographs(tmp_path_factory):
     return folder, truth
 
 
-def test_photographs_and_a_logger(photographs, tmp_path):
+def test_photographs_and_a_logger(photographs, undrawn, tmp_path):
     """The drift is recovered; import, replay, study, fit and predict work."""
     folder, truth = photographs
     m1 = tmp_path / "M1"
@@ -120,9 +120,9 @@ def test_photographs_and_a_logger(photographs, tmp_path):
         "import", folder / "photos", "--log", folder / "logger.csv", "--timezone", "UTC",
         "--testfield", folder / "frames" / "testfield.csv", "--pixel-pitch", 0.00224, "--out", m1,
     )  # fmt: skip
-    assert "12 epochs" in taken.stdout
+    assert "8 epochs" in taken.stdout
     replayed = json.loads(run("replay", m1, "--exterior", "series", "--json", "-").stdout)
-    assert replayed["ok"] == 12
+    assert replayed["ok"] == 8
     run("export", m1, "-o", tmp_path / "rows.csv", "--exterior", "series")
     rows = read_rows(tmp_path / "rows.csv")
     for name in ("c", "x0", "y0"):
@@ -141,7 +141,7 @@ def test_photographs_and_a_logger(photographs, tmp_path):
 def odd(tmp_path_factory):
     """Return the fit of a warm-up, and a function that copies it with rows left out or changed."""
     folder = tmp_path_factory.mktemp("odd")
-    tc.simulate("rpi-v2.1-heating", seed=5, epochs=90, out=folder / "plain")
+    tc.simulate("rpi-v2.1-heating", seed=5, epochs=60, out=folder / "plain")
 
     def write(name, table, change):
         out = folder / name

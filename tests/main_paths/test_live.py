@@ -182,10 +182,10 @@ def test_few_targets_of_a_wall(shared, tmp_path):
     means = []
     for seed in (4, 14, 22, 26):
         part = tmp_path / str(seed)
-        part_of(shared / "data" / "aviary-cam2", part, 0, drawn=(seed, 14))
+        part_of(shared / "data" / "aviary-cam2", part, 52, drawn=(seed, 14))
         if call("export", part, "-o", tmp_path / "part.csv").returncode == 0:
             found = good(rows(tmp_path / "part.csv"))
-            means += [column(found, "c").mean()] if len(found) > 60 else []
+            means += [column(found, "c").mean()] if len(found) > 30 else []
     assert len(means) >= 2
     assert np.abs(np.array(means) - 12.68).max() < 0.3  # 12.68 from all targets
 

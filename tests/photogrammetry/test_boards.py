@@ -51,7 +51,7 @@ OBLIQUE = [(0.0, 0.0, 300.0), (-200.0, 50.0, 220.0), (-260.0, 90.0, 180.0)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stand", mostly_slow(STANDS, STANDS[2]))
+@pytest.mark.parametrize("stand", STANDS)
 def test_all_corners_of_an_aprilgrid(april, stand, taken):
     found, errors, visible = seen(*april, stand, taken=taken)
     assert found.status.ok
@@ -83,7 +83,7 @@ def drawn_exactly(field, columns, rows, size, spacing):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stand", mostly_slow(OBLIQUE, OBLIQUE[2]))
+@pytest.mark.parametrize("stand", OBLIQUE)
 def test_standard_deviations_of_an_aprilgrid_are_true_at_any_obliquity(stand):
     """For 384 coordinates with white noise, error over sd is 1 ± 0.036."""
     field = boards.aprilgrid(4, 4, 40.0, 0.3)

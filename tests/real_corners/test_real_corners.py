@@ -44,12 +44,9 @@ def test_boards_hidden_at_times_do_not_bias_the_camera(still):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("camera", "effect", "seed"),
-    [("aviary-cam6", "thermal_lag", 1), ("aviary-cam1", "softening", 1)],
-)
-def test_an_effect_is_named_in_spite_of_a_moving_mount(camera, effect, seed):
-    assert judge(RealCase(camera, (effect,), seed)).right_or_listed
+def test_an_effect_is_named_in_spite_of_a_moving_mount():
+    """A second one is the golden `real-lag`."""
+    assert judge(RealCase("aviary-cam1", ("softening",), 1)).right_or_listed
 
 
 @pytest.mark.slow

@@ -59,6 +59,7 @@ _HALVINGS = 6  # of a step at most
 _SMALL = 0.1  # standard deviations; the partials apply a last step below it to 1e-3
 _SMALLER = 1e-4  # the same for a block, as the result must not depend on the blocks
 _NEAR = 10.0  # standard deviations up to which the partials predict the residuals after a step
+_FAR = 20.0  # times an epoch's median residual or px: gross beyond doubt, whatever the camera
 _ROUNDS = 8  # of data snooping
 _FIELD_ROUNDS = 4  # of the field's own variance component
 _SAME_FIELD = 0.1  # relative change of that component at convergence
@@ -129,7 +130,12 @@ class SeriesEstimator:
         if not solved.all():
             # Gross errors among few targets of an epoch must not spoil the common unknowns.
             few = 2 * solved.sum() < len(solved)
-            use = series._screen(start, use) if few else use & estimate.converged[:, None]
+            if few:
+                use = series._screen(start, use)
+            else:
+                middle = np.median(estimate.values[estimate.solved], axis=0)
+                use = use & (estimate.converged[:, None] | series._near(middle, use))
+                use = use & series.solve(start, use, self.unit).converged[:, None]
             offered = offered & use.any(axis=1, keepdims=True)
             estimate = series.solve(start, use, self.unit)
         if s.snooping_alpha > 0:
@@ -184,11 +190,22 @@ class SeriesEstimator:
         whose pose does not converge keeps none.
         """
         middle = np.median(start.values, axis=0)
+        use = use & self._near(middle, use)
         s = replace(self.s, exterior="per_epoch", free=(), target_offsets=False, priors={})
         alone = replace(self, s=s, bound=None, windows=())
         first = State(np.tile(middle, (len(use), 1)), np.zeros_like(start.offsets), middle[EOP])
         own = alone.solve(first, use, self.unit)
         return alone.snoop(own, use).system.use & own.converged[:, None]
+
+    def _near(self, values: Array, use: Mask) -> Mask:
+        """Select the points (E, T) that are not far off the image of a camera, values (16,)."""
+        predicted = project(self.sensor, values[IOP], values[EOP], self.testfield.points)
+        size = np.linalg.norm(self.grid.points - predicted, axis=2)
+        shown = use.any(axis=1)
+        usual = np.ones(len(use))
+        usual[shown] = np.nanmedian(np.where(use[shown], size[shown], np.nan), axis=1)
+        near: Mask = size < _FAR * np.maximum(usual, 1.0)[:, None]
+        return near
 
     @property
     def has_offsets(self) -> bool:

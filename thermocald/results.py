@@ -157,19 +157,11 @@ class Calibration(Result):
     def doubts(self) -> list[str]:
         """Probable mistakes in the estimated camera, one sentence each."""
         result = self.photographs
-        found = []
-        if result.contradiction > 1.0:
-            found.append(
-                "the photographs contradict each other more than their residuals, and the standard "
-                f"deviations are up to {result.contradiction:.1f} times larger for it: a rolling "
-                "shutter, movement during the exposure, autofocus, or a board that bends; fix the "
-                "focus, and hold camera and board still"
-            )
         if result.interior is None or not result.estimated or self.pitch_assumed:
-            return found
+            return []
         nominal = self.file.principal_distance or focal_length(Path(result.photographs[0].path))
         c, x0, y0 = result.interior.as_array()[:3].tolist()
-        return found + interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
+        return interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
 
     @property
     def status(self) -> str:

@@ -97,14 +97,12 @@ class Photographs:
     """The camera and its photographs.
 
     status: `ok` if the interior orientation was estimated; estimated: False if `interior` was given
-    and held; covariance (16, 16); contradiction: largest factor of the standard deviations,
-    which contain it, as the photographs disagree more than their residuals.
+    and held; covariance (16, 16).
     """
 
     JSON: ClassVar = {
         "interior": "", "estimated": "interior_estimated", "covariance": "",
         "n_photographs": "n_photographs", "orientation": "interior", "correlations": "correlations",
-        "contradiction": "",
     }  # fmt: skip
 
     status: str
@@ -115,7 +113,6 @@ class Photographs:
     sigma0: float
     redundancy: int
     photographs: tuple[PhotographResult, ...]
-    contradiction: float = 1.0
 
     @property
     def n_photographs(self) -> int:
@@ -250,9 +247,8 @@ def calibrate_observations(
             PhotographResult(name, "ok", "", n, rejected, rms, exterior, sd, o.points, rest, used)
         )
     return Photographs(
-        status, reason, interior, estimated, covariance, sigma0, redundancy, tuple(results),
-        together.contradiction if together is not None and estimated else 1.0,
-    )  # fmt: skip
+        status, reason, interior, estimated, covariance, sigma0, redundancy, tuple(results)
+    )
 
 
 def _first_camera(

@@ -277,21 +277,6 @@ class BundleAdjustment:
         )
         return total
 
-    def photograph_parts(self, bundle: Bundle) -> tuple[Array, Array]:
-        """Return each photograph's part of the interior orientation's normal equations: matrices
-        (k, f, f) and right-hand sides (k, f), with its pose eliminated.
-        """
-        v, by_camera, _ = self._linearised(bundle, np.ones(len(self.rays)))
-        k, f = len(bundle.centres), len(self.free)
-        N, right = np.zeros((k, f + 6, f + 6)), np.zeros((k, f + 6))
-        np.add.at(N, self.rays.photo, np.swapaxes(by_camera, 1, 2) @ by_camera)
-        np.add.at(right, self.rays.photo, np.einsum("nai,na->ni", by_camera, v))
-        mixed = N[:, :f, f:] @ np.linalg.inv(N[:, f:, f:])
-        return (
-            N[:, :f, :f] - mixed @ N[:, f:, :f],
-            right[:, :f] - np.einsum("kfp,kp->kf", mixed, right[:, f:]),
-        )
-
     def cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
         """Return the weighted sum of squares of residuals (n, 2) and targets' corrections."""
         total = float(weights @ np.sum(v * v, axis=1))

@@ -5,14 +5,8 @@ as prior, and are the same in all photographs. The weights of the image points d
 unknowns, so that the iteration ends at the minimum of the sum of squares. A photograph too poor for
 an interior orientation of its own is used as well.
 
-A rolling shutter or a movement during the exposure displaces all points of a photograph together.
-Pose and distortion absorb much of it, so that sigma0 hardly shows it, and the interior orientation
-follows it. The photographs then disagree more than their residuals, and the standard deviations are
-multiplied by that ratio.
-
 Source: Luhmann et al. (2014), section 7.3 (test-field calibration); the elimination of points as
-Brown, D. C. (1976): The bundle adjustment - progress and prospects; observations correlated in
-groups: Liang, K.-Y. and Zeger, S. L. (1986), Biometrika 73, 13-22.
+Brown, D. C. (1976): The bundle adjustment - progress and prospects.
 """
 
 from __future__ import annotations
@@ -21,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import chdtri
 
 from thermocald.errors import GeometryError
 from thermocald.photogrammetry.camera.camera_model import (
@@ -55,8 +48,6 @@ _ITERATIONS = 60
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
-_CHANCE = 0.01  # probability of a disagreement that counts as chance
-_COMPARED = 1e-3  # parameters of which photographs with others can be compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +56,7 @@ class CommonInterior:
 
     interior; covariance (16, 16): its EOP block is zero; exteriors, exterior_covariances (n, 6, 6);
     sigma0; redundancy; used: mask of the observations by photograph; residuals (n, 2) px: by
-    photograph; contradiction: largest factor of the standard deviations, which contain it, as the
-    photographs disagree more than their residuals, 1 if that may be chance; reasons: why the
-    geometry is weak, empty if it is not.
+    photograph; reasons: why the geometry is weak, empty if it is not.
     """
 
     interior: InteriorOrientation
@@ -78,7 +67,6 @@ class CommonInterior:
     redundancy: int
     used: tuple[Mask, ...]
     residuals: tuple[Array, ...]
-    contradiction: float
     reasons: tuple[str, ...]
 
 
@@ -138,10 +126,7 @@ def adjust_common_interior(
             f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
         )
     variance = every.cost(bundle, v[used], np.ones(n)) / redundancy
-    factors = _contradictions(*part.photograph_parts(bundle), variance)
-    scale = np.full(len(found.cameras), factors.min())
-    scale[: len(free)] = factors
-    Q = found.cameras * variance * np.outer(scale, scale)
+    Q = found.cameras * variance
     covariance = np.zeros((16, 16))
     covariance[np.ix_(free, free)] = Q[: len(free), : len(free)]
     eops = bundle.exteriors()
@@ -155,33 +140,8 @@ def adjust_common_interior(
         redundancy,
         tuple(np.split(used, ends)),
         tuple(np.split(replace(every, rays=rays.in_pixels()).residuals(bundle), ends)),
-        float(factors.max()),
         tuple(_weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)),
     )
-
-
-def _contradictions(N: Array, right: Array, variance: float) -> Array:
-    """Return the factors (f,) of the standard deviations by which the photographs disagree more
-    than their residuals; 1 if that may be chance.
-
-    N (k, f, f), right (k, f): the photographs' parts of the normal equations; variance: of unit
-    weight. A parameter's factor is at least that of all together.
-    """
-    Q = np.linalg.inv(N.sum(axis=0))
-    parts = N @ Q
-    squares = (parts @ parts).sum(axis=0)
-    mean = float(np.trace(np.eye(len(Q)) - squares))
-    if mean < _COMPARED:
-        return np.ones(len(Q))
-    cubes = float(np.einsum("kij,kjl,kli->", parts, parts, parts))
-    freedom = mean**2 / (float(np.trace(squares + squares @ squares)) - 2.0 * cubes)
-    shifts = right @ Q
-    ratio = float(np.sum(shifts * right)) / (variance * mean)
-    if ratio * freedom < chdtri(freedom, _CHANCE):
-        return np.ones(len(Q))
-    own = np.sum(shifts**2, axis=0) / (variance * np.diag(Q - Q @ squares))
-    factors: Array = np.sqrt(np.maximum(own, max(ratio, 1.0)))
-    return factors
 
 
 def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:

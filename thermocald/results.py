@@ -157,11 +157,21 @@ class Calibration(Result):
     def doubts(self) -> list[str]:
         """Probable mistakes in the estimated camera, one sentence each."""
         result = self.photographs
-        if result.interior is None or not result.estimated or self.pitch_assumed:
+        if result.interior is None or not result.estimated:
             return []
+        found = []
+        if result.disagreement > 1:
+            found.append(
+                "the photographs disagree: without one of them the camera moves "
+                f"{result.disagreement:.1f} times as far as the noise of image points explains "
+                "(another focus or zoom, a board that bends, a rolling shutter, blur by motion?); "
+                "the standard deviations include this, but no error that all photographs share"
+            )
+        if self.pitch_assumed:
+            return found
         nominal = self.file.principal_distance or focal_length(Path(result.photographs[0].path))
         c, x0, y0 = result.interior.as_array()[:3].tolist()
-        return interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
+        return found + interior_doubts(replace(self.file, principal_distance=nominal), c, x0, y0)
 
     @property
     def status(self) -> str:

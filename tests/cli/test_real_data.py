@@ -138,6 +138,9 @@ def test_hand_held_photographs_of_a_chessboard(shared, tmp_path):
     assert sum(status[n] == "ok" for n in images) >= len(opencv) == 9
     assert all(status[n] == "ok" for n in opencv)
     assert 915 < document["interior"]["c"] / 0.003 < 975
+    # random halves of the folder differ by 14 px in c; as if points were independent: 1.2 px
+    assert 4 < document["interior"]["sd_c"] / 0.003 < 16
+    assert document["doubts"][0].startswith("the photographs disagree")
     words = ["wrong_size", "ok", "nothing_found", "large_residuals", "flat", "bad_image"]
     assert [status[n] for n in sorted(status) if n[1] == "_"] == words
     assert all(p["reason"] for p in document["photographs"] if p["status"] != "ok")

@@ -97,11 +97,11 @@ class Photographs:
     """The camera and its photographs.
 
     status: `ok` if the interior orientation was estimated; estimated: False if `interior` was given
-    and held; covariance (16, 16).
+    and held; covariance (16, 16); disagreement: of the photographs (`CommonInterior`).
     """
 
     JSON: ClassVar = {
-        "interior": "", "estimated": "interior_estimated", "covariance": "",
+        "interior": "", "estimated": "interior_estimated", "covariance": "", "disagreement": "",
         "n_photographs": "n_photographs", "orientation": "interior", "correlations": "correlations",
     }  # fmt: skip
 
@@ -113,6 +113,7 @@ class Photographs:
     sigma0: float
     redundancy: int
     photographs: tuple[PhotographResult, ...]
+    disagreement: float = 1.0
 
     @property
     def n_photographs(self) -> int:
@@ -214,7 +215,7 @@ def calibrate_observations(
         status, interior, estimated = "held", camera.interior, False
         if settings.free:
             status = "weak_geometry"
-        covariance, sigma0, redundancy = np.zeros((16, 16)), float("nan"), 0
+        covariance, sigma0, redundancy, disagreement = np.zeros((16, 16)), float("nan"), 0, 1.0
         for k in seen.keys() - failures.keys():
             if interior is None:
                 why = f"without an interior orientation there is no pose: {reason}"
@@ -229,7 +230,7 @@ def calibrate_observations(
     else:
         status, interior, estimated = "ok", together.interior, True
         covariance, sigma0 = together.covariance, together.sigma0
-        redundancy = together.redundancy
+        redundancy, disagreement = together.redundancy, together.disagreement
         sds = np.sqrt(np.diagonal(together.exterior_covariances, axis1=1, axis2=2))
         found = zip(together.used, together.residuals, together.exteriors, sds, strict=True)
         poses = dict(zip(rows, found, strict=True))
@@ -247,8 +248,9 @@ def calibrate_observations(
             PhotographResult(name, "ok", "", n, rejected, rms, exterior, sd, o.points, rest, used)
         )
     return Photographs(
-        status, reason, interior, estimated, covariance, sigma0, redundancy, tuple(results)
-    )
+        status, reason, interior, estimated, covariance, sigma0, redundancy, tuple(results),
+        disagreement,
+    )  # fmt: skip
 
 
 def _first_camera(

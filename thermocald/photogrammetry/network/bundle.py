@@ -277,6 +277,25 @@ class BundleAdjustment:
         )
         return total
 
+    def without_each(self, bundle: Bundle, found: Cofactors) -> tuple[Array, Array]:
+        """Return how the interior orientation moves if a photograph is left out, (k, f), and the
+        cofactors (k, f, f) of that, for each of the k photographs; to first order.
+
+        Raises LinAlgError if the other photographs do not determine it.
+        """
+        f, moves, cofactors = len(self.free), [], []
+        for photo in range(len(bundle.centres)):
+            rest = replace(self, rays=self.rays.select(self.rays.photo != photo))
+            normals = rest._normal_equations(bundle, np.ones(len(rest.rays)))
+            pose = f + 6 * photo + np.arange(6)
+            normals[0][pose, pose] = 1.0  # nothing else determines it
+            S, s, _ = _reduce(normals)
+            np.linalg.cholesky(unit_diagonal(S)[0])
+            Q = scaled_inverse(S)
+            moves.append(Q[:f] @ s)
+            cofactors.append((Q - found.cameras)[:f, :f])
+        return np.array(moves), np.array(cofactors)
+
     def cost(self, bundle: Bundle, v: Array, weights: Array) -> float:
         """Return the weighted sum of squares of residuals (n, 2) and targets' corrections."""
         total = float(weights @ np.sum(v * v, axis=1))

@@ -6,11 +6,14 @@ unknowns, so that the iteration ends at the minimum of the sum of squares. A pho
 an interior orientation of its own is used as well.
 
 Source: Luhmann et al. (2014), section 7.3 (test-field calibration); the elimination of points as
-Brown, D. C. (1976): The bundle adjustment - progress and prospects.
+Brown, D. C. (1976): The bundle adjustment - progress and prospects; the covariance between
+photographs as MacKinnon, J. G., White, H. (1985): Some heteroskedasticity-consistent covariance
+matrix estimators, Journal of Econometrics 29 (jackknife), by clusters.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -47,6 +50,8 @@ if TYPE_CHECKING:
 _ITERATIONS = 60
 _ROUNDS = 10  # of data snooping, beyond the rays of one target, which go one at a time
 _LARGEST_OBLIQUENESS_NEEDED_DEG = 20.0
+_FEWEST_TO_COMPARE = 3  # photographs
+_DISAGREE = 4.0  # standard deviations of the mean square of the moves
 _LEAST_SIGMA_MM = 1e-6  # of a coordinate without a sigma in a target that has others
 
 
@@ -56,7 +61,9 @@ class CommonInterior:
 
     interior; covariance (16, 16): its EOP block is zero; exteriors, exterior_covariances (n, 6, 6);
     sigma0; redundancy; used: mask of the observations by photograph; residuals (n, 2) px: by
-    photograph; reasons: why the geometry is weak, empty if it is not.
+    photograph; reasons: why the geometry is weak, empty if it is not; disagreement: how many times
+    farther than the image points explain the interior orientation moves if a photograph is left
+    out, 1 if that may be chance; covariances include it.
     """
 
     interior: InteriorOrientation
@@ -68,6 +75,7 @@ class CommonInterior:
     used: tuple[Mask, ...]
     residuals: tuple[Array, ...]
     reasons: tuple[str, ...]
+    disagreement: float
 
 
 def adjust_common_interior(
@@ -126,22 +134,54 @@ def adjust_common_interior(
             f"{redundancy}; at least {s.bounds.minimum_redundancy} is needed"
         )
     variance = every.cost(bundle, v[used], np.ones(n)) / redundancy
-    Q = found.cameras * variance
+    Q, f = found.cameras * variance, len(free)
     covariance = np.zeros((16, 16))
-    covariance[np.ix_(free, free)] = Q[: len(free), : len(free)]
+    covariance[np.ix_(free, free)] = Q[:f, :f]
     eops = bundle.exteriors()
+    # how weak the geometry is, whatever the photographs disagree in
+    weak = _weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)
+    disagreement = 1.0
+    if f and len(photographs) >= _FEWEST_TO_COMPARE:
+        with suppress(np.linalg.LinAlgError):  # the others may be too few without one of them
+            moves, cofactors = part.without_each(bundle, found)
+            disagreement, own = _between(moves, cofactors * variance, Q[:f, :f])
+            follow = np.linalg.solve(Q[:f, :f], Q[:f])
+            Q = Q + follow.T @ (own - Q[:f, :f]) @ follow
+            covariance[np.ix_(free, free)] = own
     ends = np.cumsum([len(o) for o in photographs])[:-1]
     return CommonInterior(
         InteriorOrientation.from_array(bundle.interior),
         covariance,
         tuple(ExteriorOrientation.from_array(e) for e in eops),
-        _of_angles(Q[len(free) :, len(free) :], bundle, eops),
+        _of_angles(Q[f:, f:], bundle, eops),
         float(np.sqrt(variance)),
         redundancy,
         tuple(np.split(used, ends)),
         tuple(np.split(replace(every, rays=rays.in_pixels()).residuals(bundle), ends)),
-        tuple(_weaknesses(sensor, bundle.interior, eops, places, rays.select(used), covariance, s)),
+        tuple(weak),
+        disagreement,
     )
+
+
+def _between(moves: Array, cofactors: Array, own: Array) -> tuple[float, Array]:
+    """Return how many times farther than by chance the interior orientation moves if a photograph
+    is left out, and its covariance (f, f).
+
+    moves (k, f), with covariances (k, f, f) if all image points are independent; own (f, f):
+    covariance in that case. If they move too far, the errors within a photograph are correlated
+    (another focus, a board that bends, a rolling shutter); the photographs are still independent of
+    each other, and their jackknife gives the covariance where it is larger.
+    """
+    k, f = moves.shape
+    root = np.linalg.cholesky(own)
+    moves = np.linalg.solve(root, moves.T).T
+    cofactors = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, cofactors), 1, 2))
+    ratio = float(np.mean(moves * np.linalg.solve(cofactors, moves[..., None])[..., 0]))
+    if not ratio > 1 + _DISAGREE * np.sqrt(2 / (k * f)):
+        return 1.0, own
+    values, vectors = np.linalg.eigh((k - 1) / k * moves.T @ moves)
+    wide = root @ vectors
+    return float(np.sqrt(ratio)), wide * np.maximum(values, 1.0) @ wide.T
 
 
 def _of_angles(Q: Array, bundle: Bundle, eops: Array) -> Array:

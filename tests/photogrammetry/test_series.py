@@ -160,6 +160,24 @@ def test_gross_errors_among_twelve_targets_end_in_a_status(seed, gross_px, exter
         assert np.sqrt(np.mean(z**2)) < 1.3
 
 
+def test_a_half_of_few_targets_that_moves_widens_the_sds():
+    """Half of 12 targets, moved by 0.5 px, cannot be told from the others."""
+    z = []
+    for seed in range(12):
+        rng = np.random.default_rng([3, seed])
+        field, truth, observations = series(rng, 40, hidden=0.0)
+        few = np.sort(rng.choice(len(field), 12, replace=False))
+        observations = [o.select(np.isin(o.targets, few)) for o in observations]
+        half = rng.permutation(few)[:6]
+        for o in observations[25:]:
+            o.points[np.isin(o.targets, half), 0] += 0.5
+        r = scene.adjusted_series(field, observations)
+        assert r.step == 25
+        error = (r.values - truth)[r.ok, :3]
+        z.append((error - error.mean(axis=0)) / r.sd[r.ok, :3])
+    assert np.sqrt(np.mean(np.square(np.concatenate(z)))) < 1.2
+
+
 @pytest.mark.parametrize("factor", [1.0, 5.0])
 def test_a_field_worse_than_stated_is_reported_and_scales_the_level(factor):
     """Over 20 series of 25 epochs; with the stated sigmas, the level would be `factor` sd wrong."""

@@ -55,6 +55,11 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
 
     found, ok = [], table.ok
     time = table.frame_time[ok]
+    of_targets = np.zeros(16)
+    if table.adjustment is not None:
+        # targets' slow errors have opposite signs in the first and the last epoch
+        last = table.adjustment.last_course
+        of_targets = 2.0 * last * (1.0 - last) * np.diag(table.adjustment.slow)
     for name in names:
         column = IOP_NAMES.index(name)
         values, sds = table.values[ok, column], table.sd[ok, column]
@@ -76,7 +81,7 @@ def _lines(table: Epochs, names: Sequence[str]) -> dict[str, Course]:
             float(np.sqrt(np.mean(sds**2))), slope * span,
             float(np.hypot(noise.sd * span, tilt_sd)), min(1.0, p), drifts=False,
             last_minus_first=float(values[-1] - values[0]),
-            sd_last_minus_first=float(np.hypot(sds[-1], sds[0])),
+            sd_last_minus_first=float(np.sqrt(sds[-1] ** 2 + sds[0] ** 2 + of_targets[column])),
             sd_by_perspective=float(np.sqrt(2.0) * table.perspective_sd[column]),
         )  # fmt: skip
         found.append(line)
@@ -142,7 +147,7 @@ def _single_support(
     """
     if table.without is None or table.adjustment is None or len(table.groups) < 3:
         return None
-    slow = slow_errors(table.adjustment.residuals, table.adjustment.observed)
+    slow, *_ = slow_errors(table.adjustment.residuals, table.adjustment.observed)
     size = {first: float(np.nansum(slow[rows] ** 2)) for first, rows in table.groups.items()}
     best, least = None, _SHRUNK * abs(line.change)
     for first in sorted(size, key=lambda first: -size[first])[:_SUSPECTS]:

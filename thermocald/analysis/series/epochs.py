@@ -225,6 +225,8 @@ class Epochs(Result):
                 "outer_noise": {"value": value, "sd": sd} if uneven else None,
                 "held_affinity": _held_affinity(adjustment),
             }
+            if adjustment.step:
+                document["targets_moved_before_epoch"] = int(self.number[adjustment.step])
             seen = int(adjustment.observed.any(axis=0).sum())
             free = len(adjustment.settings.free) + 6  # and the exterior orientation
             if np.isfinite(adjustment.offsets).any() and 2 * seen - free < _TESTS_A_FIELD:
@@ -269,7 +271,12 @@ class Epochs(Result):
         out = [f"{calibrated}, exterior orientation {exterior}, {rejected}"]
         if (sigma0 := document["sigma0"]) is not None:
             cause = ""
-            if sigma0 > 1.0 + MATERIAL:
+            if moved := document.get("targets_moved_before_epoch"):
+                cause = (
+                    f"; the targets moved against one another before epoch {moved}: it cannot be "
+                    "decided which of them, and the standard deviations allow for all"
+                )
+            elif sigma0 > 1.0 + MATERIAL:
                 cause = f"; {CAUSES_OF_SIGMA0}"
                 if self.adjustment is not None and np.isfinite(self.adjustment.offsets).any():
                     cause = (

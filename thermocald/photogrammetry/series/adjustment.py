@@ -239,19 +239,21 @@ def result(
             relative[block] += common_error_covariance(system, movement.covariance)
         G = typical_sensitivity(system)
         mount_trend[own[:, None], own] = G @ movement.tilt(line_weights(sound)) @ G.T
-    slow = np.zeros((16, 16))
+    slow, step = np.zeros((16, 16)), 0
     if many:
-        slow = slow_target_covariance(
-            system, slow_errors(estimate.residuals, use), series.testfield.groups
+        changes, course, step = slow_errors(
+            estimate.residuals, use & estimate.solved[:, None], not series.windows
         )
+        slow = slow_target_covariance(system, changes, series.testfield.groups, step > 0)
         trend += slow
     if s.target_noise:
         variances = np.diagonal(relative, axis1=1, axis2=2)[:, own]
         excess[own] = _excess(series, estimate.values[:, own], variances, sound)
         relative[:, own, own] += excess[own] * sound[:, None]
-    # Slow errors: a straight line through zero in the middle of the series, uncertain at its ends.
+    # Slow errors: a straight line through zero in the middle of the series, uncertain at its ends,
+    # or a step
     if slow.any():
-        relative += np.linspace(-0.5, 0.5, len(use))[:, None, None] ** 2 * slow
+        relative += course[:, None, None] ** 2 * slow
     relative[~sound] = 0.0
     still = np.full(len(sigma0), np.nan)
     if s.exterior == "series":
@@ -276,6 +278,7 @@ def result(
         movement=movement,
         choice=series.choice,
         slow=slow,
+        step=step,
         pairs=pairs or None,
     )
 

@@ -71,12 +71,16 @@ def all_cofactors(system: SeriesSystem) -> tuple[Array, Array, Array]:
     return relative, level, trend
 
 
-def slow_target_covariance(system: SeriesSystem, errors: Array, group: Index) -> Array:
-    """Return the covariance (16, 16) of a straight line over the series from slow target errors.
+def slow_target_covariance(
+    system: SeriesSystem, errors: Array, group: Index, together: bool
+) -> Array:
+    """Return the covariance (16, 16) of a change over the series from slow target errors.
 
     errors (T, 2) px: from the residuals. The parameters have absorbed a part of the error of a
     group of targets with a common error; it is restored as in the jackknife (HC3):
-    Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups.
+    Σ Q Aᵀ W (I - H)⁻¹ e eᵀ (I - H)⁻¹ W A Q over the groups. together: whether some targets moved
+    with one another. A camera absorbs the targets' mean movement: residuals do not show it, but
+    most targets, which stood still, have as large an error.
     """
     design = system.design
     out = np.zeros((16, 16))
@@ -87,7 +91,7 @@ def slow_target_covariance(system: SeriesSystem, errors: Array, group: Index) ->
     inverse, good = cofactors((np.einsum("tkp,tkq->pq", J, J) + design.own_prior)[None])
     if not good[0]:
         return out
-    total = np.zeros((len(design.own), len(design.own)))
+    total, moved = np.zeros((len(design.own), len(design.own))), np.zeros_like(errors)
     for label in np.unique(group):
         rows = group == label
         e = (errors[rows] * w[rows]).ravel()
@@ -100,6 +104,12 @@ def slow_target_covariance(system: SeriesSystem, errors: Array, group: Index) ->
         back = vectors @ ((vectors.T @ e) / np.maximum(values, 0.1))
         pull = inverse[0] @ (Jg.T @ back)
         total += np.outer(pull, pull)
+        moved[rows] = back.reshape(-1, 2) / np.maximum(w[rows], 1e-12)
+    if together:
+        shifted = inverse[0] @ np.einsum("tkp,tk->pk", J, w)
+        squares = (moved[w[:, 0] > 0] ** 2).sum(axis=1)
+        usual = np.median(squares) / max(squares.sum(), 1e-300)
+        total += shifted @ (usual * moved.T @ moved) @ shifted.T
     out[design.own[:, None], design.own] = total
     return out
 

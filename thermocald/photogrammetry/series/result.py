@@ -138,7 +138,8 @@ class SeriesAdjustment:
     least 1; outer_noise: noise of the outermost target over that in the image's middle, and its
     standard deviation; noise_ratio: estimated over stated noise; affinity: of held C1 and C2;
     movement: of the mount; choice: how the exterior orientation was estimated, and why; slow
-    (16, 16): covariance of a straight line from slow errors of targets; pairs: of coordinates with
+    (16, 16): covariance of the change over the series from slow errors of targets; step: the first
+    epoch (row) after targets moved against one another, 0 for none; pairs: of coordinates with
     correlated errors.
     """
 
@@ -165,7 +166,13 @@ class SeriesAdjustment:
     movement: Movement = STILL
     choice: str = ""
     slow: Array = field(default_factory=lambda: np.zeros((16, 16)))
+    step: int = 0
     pairs: CorrelatedPairs | None = None
+
+    @property
+    def last_course(self) -> float:
+        """The part of the slow change, of range 1 and mean 0, that the last epoch has."""
+        return self.step / len(self.status) or 0.5
 
     @property
     def exterior(self) -> Exterior:

@@ -38,6 +38,9 @@ _SMOOTH = 15  # epochs
 _FEWEST_RADII = 8  # targets
 _LOG_CHI2 = np.pi**2 / 6  # variance of the logarithm of χ² with two degrees of freedom
 _NOISIEST = 9.0  # times the series' variance of unit weight: three times its noise
+_STEP_GAIN = 20.0  # χ² that a step must explain beyond a line, over the root of the coordinates
+_LEAST_STEP_PX = 0.02
+_SIDE, _ABRUPT = 4, 0.8  # epochs on both sides of a step, between which this share must happen
 _CLIP = 60.0  # times the median square, beyond which a square is a jump
 
 
@@ -176,27 +179,53 @@ def noise_by_radius(tests: Array, used: Mask, radius: Array) -> tuple[float, flo
     return ratio, ratio * 0.5 * outermost * float(sd)
 
 
-def slow_errors(residuals: Array, used: Mask) -> Array:
-    """Estimate the change (T, 2) px of each target's error from the first epoch to the last.
+def slow_errors(residuals: Array, used: Mask, steps: bool = True) -> tuple[Array, Array, int]:
+    """Estimate the slow change (T, 2) px of each target's error over a series.
 
-    residuals (E, T, 2) px; used (E, T). Light that wanders over a marker, or a board that gives
-    way, moves single targets slowly. The change is that of a straight line through a target's
-    residuals, less the line's noise, and 0 if the line is no steeper than its noise.
+    residuals (E, T, 2) px; used (E, T); steps: whether the change may be a step. Returns the
+    changes, their common course (E,), centred and of range 1, and the first epoch (row) after a
+    step, 0 for a straight line. Light that wanders over a marker, or a board that gives way, moves
+    single targets slowly; a knock moves a part of the field. A change is less its noise, and 0 if
+    it is no larger than that.
     """
     E = len(residuals)
-    t = np.linspace(-0.5, 0.5, E)[:, None, None]
     w = used[..., None].astype(np.float64)
     n = np.maximum(w.sum(axis=0), 1.0)
-    x = (t - (w * t).sum(axis=0) / n) * w
     v = np.where(used[..., None], residuals, 0.0)
     v = (v - v.sum(axis=0) / n) * w
-    sxx = np.maximum((x * x).sum(axis=0), 1e-12)
-    slope = (x * v).sum(axis=0) / sxx
-    variance = ((v - slope * x) ** 2).sum(axis=0) / np.maximum(n - 2, 1.0) / sxx
-    enough = (n >= FEW_EPOCHS) & (sxx > 0.01 * E)
+
+    def fit(course: Array) -> tuple[Array, Array, Array]:
+        """Return changes (T, 2), their variances, and the squares that they explain."""
+        x = course[:, None, None]
+        x = (x - (w * x).sum(axis=0) / n) * w
+        sxx = np.maximum((x * x).sum(axis=0), 1e-12)
+        slope = (x * v).sum(axis=0) / sxx
+        variance = ((v - slope * x) ** 2).sum(axis=0) / np.maximum(n - 2, 1.0) / sxx
+        enough = (n >= FEW_EPOCHS) & (sxx > 0.01 * E)
+        return np.where(enough, slope, 0.0), variance, np.where(enough, slope**2 * sxx, 0.0)
+
+    row = 0
+    course: Array = np.linspace(-0.5, 0.5, E, dtype=np.float64)
+    slope, variance, explained = fit(course)
+    if steps and E >= 2 * _SMOOTH:
+        before = np.cumsum(w, axis=0)[:-1]
+        sxx = before * (n - before) / n
+        gains = np.cumsum(v, axis=0)[:-1] ** 2 / np.maximum(sxx, 1.0)
+        gains = np.where(sxx > 0.01 * E, gains, 0.0).sum(axis=(1, 2))
+        at = 1 + int(np.argmax(gains))
+        stair: Array = np.where(np.arange(E) >= at, at / E, at / E - 1.0)
+        step = fit(stair)
+        rest = float((v**2).sum() - step[2].sum()) / max(2.0 * float(w.sum()), 1.0)
+        sides = [slice(max(at - _SIDE, 0), at), slice(at, at + _SIDE)]
+        earlier, later = (v[k].sum(axis=0) / np.maximum(w[k].sum(axis=0), 1.0) for k in sides)
+        size = float((step[0] ** 2).sum())
+        abrupt = float(((later - earlier) * step[0]).sum()) > _ABRUPT * size
+        gain, moving = float(step[2].sum() - explained.sum()), np.count_nonzero(step[2])
+        large = size > moving * _LEAST_STEP_PX**2
+        if large and abrupt and gain > _STEP_GAIN * np.sqrt(moving) * rest:
+            (slope, variance, _), row, course = step, at, stair
     left = np.sqrt(np.maximum(1 - variance / np.maximum(slope**2, 1e-300), 0.0))
-    slow: Array = np.where(enough, slope * left, 0.0)
-    return slow
+    return slope * left, course, row
 
 
 def neighbours_variance(unit: Array, known: Mask) -> Array:

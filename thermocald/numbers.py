@@ -22,6 +22,7 @@ _SYMBOLS = {"sigma0": "σ₀", "x0": "x₀", "y0": "y₀"}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?|\([-+]?\d[\d. ±]*\))e([+-]?\d{1,3})(?![\w.]*\w)")
 _UNIT_POWER = re.compile(r"(?<![\w-])mm(-\d)(?![\w-])")
+_DEGREES = re.compile(r"(?<=[\d)] )degC\b")
 _MINUS = "−"
 
 
@@ -57,7 +58,11 @@ def superscript(exponent: int) -> str:
 
 
 def typeset_powers(text: str) -> str:
-    """Return a text with powers typeset: (-1.2 ± 0.1)e-06 mm-1 as (−1.2 ± 0.1)·10⁻⁶ mm⁻¹."""
+    """Return a text with powers typeset: (-1.2 ± 0.1)e-06 mm-1 as (−1.2 ± 0.1)·10⁻⁶ mm⁻¹.
+
+    The unit degC behind a number, as files spell it, becomes °C.
+    """
+    text = _DEGREES.sub("°C", text)
     text = _COMPUTED.sub(lambda m: f"{m[1].replace('-', _MINUS)}·10{superscript(int(m[2]))}", text)
     return _UNIT_POWER.sub(lambda m: f"mm{m[1].translate(_SUPERSCRIPT)}", text)
 

@@ -353,9 +353,11 @@ def require_within(**bounds: tuple[Any, float] | tuple[Any, float, float]) -> No
     for name, (value, least, *rest) in bounds.items():
         if value is None:
             continue
-        kind, words = (Integral, "a whole number") if isinstance(least, int) else (Real, "a number")
-        if isinstance(value, bool) or not isinstance(value, kind):
-            raise UsageError(f"{name} is {value!r}; it must be {words}")
+        whole = isinstance(least, int)
+        is_number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
+        if not is_number:
+            kind = "a whole number" if whole else "a number"
+            raise UsageError(f"{name} is {value!r}; it must be {kind}")
         if not (least <= value <= (rest[0] if rest else sys.float_info.max)):
             bound = f"from {least:g} to {rest[0]:g}" if rest else f"at least {least:g}"
             raise UsageError(f"{name} is {value}; it must be {bound}")

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 UNITS = {
     "c": "mm",
@@ -120,6 +124,12 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
 def counted(count: int, noun: str) -> str:
     """Write `1 epoch`, `3 epochs`."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """Write `a, b, c`, or `a, b and 3 more` if there are more than `most`."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def duration(seconds: float) -> str:

@@ -128,7 +128,6 @@ def export(
 
     Example: thermocald export M1 --units px,deg --time iso --separator ';' --decimal ',' -o M1.csv
     """
-    from thermocald.analysis.series.epochs import csv_text
     from thermocald.output import series_export
     from thermocald.store.recording.parquet_table import write_parquet
 
@@ -154,7 +153,7 @@ def export(
     elif format_ == "json":
         write_parts(series_export.as_json(parts), output)
     else:
-        write_parts(csv_text(parts, style.separator, style.decimal), output)
+        write_parts(series_export.as_csv(parts, style), output)
     for sentence, count in sorted(table.without_result.items()):
         say(f"{count} epochs without a result: {sentence}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from datetime import date
 from pathlib import Path
 from typing import get_args
 
@@ -99,9 +100,14 @@ BAD = [
     (camera(principal_distance_mm=False), "cameras[0].principal_distance_mm: is False"),
     (camera(principal_distance_mm=0.00304), "cameras[0].principal_distance_mm: is 0.00304"),
     (camera(period_s=float("nan")), "cameras[0].period_s: is nan"),
+    (camera(name=False), "cameras[0].name: is false; must be text; put it in quotes"),
+    (camera(series=date(2026, 1, 2)), "cameras[0].series: is 2026-01-02; must be text"),
+    (camera(thermometers="lens"), "cameras[0].thermometers: is 'lens'; must be a list: [a, b]"),
+    (document(calibration={"priors": {"c": 3}}), "priors.c: is 3; must hold `key: value` lines"),
+    (document(forward={"to": "mysql://a/b"}), "forward.to: is 'mysql://a/b'; must begin with post"),
     (camera(name="a b"), "cameras[0].name: is 'a b'"),
     (camera(name="../x"), "cameras[0].name: is '../x'"),
-    (camera(driver=None), "cameras[0].driver: is None"),
+    (camera(driver=None), "cameras[0].driver: is empty; must be text"),
     (camera(testfield="none.csv"), "cameras[0].testfield: there is no file /etc/thermocald/none"),
     (camera(thermometers=["lense"]), "there is no thermometer 'lense'; is 'lens' meant?"),
     (

@@ -307,7 +307,7 @@ def discover(
     from thermocald.results import Discovery
     from thermocald.thermal.reduce import reduce_together
 
-    require_within(jobs=(jobs, 1))
+    require_within(jobs=(jobs, 1, 256))
     tell = say or (lambda _: None)
     require_series(verify)
     every = (series, *verify)
@@ -450,9 +450,9 @@ def simulate(
 def _check_settings(s: StudySettings) -> None:
     require_within(
         window=(s.window, 3), alpha=(s.alpha, 1e-6, 0.5), sets=(s.sets, 2), seed=(s.seed, 0),
-        distance_mm=(s.distance_mm, 10), grid=(s.grid, 2, 9), focus_mm=(s.focus_mm, 10),
+        distance_mm=(s.distance_mm, 10.0), grid=(s.grid, 2, 9), focus_mm=(s.focus_mm, 10.0),
         f_number=(s.f_number, 0.1), confusion_mm=(s.confusion_mm, 1e-6),
-        thermometer_sd=(s.thermometer_sd, 0),
+        thermometer_sd=(s.thermometer_sd, 0.0),
     )  # fmt: skip
     if s.window % 2 == 0:
         raise UsageError(f"window is {s.window}; it must be odd, so that it has a centre")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 from urllib.parse import urlsplit
@@ -32,6 +33,7 @@ from thermocald.errors import ConfigurationError
 from thermocald.files import is_ordinary, read_yaml
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+_SERVER = r"^postgres(ql)?://"
 Name = Annotated[str, Field(pattern=_NAME)]
 Period = Annotated[float, Field(ge=0.05, le=86400.0)]
 Positive = Annotated[float, Field(gt=0.0, le=1e9)]
@@ -94,6 +96,21 @@ def nearest(key: str, known: list[str]) -> str:
     return f"; is {near[0]!r} meant?" if near else f"; known are: {', '.join(known) or 'none'}"
 
 
+_LIST = "must be a list: [a, b], or lines that begin with `- `"
+_LINES = "must hold `key: value` lines"
+# pydantic's words are those of Python, whose types a configuration does not name
+_RULES = {
+    _NAME: "must be a letter or digit, then up to 63 letters, digits, `_`, `.`, `-`",
+    _SERVER: "must begin with postgresql://",
+    **dict.fromkeys(("list_type", "tuple_type"), _LIST),
+    **dict.fromkeys(("dict_type", "mapping_type", "model_type"), _LINES),
+    "bool_parsing": "must be true or false",
+    "bool_type": "must be true or false",
+    "path_type": "must be a path; put it in quotes",
+    "string_type": "must be text; put it in quotes",
+}
+
+
 def in_words(path: Path | str, error: ValidationError) -> str:
     """Return the first error as a message: file or place, if any, dotted key, value and bounds."""
     first = error.errors()[0]
@@ -112,8 +129,7 @@ def in_words(path: Path | str, error: ValidationError) -> str:
         message = str(context["error"])
     elif first["type"] not in ("thermocald", "of_key"):
         given = "a secret" if is_secret(where.rpartition(".")[2]) else _short(first["input"])
-        if context.get("pattern") == _NAME:
-            message = "must be a letter or digit, then up to 63 letters, digits, `_`, `.`, `-`"
+        message = _RULES.get(context.get("pattern") or first["type"], message)
         message = f"is {given}; {message[0].lower()}{message[1:]}"
     return f"{place}{where + ': ' if where else ''}{message}{more}"
 
@@ -124,7 +140,10 @@ def _key(key: str) -> str:
 
 
 def _short(value: Any) -> str:
-    text = without_secrets(repr(value))
+    if value is None:
+        return "empty"
+    written = str(value).lower() if isinstance(value, bool | date) else repr(value)
+    text = without_secrets(written)
     return text if len(text) <= 60 else f"{text[:57]}…"
 
 
@@ -340,7 +359,7 @@ class DashboardConfig(Section):
 class ForwardConfig(Section):
     """The server to which `thermocald forward`, a separate process, sends the store's rows."""
 
-    to: Annotated[str, Field(pattern=r"^postgres(ql)?://")] | None = None
+    to: Annotated[str, Field(pattern=_SERVER)] | None = None
     """The server, postgresql://USER@HOST/DATABASE; null: nothing is sent."""
     station: Name | None = None
     """The station's name on the server; null: the host's."""

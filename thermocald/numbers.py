@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 UNITS = {
     "c": "mm",
@@ -22,6 +26,7 @@ _SYMBOLS = {"sigma0": "σ₀", "x0": "x₀", "y0": "y₀"}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _COMPUTED = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?|\([-+]?\d[\d. ±]*\))e([+-]?\d{1,3})(?![\w.]*\w)")
 _UNIT_POWER = re.compile(r"(?<![\w-])mm(-\d)(?![\w-])")
+_DEGREES = re.compile(r"(?<=[\d)] )degC\b")
 _MINUS = "−"
 
 
@@ -57,7 +62,11 @@ def superscript(exponent: int) -> str:
 
 
 def typeset_powers(text: str) -> str:
-    """Return a text with powers typeset: (-1.2 ± 0.1)e-06 mm-1 as (−1.2 ± 0.1)·10⁻⁶ mm⁻¹."""
+    """Return a text with powers typeset: (-1.2 ± 0.1)e-06 mm-1 as (−1.2 ± 0.1)·10⁻⁶ mm⁻¹.
+
+    The unit degC behind a number, as files spell it, becomes °C.
+    """
+    text = _DEGREES.sub("°C", text)
     text = _COMPUTED.sub(lambda m: f"{m[1].replace('-', _MINUS)}·10{superscript(int(m[2]))}", text)
     return _UNIT_POWER.sub(lambda m: f"mm{m[1].translate(_SUPERSCRIPT)}", text)
 
@@ -115,6 +124,12 @@ def plain(value: float, unit: str = "", digits: int = 4) -> str:
 def counted(count: int, noun: str) -> str:
     """Write `1 epoch`, `3 epochs`."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """Write `a, b, c`, or `a, b and 3 more` if there are more than `most`."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def duration(seconds: float) -> str:

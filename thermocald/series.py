@@ -5,12 +5,13 @@ It is read from a recording's folder, a store or a server; callers need not know
 
 from __future__ import annotations
 
-import math
+import sys
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -185,6 +186,7 @@ class Series:
             check_exterior(exterior)
         elif isinstance(self._measured, Recording):
             raise UsageError(f"exterior 'stored': {self.source} is a recording, not a store")
+        require_within(jobs=(jobs, 1, 256))
         settings = AdjustmentSettings(free=free_names(free))
         if store is None:
             with self._opened() as source:
@@ -343,15 +345,22 @@ def require_series(series: Sequence[Series]) -> None:
                 )
 
 
-def require_within(
-    **bounds: tuple[float | None, float] | tuple[float | None, float, float],
-) -> None:
-    """Raise UsageError for an argument, name=(value, least[, most]), out of bounds; None passes."""
+def require_within(**bounds: tuple[Any, float] | tuple[Any, float, float]) -> None:
+    """Raise UsageError for an argument, name=(value, least[, most]), out of bounds; None passes.
+
+    If `least` is a whole number, so must the value be.
+    """
     for name, (value, least, *rest) in bounds.items():
-        most = rest[0] if rest else math.inf
-        if value is not None and not (math.isfinite(value) and least <= value <= most):
-            bound = f"from {least:g} to {most:g}" if rest else f"at least {least:g}"
-            raise UsageError(f"{name} is {value:g}; it must be {bound}")
+        if value is None:
+            continue
+        whole = isinstance(least, int)
+        is_number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
+        if not is_number:
+            kind = "a whole number" if whole else "a number"
+            raise UsageError(f"{name} is {value!r}; it must be {kind}")
+        if not (least <= value <= (rest[0] if rest else sys.float_info.max)):
+            bound = f"from {least:g} to {rest[0]:g}" if rest else f"at least {least:g}"
+            raise UsageError(f"{name} is {value}; it must be {bound}")
 
 
 def free_names(given: str | Iterable[str]) -> tuple[str, ...]:

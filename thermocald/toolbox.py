@@ -160,7 +160,7 @@ def correct(
     from thermocald.analysis.thermal.correction import first_times
     from thermocald.output.corrected import Correction
 
-    require_within(to=(to, COLDEST_C), temperature_sd=(temperature_sd, 0))
+    require_within(to=(to, COLDEST_C), temperature_sd=(temperature_sd, 0.0))
     width, height = size or (1, 1)
     require_within(width=(width, 1), height=(height, 1))
     thermal, path = _thermal(model), source_of(points)
@@ -294,7 +294,7 @@ def fit_calibrations(
 
     if not calibrations:
         raise UsageError("give at least two calibrations to fit a model to")
-    require_within(T0=(T0, COLDEST_C), temperature_sd=(temperature_sd, 0))
+    require_within(T0=(T0, COLDEST_C), temperature_sd=(temperature_sd, 0.0))
     for name in calibrations:
         if not calibrated.is_calibration(source_of(name)):
             raise UsageError(f"{name}: is not a calibration; fit series and calibrations apart")

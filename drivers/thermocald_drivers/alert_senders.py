@@ -31,7 +31,7 @@ alert_exec: the program receives the alert as JSON on its standard input, and `T
 (out, in), `THERMOCALD_CONDITION`, `THERMOCALD_DEVICE` and `THERMOCALD_TEXT` in its environment. Of
 the daemon's environment it receives only PATH, HOME, LANG, LC_ALL and TZ. Its output is discarded.
 After `timeout_s` it is killed with all processes it started. After three failures the alert is
-dropped and an error is logged.
+dropped, which is logged, and a warning of the status until one is delivered.
 
 alert_webhook: each alert is one POST of JSON. An answer of 2xx means delivered; 401, 403 and 404
 stop the output; after any other answer the alert is sent again. Redirections are not followed: they
@@ -123,6 +123,10 @@ class ExecAlert(AlertOutput):
         super().__init__(**options)
         self.where: str = self.options.command[0]
         self._failed = 0
+        self._dropped = ""  # why the last alert was not delivered, else empty
+
+    def warnings(self) -> list[str]:
+        return [self._dropped] if self._dropped else []
 
     def open(self) -> None:
         if shutil.which(self.where) is None:
@@ -130,14 +134,16 @@ class ExecAlert(AlertOutput):
         self.handle = True
 
     def deliver(self, alert: Alert) -> None:
+        dropped = ""
         try:
             self._run(alert)
         except DeviceError as error:
             self._failed += 1
             if self._failed < TRIES:
                 raise
-            log.error("%s; the alert is dropped after %d tries", error, TRIES)
-        self._failed = 0
+            dropped = f"{error}; the alert is dropped after {TRIES} tries"
+            log.error(dropped)
+        self._failed, self._dropped = 0, dropped
 
     def _run(self, alert: Alert) -> None:
         variables = {

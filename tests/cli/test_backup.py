@@ -49,6 +49,9 @@ def test_a_damaged_store_is_not_backed_up_and_check_names_the_place(store_path, 
     database.execute("UPDATE epoch SET c = c * 1.0001 WHERE number = 2")
     database.commit()
     database.close()
+    done = call("backup", store_path, f"{tmp_path}/new/")
+    assert done.returncode == 1
+    assert list((tmp_path / "new").iterdir()) == []
     done = call("backup", store_path, tmp_path / "copy.db")
     assert done.returncode == 1
     assert "epoch 2" in done.stderr

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.commands import call
+
 UNITS = Path(__file__).resolve().parents[2] / "systemd"
 
 
@@ -71,6 +73,13 @@ def test_the_unit_waits_for_ready_feeds_a_watchdog_and_starts_without_the_networ
     for line in ("Type=notify", "WatchdogSec=60", "Restart=on-failure", "User=thermocald"):
         assert f"\n{line}\n" in text
     assert "network" not in re.sub(r"#.*", "", text).lower().replace("networkless", "")
+
+
+@pytest.mark.parametrize("unit", sorted(path.name for path in UNITS.glob("*.service")))
+def test_the_command_of_a_unit_has_the_options_that_the_unit_gives(unit):
+    """The daily backup gave `--to`, which `backup` does not have, and failed every day."""
+    (line,) = re.findall(r"^ExecStart=\S+ (.*)$", (UNITS / unit).read_text(), re.MULTILINE)
+    assert call(*line.split(), "--help").returncode == 0
 
 
 def test_everything_is_installed_where_it_belongs(tmp_path):

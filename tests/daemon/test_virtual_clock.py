@@ -63,3 +63,11 @@ def test_what_is_away_loses_its_own_and_gives_nothing_that_was_not_taken(run):
     assert np.round(np.diff(found["frame_time"])).tolist() == [10.0, 30.0, 10.0, 10.0]
     own = (skew_s(found) > 0) & (skew_s(found) < 1)
     assert own.tolist() == [True, True, True, False, True]
+
+
+def test_a_camera_that_repeats_its_frame_is_reported_once(run):
+    """Its epochs would count as independent measurements, with standard deviations too small."""
+    store, _, _ = run(8, [{"kind": "stuck", "at": 3, "count": 3}])
+    with store:
+        (frozen,) = [event for event in store.events() if event.kind == "frozen"]
+    assert "its last 3 frames are identical" in frozen.text

@@ -82,8 +82,13 @@ def test_a_program_that_hangs_is_killed(tmp_path):
         assert time.monotonic() - begin < 10
         with pytest.raises(DeviceTimeout):  # tried again, although the result is the same
             device.emit(OUT)
+        assert not device.warnings()
         device.emit(OUT)  # dropped after three tries
+        assert "not finished in 0.3 s; the alert is dropped" in device.warnings()[0]
         device.emit(OUT)
+        script.write_text("#!/bin/sh\n")
+        device.emit(IN)
+        assert not device.warnings()
 
 
 @pytest.fixture

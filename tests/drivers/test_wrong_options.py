@@ -56,7 +56,7 @@ WRONG = {
     ]),
     ("thermometer", "mock"): ({}, [
         ({"programme": [[0, 20], [0, 30]]}, "times must increase"),
-        ({"programme": [0, 20]}, "valid list"), ({"programme": "warm"}, "valid list"),
+        ({"programme": [0, 20]}, "must be a list"), ({"programme": "warm"}, "must be a list"),
         ({"programme": [[0, 20, 3]]}, "list of"),
         *(({"programme": [[0, celsius]]}, "programme")  # impossible temperatures
           for celsius in (1e300, -300, "nan", float("inf"))),

@@ -17,6 +17,7 @@ import pytest
 from thermocald.epoch import Epoch
 from thermocald.errors import ConfigurationError
 from thermocald.output.dashboard import serve
+from thermocald.output.dashboard.view import View
 from thermocald.photogrammetry.camera.camera_model import Sensor
 from thermocald.photogrammetry.field.testfield import TestField
 from thermocald.store.database.store import Store
@@ -103,6 +104,20 @@ def client_of(folders):
         return Client(build_application(*folders, token, host), base)
 
     return make
+
+
+@pytest.mark.parametrize(("late", "shown"), [(0, 5), (3, 3)])
+def test_epochs_before_the_clock_was_set_are_counted_and_not_drawn(tmp_path, late, shown):
+    """A Raspberry Pi without a battery begins in 1970; a simulated series stays there."""
+    head = Head("rpi", "M1", 10.0, CameraSpec("rpi", Sensor(64, 48, 0.003)), {"t": Channel()})
+    with Store.open(tmp_path / "t.db", "append", durable=False) as store:
+        series = store.create_series(head, TestField.build(["a"], np.zeros((1, 3))))
+        for n in range(5):
+            t = 10.0 * n + (1.75e9 if n >= 5 - late else 0.0)
+            store.append(series, Epoch(n + 1, t, t, {"t": 20.0}), None)
+    columns = View(tmp_path / "t.db", tmp_path).columns("rpi", "M1", None, None, 100)
+    assert (columns["epochs"], columns["unset"]) == (shown, 5 - shown)
+    assert min(columns["frame_time"]) == (1.75e9 + 20.0 if late else 0.0)
 
 
 def test_charts_csv_status_frame_and_events(client_of):

@@ -13,6 +13,7 @@ from thermocald.store.logger.clock import DeviceClock, clock_error, parse_moment
 from thermocald.store.logger.dialect import stated_unit, without_unit
 from thermocald.store.logger.photographs import find_photographs
 from thermocald.store.logger.temperatures import LogOptions, log_options, read_log
+from thermocald.store.recording.readings import interpolate_readings
 
 BERLIN = DeviceClock(time_zone("Europe/Berlin"))
 JUNE = datetime(2026, 6, 14, 10, 0, tzinfo=UTC).timestamp()  # 12:00 in Berlin
@@ -163,6 +164,24 @@ def test_sensors_below_one_another_are_channels(tmp_path):
     box, air = found.channels.values()
     assert box[np.isfinite(box)].tolist() == [21.5, 21.75]
     assert air[np.isfinite(air)].tolist() == [19.5]
+
+
+def test_a_log_of_changes_holds_its_value_in_a_pause_but_not_while_unavailable(tmp_path):
+    """Home Assistant writes no row while a value stays the same; ten minutes were a gap."""
+    rows: list = [(20.0 + k, 10 * k) for k in range(6)]
+    rows += [(25.1, 650), ("unavailable", 660), (25.2, 1300)]
+    data = "entity_id,state,last_changed\n" + "".join(
+        f"sensor.{name},{value},{1.78e9 + t:.0f}\n"
+        for value, t in rows for name in ("box_temperature", "air_temperature")
+    )  # fmt: skip
+    found = logged(tmp_path, data)
+    assert found.step == 10.0
+    at = found.times[0] + np.array([30.0, 300.0, 645.0, 900.0])
+    for readings in found.channels.values():
+        known = interpolate_readings(at, found.times, readings)
+        np.testing.assert_allclose(known[:3], [23.0, 25.0, 25.05])
+        assert np.isnan(known[3])
+    assert sum("is held in 1 pause of up to 600 s" in note for note in found.notes) == 2
 
 
 AMBIGUOUS = "time,temp\n06/07/2026 12:00,21\n06/07/2026 12:01,21\n"

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 from thermocald.acquisition.calibrator import CalibratedEpoch, EpochCalibrator
 from thermocald.epoch import Epoch
 from thermocald.errors import DataError
+from thermocald.numbers import listed
 from thermocald.photogrammetry.epoch.adjustment import failed
 from thermocald.photogrammetry.field.testfield import observations_from_lists
 from thermocald.photogrammetry.targets.image_file import EncodedImage
@@ -332,9 +333,8 @@ def check_frame(name: str, calibrator: EpochCalibrator, frame: Frame) -> tuple[l
         for key, bad, words in _RULES:
             values = zip(seen.targets, seen.quality.get(key, ()), strict=False)
             if rows := [int(target) for target, value in values if bad(value)]:
-                shown = ", ".join(names[row] for row in rows[:_MOST_NAMES])
-                more = f" and {len(rows) - _MOST_NAMES} more" if len(rows) > _MOST_NAMES else ""
-                lines.append(f"  target {shown}{more}: {words}")
+                shown = listed([names[row] for row in rows], _MOST_NAMES)
+                lines.append(f"  target {shown}: {words}")
     if not result.ok:
         return lines, f"{result.status}: {result.reason}"
     c, sd = result.values[0], result.sd[0]

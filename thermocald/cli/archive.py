@@ -152,7 +152,9 @@ def archive(
 
 def backup(
     store: StoreArgument = None,
-    to: Path | None = typer.Argument(None, help="A file that does not exist yet, or a folder."),
+    to: str | None = typer.Argument(
+        None, metavar="[TO]", help="A file that does not exist yet, or a folder: FOLDER/ is made."
+    ),
     config: StoreConfigOption = None,
     keep: int = typer.Option(0, min=0, help="In a folder, keep only the newest N; 0 keeps all."),
     json: JsonOption = None,
@@ -165,13 +167,17 @@ def backup(
     Example: thermocald backup thermocald.db backups/
     """
     from thermocald.config import load_config
+    from thermocald.files import make_folder
     from thermocald.store.database.archive import back_up
 
     if config is not None:
-        store, to = load_config(config).store.path, to or store
+        to = to or (None if store is None else str(store))
+        store = load_config(config).store.path
     if store is None or to is None:
         raise UsageError("give STORE and TO, or --config FILE and TO")
-    document = back_up(store, to, keep)
+    if to.endswith("/"):
+        make_folder(Path(to))
+    document = back_up(store, Path(to), keep)
     say(f"{document['backup']}: {document['epochs']} epochs, every row verified")
     for path in document["deleted"]:
         say(f"{path}: deleted; {keep} newer backups are left")

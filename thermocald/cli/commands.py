@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import re
 from collections.abc import Callable
@@ -102,11 +103,17 @@ _SHOWN = {"Path": "path", "path": "path", "str": "text", "int": "number", "float
 class Command(TyperCommand):
     """A command whose help lists the advanced options in their own section.
 
-    An output that cannot be written is refused before anything is computed.
+    A number that is not finite and an output that cannot be written are refused before anything is
+    computed.
     """
 
     def invoke(self, ctx: Any) -> Any:
-        """Check that the outputs can be written, then run the command."""
+        """Check numbers and outputs, then run the command."""
+        for parameter in self.get_params(ctx):
+            given = ctx.params.get(parameter.name)
+            for value in given if isinstance(given, tuple | list) else (given,):
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise UsageError(f"{parameter.opts[0]}: {value} is no finite number")
         if not ctx.params.get("dry_run"):
             _check_outputs(ctx)
         return super().invoke(ctx)

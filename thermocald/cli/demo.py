@@ -61,7 +61,8 @@ def _print_drift(document: dict[str, Any]) -> None:
         f"{document['ok']} of {document['epochs']} epochs calibrated, {document['targets']} "
         f"targets, {low:.1f} to {high:.1f} °C, sigma0 {document['sigma0']:.2f}"
     )
-    table = Table(title="Drift from the first epoch to the hottest, px", box=None, pad_edge=False)
+    typer.echo("Drift from the first epoch to the hottest, px:")
+    table = Table(box=None, pad_edge=False)
     for title in ("", "true", "estimated", "sd", "scatter / sd"):
         table.add_column(title, justify="left" if not title else "right")
     for row in document["parameters"]:

@@ -44,9 +44,9 @@ def _board(
     charuco: str | None = typer.Option(None, help="A ChArUco board, such as 11x8 squares."),
     chessboard: str | None = typer.Option(None, help="A chessboard, such as 9x6 inner corners."),
     aprilgrid: str | None = typer.Option(None, help="An AprilGrid of Kalibr, such as 6x6 tags."),
-    square: float | None = typer.Option(None, min=0.1, help="Side of a square, mm."),
-    marker: float | None = typer.Option(None, min=0.1, help="Side of a marker or tag, mm."),
-    spacing: float = expert(0.3, help="Gap between AprilGrid tags, relative to a tag's side."),
+    square: float | None = typer.Option(None, min=0.1, max=2000, help="Side of a square, mm."),
+    marker: float | None = typer.Option(None, min=0.1, max=2000, help="Side of a tag, mm."),
+    spacing: float = expert(0.3, min=0.01, max=10, help="Gap between AprilGrid tags, in sides."),
     dictionary: str = expert(
         "DICT_5X5_1000", help="Dictionary of a ChArUco board, by its OpenCV name."
     ),
@@ -62,6 +62,8 @@ def _board(
     if len(given) > 1:
         raise UsageError(f"--{given[0][0]} and --{given[1][0]}: one board at a time")
     if not given:
+        if square or marker:
+            raise UsageError("--square, --marker: give --charuco, --chessboard or --aprilgrid too")
         return None
     kind, counts = given[0]
     columns, rows = counts_of(f"--{kind}", counts)

@@ -14,6 +14,7 @@ import threading
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 from thermocald.acquisition.calibrator import CalibratedEpoch, Calibrator
 from thermocald.acquisition.device_loop import DeviceLoop, Link
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from thermocald.daemon.live_state import LiveState
     from thermocald.daemon.plan import CameraPlan
     from thermocald.daemon.store_guard import StoreGuard
+    from thermocald.hal import Frame
     from thermocald.photogrammetry.field.testfield import Observations
 
 START_EPOCHS = 10
@@ -99,6 +101,8 @@ _PREVIEW_EVERY_S = 5.0
 _SHOW_EVERY_S = 0.5
 _SWITCH_GRACE_S = 20.0
 _VIRTUAL_PATIENCE_S = 60.0  # real seconds that a tick of a virtual clock waits for room
+_SAMPLED_ROWS = 16  # every 16th row of an image tells two frames apart
+_FROZEN = 2  # repeats from which a camera counts as frozen
 _REMEMBERED = 200  # epochs, as many as a `RunningSeries` holds
 
 
@@ -272,6 +276,8 @@ class CameraLine:
         self.run: SeriesRun | None = None
         self._checking = False
         self._started = False
+        self._sample: int | None = None  # of the last frame
+        self._repeats = 0  # frames since then that are identical to it
         self._swap = threading.Lock()
         self.link = Link(
             "camera", plan.name, plan.camera, runtime.clock,
@@ -339,6 +345,7 @@ class CameraLine:
         ):
             return
         frame = self.plan.camera.capture()
+        self._count_repeats(frame)
         if runtime.fast:
             self.thermometers.read_now(self.plan.config.thermometers)
         if self._checking:
@@ -354,6 +361,25 @@ class CameraLine:
             run.pipeline.submit(frame)
         if runtime.epochs and run.taken - run.first + 1 >= runtime.epochs:
             self.loop.stop()
+
+    def _count_repeats(self, frame: Frame) -> None:
+        """Count frames that are identical to the one before, as noise makes impossible."""
+        data = frame.encoded if frame.image is None else frame.image[::_SAMPLED_ROWS].tobytes()
+        sample = None if data is None else crc32(data)
+        repeated = sample is not None and sample == self._sample
+        self._sample, self._repeats = sample, self._repeats + 1 if repeated else 0
+        if self._repeats == _FROZEN:
+            text = f"camera {self.plan.name}: {self._frozen()[0]}"
+            log.warning(text, extra={"event": "frozen"})
+            self._event(frame.utc, "frozen", text)
+
+    def _frozen(self) -> list[str]:
+        """Return the warning of a camera that delivers one frame again and again, else none."""
+        text = (
+            f"its last {self._repeats + 1} frames are identical: it is frozen, or sees no light; "
+            "they are one measurement, not many"
+        )
+        return [text] if self._repeats >= _FROZEN else []
 
     def waiting(self) -> int:
         """Return the number of epochs in the pipeline."""
@@ -376,10 +402,12 @@ class CameraLine:
         """Return the camera's part of the status document."""
         run = self.run
         pipeline = None if run is None else run.pipeline
+        link = self.link.status(self.loop.busy_s(), self.runtime.hang_after_s)
         return {
             "series": "" if run is None else run.plan.series,
             "period_s": self.plan.config.period_s,
-            **self.link.status(self.loop.busy_s(), self.runtime.hang_after_s),
+            **link,
+            "warnings": link["warnings"] + self._frozen(),
             **self.loop.schedule.stats(),
             "lost": self.loop.lost + (0 if pipeline is None else pipeline.lost),
             "waiting": self.waiting(),

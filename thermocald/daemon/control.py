@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from thermocald.config import Config, Name  # noqa: TC001 - pydantic reads it at run time
+from thermocald.config import Config, Name, in_words
 from thermocald.daemon.live_state import find_state
 from thermocald.daemon.session import Session  # noqa: TC001
 from thermocald.errors import DataError, DeviceError, ThermocaldError, UsageError
@@ -185,9 +185,7 @@ def _parse(line: bytes) -> Request:
     try:
         return Request.model_validate(json.loads(line))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"the request is refused: {where or 'it'}: {first['msg']}") from error
+        raise UsageError(f"the request is refused: {in_words('', error)}") from error
     except (ValueError, RecursionError) as error:
         raise UsageError("the request is refused: it is not a JSON object in one line") from error
 

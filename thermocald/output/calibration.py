@@ -16,7 +16,7 @@ from thermocald.analysis.field import CELLS, FieldCheck
 from thermocald.analysis.series.epochs import CAUSES_OF_SIGMA0, MATERIAL
 from thermocald.arrays import spread_rows
 from thermocald.figures import BAND, PALETTE, Arrows, Curve, Figure, Panel, image_panel
-from thermocald.numbers import UNITS, coefficient, parameter_label, percent, plain, with_sd
+from thermocald.numbers import UNITS, coefficient, listed, parameter_label, percent, plain, with_sd
 from thermocald.photogrammetry.camera.camera_model import IOP_NAMES, Sensor, project
 from thermocald.report import Answer, Chapter, Section, Table, as_sentence
 
@@ -65,7 +65,7 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
     for p in result.photographs:
         if not len(p.points):
             without.setdefault(_outcome(p, ", "), []).append(Path(p.path).name)
-    steps = [f"{_listed(names)}: {outcome}." for outcome, names in without.items()]
+    steps = [f"{listed(names, _FEW_NAMES)}: {outcome}." for outcome, names in without.items()]
     if not posed or result.interior is None:
         return Answer(f"Not calibrated: {result.reason}.", proof, next_steps=tuple(steps))
     points, residuals = _used(posed)
@@ -99,11 +99,6 @@ def _answer(result: Photographs, posed: Sequence[PhotographResult], sensor: Sens
             "Errors of the camera model, which the standard deviations do not include.",
         ),
     )  # fmt: skip
-
-
-def _listed(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:_FEW_NAMES])
-    return f"{shown} and {len(names) - _FEW_NAMES} more" if len(names) > _FEW_NAMES else shown
 
 
 def _estimates(result: Photographs, sensor: Sensor) -> str:

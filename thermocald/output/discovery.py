@@ -179,6 +179,15 @@ def _model(fit: Fit, series: int) -> Array:
     return np.asarray((C * fit.coefficients[index]) @ V.T)
 
 
+def _of_readings(d: Discovery) -> Array:
+    """Return what the noise of the readings does to the parameters (P,): one sd of it."""
+    e = d.examination.fitter.series[0]
+    T = e.averaged(e.history.temperature())
+    T = np.nan_to_num(T - np.nanmean(T))
+    rates = T @ _model(d.base_fit, 0) / max(float(T @ T), 1e-12)
+    return np.asarray(rates * e.thermometers[e.history.reference].noise)
+
+
 def _trajectory(d: Discovery) -> Figure:
     """Draw measured and modelled image movement over time and temperature, residuals below."""
     e = d.examination.fitter.series[0]
@@ -193,6 +202,7 @@ def _trajectory(d: Discovery) -> Figure:
     noise = e.sigma_px / np.sqrt(max(float(2 * e.n.mean()), 1.0))
     along = root @ v[0] * noise
     measured, (before, after) = _without_level(e, e.values) @ along, (r @ along for r in rests)
+    sd = float(np.hypot(noise, _of_readings(d) @ along))
     name = " + ".join(effect.effect for effect in d.effects) if found else ""
     label = f"with {name}" if len(d.effects) == 1 else "with all effects"
     above, below = [], []
@@ -204,7 +214,7 @@ def _trajectory(d: Discovery) -> Figure:
             Curve("measured", x, measured, "points", PALE),
             Curve("base model", x, measured - before, "line", _BASE, dashed=True),
         ]
-        ends, band = np.array([np.nanmin(x), np.nanmax(x)]), np.full(2, BAND * noise)
+        ends, band = np.array([np.nanmin(x), np.nanmax(x)]), np.full(2, BAND * sd)
         left = [
             Curve("", ends, np.zeros(2), "line", GREY, band),
             Curve("", x, before, "points", _BASE),
@@ -220,7 +230,7 @@ def _trajectory(d: Discovery) -> Figure:
         "Movement of the image in the pattern of "
         + (name if found else "the largest misfit")
         + ", root mean square over the targets of M1, as measured and as modelled. Below: the "
-        "residuals of each model; grey: 95 % of the noise of an epoch.",
+        "residuals of each model; grey: 95 % of the noise of an epoch and of the readings.",
         (*above, *below),
         columns=2,
     )
@@ -242,11 +252,8 @@ def _movement(d: Discovery) -> Figure:
         pattern = U[:, keep] @ (v[0][keep] / np.sqrt(size[keep])) * s[0] / np.sqrt(len(r))
         misfit = np.sqrt(np.mean(np.einsum("tij,ej->eti", e.columns[seen], r) ** 2))
         drawn.append((float(misfit), np.einsum("tij,j->ti", e.columns[seen], pattern)))
-    T = e.averaged(e.history.temperature())
-    T = np.nan_to_num(T - np.nanmean(T))
-    rates = T @ _model(d.base_fit, 0) / max(float(T @ T), 1e-12)
     reading_sd = e.thermometers[e.history.reference].noise
-    of_readings = reading_sd * float(np.sqrt(np.mean((e.columns[seen] @ rates) ** 2)))
+    of_readings = float(np.sqrt(np.mean((e.columns[seen] @ _of_readings(d)) ** 2)))
     # a movement below the noise must not look large
     longest = max(float(np.linalg.norm(drawn[0][1], axis=1).max()), e.sigma_px)
     frame = (e.source.sensor.width, e.source.sensor.height)

@@ -145,7 +145,7 @@ class Parameter:
 def say_estimate(estimate: Values) -> str:
     """Format an estimate with two digits of its standard deviation: 84.1 ± 1.9 s."""
     value, sd, unit = estimate.get("value"), estimate.get("sd"), estimate.get("unit", "")
-    unit = "" if unit == "1" else f" {unit}"
+    unit = "" if unit == "1" else f" {unit.replace('degC', '°C')}"
     if isinstance(value, str) or value is None:
         return f"{value}{unit}"
     if not sd or not np.isfinite(sd):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from thermocald.errors import StoreError
+from thermocald.numbers import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -246,11 +247,10 @@ class SeriesReader(ABC):
         every = self.all_series()
         found = [s for s in every if camera in (None, s.camera) and name in (None, s.name)]
         if len(found) != 1:
-            there = ", ".join(self._label(s) for s in every[:_LISTED]) or "none"
-            more = f" and {len(every) - _LISTED} more" if len(every) > _LISTED else ""
+            there = listed([self._label(s) for s in every], _LISTED) or "none"
             raise StoreError(
                 f"{self.where}: {'several series fit' if found else 'there is no such series'}; "
-                f"camera/series in this store: {there}{more}{self._remedy}"
+                f"camera/series in this store: {there}{self._remedy}"
             )
         return found[0]
 

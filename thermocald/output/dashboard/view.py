@@ -11,6 +11,7 @@ import numpy as np
 
 from thermocald.errors import DataError, ThermocaldError
 from thermocald.files import read_json
+from thermocald.machine import NOT_BEFORE
 from thermocald.photogrammetry.camera.camera_model import (
     EOP_NAMES,
     IOP_NAMES,
@@ -162,7 +163,8 @@ class View:
 
         until: UTC, s, by default the last epoch; since_s: only this many s before `until`, None:
         all. A standard deviation is the mean of those of the bin's epochs, hence larger than that
-        of the bin's mean.
+        of the bin's mean. Epochs taken before the machine knew the time, which `unset` counts, are
+        left out if the series has later ones.
         """
         names = ["sigma0", *_SHOWN, *(f"sd_{n}" for n in _SHOWN)]
         with Store.open(self._store) as store:
@@ -170,7 +172,9 @@ class View:
             channels = list(found.head.channels)
             # one column at a time: all columns of a year would not fit into the page's memory
             times = store.series_columns(found, ["frame_time"])["frame_time"]
-            chosen = np.ones(len(times), dtype=bool)
+            chosen = times >= NOT_BEFORE
+            unset = int((~chosen).sum()) if chosen.any() else 0
+            chosen |= unset == 0  # a simulated series begins in 1970
             if until is not None:
                 chosen &= times <= until
             if since_s is not None and chosen.any():
@@ -185,6 +189,7 @@ class View:
                 averaged[name] = _means(column, bins)
         return {
             "epochs": len(rows),
+            "unset": unset,
             "per_point": int(max((len(b) for b in bins), default=0)),
             "channels": channels,
             **averaged,

@@ -225,7 +225,7 @@ def _codes(design: Design) -> Iterator[str]:
         for number in available[design.first_code :]:
             yield ring_code.write(design.bits, number)
         raise UsageError(
-            f"the field needs more than the {len(available) - design.first_code} ring codes of "
+            f"the field needs more than the {len(available[design.first_code :])} ring codes of "
             f"{design.bits} bits that are left; "
             + ("use --bits 14, or " if design.bits == 12 else "use ")
             + "larger discs, smaller paper, or markers in between"

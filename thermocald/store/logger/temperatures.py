@@ -72,6 +72,9 @@ _ABOVE = re.compile(r"(?:unit|einheit)\w*\W+(?:°\s*)?F\b|fahrenheit|°\s*F\b|�
 """Lines above a table that state °F."""
 _LABEL = "entity_id"
 """Home Assistant's column with the sensor of each row: one table has all sensors."""
+_CHANGES = "last_changed"
+"""Home Assistant's column of times: it writes a row when the value changes, and only then."""
+_PAUSE, _LONGEST_PAUSE_S = 5.0, 86400.0  # of the usual interval: a longer one is a pause
 _NO_READING = {-127.0, -999.0, -9999.0, -99.0, 9999.0}
 _PLAUSIBLE_C = (-90.0, 180.0)
 _KELVIN = (220.0, 450.0)
@@ -132,6 +135,8 @@ def log_options(
             raise UsageError(f"--name {text}: {fault}")
         names[column] = label
     mark = {"tab": "\t", "\\t": "\t"}.get(separator or "", separator)
+    if mark is not None and (len(mark) != 1 or mark.isalnum()):
+        raise UsageError(f"--separator {separator}: must be one character, or the word tab")
     clock = device_clock(timezone, log_timezone, log_clock, ambiguous, "--log-timezone")
     return LogOptions(
         tuple(time_column or ()), tuple(temperature_column or ()), mark, decimal, date_order, unit,
@@ -179,6 +184,10 @@ def read_log(
         notes += unit_note
     if table.labels:
         channels = _split_by_label(table, next(iter(channels.values())), options)
+    if _CHANGES in time_names:
+        labels = np.array(table.labels or [""] * len(times))
+        times, channels, held = _hold_readings(times, channels, labels)
+        notes += held
     notes = [
         f"log: {len(times)} rows, {file.description}",
         f"log: time from {_quoted(time_names)}; temperatures from {_quoted(channels)}"
@@ -189,6 +198,36 @@ def read_log(
     if repeated:
         notes.append(f"log: {counted(repeated, 'row')} with the time of the row before: left out")
     return TemperatureLog(times, channels, tuple(notes))
+
+
+def _hold_readings(
+    times: Array, channels: dict[str, Array], labels: Array
+) -> tuple[Array, dict[str, Array], list[str]]:
+    """Repeat the readings in the pauses of a log of changes, in which the value stayed the same.
+
+    labels: the sensor of each row. A sensor that was unavailable has a row without a reading, after
+    which nothing is known.
+    """
+    more, notes = [times], []
+    repeated = {name: [values] for name, values in channels.items()}
+    for name, values in channels.items():
+        sensor = labels == labels[np.isfinite(values).argmax()]
+        order = np.argsort(times[sensor], kind="stable")
+        t, v = times[sensor][order], values[sensor][order]
+        steps = np.diff(t)
+        usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
+        long = (steps > _PAUSE * usual) & (steps <= _LONGEST_PAUSE_S) & np.isfinite(v[:-1])
+        for k in np.flatnonzero(long).tolist():
+            held = np.arange(t[k] + usual, t[k + 1] - 0.5 * usual, usual)
+            more.append(held)
+            for other, columns in repeated.items():
+                columns.append(np.full(len(held), v[k] if other == name else np.nan))
+        if long.any():
+            notes.append(
+                f"log: {name!r} has a row for each change only: its value is held in "
+                f"{counted(int(long.sum()), 'pause')} of up to {steps[long].max():.0f} s"
+            )
+    return np.concatenate(more), {n: np.concatenate(c) for n, c in repeated.items()}, notes
 
 
 def _sort_by_time(times: Array, channels: dict[str, Array]) -> tuple[Array, dict[str, Array], int]:

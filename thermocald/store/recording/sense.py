@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from thermocald.numbers import counted
+from thermocald.numbers import counted, listed
 from thermocald.photogrammetry.field.testfield import ELSEWHERE, find_misplaced
 
 if TYPE_CHECKING:
@@ -310,11 +310,10 @@ def target_doubts(
         return []
     size = np.hypot(*np.asarray(offsets)[rows].T)
     each = [f"{names[r]} {s:.0f} px" for r, s in zip(rows, size, strict=True)]
-    listed = ", ".join(each[:_MOST_NAMED])
-    listed += f" and {len(each) - _MOST_NAMED} more" if len(each) > _MOST_NAMED else ""
+    shown = listed(each, _MOST_NAMED)
     opposite = len(rows) == 2 and bool(np.hypot(*offsets[rows].sum(axis=0)) < 0.1 * size.sum())
     why = "their names look exchanged" if opposite else "are names exchanged, or coordinates wrong?"
-    return [f"targets are not where the test field has them: {listed} off; {why}"]
+    return [f"targets are not where the test field has them: {shown} off; {why}"]
 
 
 def pitch_doubts(pitch: float, known: float | None) -> list[str]:

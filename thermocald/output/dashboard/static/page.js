@@ -258,6 +258,7 @@ function draw(columns, name) {
   Plotly.react("course", traces, layout, { responsive: true, displaylogo: false });
   $("course-note").textContent = `${name}: ${counted(columns.epochs, "epoch")}` +
     (columns.per_point > 1 ? `, up to ${columns.per_point} averaged per point` : "") +
+    (columns.unset ? `; ${counted(columns.unset, "epoch")} from before the clock was set not shown` : "") +
     "; bands: 95 % uncertainty of a single epoch";
 }
 

@@ -6,6 +6,7 @@ Wrong input raises the errors of `thermocald.errors`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -416,8 +417,12 @@ def simulate(
     from thermocald.physics.testfields import load_field
 
     require_within(seed=(seed, 0), epochs=(epochs, 1))
-    if lamp is not None and (not lamp or [t for t, _ in lamp] != sorted({t for t, _ in lamp})):
-        raise UsageError(f"lamp is {list(lamp)}; give (from s, W) in the order of time")
+    if lamp is not None and (
+        not lamp
+        or [t for t, _ in lamp] != sorted({t for t, _ in lamp})
+        or not all(math.isfinite(v) for pair in lamp for v in pair)
+    ):
+        raise UsageError(f"lamp is {list(lamp)}; give finite (from s, W) in the order of time")
     thermal, device, course_file = (
         None if p is None else source_of(p) for p in (model, camera, programme)
     )

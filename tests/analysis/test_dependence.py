@@ -110,6 +110,18 @@ def test_a_thermometer_whose_noise_is_an_eighth_of_the_rise():
     assert 0.65 < _error_over_sd(WARM_UP, 0.0, 0.0, 400, 4, 0.125) < 1.1
 
 
+@pytest.mark.parametrize(
+    "steps",
+    [[0, 0, 0, 0, 0, 0, -1, -1, 0, -1, 0, 1, 0, 0, 0], [0, 0, -1, -1, -1, -1],
+     [0, 0, 0, 0, 0, 0, 0, 0, -1, -1, -1, -1]],
+)  # fmt: skip
+def test_a_coarse_thermometer_of_few_steps_gives_a_finite_sd(steps):
+    """No frequency alone stands out of the thermometer's noise; the sd once was infinite."""
+    y = np.random.default_rng(7).standard_normal(len(steps))
+    noise = slope_noise(y, 25 + 0.5 * np.array(steps), 0.0, 0.5 / np.sqrt(12))
+    assert 0.5 < noise.sd < 50
+
+
 def test_a_memory_as_long_as_the_series_is_reported():
     rng = np.random.default_rng(5)
     short = [slope_noise(noise(rng, 1.0, 0.99), WARM_UP, 0.0).too_short for _ in range(40)]

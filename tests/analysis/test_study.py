@@ -207,7 +207,7 @@ def test_correlations_over_time_refer_to_each_series_mean(warm_up):
 def test_the_summary_explains_the_draws_and_the_cameras_course(warm_up):
     camera = study_camera("nexus", [warm_up()()], StudySettings(sets=500))
     text = " ".join(answer_sentences(camera))
-    assert "drawn from independent normal distributions about the series' mean" in text
+    assert "drawn normally about the series' mean with the correlations of an epoch's" in text
     assert "along its own path" in text
     assert "x₀ and y₀ −0.999" in text or "x₀ and y₀ −1" in text
 

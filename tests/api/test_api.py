@@ -310,6 +310,7 @@ OUT_OF_BOUNDS = {
     "jobs is 0": lambda M1, field: tc.discover(M1, jobs=0),
     "seeds is 0": lambda M1, field: tc.plan(M1, seeds=0),
     "epochs is 0": lambda M1, field: tc.simulate("rpi-v2.1-heating", epochs=0),
+    "give finite": lambda M1, field: tc.simulate("nexus5-cold", lamp=[(0, float("nan"))]),
     "in the order of time": lambda M1, field: tc.simulate("nexus5-cold", lamp=[(9, 1), (0, 3)]),
     "temperature is nan": lambda M1, field: tc.predict("camera.yaml", np.nan),
     "height is 0": lambda M1, field: tc.correct("x.csv", "camera.yaml", log="M1", size=(9, 0)),

@@ -117,20 +117,24 @@ def slope_noise(
     # frequencies at which x is only noise do not determine the slope
     power = u * u
     around = np.convolve(power, np.full(_NEIGHBOURS, 1.0 / _NEIGHBOURS), "same")[: len(u)]
-    known = around >= min(_ABOVE_NOISE * sd_x**2, float(around.max()))
-    uu = at.sums(np.where(known, power - sd_x**2, 0.0))
+    known = around >= _ABOVE_NOISE * sd_x**2
+    if not np.sum(power[known] - sd_x**2) > 0:
+        known[:] = True
+    whole = at.sums(np.where(known, power, 0.0))
+    uu = whole - at.sums(np.where(known, sd_x**2, 0.0))
     ur = at.sums(np.where(known, u * r + slope * sd_x**2, 0.0))
     rr = at.sums(r * r)
     phi, coloured, tau, prior = _models(max(_LONGEST, float(n)))
     spectrum = at.spectra(mixtures(phi, coloured))
-    product, information, left, deviance = _regressed(at, spectrum, uu, ur, rr)
+    chance = at.sums(np.where(known, 2.0 * sd_x**4, 0.0))
+    product, information, left, deviance = _regressed(at, spectrum, uu, ur, rr, chance)
     plausible = prior * np.exp(-0.5 * (deviance - deviance.min()))
     plausible /= plausible.sum()
     freedom = max(len(r) - 3, 1)
     off = product / information
     variance = float(plausible @ (left / freedom / information + off**2))
     # geometric: models that a short series cannot exclude would dominate an arithmetic mean
-    inflation = np.exp(plausible @ np.log(spectrum @ uu / uu.sum()))
+    inflation = np.exp(plausible @ np.log(spectrum @ whole / whole.sum()))
     return SlopeNoise(
         float(np.sqrt(variance)),
         n / max(1.0, float(inflation)),
@@ -140,16 +144,18 @@ def slope_noise(
 
 
 def _regressed(
-    at: Frequencies, spectrum: Array, uu: Array, ur: Array, rr: Array
+    at: Frequencies, spectrum: Array, uu: Array, ur: Array, rr: Array, chance: Array | float = 0.0
 ) -> tuple[Array, Array, Array, Array]:
     """Regress r on u by generalised least squares under each noise model (g,).
 
     spectrum (g, m): of the models; uu, ur, rr (m,): sums of squares and products of the
-    coefficients of u and r. Returns the weighted product of u and r, the information on the slope
+    coefficients of u and r; chance (m,): variances of uu if u is only noise, whose sd the
+    information is at least. Returns the weighted product of u and r, the information on the slope
     (their ratio is the slope), the residuals' weighted squares, and -2 log restricted likelihood.
     """
     weight = 1.0 / spectrum
-    information = np.maximum(weight @ uu, np.finfo(float).tiny)
+    least = np.sqrt(np.sum(weight**2 * chance, axis=1))
+    information = np.maximum(weight @ uu, np.maximum(least, np.finfo(float).tiny))
     product = weight @ ur
     left = np.maximum(weight @ rr - product**2 / information, np.finfo(float).tiny)
     degrees = float(at.count.sum()) - 1.0

@@ -349,14 +349,15 @@ def _matrices(camera: CameraStudy) -> Iterator[Figure]:
     """Draw the correlations over the epochs of each series, and those within the adjustments."""
     for study in camera.series:
         if len(study.series) >= FEWEST_FOR_R:
-            names = [parameter_label(n) for n in study.columns]
+            rows = np.flatnonzero(np.isfinite(study.matrix).any(axis=0))
+            names = [parameter_label(study.columns[k]) for k in rows]
             title = f"Correlation matrix, {study.series.name}"
             yield Figure(
                 f"correlation-{file_name(study.series.name)}",
                 title,
                 "Pearson's correlation over the epochs among parameters, σ₀ and temperatures. Red: "
                 "they rise together; blue: one rises as the other falls.",
-                drawing=draw_matrix(study.matrix, names, title),
+                drawing=draw_matrix(study.matrix[rows][:, rows], names, title),
             )
     free = [k for k in range(10) if camera.sds[k] > 0]
     if camera.correlations is not None and free:

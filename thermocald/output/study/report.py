@@ -89,16 +89,28 @@ def _answer(camera: CameraStudy) -> Answer:
         steps = ["Record a temperature with the frames; without one nothing can be corrected."]
     if len(camera.series) < 2:
         steps.append("Measure a second series on another day, to see which changes repeat.")
+    uncovered = [
+        "Temperatures other than those measured, and changes faster than the epochs.",
+        "Errors of the camera model itself, and changes of focus or lens by hand.",
+        "The behaviour of another specimen of this camera, which needs its own series.",
+    ]
+    courses = [
+        study.deviations[c.thermometer.name]
+        for study in camera.series
+        for c in study.channels[:1]
+        if c.dependences
+    ]
+    if courses and not any(d.returned for d in courses):
+        uncovered.append(
+            "Changes with time alone, such as a creeping mount: the temperature did not return, "
+            "so that they look like a dependence on it."
+        )
     return Answer(
         sentences[0],
         None if proof is None else replace(proof, name="proof"),
         tuple(sentences[1:]),
         tuple(steps),
-        (
-            "Temperatures other than those measured, and changes faster than the epochs.",
-            "Errors of the camera model itself, and changes of focus or lens by hand.",
-            "The behaviour of another specimen of this camera, which needs its own series.",
-        ),
+        tuple(uncovered),
     )
 
 

@@ -77,10 +77,10 @@ def answer_sentences(camera: CameraStudy) -> list[str]:
     sentences += [s for study in camera.series if (s := _change(study))]
     if mc is not None:
         sentences.append(
-            f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn from "
-            "independent normal distributions about the series' mean (the reference's procedure) "
-            f"cause errors of {mc.overall_mean / 10:.2f} cm on average and up to "
-            f"{mc.mean_largest / 10:.1f} cm (mean of the largest of {mc.sets:,} draws); "
+            f"On a plane at {mc.distance_mm / 1000:g} m, interior orientations drawn normally "
+            "about the series' mean with the correlations of an epoch's adjustment (the "
+            f"reference's procedure) cause errors of {mc.overall_mean / 10:.2f} cm on average and "
+            f"up to {mc.mean_largest / 10:.1f} cm (mean of the largest of {mc.sets:,} draws); "
             f"{percent(float(mc.fractions[0]))} stay below {mc.clusters_mm[0] / 10:g} cm."
         )
         sentences += _trajectory(camera, mc.clusters_mm[0])
@@ -203,9 +203,9 @@ def _distance(c: Deviation) -> str:
     """Describe the change of the principal distance."""
     if c.returned:
         grew = "grew" if c.largest > 0 else "shrank"
-        ended = "where it started" if abs(c.change) < 3 * c.sd_change else (
-            f"{plain(1000 * abs(c.change), 'µm', 2)} {'longer' if c.change > 0 else 'shorter'}"
-        )  # fmt: skip
+        ended = f"{plain(1000 * abs(c.change), 'µm', 2)} {'longer' if c.change > 0 else 'shorter'}"
+        if abs(c.change) < 3 * c.sd_change:
+            ended = f"within {plain(3000 * c.sd_change, 'µm', 2)} of where it started"
         return (
             f"the principal distance {grew} by up to {plain(1000 * abs(c.largest), 'µm', 2)} and "
             f"ended {ended}"

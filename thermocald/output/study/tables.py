@@ -236,6 +236,8 @@ def object_space_tables(camera: CameraStudy) -> list[Table]:
     values, vectors = np.linalg.eigh(mc.covariance)  # the longer axis is the last
     axes = np.sqrt(np.maximum(values, 0.0)) / 10
     direction = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])) % 180
+    used = max(mc.sets - mc.folded, 1)
+    chance = float(np.sqrt(np.trace(mc.covariance, axis1=1, axis2=2).mean() / used))
     points = Table.of(
         "Errors by image point",
         range(len(mc.image_points)),
@@ -250,6 +252,7 @@ def object_space_tables(camera: CameraStudy) -> list[Table]:
             "bias mm": lambda k: f"{np.linalg.norm(mc.mean_error[k]):.2f}",
         },
         "Direction: of the longer axis, from X (right) towards Y (up) as the camera sees them. "
-        "Bias: length of the mean error vector, an effect of second order.",
+        "Bias: length of the mean error vector, an effect of second order; chance alone gives "
+        f"about {plain(chance, 'mm', 1)}.",
     )
     return [clusters, points]

@@ -150,6 +150,23 @@ def test_missing_readings_are_refused():
     assert camera.live().update(0.0, np.float32(25.0)).temperature == 25.0
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda camera: camera.at(30.0, temperature_sd="0.1"),
+        lambda camera: camera.at(30.0, channels=[30.0]),
+        lambda camera: camera.along([0, 1], [25.0, 26.0], relative_to="x"),
+        lambda camera: camera.live(size=("640", "480")),
+        lambda camera: camera.live(size=640),
+        lambda camera: camera.live().correct([[1, 2], [3, 4]]),
+        lambda camera: tc.load_camera(None),
+    ],
+)
+def test_a_wrong_type_is_one_clear_error(call):
+    with pytest.raises(UsageError, match=r"(is|is a) .*(give|must be)"):
+        call(ThermalCamera(thermal_model()))
+
+
 def test_images_of_another_camera_a_crop_and_a_binning():
     camera = ThermalCamera(thermal_model())
     with pytest.raises(ConfigurationError, match="belongs to one camera"):

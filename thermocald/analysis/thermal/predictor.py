@@ -22,8 +22,7 @@ from thermocald.photogrammetry.camera.camera_model import IOP, partials, rays
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from thermocald.analysis.thermal.live_camera import LiveCamera
-    from thermocald.analysis.thermal.thermal_camera import ThermalCamera
+    from thermocald.analysis.thermal.thermal_camera import LiveCamera, ThermalCamera
     from thermocald.arrays import Array
 
 _LONG_S = 30 * 86400.0  # after this long at one temperature everything has settled
